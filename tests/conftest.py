@@ -1,0 +1,35 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+
+matplotlib.use("Agg")
+
+
+def _data_folder():
+    named = os.environ.get("ISA_NRSFM_DATA")
+    checkout = Path(__file__).resolve().parents[1]
+    return Path(named) if named else checkout.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def data_path():
+    """Return a function from a file name to its path; skip where it is absent."""
+
+    def path(name):
+        file = _data_folder() / name
+        if not file.is_file():
+            pytest.skip(f"{name} not found: set ISA_NRSFM_DATA to the folder with it")
+        return file
+
+    return path
+
+
+@pytest.fixture(scope="session")
+def load_data(data_path):
+    """Return a function from the name of a data set to its arrays."""
+    return lambda name: np.load(data_path(f"{name}.npz"), allow_pickle=False)
