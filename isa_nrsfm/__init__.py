@@ -1,3 +1,8 @@
 """Non-rigid structure from motion by independent subspace analysis."""
 
+from isa_nrsfm._estimator import AffineNRSfM, Decomposition
+from isa_nrsfm.isa import FastISA, PooledFastICA
+
 __version__ = "0.1.0"
+
+__all__ = ["AffineNRSfM", "Decomposition", "FastISA", "PooledFastICA", "__version__"]

@@ -1,0 +1,131 @@
+"""The canonical choice among shapes and cameras that fit a table equally well.
+
+An affinity of space, the order, scale and sign of the basis shapes are free: here
+they are fixed. What stays free is the mirror image in depth: a table seen by affine
+cameras does not tell it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._camera import mean_view
+from isa_nrsfm._factorisation import orientations
+
+
+def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
+    """
+    Return the affinity of space that makes the mean shape white and seen from front.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        B_0, centred.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, each divided by the size of its frame.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        A such that shapes ``B A^T`` and cameras ``M A^-1`` are canonical: the mean of
+        ``b b^T`` over the points of the mean shape is the identity (with zeros along
+        directions in which it is flat), and the rows of the mean camera span the x
+        and y axes and are as near to them as can be. Where the cameras have no common
+        view x, y and z are the principal axes of ``sum_i M_i^T M_i`` instead. The
+        third moment of depth is not negative.
+    """
+    variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
+    inside = variance > 1e-18 * variance[-1]
+    scale = np.where(inside, 1.0 / np.sqrt(np.where(inside, variance, 1.0)), 1.0)
+    whitening = (axes * scale) @ axes.T
+    white_motion = motion @ np.linalg.inv(whitening)
+    white_shape = mean_shape @ whitening
+    view = mean_view(white_motion)
+    if view is None:
+        second = np.einsum("irc,ird->cd", white_motion, white_motion)
+        rotation = np.linalg.eigh(second)[1][:, ::-1].T
+        rotation = rotation * orientations(rotation @ white_shape.T)[:, None]
+    else:
+        U, _, Vt = np.linalg.svd(view, full_matrices=False)
+        across = U @ Vt
+        rotation = np.vstack([across, np.cross(*across)])
+        rotation[2] *= orientations((white_shape @ rotation[2:].T).T)[0]
+    return rotation @ whitening
+
+
+class Gauge(NamedTuple):
+    """
+    Canonical shapes.
+
+    Attributes
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape in the canonical space.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes in the canonical space, order and scale.
+    order : ndarray of int, shape (n_components,)
+        Where each basis shape was before.
+    """
+
+    mean_shape: NDArray
+    basis: NDArray
+    order: NDArray
+
+
+def canonical_gauge(
+    mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
+) -> Gauge:
+    """
+    Return the canonical shapes among those that fit equally well.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        B_0, centred.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, each divided by the size of its frame.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    Gauge
+        The shapes in the space of `canonical_space`, the basis by decreasing energy
+        in the images, ``sum_i ||alpha_ik M_i B_k||_F^2``, and such that the
+        coefficients have unit variance over the frames (unit mean square where they
+        do not vary) and a third moment that is not negative. A basis shape without
+        motion becomes zero.
+    """
+    G = basis.transpose(0, 2, 1) @ basis
+    seen = np.einsum("kcd,irc,ird->ik", G, motion, motion, optimize=True)
+    order = np.argsort(-np.sum(alpha**2 * seen, axis=0), kind="stable")
+
+    deviation = alpha.std(axis=0)
+    constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
+    size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
+    scaled = (orientations(alpha.T) * size)[:, None, None] * basis
+    space = canonical_space(mean_shape, motion).T
+    return Gauge(mean_shape @ space, scaled[order] @ space, order)
+
+
+def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:
+    """
+    Return a matrix with its 3x3 blocks in another order.
+
+    Parameters
+    ----------
+    matrix : ndarray of shape (3 * n_blocks, 3 * n_blocks)
+        The matrix.
+    order : ndarray of int, shape (n_blocks,)
+        Where each block was before.
+
+    Returns
+    -------
+    ndarray of shape (3 * n_blocks, 3 * n_blocks)
+        The matrix with rows and columns rearranged.
+    """
+    index = (3 * order[:, None] + np.arange(3)).ravel()
+    return matrix[np.ix_(index, index)]

@@ -1,0 +1,126 @@
+"""What the strategies of independent subspace analysis share."""
+
+from abc import ABCMeta, abstractmethod
+from numbers import Integral
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import (
+    BaseEstimator,
+    ClassNamePrefixFeaturesOutMixin,
+    TransformerMixin,
+    _fit_context,
+)
+from sklearn.utils._param_validation import Interval
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+# Signals whose smallest variance is below this share of the largest are dependent.
+DEPENDENT = 1e-14
+
+
+class BaseSubspaceAnalysis(
+    ClassNamePrefixFeaturesOutMixin,
+    TransformerMixin,
+    BaseEstimator,
+    metaclass=ABCMeta,
+):
+    """Whitening, validation and projection; a strategy adds `_unmix`."""
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "subspace_size": [Interval(Integral, 1, None, closed="left")],
+        "n_init": [Interval(Integral, 1, None, closed="left")],
+        "random_state": ["random_state"],
+    }
+
+    subspace_size: int
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, signals: Any, y: Any = None, **fit_params: Any) -> Self:
+        """
+        Find the independent subspaces.
+
+        Parameters
+        ----------
+        signals : array-like of shape (n_samples, n_signals)
+            The signals, one a column.
+        y : None
+            Ignored.
+        **fit_params : dict
+            What the strategy takes in addition.
+
+        Returns
+        -------
+        object
+            The fitted strategy.
+        """
+        signals = validate_data(
+            self,
+            signals,
+            dtype=np.float64,
+            ensure_min_samples=2,
+            ensure_min_features=self.subspace_size,
+        )
+        n_signals = signals.shape[1]
+        if n_signals % self.subspace_size:
+            raise ValueError(
+                f"the number of signals must be a multiple of subspace_size="
+                f"{self.subspace_size}; got n_features={n_signals}"
+            )
+        self.mean_ = signals.mean(axis=0)
+        Z, whitening = whiten(signals - self.mean_)
+        self.components_ = self._unmix(Z, whitening, **fit_params) @ whitening
+        self._n_features_out = n_signals
+        return self
+
+    @abstractmethod
+    def _unmix(self, Z: NDArray, whitening: NDArray, **fit_params: Any) -> NDArray:
+        """Return the orthogonal matrix that unmixes white signals Z, one a row."""
+
+    def transform(self, signals: Any) -> NDArray:
+        """
+        Return the sources.
+
+        Parameters
+        ----------
+        signals : array-like of shape (n_samples, n_signals)
+            The signals, one a column.
+
+        Returns
+        -------
+        ndarray of shape (n_samples, n_signals)
+            ``(signals - mean_) @ components_.T``; consecutive columns form a subspace.
+        """
+        check_is_fitted(self)
+        signals = validate_data(self, signals, dtype=np.float64, reset=False)
+        return (signals - self.mean_) @ self.components_.T
+
+
+def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return uncorrelated signals of unit variance, as near to the given as can be.
+
+    Signals that are white already stay as they are, up to rounding.
+
+    Parameters
+    ----------
+    centred : ndarray of shape (n_samples, n_signals)
+        Signals with zero mean.
+
+    Returns
+    -------
+    Z : ndarray of shape (n_signals, n_samples)
+        White signals, ``Z Z^T = n_samples I``.
+    whitening : ndarray of shape (n_signals, n_signals)
+        Symmetric, ``Z = whitening @ centred.T``.
+    """
+    n_samples, n_signals = centred.shape
+    variance, axes = np.linalg.eigh(centred.T @ centred / n_samples)
+    rank = int(np.sum(variance > DEPENDENT * variance[-1]))
+    if rank < n_signals:
+        raise ValueError(
+            f"{n_signals} linearly independent signals are needed; got rank {rank} "
+            f"in n_samples={n_samples} samples"
+        )
+    whitening = (axes / np.sqrt(variance)) @ axes.T
+    return np.ascontiguousarray(whitening @ centred.T), whitening

@@ -1,0 +1,201 @@
+"""FastISA with many starts: ISA1."""
+
+import warnings
+from numbers import Integral, Real
+from typing import Any, ClassVar
+
+import numpy as np
+from joblib import effective_n_jobs
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
+from sklearn.utils._param_validation import HasMethods, Interval
+from sklearn.utils.parallel import Parallel, delayed
+
+from isa_nrsfm.isa._base import BaseSubspaceAnalysis
+from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
+from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
+from isa_nrsfm.isa._grouping import likelihood_gains, swap_until_best
+
+# Starts that are iterated together: enough to make numpy's overhead small, few enough
+# that their arrays stay in the cache.
+BATCH_SIZE = 8
+
+
+class FastISA(BaseSubspaceAnalysis):
+    """
+    Independent subspace analysis by fixed-point iteration from many starts.
+
+    Finds a linear transformation of the signals whose rows fall into groups of
+    `subspace_size` such that the groups are as independent of each other as possible
+    and the sources inside a group share their energy.
+
+    Each start takes a random orthogonal matrix, runs symmetric FastICA with the same
+    density (subspaces of size one), groups its rows by greedy swaps and runs FastISA.
+    The start with the largest likelihood is kept.
+
+    Parameters
+    ----------
+    subspace_size : int, default=3
+        Dimension of each subspace; the number of signals must be a multiple of it.
+    n_init : int, default=30
+        Number of starts.
+    density : object, default=None
+        Logarithm of the density of a subspace's energy, with the methods
+        ``log_density(energy)`` and ``derivatives(energy)``; None is
+        ``SqrtDensity(eps=0.1)``.
+    max_iter : int, default=500
+        The most steps of each of the two iterations of a start.
+    tol : float, default=1e-4
+        An iteration has converged when no subspace turns by more than this mean
+        square sine of the principal angles.
+    random_state : int, RandomState instance or None, default=None
+        Draws the starts; an int makes the result reproducible.
+    n_jobs : int or None, default=None
+        Number of joblib workers that share the starts; the result does not depend on
+        it.
+    verbose : int, default=0
+        Above zero, print a line for each batch of starts.
+
+    Attributes
+    ----------
+    components_ : ndarray of shape (n_signals, n_signals)
+        Unmixing matrix, whitening included: ``(signals - mean_) @ components_.T`` are
+        the sources, uncorrelated with unit variance; consecutive rows form a
+        subspace. Orthogonal when the signals are white already.
+    mean_ : ndarray of shape (n_signals,)
+        Mean of the signals.
+    log_likelihood_ : float
+        Mean log-likelihood of a sample, up to a constant, of the start that is kept.
+    log_likelihoods_ : ndarray of shape (n_init,)
+        The same for every start.
+    n_iter_ : int
+        Steps of the start that is kept, of both iterations together.
+    n_iters_ : ndarray of int, shape (n_init,)
+        The same for every start.
+    n_features_in_ : int
+        Number of signals.
+    feature_names_in_ : ndarray of shape (n_signals,)
+        Names of the signals, where they came in a dataframe with string names.
+
+    See Also
+    --------
+    PooledFastICA : Independent components that are grouped afterwards.
+
+    References
+    ----------
+    A. Hyvarinen, U. Koster, "FastISA: A fast fixed-point algorithm for independent
+    subspace analysis", ESANN 2006.
+
+    S. Brandt, H. Ackermann, S. Grasshof, "Uncalibrated Non-Rigid Factorisation by
+    Independent Subspace Analysis", 2018, section 3.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.isa import FastISA
+    >>> rng = np.random.default_rng(0)
+    >>> sources = rng.normal(size=(2000, 2, 3)) * rng.exponential(size=(2000, 2, 1))
+    >>> signals = sources.reshape(2000, 6) @ rng.normal(size=(6, 6))
+    >>> isa = FastISA(n_init=5, random_state=0).fit(signals)
+    >>> isa.components_.shape
+    (6, 6)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **BaseSubspaceAnalysis._parameter_constraints,
+        "density": [None, HasMethods(["log_density", "derivatives"])],
+        "max_iter": [Interval(Integral, 1, None, closed="left")],
+        "tol": [Interval(Real, 0, None, closed="neither")],
+        "n_jobs": [None, Integral],
+        "verbose": ["verbose"],
+    }
+
+    def __init__(
+        self,
+        subspace_size: int = 3,
+        *,
+        n_init: int = 30,
+        density: SubspaceDensity | None = None,
+        max_iter: int = 500,
+        tol: float = 1e-4,
+        random_state: Any = None,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ):
+        self.subspace_size = subspace_size
+        self.n_init = n_init
+        self.density = density
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+        self.n_jobs = n_jobs
+        self.verbose = verbose
+
+    def _unmix(self, Z: NDArray, whitening: NDArray, **fit_params: Any) -> NDArray:
+        density = SqrtDensity() if self.density is None else self.density
+        random_state = check_random_state(self.random_state)
+        n_signals = len(Z)
+        starts = orthogonalise(
+            random_state.standard_normal((self.n_init, n_signals, n_signals))
+        )
+        batches = [
+            starts[first : first + BATCH_SIZE]
+            for first in range(0, self.n_init, BATCH_SIZE)
+        ]
+        n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
+        runs = Parallel(n_jobs=n_jobs, return_as="generator")(
+            delayed(_run)(
+                batch, Z, self.subspace_size, density, self.max_iter, self.tol
+            )
+            for batch in batches
+        )
+        results = []
+        for run in runs:
+            results.append(run)
+            if self.verbose:
+                done = sum(len(W) for W, *_ in results)
+                best = max(values.max() for _, values, *_ in results)
+                print(f"[FastISA] {done}/{self.n_init} starts, best {best:.6g}")
+        W, log_likelihoods, n_iters, converged = map(
+            np.concatenate, zip(*results, strict=True)
+        )
+        best = int(np.argmax(log_likelihoods))
+        if not converged[best]:
+            warnings.warn(
+                f"FastISA did not converge in max_iter={self.max_iter} steps: its "
+                "best start still moves; increase max_iter or tol",
+                ConvergenceWarning,
+                stacklevel=3,
+            )
+        self.log_likelihoods_ = log_likelihoods
+        self.log_likelihood_ = float(log_likelihoods[best])
+        self.n_iters_ = n_iters
+        self.n_iter_ = int(n_iters[best])
+        return W[best]
+
+
+def _run(
+    starts: NDArray,
+    Z: NDArray,
+    subspace_size: int,
+    density: SubspaceDensity,
+    max_iter: int,
+    tol: float,
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return unmixing, likelihood, steps and convergence of a batch of starts."""
+    W, n_iter_ica, _ = iterate(starts, Z, 1, density, max_iter=max_iter, tol=tol)
+    n_signals = len(Z)
+    first = np.repeat(np.arange(n_signals // subspace_size), subspace_size)
+    for r in range(len(W)):
+        assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
+        W[r] = W[r][np.argsort(assignment, kind="stable")]
+    W, n_iter, converged = iterate(
+        W, Z, subspace_size, density, max_iter=max_iter, tol=tol
+    )
+    return (
+        W,
+        log_likelihood(W, Z, subspace_size, density),
+        n_iter_ica + n_iter,
+        converged,
+    )

@@ -1,0 +1,212 @@
+"""The fixed-point iteration of FastISA on a batch of starts."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm.isa._density import SubspaceDensity
+
+# A start whose subspaces have not come closer to standing still for this many steps
+# goes round in a cycle: its steps are halved.
+PATIENCE = 10
+SHORTEST_STEP = 1.0 / 16.0
+
+
+def orthogonalise(W: NDArray) -> NDArray:
+    """
+    Return the orthogonal matrices nearest to the given ones.
+
+    Parameters
+    ----------
+    W : ndarray of shape (..., n, n)
+        Square matrices.
+
+    Returns
+    -------
+    ndarray of shape (..., n, n)
+        ``(W W^T)^(-1/2) W``, the symmetric orthogonalisation.
+    """
+    U, _, Vt = np.linalg.svd(W)
+    return U @ Vt
+
+
+def subspace_energies(Y: NDArray, subspace_size: int) -> NDArray:
+    """
+    Return the energy of each subspace at each sample.
+
+    Parameters
+    ----------
+    Y : ndarray of shape (..., n_signals, n_samples)
+        Signals; consecutive rows form a subspace.
+    subspace_size : int
+        Rows in a subspace.
+
+    Returns
+    -------
+    ndarray of shape (..., n_signals // subspace_size, n_samples)
+        Sums of squares.
+    """
+    *batch, _, n_samples = Y.shape
+    return (Y * Y).reshape(*batch, -1, subspace_size, n_samples).sum(axis=-2)
+
+
+def log_likelihood(
+    W: NDArray, Z: NDArray, subspace_size: int, density: SubspaceDensity
+) -> NDArray:
+    """
+    Return the mean log-likelihood of a sample, up to a constant.
+
+    Parameters
+    ----------
+    W : ndarray of shape (..., n_signals, n_signals)
+        Orthogonal matrices.
+    Z : ndarray of shape (n_signals, n_samples)
+        White signals.
+    subspace_size : int
+        Rows in a subspace.
+    density : SubspaceDensity
+        Gives F.
+
+    Returns
+    -------
+    ndarray of shape (...)
+        ``sum_k E F(u_k)``.
+    """
+    u = subspace_energies(W @ Z, subspace_size)
+    return density.log_density(u).mean(axis=-1).sum(axis=-1)
+
+
+def fixed_point_step(
+    W: NDArray,
+    Z: NDArray,
+    subspace_size: int,
+    density: SubspaceDensity,
+    length: NDArray | float = 1.0,
+) -> NDArray:
+    """
+    Return one step of FastISA (Hyvarinen and Koster 2006).
+
+    Parameters
+    ----------
+    W : ndarray of shape (n_batch, n_signals, n_signals)
+        Orthogonal matrices.
+    Z : ndarray of shape (n_signals, n_samples)
+        White signals.
+    subspace_size : int
+        Rows in a subspace.
+    density : SubspaceDensity
+        Gives g = F' and g'.
+    length : float or ndarray of shape (n_batch,), default=1.0
+        Below 1.0 each row keeps more of its direction, which shortens the step to
+        about this share and leaves the fixed points where they are.
+
+    Returns
+    -------
+    ndarray of shape (n_batch, n_signals, n_signals)
+        For each row w of subspace k, with y = w z, the orthogonalised
+        ``E[z y g(u_k)] - E[g(u_k) + 2 y^2 g'(u_k)] w``.
+    """
+    n_batch, n_signals, n_samples = len(W), *Z.shape
+    Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
+    square = Y * Y
+    g, dg = density.derivatives(square.sum(axis=2))
+    curvature = g.sum(axis=-1)[..., None] + 2.0 * np.vecdot(square, dg[:, :, None])
+    Y *= g[:, :, None]
+    step = Y.reshape(n_batch, n_signals, n_samples) @ Z.T
+    step -= curvature.reshape(n_batch, n_signals, 1) * W
+    kept = np.vecdot(step, W) * (1.0 / np.reshape(length, (-1, 1)) - 1.0)
+    step += kept[..., None] * W
+    return orthogonalise(step)
+
+
+def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
+    """
+    Return how far the subspaces of two orthogonal matrices are apart.
+
+    Rows may rotate inside their subspace for ever, so the projectors are compared.
+
+    Parameters
+    ----------
+    W, W_new : ndarray of shape (n_batch, n_signals, n_signals)
+        Orthogonal matrices.
+    subspace_size : int
+        Rows in a subspace.
+
+    Returns
+    -------
+    ndarray of shape (n_batch,)
+        The largest mean square sine of the principal angles over the subspaces,
+        ``||P_k - P_new,k||_F^2 / (2 d)`` with projectors ``P_k = W_k^T W_k``.
+    """
+    shape = (len(W), -1, subspace_size, W.shape[-1])
+    cosines = W.reshape(shape) @ W_new.reshape(shape).swapaxes(-1, -2)
+    return np.max(1.0 - np.sum(cosines**2, axis=(-1, -2)) / subspace_size, axis=1)
+
+
+def iterate(
+    W: NDArray,
+    Z: NDArray,
+    subspace_size: int,
+    density: SubspaceDensity,
+    *,
+    max_iter: int,
+    tol: float,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Repeat `fixed_point_step` on each start until its subspaces stand still.
+
+    With few samples the published iteration ends in cycles more often than not, so
+    the steps of a start that goes round are shortened, which leaves its fixed points
+    where they are.
+
+    Parameters
+    ----------
+    W : ndarray of shape (n_batch, n_signals, n_signals)
+        Orthogonal starts.
+    Z : ndarray of shape (n_signals, n_samples)
+        White signals.
+    subspace_size : int
+        Rows in a subspace.
+    density : SubspaceDensity
+        The model.
+    max_iter : int
+        The most steps of a start.
+    tol : float
+        A start has converged when a whole step would turn no subspace by more than
+        this mean square sine of the principal angles.
+
+    Returns
+    -------
+    W : ndarray of shape (n_batch, n_signals, n_signals)
+        Last iterates.
+    n_iter : ndarray of int, shape (n_batch,)
+        Steps of each start.
+    converged : ndarray of bool, shape (n_batch,)
+        Whether each start has converged.
+    """
+    W = W.copy()
+    n_iter = np.zeros(len(W), dtype=int)
+    converged = np.zeros(len(W), dtype=bool)
+    running = np.arange(len(W))
+    length = np.ones(len(W))
+    least_change = np.full(len(W), np.inf)
+    waited = np.zeros(len(W), dtype=int)
+    for _ in range(max_iter):
+        part = length[running]
+        new = fixed_point_step(W[running], Z, subspace_size, density, part)
+        change = subspace_change(W[running], new, subspace_size) / part**2
+        W[running] = new
+        n_iter[running] += 1
+
+        nearer = change < least_change[running]
+        least_change[running[nearer]] = change[nearer]
+        waited[running] = np.where(nearer, 0, waited[running] + 1)
+        cycling = running[waited[running] >= PATIENCE]
+        length[cycling] = np.maximum(length[cycling] / 2, SHORTEST_STEP)
+        waited[cycling] = 0
+
+        still = change < tol
+        converged[running[still]] = True
+        running = running[~still]
+        if not len(running):
+            break
+    return W, n_iter, converged

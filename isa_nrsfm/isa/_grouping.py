@@ -1,0 +1,142 @@
+"""Grouping of signals into subspaces by greedy pairwise swaps."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm.isa._density import SubspaceDensity
+
+# A swap must gain more than rounding errors, relative to the size of the objective.
+LEAST_GAIN = 1e-12
+
+
+def swap_until_best(
+    assignment: NDArray, gains: Callable[[NDArray], tuple[NDArray, float]]
+) -> NDArray:
+    """
+    Swap the two signals whose swap gains most, until no swap gains.
+
+    Parameters
+    ----------
+    assignment : ndarray of int, shape (n_signals,)
+        The subspace of each signal at the start.
+    gains : callable
+        Returns for an assignment the gains (n_signals, n_signals), symmetric, of the
+        swap of any two signals, and the size of the objective.
+
+    Returns
+    -------
+    ndarray of int, shape (n_signals,)
+        An assignment that no swap of two signals improves.
+    """
+    assignment = assignment.copy()
+    while True:
+        gain, size = gains(assignment)
+        gain = np.where(assignment[:, None] == assignment, 0.0, gain)
+        a, b = np.unravel_index(np.argmax(gain), gain.shape)
+        if not gain[a, b] > LEAST_GAIN * size:
+            return assignment
+        assignment[[a, b]] = assignment[[b, a]]
+
+
+def covariance_gains(
+    covariance: NDArray,
+) -> Callable[[NDArray], tuple[NDArray, float]]:
+    """
+    Return the gains for pooling by covariance.
+
+    The objective is the energy of the covariance inside the diagonal blocks of the
+    subspaces (Brandt et al. 2018, section 3.3).
+
+    Parameters
+    ----------
+    covariance : ndarray of shape (n_signals, n_signals)
+        Symmetric.
+
+    Returns
+    -------
+    callable
+        For `swap_until_best`.
+    """
+    energy = covariance**2
+    total = float(energy.sum())
+    diagonal = np.diag(energy)
+
+    def gains(assignment: NDArray) -> tuple[NDArray, float]:
+        member = assignment[:, None] == np.arange(assignment.max() + 1)
+        shared = energy @ member  # of a signal with each subspace
+        there = shared[:, assignment]  # of signal a with the subspace of b
+        leave = diagonal - there[np.arange(len(energy)), np.arange(len(energy))]
+        gain = there - energy + leave[:, None]
+        return gain + gain.T, total
+
+    return gains
+
+
+def value_gains(
+    value: Callable[[NDArray], NDArray], n_signals: int
+) -> Callable[[NDArray], tuple[NDArray, float]]:
+    """
+    Return the gains for an objective that is a sum over the subspaces.
+
+    Parameters
+    ----------
+    value : callable
+        Takes groups of signals, ndarray of int of shape (n_groups, subspace_size), and
+        returns the value of each as a subspace, whatever the order in the group.
+    n_signals : int
+        Number of signals.
+
+    Returns
+    -------
+    callable
+        For `swap_until_best`.
+    """
+    # with_b[a, b]: value of the subspace of a with a replaced by b. It depends only
+    # on who shares the subspace with a: one swap changes two subspaces.
+    with_b = np.empty((n_signals, n_signals))
+    mates_before = np.zeros((n_signals, n_signals), dtype=bool)
+    everyone = np.arange(n_signals)
+
+    def gains(assignment: NDArray) -> tuple[NDArray, float]:
+        mates = assignment[:, None] == assignment
+        for a in np.flatnonzero((mates != mates_before).any(axis=1)):
+            rest = np.flatnonzero(mates[a] & (everyone != a))
+            groups = np.column_stack([np.tile(rest, (n_signals, 1)), everyone])
+            with_b[a] = value(groups)
+        mates_before[:] = mates
+        own = np.diag(with_b)
+        gain = with_b - own[:, None]
+        return gain + gain.T, float(np.abs(own).sum())
+
+    return gains
+
+
+def likelihood_gains(
+    signals: NDArray, density: SubspaceDensity
+) -> Callable[[NDArray], tuple[NDArray, float]]:
+    """
+    Return the gains for grouping by the likelihood of ISA, ``sum_k E F(u_k)``.
+
+    Parameters
+    ----------
+    signals : ndarray of shape (n_signals, n_samples)
+        Uncorrelated signals of unit variance.
+    density : SubspaceDensity
+        Gives F of the energy u_k of subspace k.
+
+    Returns
+    -------
+    callable
+        For `swap_until_best`.
+    """
+    square = signals**2
+
+    def value(groups: NDArray) -> NDArray:
+        energy = np.zeros((len(groups), square.shape[1]))
+        for member in groups.T:
+            energy += square[member]
+        return density.log_density(energy).mean(axis=1)
+
+    return value_gains(value, len(signals))

@@ -1,0 +1,240 @@
+"""Landmark columns recognised by their names."""
+
+import numpy as np
+import pytest
+
+from isa_nrsfm._landmark_names import (
+    MIN_POINTS,
+    find_landmark_columns,
+    landmark_sets,
+    names_layout,
+    parse_coordinate,
+    point_names,
+)
+
+N_POINTS = 9
+
+
+def openface_names():
+    """Return the header of an OpenFace 2 file with all its outputs."""
+    names = ["frame", "face_id", "timestamp", "confidence", "success"]
+    names += [f"gaze_{eye}_{axis}" for eye in (0, 1) for axis in "xyz"]
+    names += ["gaze_angle_x", "gaze_angle_y"]
+    names += [f"eye_lmk_{axis}_{j}" for axis in "xyXYZ" for j in range(56)]
+    names += [f"pose_{kind}{axis}" for kind in "TR" for axis in "xyz"]
+    names += [f"{axis}_{j}" for axis in "xyXYZ" for j in range(68)]
+    names += ["p_scale", "p_rx", "p_ry", "p_rz", "p_tx", "p_ty"]
+    names += [f"p_{j}" for j in range(34)]
+    names += [f"AU{unit:02d}_r" for unit in range(17)]
+    return names + [f"AU{unit:02d}_c" for unit in range(18)]
+
+
+def named(template, axes="xy", points=range(N_POINTS)):
+    """Return interleaved names from a template with {a} and {p}."""
+    return [template.format(a=axis, p=point) for point in points for axis in axes]
+
+
+@pytest.mark.parametrize(
+    ("template", "pattern"),
+    [
+        ("{a}{p:02d}", "x#,y#"),
+        ("{a}{p}", "x#,y#"),
+        ("{a}_{p}", "x_#,y_#"),
+        ("{a}-{p}", "x-#,y-#"),
+        ("{a}.{p}", "x.#,y.#"),
+        ("{p}_{a}", "#_x,#_y"),
+        ("{p}.{a}", "#.x,#.y"),
+        ("{p}{a}", "#x,#y"),
+        ("landmark_{p}_{a}", "landmark_#_x,landmark_#_y"),
+        ("eye_lmk_{a}_{p}", "eye_lmk_x_#,eye_lmk_y_#"),
+        ("  {a}_{p} ", "x_#,y_#"),
+    ],
+)
+def test_numbered_points_are_found_in_numeric_order(template, pattern):
+    names = named(template, points=range(12))
+    shuffled = ["id", *np.random.default_rng(0).permutation(names), "confidence"]
+    found = find_landmark_columns(shuffled)
+    assert found.pattern == pattern
+    assert found.interleaved == names
+    assert found.gaps == ()
+    assert find_landmark_columns(shuffled, columns=pattern) == found
+
+
+@pytest.mark.parametrize(
+    ("template", "pattern"),
+    [("{p}_{a}", "*_x,*_y"), ("{p}.{a}", "*.x,*.y"), ("{a}_{p}", "x_*,y_*")],
+)
+def test_named_points_keep_the_order_of_the_table(template, pattern):
+    points = ["nose", "chin", "left eye", "brow_1", "brow_2", "mouth-l", "mouth-r"]
+    names = ["id", *named(template, points=points)]
+    found = find_landmark_columns(names)
+    assert found.pattern == pattern
+    assert found.interleaved == names[1:]
+    assert found.points == tuple(points)
+
+
+def test_fingers_are_one_set_of_named_points():
+    points = [f"{f}_{j}" for f in ("thumb", "index") for j in (10, 9, 8, 7)]
+    found = find_landmark_columns(named("{p}_{a}", points=points))
+    assert found.pattern == "*_x,*_y"
+    assert found.points == tuple(points)
+
+
+def test_third_coordinate_is_set_aside_and_reported():
+    names = named("{a}_{p}", axes="xyz")
+    found = find_landmark_columns(names)
+    assert found.interleaved == named("{a}_{p}")
+    assert found.z == tuple(f"z_{j}" for j in range(N_POINTS))
+    assert find_landmark_columns(names, columns="x_#,y_#").z == found.z
+
+
+def test_gaps_in_the_numbers_are_reported_not_refused():
+    names = named("{a}{p}", points=[3, 4, 5, 7, 8, 9, 12])
+    found = find_landmark_columns(names)
+    assert found.gaps == (6, 10, 11)
+    assert found.points == ("3", "4", "5", "7", "8", "9", "12")
+
+
+def test_zero_padding_does_not_separate_coordinates():
+    names = [f"x{j:02d}" for j in range(12)] + [f"y{j}" for j in range(12)]
+    assert find_landmark_columns(names).interleaved[2:4] == ["x01", "y1"]
+
+
+def test_case_and_prefix_separate_sets():
+    sets = landmark_sets(openface_names())
+    assert len(openface_names()) == 714
+    assert sets == {
+        "gaze_#_x,gaze_#_y": 2,
+        "*_x,*_y": 3,
+        "eye_lmk_x_#,eye_lmk_y_#": 56,
+        "eye_lmk_X_#,eye_lmk_Y_#": 56,
+        "x_#,y_#": 68,
+        "X_#,Y_#": 68,
+    }
+
+
+def test_several_sets_are_refused_with_the_ways_to_choose():
+    names = [f" {name}" for name in openface_names()]
+    with pytest.raises(ValueError, match="more than one set") as error:
+        find_landmark_columns(names)
+    message = str(error.value)
+    assert "'x_#,y_#' (68 points: x_0 to x_67)" in message
+    assert "'eye_lmk_x_#,eye_lmk_y_#' (56 points: " in message
+    assert "'X_#,Y_#' (68 points, with a z each: X_0 to X_67)" in message
+    assert "gaze" not in message
+    assert "--columns" in message
+    found = find_landmark_columns(names, columns="x_#,y_#")
+    assert found.x == tuple(f" x_{j}" for j in range(68))
+    assert found.z == ()
+    upper = find_landmark_columns(names, columns="X_#,Y_#")
+    assert upper.x[0] == " X_0"
+    assert upper.z[67] == " Z_67"
+
+
+def test_a_numbered_set_with_another_point_of_that_form_is_ambiguous():
+    names = [*named("lm_{p}_{a}"), "box_x", "box_y"]
+    with pytest.raises(ValueError, match=r"'lm_#_x,lm_#_y' \(9 .*'\*_x,\*_y' \(10 "):
+        find_landmark_columns(names)
+    assert len(find_landmark_columns(names, columns="lm_#_x,lm_#_y").x) == N_POINTS
+    assert len(find_landmark_columns(names, columns="*_x,*_y").x) == N_POINTS + 1
+
+
+def test_several_pairs_of_patterns_follow_one_another():
+    names = named("right_{p}_{a}") + named("left_{p}_{a}")
+    found = find_landmark_columns(
+        names, columns="left_#_x, left_#_y, right_#_x, right_#_y"
+    )
+    assert found.points[N_POINTS - 1 : N_POINTS + 1] == ("left_8", "right_0")
+    as_list = ["left_#_x", "left_#_y", "right_#_x", "right_#_y"]
+    assert find_landmark_columns(names, columns=as_list) == found
+
+
+def test_patterns_reach_names_of_any_form():
+    names = [f"{axis}{j}px" for j in (2, 10, 1) for axis in "vu"]
+    found = find_landmark_columns(names, columns="u#px,v#px")
+    assert found.interleaved == ["u1px", "v1px", "u2px", "v2px", "u10px", "v10px"]
+    assert found.points == ("u1px", "u2px", "u10px")
+    single = find_landmark_columns(["a", "b", "c"], columns="c,a")
+    assert single.interleaved == ["c", "a"]
+
+
+def test_small_sets_do_not_compete_and_do_not_suffice():
+    small = named("{p}_{a}", points=["gaze", *"abcde"])
+    assert len(small) == 2 * (MIN_POINTS - 1)
+    found = find_landmark_columns(small + named("{a}{p}"))
+    assert found.pattern == "x#,y#"
+    with pytest.raises(ValueError, match=r"fewer than 7 points: '\*_x,\*_y' \(6\)"):
+        find_landmark_columns(small)
+    assert len(find_landmark_columns(small, columns="*_x,*_y").x) == MIN_POINTS - 1
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "message"),
+    [
+        (["age", "sex"], None, "2 columns are 'age', 'sex'. If"),
+        ([f"x{j}" for j in range(20)], None, "'x0', 'x1', 'x2', 'x3', ...."),
+        ([], None, "no landmark columns"),
+        ([*named("{a}{p}"), "x9"], None, "'x9' has no partner among the columns 'y#':"),
+        ([*named("{a}{p}"), "y9"], None, "'y9' has no partner among the columns 'x#':"),
+        ([*named("{a}{p}"), "x9", "x10"], None, r"'y#' \(nor have 1 more\)"),
+        ([*named("{a}{p}"), "x00"], None, "'x0' and 'x00' name the same coordinate"),
+        ([*named("{a}{p}"), "y8"], None, "'y8' and 'y8' name the same coordinate"),
+        (["x", "y", *named("{a}.{p}")], None, "a header that repeats the same names"),
+        (named("{a}{p}"), "x_#,y_#", "no column matches 'x_#'; the table's 18 columns"),
+        (named("{a}{p}"), "x#", "x and y columns in turn.*got 'x#'"),
+        (named("{a}{p}"), "x#,", "x and y columns in turn"),
+        (named("{a}{p}"), [], "x and y columns in turn"),
+        (named("{a}{p}"), "x#,y#,x1,y1", "x#,y#,x1,y1 match 'x1' twice"),
+    ],
+)
+def test_errors_name_what_is_wrong(names, columns, message):
+    with pytest.raises(ValueError, match=message):
+        find_landmark_columns(names, columns)
+
+
+OTHER_NAMES = "AU01_r pose_Tx p_rx FaceRectX x _x max0 frame index1 a,b_x x_ p_scale"
+
+
+@pytest.mark.parametrize("name", [*OTHER_NAMES.split(), "", 7, ("nose", "x"), None])
+def test_other_names_are_not_coordinates(name):
+    assert parse_coordinate(name) is None
+
+
+def test_point_names_fall_back_to_columns_where_they_would_collide():
+    assert point_names(["x00", "x01"]) == ("00", "01")
+    assert point_names(["nose_x", " chin_x"]) == ("nose", "chin")
+    assert point_names(["x_1", "1_x"]) == ("x_1", "1_x")
+    assert point_names(["u1", "x1"]) == ("u1", "x1")
+
+
+@pytest.mark.parametrize(
+    ("names", "layout"),
+    [
+        (named("{a}{p}"), "interleaved"),
+        (named("{a}{p}", points=[5, 2, 9]), "interleaved"),
+        (named(" {p}_{a}", points=["nose", "chin"]), "interleaved"),
+        (["x0", "y0"], "interleaved"),
+        (["x0", "x1", "y0", "y1"], "planar"),
+        (["X_3", "X_1", "Y_3", "Y_1"], "planar"),
+        (["x0", "x1", "y1", "y0"], "other"),
+        (["y0", "x0", "y1", "x1"], "other"),
+        (["x0", "y0", "z0"], "other"),
+        (["x0", "y0", "x1"], "other"),
+        (["x0", "y0", "x0", "y0"], "other"),
+        (["x0", "Y0", "x1", "Y1"], "other"),
+        (["x0", "y0", "age", "sex"], None),
+        (["x0", "x1", "x2", "x3"], None),
+        (["y0", "y1"], None),
+        (["a", "b"], None),
+        ([0, 1, 2, 3], None),
+        ([], None),
+    ],
+)
+def test_names_layout(names, layout):
+    assert names_layout(names) == layout
+
+
+def test_layout_of_what_is_found_is_interleaved():
+    found = find_landmark_columns(openface_names(), columns="eye_lmk_x_#,eye_lmk_y_#")
+    assert names_layout(found.interleaved) == "interleaved"
+    assert names_layout(found.x + found.y) == "planar"
