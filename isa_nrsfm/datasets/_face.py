@@ -1,0 +1,202 @@
+"""Draw the tracks of a face with expressions."""
+
+from numbers import Integral, Real
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sklearn.utils import Bunch, check_random_state
+from sklearn.utils._param_validation import Interval, StrOptions, validate_params
+
+from isa_nrsfm._tracks import LAYOUTS, Layout
+from isa_nrsfm.datasets._face_model import (
+    COMPONENT_NAMES,
+    SIGNED_COMPONENTS,
+    deformations,
+    neutral_shape,
+)
+from isa_nrsfm.datasets._scene import (
+    CAMERAS,
+    Camera,
+    centre_shapes,
+    draw_motion,
+    observe,
+    standardise,
+)
+
+# Largest yaw, pitch and roll in degrees.
+LARGEST_ANGLES = (45.0, 25.0, 20.0)
+# Pixels a millimetre.
+SCALES = (1.0, 4.0)
+# Left, top and right, bottom of the part of the image where the centre of a face lies.
+CENTRES = ((320.0, 240.0), (960.0, 720.0))
+
+
+@validate_params(
+    {
+        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        "n_components": [Interval(Integral, 0, len(COMPONENT_NAMES), closed="both")],
+        "camera": [StrOptions(set(CAMERAS))],
+        "noise": [Interval(Real, 0, None, closed="left")],
+        "missing": [Interval(Real, 0, 1, closed="left")],
+        "layout": [StrOptions(set(LAYOUTS))],
+        "random_state": ["random_state"],
+    },
+    prefer_skip_nested_validation=True,
+)
+def make_face_tracks(
+    n_frames: int = 400,
+    *,
+    n_components: int = 4,
+    camera: Camera = "weak_perspective",
+    noise: float = 0.005,
+    missing: float = 0.0,
+    layout: Layout = "interleaved",
+    random_state: int | RandomState | None = None,
+) -> Bunch:
+    r"""
+    Generate the 68 landmarks of a face that moves its head and its features.
+
+    The face is drawn by hand, not measured. The points are in the order of the
+    iBUG-68 scheme: jaw 0 to 16, right brow 17 to 21, left brow 22 to 26, bridge and
+    tip of the nose 27 to 30, nostrils 31 to 35, right eye 36 to 41, left eye 42 to 47,
+    outer lips 48 to 59, inner lips 60 to 67. Right is the subject's right, on the
+    left of the image. The table follows the model of `AffineNRSfM`: the points of
+    frame i are :math:`(B_0 + \sum_k \alpha_{ik} B_k) M_i^T + t_i` plus noise.
+
+    Parameters
+    ----------
+    n_frames : int, default=400
+        Number of frames, at least 2. They are independent of each other.
+    n_components : int, default=4
+        Number of basis shapes K, 0 to 8: the first of "jaw open", "smile",
+        "brow raise", "blink", "lip pucker", "brow lower", "nose wrinkle" and
+        "face width".
+    camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
+        The head turns by yaw, pitch and roll (see `angles` below), uniform within
+        45, 25 and 20 degrees to either side. Orthographic cameras have 2 pixels a
+        millimetre, weak-perspective and affine ones 1 to 4, drawn log-uniformly for
+        each frame. Affine ones moreover stretch the image along a random axis; their
+        smaller singular value is 0.5 to 1 times the larger.
+    noise : float, default=0.005
+        Standard deviation of the Gaussian noise that is added to every coordinate,
+        divided by the root mean square of all coordinates of the tracks without
+        noise, each frame centred over its points. The noise is equal in all frames.
+        The default is about half a pixel.
+    missing : float, default=0.0
+        Share of the points that are not seen, in [0, 1). They are chosen at random
+        over the whole table, and both of their coordinates are NaN.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    random_state : int, RandomState instance or None, default=None
+        Determines all random numbers. Pass an int for reproducible tables. Of two
+        calls with the same int that differ in `noise`, `missing` or `layout`, the
+        truths are the same.
+
+    Returns
+    -------
+    sklearn.utils.Bunch
+        Dictionary-like object with the attributes
+
+        data : ndarray of shape (n_frames, 136)
+            The table in pixels, with noise, NaN where a point is not seen. y points
+            down.
+        tracks : ndarray of shape (n_frames, 68, 2)
+            The same numbers, one (x, y) pair a point.
+        clean : ndarray of shape (n_frames, 68, 2)
+            The tracks without noise, complete.
+        visible : ndarray of shape (n_frames, 68), dtype=bool
+            False where a point is missing from the table.
+        mean_shape : ndarray of shape (68, 3)
+            The mean face in millimetres, centred over the points: x points to the
+            right of the image, y down, z away from the camera.
+        basis : ndarray of shape (n_components, 68, 3)
+            The basis shapes in the order of `component_names`, in millimetres,
+            centred over the points. Before the centring each of them moves only a part
+            of the face. They point into the direction of their name and have the size
+            of one standard deviation of the expression.
+        alpha : ndarray of shape (n_frames, n_components)
+            The coefficients, independent of each other; each has zero mean and unit
+            variance over the frames.
+        motion : ndarray of shape (n_frames, 2, 3)
+            The cameras, in pixels a millimetre.
+        translation : ndarray of shape (n_frames, 2)
+            The centroids of the faces in pixels, uniform in x from 320 to 960 and y
+            from 240 to 720.
+        shapes : ndarray of shape (n_frames, 68, 3)
+            The shape of every frame, ``mean_shape + tensordot(alpha, basis, 1)``.
+        noise_variance : float
+            Variance of the noise in one coordinate, in squared pixels.
+        feature_names : list of str
+            The names of the columns, x_0, y_0, x_1, ... in the order of `layout`.
+        component_names : list of str
+            The names of the basis shapes.
+        neutral_shape : ndarray of shape (68, 3)
+            The face at rest, centred over the points.
+        strength : ndarray of shape (n_frames, n_components)
+            The expressions as drawn, before `alpha` was standardised: 0 is the face at
+            rest, 1 the full expression. Most faces are near rest: the strengths have
+            the skewed and heavy-tailed Beta(0.4, 2) distribution. Only the "face
+            width" is symmetric between -1 and 1: 2 Beta(2, 2) - 1.
+        angles : ndarray of shape (n_frames, 3)
+            Yaw, pitch and roll in degrees, the rotations about the y, x and z axes
+            that are applied in this order. Positive yaw turns the nose to the left of
+            the image, positive pitch down, positive roll turns the image clockwise.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not of the kind or in the range given above.
+
+    See Also
+    --------
+    make_nonrigid_tracks : Random points and random deformations.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> faces = make_face_tracks(n_frames=100, random_state=0)
+    >>> faces.data.shape
+    (100, 136)
+    >>> faces.component_names
+    ['jaw open', 'smile', 'brow raise', 'blink']
+    """
+    rng = check_random_state(random_state)
+    strength = _draw_strength(n_frames, n_components, rng)
+    alpha = standardise(strength)
+    neutral = centre_shapes(neutral_shape())
+    full = centre_shapes(deformations(n_components))
+    mean_shape = neutral + np.tensordot(strength.mean(axis=0), full, 1)
+    basis = full * strength.std(axis=0)[:, None, None]
+
+    angles = rng.uniform(-1.0, 1.0, (n_frames, 3)) * LARGEST_ANGLES
+    rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    motion = draw_motion(rotations, camera, SCALES, rng)
+    translation = rng.uniform(*CENTRES, size=(n_frames, 2))
+    return observe(
+        mean_shape,
+        basis,
+        alpha,
+        motion,
+        translation,
+        noise=noise,
+        missing=missing,
+        layout=layout,
+        rng=rng,
+        component_names=list(COMPONENT_NAMES[:n_components]),
+        neutral_shape=neutral,
+        strength=strength,
+        angles=angles,
+    )
+
+
+def _draw_strength(
+    n_frames: int, n_components: int, rng: RandomState
+) -> NDArray[np.float64]:
+    """Return the strengths of the expressions, (n_frames, n_components)."""
+    strength = rng.beta(0.4, 2.0, (n_frames, n_components))
+    for k, name in enumerate(COMPONENT_NAMES[:n_components]):
+        if name in SIGNED_COMPONENTS:
+            strength[:, k] = 2 * rng.beta(2.0, 2.0, n_frames) - 1
+    return strength

@@ -1,0 +1,608 @@
+"""Measures that ignore what the images cannot determine, and nothing else."""
+
+import time
+from itertools import permutations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import check_grad, minimize
+from scipy.stats import ortho_group
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._affine_alignment import (
+    _squared_cosines,
+    best_affinity,
+    unit_shapes,
+)
+from isa_nrsfm._tracks import tracks_to_table
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.metrics import (
+    affine_shape_error,
+    basis_similarity,
+    inverse_snr,
+    subspace_distance,
+)
+
+AFFINITIES = [
+    np.diag([1.0, -1.0, 1.0]),
+    np.array([[1.0, 0.5, 0.2], [0.0, 2.0, -0.3], [0.3, 0.0, 0.4]]),
+    np.diag([1.0, 1e3, 1e-3]),
+]
+
+
+@pytest.fixture
+def rng():
+    return np.random.RandomState(0)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_nonrigid_tracks(60, 30, 3, amplitude=0.3, random_state=0)
+
+
+class TestInverseSNR:
+    def test_hand_computed_value(self):
+        # Centred: (-1, 0), (1, 0) and (0, -1), (0, 1), energy 4; the second frame
+        # is reprojected at half its size, error 2 * 0.25.
+        X = np.array([[0.0, 0.0, 2.0, 0.0], [5.0, 5.0, 5.0, 7.0]])
+        X_hat = np.array([[3.0, 1.0, 5.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+        assert inverse_snr(X, X_hat) == 0.125
+        assert inverse_snr(X, X) == 0
+        assert inverse_snr(X, np.zeros_like(X)) == 1
+
+    def test_scaled_frames_count_alike(self):
+        X = np.array([[0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 200.0]])
+        X_hat = np.array([[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 200.0]])
+        assert_allclose(inverse_snr(X, X_hat), 2 / 20002)
+        assert_allclose(inverse_snr(X, X_hat, scale_frames=True), 0.5)
+
+    @pytest.mark.parametrize("scale_frames", [False, True])
+    def test_invariances(self, rng, scale_frames):
+        tracks = rng.standard_normal((6, 5, 2))
+        fitted = tracks + 0.1 * rng.standard_normal((6, 5, 2))
+
+        def value(a, b, **more):
+            return inverse_snr(
+                a.reshape(6, -1), b.reshape(6, -1), scale_frames=scale_frames, **more
+            )
+
+        expected = value(tracks, fitted)
+        assert 0.001 < expected < 0.1
+        shift = 100 * rng.standard_normal((2, 6, 1, 2))
+        assert_allclose(value(tracks + shift[0], fitted + shift[1]), expected)
+        assert_allclose(value(7 * tracks, 7 * fitted), expected)
+        order = rng.permutation(5)
+        assert_allclose(value(tracks[:, order], fitted[:, order]), expected)
+        planar = [tracks_to_table(t, "planar") for t in (tracks, fitted)]
+        assert_allclose(value(*planar, layout="planar"), expected)
+        assert not np.isclose(value(*planar), expected)
+        scales = rng.uniform(1, 9, (6, 1, 1))
+        rescaled = value(scales * tracks, scales * fitted)
+        assert np.isclose(rescaled, expected) == scale_frames
+
+    def test_is_the_relative_noise_of_the_truth(self):
+        tracks = make_nonrigid_tracks(noise=0.1, random_state=0)
+        clean = tracks_to_table(tracks.clean)
+        # The centroids take one of 68 degrees of freedom from the noise.
+        assert_allclose(inverse_snr(clean, tracks.data), 0.01 * 67 / 68, rtol=0.02)
+
+    @pytest.mark.parametrize("scale_frames", [False, True])
+    def test_agrees_with_the_estimator(self, scale_frames):
+        X = make_nonrigid_tracks(noise=0.02, random_state=0).data
+        model = AffineNRSfM(
+            scale_frames=scale_frames, refinement="alternating", random_state=0
+        ).fit(X)
+        error = inverse_snr(X, model.reproject(X), scale_frames=scale_frames)
+        assert_allclose(error, model.inverse_snr_)
+
+    @pytest.mark.parametrize("scale_frames", [False, True])
+    def test_missing_points_are_left_out(self, rng, scale_frames):
+        tracks = rng.standard_normal((4, 6, 2))
+        fitted = tracks + 0.1 * rng.standard_normal((4, 6, 2))
+        partial = tracks.copy()
+        partial[:, 4] = np.nan
+        partial[:, 5, 0] = np.nan  # one coordinate is enough
+        changed = fitted.copy()
+        changed[:, 4] = 1e6
+        changed[:, 5] = np.nan
+        seen = [t[:, :4].reshape(4, -1) for t in (tracks, fitted)]
+        assert_allclose(
+            inverse_snr(
+                partial.reshape(4, -1),
+                changed.reshape(4, -1),
+                scale_frames=scale_frames,
+            ),
+            inverse_snr(*seen, scale_frames=scale_frames),
+        )
+
+    @pytest.mark.parametrize("scale_frames", [False, True])
+    def test_frames_without_points_do_not_count(self, rng, scale_frames):
+        X, X_hat = rng.standard_normal((2, 3, 8))
+        empty = np.full((1, 8), np.nan)
+        assert inverse_snr(
+            np.vstack([X, empty]), np.vstack([X_hat, empty]), scale_frames=scale_frames
+        ) == inverse_snr(X, X_hat, scale_frames=scale_frames)
+
+    def test_takes_dataframes_and_float32(self, rng):
+        pd = pytest.importorskip("pandas")
+        X, X_hat = rng.standard_normal((2, 3, 8)).astype(np.float32)
+        assert_allclose(
+            inverse_snr(pd.DataFrame(X), pd.DataFrame(X_hat)), inverse_snr(X, X_hat)
+        )
+
+    @pytest.mark.parametrize(
+        ("X", "X_hat", "message"),
+        [
+            (np.ones((2, 4)), np.ones((3, 4)), r"got \(2, 4\) and \(3, 4\)"),
+            (np.ones((2, 5)), np.ones((2, 5)), "even number; got n_features=5"),
+            (np.ones((2, 4)), np.ones((2, 4)), "X has no energy"),
+            (np.full((2, 4), np.nan), np.ones((2, 4)), "X has no energy"),
+            (np.full((2, 4), np.inf), np.ones((2, 4)), "Input X contains infinity"),
+            (
+                np.eye(4),
+                np.where(np.eye(4)[::-1], np.nan, 1),
+                r"X_hat is NaN at 4 point\(s\) that are seen in X, the first in row 0",
+            ),
+        ],
+    )
+    def test_errors(self, X, X_hat, message):
+        with pytest.raises(ValueError, match=message):
+            inverse_snr(X, X_hat)
+
+    def test_scaling_needs_extended_frames(self):
+        X = np.array([[0.0, 0.0, 2.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
+        with pytest.raises(ValueError, match=r"in 1 frame\(s\), the first is row 1"):
+            inverse_snr(X, X, scale_frames=True)
+
+    def test_unknown_layout(self):
+        with pytest.raises(ValueError, match=r"layout must be one of .* got 'rows'"):
+            inverse_snr(np.eye(4), np.eye(4), layout="rows")
+
+
+class TestAffineShapeError:
+    @pytest.mark.parametrize("affinity", AFFINITIES)
+    def test_zero_for_equivalent_shapes(self, scene, rng, affinity):
+        scales = np.exp(rng.standard_normal((60, 1, 1)))
+        shifts = rng.standard_normal((60, 1, 3))
+        assert affine_shape_error(scene.shapes, scene.shapes) < 1e-13
+        moved = scales * scene.shapes @ affinity.T + shifts
+        assert affine_shape_error(scene.shapes, moved) < 1e-12
+
+    @pytest.mark.parametrize("affinity", AFFINITIES)
+    @pytest.mark.parametrize("noise", [0.01, 0.3, 3.0])
+    def test_invariance(self, scene, rng, affinity, noise):
+        shapes = scene.shapes
+        X = shapes + noise * rng.standard_normal(shapes.shape)
+        expected = affine_shape_error(shapes, X)
+        scales = rng.standard_normal((60, 1, 1))  # of both signs
+        shifts = rng.standard_normal((2, 60, 1, 3))
+        moved = scales * X @ affinity.T + shifts[0]
+        assert_allclose(affine_shape_error(shapes, moved), expected, atol=1e-10)
+        # The truth may be moved, scaled frame by frame, and rotated.
+        rotation = ortho_group.rvs(3, random_state=rng)
+        truth = np.exp(scales) * shapes @ rotation + shifts[1]
+        assert_allclose(affine_shape_error(truth, X), expected, atol=1e-10)
+        frames, points = rng.permutation(60), rng.permutation(30)
+        assert_allclose(
+            affine_shape_error(shapes[frames][:, points], X[frames][:, points]),
+            expected,
+            atol=1e-10,
+        )
+
+    def test_hand_computed_value(self):
+        # Axis-aligned pairs of points. The estimate misses the third pair in one
+        # frame and is exact in the other.
+        full = np.vstack([np.eye(3), -np.eye(3)])
+        part = full * (1, 1, 0)
+        # The frames weigh alike, so A = diag(1, 1, c), and the error of the first
+        # frame is sqrt(1/3) if the truth is full and the estimate is not.
+        error = affine_shape_error([full, full], [full, part])
+        assert_allclose(error, np.sqrt(1 / 3) / 2)
+
+    def test_one_affinity_for_all_frames(self, rng):
+        shape = rng.standard_normal((20, 3))
+        S = np.array([shape, shape])
+        X = np.array([shape, shape @ AFFINITIES[1]])
+        assert affine_shape_error(S[:1], X[:1]) < 1e-13
+        assert affine_shape_error(S[1:], X[1:]) < 1e-13
+        assert affine_shape_error(S, X) > 0.05
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_minimum_is_global(self, seed):
+        rng = np.random.RandomState(seed)
+        n, n_points = rng.randint(1, 8), rng.randint(5, 20)
+        S = unit_shapes(rng.standard_normal((n, n_points, 3)))
+        noise = rng.uniform() * rng.standard_normal(S.shape)
+        X = unit_shapes(S * rng.choice([0, 0.3, 1]) + noise)
+
+        def cost(a):
+            images = X @ a.reshape(3, 3)
+            inner = np.sum(S * images, axis=(1, 2))
+            return n - np.sum(inner**2 / np.sum(images**2, axis=(1, 2)))
+
+        found = cost(best_affinity(S, X).ravel())
+        others = [minimize(cost, rng.standard_normal(9)).fun for _ in range(5)]
+        assert found <= min(others) + 1e-7
+
+    def test_derivatives(self, rng):
+        cross = rng.standard_normal((5, 9))
+        factors = rng.standard_normal((5, 3, 3))
+        scatter = factors @ factors.transpose(0, 2, 1)
+        a = rng.standard_normal(9)
+        value, gradient, hessian = _squared_cosines(a, cross, scatter)
+        assert (
+            check_grad(
+                lambda x: _squared_cosines(x, cross, scatter)[0],
+                lambda x: _squared_cosines(x, cross, scatter)[1],
+                a,
+            )
+            < 1e-5 * value
+        )
+        step = 1e-6 * rng.standard_normal(9)
+        difference = (
+            _squared_cosines(a + step, cross, scatter)[1]
+            - _squared_cosines(a - step, cross, scatter)[1]
+        )
+        assert_allclose(hessian @ step * 2, difference, rtol=1e-5, atol=1e-12)
+        assert_allclose(gradient @ a, 0, atol=1e-12)  # constant along a
+
+    def test_mean_shape_leaves_the_deformation(self):
+        scene = make_nonrigid_tracks(500, 40, 2, amplitude=0.05, random_state=0)
+        rigid = np.broadcast_to(scene.mean_shape, scene.shapes.shape)
+        error = affine_shape_error(scene.shapes, rigid)
+        assert 0.03 < error < 0.05  # less than the amplitude, of which a part is affine
+
+    def test_planar_and_zero_estimates(self, scene):
+        flat = scene.shapes * (1, 1, 0)
+        error = affine_shape_error(scene.shapes, flat)
+        lost = np.linalg.norm(scene.shapes[..., 2], axis=1)
+        lost /= np.linalg.norm(scene.shapes, axis=(1, 2))
+        assert 0 < error <= lost.mean() + 1e-9
+        assert affine_shape_error(scene.shapes, np.zeros_like(flat)) == 1
+        # A frame without an estimate counts as lost and does not disturb the others.
+        X = scene.shapes.copy()
+        X[7] = 5.0
+        assert_allclose(affine_shape_error(scene.shapes, X), 1 / 60, atol=1e-12)
+
+    def test_unrelated_shapes(self):
+        # Orthogonal to the truth: A cannot help, and nothing is divided by zero.
+        truth = np.zeros((1, 8, 3))
+        other = np.zeros((1, 8, 3))
+        truth[0, :2, 0] = 1, -1
+        other[0, 2:4, 0] = 1, -1
+        assert_allclose(affine_shape_error(truth, other), 1)
+
+    def test_extreme_units(self, scene):
+        X = scene.shapes + 0.1 * scene.shapes**2
+        expected = affine_shape_error(scene.shapes, X)
+        for unit in (1e-200, 1e200):
+            assert_allclose(affine_shape_error(unit * scene.shapes, X), expected)
+            assert_allclose(affine_shape_error(scene.shapes, unit * X), expected)
+
+    def test_many_frames_are_fast(self, rng):
+        S = rng.standard_normal((2500, 68, 3))
+        X = S + rng.standard_normal(S.shape)
+        start = time.perf_counter()
+        error = affine_shape_error(S, X)
+        assert time.perf_counter() - start < 10  # about 0.2 s
+        assert_allclose(error, np.sqrt(0.5), rtol=0.02)
+
+    @pytest.mark.parametrize(
+        ("S", "X", "message"),
+        [
+            (np.ones((2, 5, 3)), np.ones((2, 6, 3)), r"S and X must be of the same"),
+            (np.ones((5, 3)), np.ones((5, 3)), r"S must be of the shape .* \(5, 3\)"),
+            (np.ones((2, 5, 2)), np.ones((2, 5, 2)), r"got \(2, 5, 2\)"),
+            (np.ones((0, 5, 3)), np.ones((0, 5, 3)), r"got \(0, 5, 3\)"),
+            (np.ones((2, 5, 3)), np.ones((2, 5, 3)), r"2 frame\(s\) of S, .* is 0"),
+            (
+                np.ones((2, 5, 3)),
+                np.full((2, 5, 3), np.nan),
+                "X must be finite; 30 entries",
+            ),
+        ],
+    )
+    def test_errors(self, S, X, message):
+        with pytest.raises(ValueError, match=message):
+            affine_shape_error(S, X)
+
+
+def orthonormal_shapes(rng, n):
+    shapes = unit_shapes(rng.standard_normal((n, 10, 3)))
+    return np.linalg.qr(shapes.reshape(n, -1).T)[0].T.reshape(n, 10, 3)
+
+
+class TestBasisSimilarity:
+    @pytest.mark.parametrize("affinity", AFFINITIES)
+    @pytest.mark.parametrize(
+        ("with_mean", "modulo"), [(False, False), (True, False), (True, True)]
+    )
+    def test_one_for_equivalent_bases(self, scene, affinity, with_mean, modulo):
+        factors = np.array([-2.0, 0.1, 5.0])[:, None, None]
+        estimate = factors * scene.basis[[2, 0, 1]] @ affinity.T + [1.0, 2.0, 3.0]
+        means = {}
+        if with_mean:
+            means["mean_shape_true"] = scene.mean_shape
+            means["mean_shape"] = 3 * scene.mean_shape @ affinity.T + 4.0
+            means["modulo_mean_shape"] = modulo
+        similarity, matching = basis_similarity(
+            scene.basis, estimate, return_matching=True, **means
+        )
+        assert_allclose(similarity, 1, atol=1e-10)
+        assert_array_equal(matching, [1, 2, 0])
+        assert_array_equal(basis_similarity(scene.basis, estimate, **means), similarity)
+
+    @pytest.mark.parametrize("with_mean", [False, True])
+    def test_invariance_of_inexact_bases(self, scene, rng, with_mean):
+        noisy = scene.basis + 0.05 * rng.standard_normal(scene.basis.shape)
+        affinity = AFFINITIES[1]
+
+        def value(basis, mean):
+            means = {"mean_shape_true": scene.mean_shape, "mean_shape": mean}
+            return basis_similarity(scene.basis, basis, **(means if with_mean else {}))
+
+        expected = value(noisy, scene.mean_shape)
+        assert (0.5 < expected).all()
+        assert (expected < 0.99).all()
+        moved = value(-7 * noisy[::-1] @ affinity, scene.mean_shape @ affinity)
+        assert_allclose(moved, expected, atol=1e-10)
+
+    def test_known_cosines(self, rng):
+        # The mean shapes are equal, so that A is the unit matrix.
+        mean = rng.standard_normal((10, 3))
+        basis_true = orthonormal_shapes(rng, 3)
+        angles = np.radians([20.0, 60.0])
+        turned = [
+            np.cos(angles[0]) * basis_true[0] + np.sin(angles[0]) * basis_true[2],
+            np.cos(angles[1]) * basis_true[1] - np.sin(angles[1]) * basis_true[2],
+        ]
+        similarity = basis_similarity(
+            basis_true[:2], turned[::-1], mean_shape_true=mean, mean_shape=mean
+        )
+        assert_allclose(similarity, np.cos(angles))
+        # Without them A is free to do better, on the whole.
+        free = basis_similarity(basis_true[:2], turned[::-1])
+        assert np.sum(free**2) >= np.sum(np.cos(angles) ** 2)
+
+    def test_matching_is_not_greedy(self, rng):
+        # The best single pair, e0 and the first, would leave e1 with nothing.
+        e = orthonormal_shapes(rng, 4)
+        first, second = unit_shapes(
+            np.array([0.72 * e[0] + 0.65 * e[1], 0.6 * e[0] + 0.8 * e[3]])
+        )
+        mean = rng.standard_normal((10, 3))
+        similarity, matching = basis_similarity(
+            e[:2],
+            [first, second],
+            mean_shape_true=mean,
+            mean_shape=mean,
+            return_matching=True,
+        )
+        assert_array_equal(matching, [1, 0])
+        assert_allclose(similarity, [0.6, 0.65 / np.hypot(0.72, 0.65)])
+
+    def test_matching_is_the_best_of_all(self, scene, rng):
+        estimate = rng.standard_normal(scene.basis.shape)
+        means = {"mean_shape_true": scene.mean_shape, "mean_shape": scene.mean_shape}
+        similarity = basis_similarity(scene.basis, estimate, **means)
+        truth, other = unit_shapes(scene.basis), unit_shapes(estimate)
+        cosines = np.einsum("kjc,ljc->kl", truth, other)
+        best = max(np.sum(cosines[range(3), p] ** 2) for p in permutations(range(3)))
+        assert_allclose(np.sum(similarity**2), best)
+
+    def test_free_affinity_is_optimal(self, scene, rng):
+        noisy = (scene.basis + 0.1 * rng.standard_normal(scene.basis.shape))[[2, 0, 1]]
+        quality = np.sum(basis_similarity(scene.basis, noisy) ** 2)
+        truth, other = unit_shapes(scene.basis), unit_shapes(noisy)
+
+        def cost(a):
+            images = unit_shapes(other[[1, 2, 0]] @ a.reshape(3, 3))
+            return -np.sum(np.sum(truth * images, axis=(1, 2)) ** 2)
+
+        assert quality >= -minimize(cost, np.eye(3).ravel()).fun - 1e-9
+
+    @pytest.mark.parametrize("n_components", [2, 3, 6])
+    def test_affinity_may_be_far_from_the_unit_matrix(self, rng, n_components):
+        for seed in range(30):
+            basis = make_nonrigid_tracks(2, 40, n_components, random_state=seed).basis
+            affinity = rng.standard_normal((3, 3))
+            similarity = basis_similarity(basis, basis[::-1] @ affinity)
+            assert_allclose(similarity, 1, atol=1e-9)
+
+    def test_shapes_of_low_rank(self):
+        # Faces have deformations that are nearly along one direction.
+        basis = make_face_tracks(n_components=8, random_state=0).basis
+        basis[3, :, [0, 2]] = 0
+        order = [4, 1, 7, 0, 2, 6, 5, 3]
+        similarity, matching = basis_similarity(
+            basis, basis[order] @ AFFINITIES[1], return_matching=True
+        )
+        assert_allclose(similarity, 1, atol=1e-9)
+        assert_array_equal(np.array(order)[matching], np.arange(8))
+
+    def test_multiples_of_the_mean_shape(self, scene):
+        mean, affinity = scene.mean_shape, AFFINITIES[1]
+        multiples = np.array([0.1, -0.2, 0.05])[:, None, None]
+        estimate = (scene.basis + multiples * mean) @ affinity
+        means = {"mean_shape_true": mean, "mean_shape": mean @ affinity}
+        assert basis_similarity(scene.basis, estimate, **means).max() < 0.97
+        without = basis_similarity(
+            scene.basis, estimate, **means, modulo_mean_shape=True
+        )
+        assert_allclose(without, 1, atol=1e-10)
+
+    def test_multiple_of_the_mean_shape_is_nothing_modulo_it(self, scene):
+        basis = scene.basis.copy()
+        basis[1] = 3 * scene.mean_shape
+        means = {"mean_shape_true": scene.mean_shape, "mean_shape": scene.mean_shape}
+        assert_allclose(basis_similarity(basis, basis, **means), 1)
+        similarity = basis_similarity(basis, basis, **means, modulo_mean_shape=True)
+        assert_allclose(similarity, [1, 0, 1])
+
+    @pytest.mark.parametrize("side", [0, 1])
+    @pytest.mark.parametrize("nothing", [0.0, 0.1])
+    @pytest.mark.parametrize("with_mean", [False, True])
+    def test_zero_shapes_resemble_nothing(self, scene, side, nothing, with_mean):
+        # All points equal is zero, too; 0.1 leaves a rest after the centring.
+        bases = [scene.basis.copy(), scene.basis.copy()]
+        bases[side][1] = nothing
+        mean = scene.mean_shape if with_mean else None
+        similarity = basis_similarity(*bases, mean_shape_true=mean, mean_shape=mean)
+        assert_allclose(similarity, [1, 0, 1], atol=1e-12)
+
+    def test_only_zeros(self):
+        assert_array_equal(basis_similarity(np.zeros((2, 9, 3)), np.ones((2, 9, 3))), 0)
+
+    def test_different_numbers_of_shapes(self, scene):
+        similarity, matching = basis_similarity(
+            scene.basis, scene.basis[[2, 1]], return_matching=True
+        )
+        assert_allclose(similarity, [0, 1, 1], atol=1e-12)
+        assert_array_equal(matching, [-1, 1, 0])
+        similarity, matching = basis_similarity(
+            scene.basis[[2, 1]], scene.basis, return_matching=True
+        )
+        assert_allclose(similarity, 1)
+        assert_array_equal(matching, [2, 1])
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"basis": np.ones((3, 29, 3))}, "same points; got 30 and 29"),
+            ({"basis": np.ones((30, 3))}, r"basis must be of the shape .* \(30, 3\)"),
+            ({"basis": np.full((3, 30, 3), np.inf)}, "basis must be finite; 270"),
+            ({"mean_shape": np.eye(30, 3)}, "give both mean_shape_true and mean_shape"),
+            ({"modulo_mean_shape": True}, "needs mean_shape_true and mean_shape"),
+            (
+                {"mean_shape_true": np.eye(30, 3), "mean_shape": np.eye(29, 3)},
+                r"mean_shape must be of the shape \(30, 3\).*got \(29, 3\)",
+            ),
+            (
+                {"mean_shape_true": np.ones((30, 3)), "mean_shape": np.eye(30, 3)},
+                "all points of mean_shape_true are equal",
+            ),
+        ],
+    )
+    def test_errors(self, scene, arguments, message):
+        basis = arguments.pop("basis", scene.basis)
+        with pytest.raises(ValueError, match=message):
+            basis_similarity(scene.basis, basis, **arguments)
+
+
+class TestSubspaceDistance:
+    @pytest.mark.parametrize("degrees", [0.0, 1e-6, 30.0, 90.0])
+    def test_planes_at_a_known_angle(self, degrees):
+        # Both axes of the first plane turn by the angle into new directions.
+        angle = np.radians(degrees)
+        truth = np.eye(6)[:4]
+        turned = truth.copy()
+        turned[:2] = np.cos(angle) * np.eye(6)[:2] + np.sin(angle) * np.eye(6)[4:]
+        assert_allclose(
+            subspace_distance(truth, turned, 2), np.sin(angle), rtol=1e-7, atol=1e-15
+        )
+
+    def test_root_mean_square_of_the_sines(self):
+        angles = np.radians([10.0, 20.0, 60.0])[:, None]
+        a = np.eye(6)[:3]
+        b = np.cos(angles) * np.eye(6)[:3] + np.sin(angles) * np.eye(6)[3:]
+        expected = np.sqrt(np.mean(np.sin(angles) ** 2))
+        assert_allclose(subspace_distance(a, b), expected)
+
+    @pytest.mark.parametrize("size", [1, 2, 3, 4])
+    def test_invariances(self, rng, size):
+        n_blocks, n_features = 4, 4 * size + 2
+        shape = (n_blocks, size, n_features)
+        a = rng.standard_normal(shape)
+        b = a + 0.3 * rng.standard_normal(shape)
+
+        def value(x, y):
+            rows = (n_blocks * size, n_features)
+            return subspace_distance(x.reshape(rows), y.reshape(rows), size)
+
+        expected = value(a, b)
+        assert 0.05 < expected < 1
+        assert_allclose(value(b, a), expected, atol=1e-12)
+        mixed = rng.standard_normal((n_blocks, size, size)) @ b
+        assert_allclose(value(a, mixed), expected, atol=1e-10)
+        order = rng.permutation(n_blocks)
+        assert_allclose(value(a, b[order]), expected, atol=1e-12)
+        rotation = ortho_group.rvs(n_features, random_state=rng)
+        assert_allclose(value(a @ rotation, b @ rotation), expected, atol=1e-12)
+        assert value(a, rng.standard_normal((n_blocks, size, size)) @ a) < 1e-11
+
+    def test_worst_pair_counts(self):
+        turned = np.eye(9)
+        turned[[0, 3]] = turned[[3, 0]]  # two groups exchange one direction each
+        assert_allclose(subspace_distance(np.eye(9), turned), np.sqrt(1 / 3))
+
+    def test_matching_is_not_greedy(self):
+        # Lines in the plane: the closest two are a0 and b0, which would leave a1 and
+        # b1 at right angles.
+        def lines(*degrees):
+            angles = np.radians(degrees)
+            return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+        a, b = lines(0, 40), lines(15, -50)
+        assert_allclose(subspace_distance(a, b, 1), np.sin(np.radians(50)), atol=1e-12)
+
+    def test_matching_is_the_best_of_all(self, rng):
+        for _ in range(20):
+            a, b = rng.standard_normal((2, 4, 2, 5))
+            pairs = [[subspace_distance(x, y, 2) for y in b] for x in a]
+            expected = min(
+                max(pairs[k][p[k]] for k in range(4)) for p in permutations(range(4))
+            )
+            distance = subspace_distance(a.reshape(8, 5), b.reshape(8, 5), 2)
+            assert_allclose(distance, expected)
+
+    def test_triangle_inequality(self, rng):
+        for _ in range(50):
+            a, b, c = rng.standard_normal((3, 6, 4))
+            direct = subspace_distance(a, c, 2)
+            detour = subspace_distance(a, b, 2) + subspace_distance(b, c, 2)
+            assert direct <= detour + 1e-12
+
+    def test_one_block_of_everything(self, rng):
+        a, b = rng.standard_normal((2, 3, 3))
+        assert subspace_distance(a, b) < 1e-12
+
+    def test_unmixing_of_whitened_signals(self, rng):
+        mixing = rng.standard_normal((6, 6))  # of white sources
+        values, axes = np.linalg.eigh(mixing @ mixing.T)
+        whitening = (axes / np.sqrt(values)).T
+        truth = np.linalg.inv(whitening @ mixing)
+        assert_allclose(truth @ truth.T, np.eye(6), atol=1e-10)
+        found = ortho_group.rvs(3, random_state=rng) @ truth.reshape(2, 3, 6)
+        found = found[::-1].reshape(6, 6)
+        assert subspace_distance(found, truth) < 1e-12
+        of_signals = found @ whitening  # the same, for signals that are not white
+        assert subspace_distance(of_signals @ np.linalg.inv(whitening), truth) < 1e-10
+
+    @pytest.mark.parametrize(
+        ("a", "b", "size", "message"),
+        [
+            (
+                np.eye(6),
+                np.eye(7)[:6],
+                3,
+                "components_b must be of the same shape",
+            ),
+            (
+                np.eye(6),
+                np.eye(6)[:3],
+                3,
+                "components_b must be of the same shape",
+            ),
+            (np.eye(5), np.eye(5), 3, r"components_a .* subspace_size=3 .*\(5, 5\)"),
+            (np.ones(6), np.eye(6), 3, r"got the shape \(6,\)"),
+            (np.eye(6), np.eye(6), 0, "positive integer; got 0"),
+            (np.eye(6), np.eye(6), 1.5, "positive integer; got 1.5"),
+            (np.eye(6), np.diag([1.0, 1, 1, 1, 0, 1]), 3, "group 1 has rank 2"),
+            (np.eye(6)[:, :2], np.eye(6)[:, :2], 3, "group 0 has rank 2"),
+            (np.eye(6), np.full((6, 6), np.nan), 3, "components_b must be finite"),
+        ],
+    )
+    def test_errors(self, a, b, size, message):
+        with pytest.raises(ValueError, match=message):
+            subspace_distance(a, b, size)
