@@ -1,0 +1,5 @@
+"""The command line ``isa-nrsfm`` with its commands fit, transform and demo."""
+
+from isa_nrsfm.cli._main import main
+
+__all__ = ["main"]

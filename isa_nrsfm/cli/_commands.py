@@ -1,0 +1,231 @@
+"""The commands fit and transform, from options to the text of their report."""
+
+import contextlib
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm._landmark_names import find_landmark_columns, parse_coordinate
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.cli._frames import Frames, choose_frames
+from isa_nrsfm.cli._outputs import (
+    beside_other_columns,
+    component_names,
+    prepare_folder,
+    refuse_overwriting,
+    write_figures,
+    write_report,
+    write_results,
+)
+from isa_nrsfm.cli._report import (
+    fit_text,
+    lay_out,
+    model_report,
+    table_lines,
+    table_report,
+    versions,
+)
+from isa_nrsfm.io import load_model, read_table, write_table
+from isa_nrsfm.io._tables import table_suffix
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Points and coordinates in the order of the columns.
+_SHAPES = {"interleaved": (-1, 2), "planar": (2, -1)}
+
+
+def run_fit(args: Namespace, warned: list[str]) -> str:
+    """Fit a table, write everything, and return the report."""
+    return fit_text(fit_table(args, warned), Path(args.output))
+
+
+def fit_table(
+    args: Namespace,
+    warned: list[str],
+    **extra: "Callable[[AffineNRSfM, pd.DataFrame], Any]",
+) -> dict[str, Any]:
+    """Fit a table and write everything; return the report.
+
+    Parameters
+    ----------
+    args : Namespace
+        The options of the command fit.
+    warned : list of str
+        The messages of the warnings shown so far. It grows while the fit runs.
+    **extra : callable
+        Further entries of the report, computed from the model and its table.
+    """
+    # What is missing at the end of a long fit should be known before it.
+    import_optional("skops.io", extra="share")
+    if not args.no_figures:
+        import_optional("matplotlib", extra="plot")
+    folder = Path(args.output)
+    clock = [time.perf_counter()]
+    frames = _read_frames(args)
+    X = frames.points[frames.usable]
+    if X.empty:
+        raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
+    files = prepare_folder(folder, [args.table], figures=not args.no_figures)
+    clock.append(time.perf_counter())
+
+    estimator = AffineNRSfM(
+        args.n_components,
+        isa=_strategy(args),
+        block_recovery=args.block_recovery,
+        refinement=None if args.refinement == "none" else args.refinement,
+        scale_frames=not args.no_scale_frames,
+        random_state=args.random_state,
+        n_jobs=args.n_jobs,
+    )
+    with _progress(estimator):
+        estimator.fit(X)
+    clock.append(time.perf_counter())
+
+    other = frames.other[frames.usable]
+    write_results(folder, estimator, X, other, frames.columns.points)
+    if not args.no_figures:
+        write_figures(folder, estimator, X, args.random_state)
+    clock.append(time.perf_counter())
+    report = {
+        "command": "fit",
+        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+        "table": table_report(args.table, frames),
+        "model": model_report(estimator, X),
+        **{name: compute(estimator, X) for name, compute in extra.items()},
+        "seconds": dict(
+            zip(("read", "fit", "write"), np.diff(clock).round(3), strict=True)
+        ),
+        "warnings": warned,
+        "versions": versions(),
+        "files": files,
+    }
+    write_report(folder, report)
+    return report
+
+
+def run_transform(args: Namespace, warned: list[str]) -> str:
+    """Write the coefficients of a table's rows, and return the report."""
+    pd = import_optional("pandas", extra="io")
+    output = Path(args.output)
+    table_suffix(output)
+    estimator = load_model(args.model)
+    frames = _read_frames(args, estimator)
+    for source in (args.table, args.model):
+        refuse_overwriting(source, [output])
+    points = frames.points[frames.usable]
+    alpha = np.full((len(frames.points), len(estimator.basis_)), np.nan)
+    if not points.empty:
+        alpha[frames.usable] = estimator.transform(_as_fitted(estimator, points))
+    results = pd.DataFrame(
+        alpha, index=frames.points.index, columns=component_names(alpha.shape[1])
+    )
+    write_table(beside_other_columns(results, frames.other), output)
+
+    table = table_report(args.table, frames)
+    title = f"{len(alpha.T)} coefficients of {table['n_frames']} frames"
+    sections = {
+        "Table": table_lines(table, unusable="without coefficients"),
+        "Model": [args.model],
+        "Output": [str(output), f"{len(alpha)} rows"],
+    }
+    return f"{title}\n\n{lay_out(sections)}"
+
+
+def _read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
+    """Read the table and take its frames, for a model those with its points."""
+    table = read_table(args.table)
+    columns = args.columns
+    if estimator is not None:
+        columns = _columns_of_model(estimator, table, columns)
+    return choose_frames(
+        table,
+        columns=columns,
+        rules=args.skip_rows,
+        zeros_missing=args.zeros_missing,
+    )
+
+
+def _columns_of_model(
+    estimator: AffineNRSfM, table: "pd.DataFrame", columns: str | None
+) -> str | list[str] | None:
+    """Return the columns of the points that a model was fitted to."""
+    fitted = getattr(estimator, "feature_names_in_", None)
+    n_points = len(estimator.mean_shape_)
+    if fitted is None:
+        found = find_landmark_columns(table.columns, columns)
+        if len(found.points) != n_points:
+            raise ValueError(
+                f"the model has {n_points} points, the table has {len(found.points)} "
+                f"({found.pattern})"
+            )
+        return columns
+    wanted = [str(name).strip() for name in fitted]
+    coordinates = (
+        [name for name in table.columns if parse_coordinate(name) is not None]
+        if columns is None
+        else find_landmark_columns(table.columns, columns).interleaved
+    )
+    present = {str(name).strip() for name in table.columns if columns is None}
+    present.update(name.strip() for name in coordinates)
+    absent = [name for name in wanted if name not in present]
+    surplus = [name.strip() for name in coordinates if name.strip() not in set(wanted)]
+    if absent or (surplus and columns is not None):
+        differences = [
+            f"{len(names)} columns are only in the {where} ({_shortened(names)})"
+            for names, where in ((absent, "model"), (surplus, "table"))
+            if names
+        ]
+        raise ValueError(
+            "the points of the table are not those of the model: "
+            + "; ".join(differences)
+        )
+    tracks = np.array(wanted).reshape(_SHAPES[estimator.layout])
+    return (tracks.T if estimator.layout == "planar" else tracks).ravel().tolist()
+
+
+def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
+    """Return a table of landmarks with the columns that the model was fitted to."""
+    fitted = getattr(estimator, "feature_names_in_", None)
+    if fitted is None:
+        x_then_y = points.to_numpy().reshape(len(points), -1, 2).swapaxes(1, 2)
+        planar = estimator.layout == "planar"
+        return x_then_y.reshape(points.shape) if planar else points.to_numpy()
+    in_order = points[[str(name).strip() for name in fitted]]
+    return in_order.set_axis(list(fitted), axis=1)
+
+
+def _strategy(args: Namespace) -> Any:
+    """Return the independent subspace analysis that the options ask for."""
+    strategy = PooledFastICA() if args.isa == "pooled" else FastISA()
+    return strategy if args.n_init is None else strategy.set_params(n_init=args.n_init)
+
+
+@contextlib.contextmanager
+def _progress(estimator: AffineNRSfM) -> Iterator[None]:
+    """Show the progress of a fit on the terminal, if there is one."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    estimator.set_params(verbose=1)
+    with contextlib.redirect_stdout(sys.stderr):
+        yield
+    estimator.set_params(verbose=0)
+
+
+def _reasons(frames: Frames) -> str:
+    """Say which rows were left out, for a message."""
+    counts = [f"{len(out.rows)} left out ({out.reason})" for out in frames.left_out]
+    return f": {', '.join(counts)}" if counts else ""
+
+
+def _shortened(names: list[str]) -> str:
+    """List the first names."""
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

@@ -1,0 +1,111 @@
+"""Run a command, and turn what can go wrong into messages and exit codes."""
+
+import contextlib
+import os
+import sys
+import warnings
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from typing import TextIO
+
+from isa_nrsfm.cli._parser import PROGRAM, build_parser
+
+FINE, BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 0, 1, 130, 141
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command line.
+
+    The report goes to the standard output, and everything else (errors, warnings and,
+    on a terminal, the progress) to the standard error.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The arguments. By default those of the process.
+
+    Returns
+    -------
+    int
+        The exit code: 0 if all went well, 1 if the table, the model or another input
+        is bad, 130 if interrupted, 141 if the reader of the output has gone.
+
+    Raises
+    ------
+    SystemExit
+        With code 2 if the arguments are wrong, with 0 after ``--help`` and
+        ``--version``.
+    """
+    args = build_parser().parse_args(argv)
+    try:
+        with _warnings_as_lines() as warned:
+            report = _run(args, warned)
+        print(report, flush=True)
+    except KeyboardInterrupt:
+        _say("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # Python flushes the standard output once more at exit.
+        with contextlib.suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except (ValueError, OSError, ImportError) as error:
+        _say(f"error: {_message(error)}")
+        return BAD_INPUT
+    return FINE
+
+
+def _run(args: Namespace, warned: list[str]) -> str:
+    """Run the command and return its report."""
+    # What only a command needs is loaded only for a command, not for help.
+    if args.command == "demo":
+        from isa_nrsfm.cli._demo import run_demo
+
+        return run_demo(args, warned)
+    from isa_nrsfm.cli._commands import run_fit, run_transform
+
+    return (run_fit if args.command == "fit" else run_transform)(args, warned)
+
+
+@contextlib.contextmanager
+def _warnings_as_lines() -> Iterator[list[str]]:
+    """Show each warning once, as a line; yield the list of those shown."""
+    warned: list[str] = []
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        text = _one_line(str(message))
+        if text not in warned:
+            warned.append(text)
+            _say(f"warning: {text}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        for category in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
+            warnings.simplefilter("ignore", category)
+        warnings.showwarning = show
+        yield warned
+
+
+def _message(error: Exception) -> str:
+    """Return what an error says, in one line."""
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
+    return _one_line(str(error)) or type(error).__name__
+
+
+def _one_line(text: str) -> str:
+    """Join the lines of a text."""
+    return " ".join(text.split())
+
+
+def _say(text: str) -> None:
+    """Write a line to the standard error."""
+    print(f"{PROGRAM}: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,168 @@
+"""Write the results of a fit to a folder."""
+
+import json
+import tempfile
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io import save_model, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+REPORT = "report.json"
+FIGURES = {
+    "basis_shapes.png": "mean shape and basis shapes",
+    "mode_covariance.png": "covariance of the independent signals in 3x3 blocks",
+    "reprojection.png": "some frames, as observed and as the model has them",
+}
+TABLES = {
+    "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
+    "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
+    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty",
+}
+ARRAYS = {
+    "shapes.npz": "mean_shape, basis, point_names, component_names; the shape of a "
+    "frame is mean_shape + sum_k alpha_k basis[k]",
+}
+MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
+
+
+def component_names(n_components: int) -> list[str]:
+    """Name the coefficients, counted from 1: number 0 is the mean shape."""
+    return [f"alpha_{k + 1}" for k in range(n_components)]
+
+
+def prepare_folder(
+    folder: Path, inputs: Iterable[str], *, figures: bool
+) -> dict[str, str]:
+    """Create the output folder, check that it can be written, and list its files."""
+    files = MODEL | TABLES | ARRAYS | (FIGURES if figures else {})
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+    for path in inputs:
+        refuse_overwriting(path, [folder / name for name in (*files, REPORT)])
+    if not figures:
+        stale = [name for name in FIGURES if (folder / name).exists()]
+        if stale:
+            warnings.warn(
+                f"{folder} has figures of an earlier run: {', '.join(stale)}",
+                stacklevel=2,
+            )
+    return files
+
+
+def refuse_overwriting(source: str, targets: Iterable[Path]) -> None:
+    """Raise if an output file would replace an input file."""
+    for target in targets:
+        if target.exists() and target.samefile(source):
+            raise ValueError(
+                f"{source} would be overwritten by the results: choose another --output"
+            )
+
+
+def beside_other_columns(
+    results: "pd.DataFrame", other: "pd.DataFrame"
+) -> "pd.DataFrame":
+    """Put the row number and a table's other columns in front of the results.
+
+    An underscore is added to the names of results that the other columns have, too.
+    """
+    pd = import_optional("pandas", extra="io")
+    taken = {str(name) for name in other.columns}
+    names = {"row": "row"} | {str(name): str(name) for name in results.columns}
+    for name in names:
+        while names[name] in taken:
+            names[name] += "_"
+    row = pd.Series(results.index, index=results.index, name=names["row"])
+    return pd.concat([row, other, results.rename(columns=names)], axis=1)
+
+
+def write_results(
+    folder: Path,
+    estimator: AffineNRSfM,
+    points: "pd.DataFrame",
+    other: "pd.DataFrame",
+    point_names: Sequence[str],
+) -> None:
+    """Write model, coefficients, cameras and shapes; rows are the frames of the fit."""
+    pd = import_optional("pandas", extra="io")
+    names = component_names(len(estimator.basis_))
+    alpha = pd.DataFrame(estimator.alpha_, index=points.index, columns=names)
+    write_table(beside_other_columns(alpha, other), folder / "alpha.csv")
+
+    cameras = pd.DataFrame(
+        np.hstack([estimator.motion_.reshape(-1, 6), estimator.translation_]),
+        columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
+    )
+    cameras.insert(0, "row", points.index)
+    write_table(cameras, folder / "cameras.csv")
+
+    np.savez(
+        folder / "shapes.npz",
+        mean_shape=estimator.mean_shape_,
+        basis=estimator.basis_,
+        point_names=np.array(point_names, dtype=str),
+        component_names=np.array(names, dtype=str),
+        reference_motion=estimator.reference_motion_,
+        reference_translation=estimator.reference_translation_,
+    )
+    save_model(estimator, folder / "model.skops")
+
+
+def write_figures(
+    folder: Path, estimator: AffineNRSfM, points: "pd.DataFrame", random_state: int
+) -> None:
+    """Draw the figures without a screen."""
+    import_optional("matplotlib", extra="plot").use("Agg")
+    plt = import_optional("matplotlib.pyplot", extra="plot")
+    from isa_nrsfm.plotting import (
+        BasisShapeDisplay,
+        ModeCovarianceDisplay,
+        ReprojectionDisplay,
+    )
+
+    frames = ReprojectionDisplay.from_estimator(
+        estimator, points, random_state=random_state
+    )
+    # Its titles count the frames of the fit; the rows of the table are better known.
+    plt.close(frames.figure_)
+    frames.frames = points.index.to_numpy()[frames.frames]
+    figures = (
+        BasisShapeDisplay.from_estimator(estimator).figure_,
+        ModeCovarianceDisplay.from_estimator(estimator).figure_,
+        frames.plot().figure_,
+    )
+    for name, figure in zip(FIGURES, figures, strict=True):
+        figure.savefig(folder / name, dpi=150)
+        plt.close(figure)
+
+
+def write_report(folder: Path, report: dict[str, Any]) -> None:
+    """Write the report as JSON, in which NaN and infinities become null."""
+    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Turn a value into what JSON can hold."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
+    return repr(value)

@@ -1,0 +1,256 @@
+"""The options of the command line."""
+
+import argparse
+import re
+from typing import Any, NamedTuple
+
+from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
+from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+
+PROGRAM = "isa-nrsfm"
+
+_OVERVIEW = """\
+Factorise a table of 2D landmarks (one row a frame) into a mean 3D shape, basis shapes
+and, for every frame, coefficients that do not depend on the viewpoint."""
+
+_EXAMPLES = """\
+examples:
+  isa-nrsfm demo
+      fit an artificial table of faces, and see what a table looks like
+  isa-nrsfm fit faces.csv --n-components 9 --output results
+      fit a table and write coefficients, shapes, cameras, figures and the model
+  isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
+      coefficients of new frames
+
+Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
+such as x0, y0 or nose_x, nose_y; all other columns are kept beside the results."""
+
+_FIT_EXAMPLES = """\
+examples:
+  isa-nrsfm fit faces.csv --n-components 9 --output results
+  isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
+      --n-components 9 --output muct
+  isa-nrsfm fit openface.csv --columns 'x_#,y_#' --skip-rows 'success=^0' \\
+      --n-components 5 --output results
+
+Rows with missing points are left out and counted. Files of an earlier run in the output
+folder are replaced."""
+
+_TRANSFORM_EXAMPLES = """\
+example:
+  isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
+
+The table must have the landmark columns that the model was fitted to. Every row has its
+row in the output; where points are missing, the coefficients are empty."""
+
+_DEMO_EXAMPLES = """\
+example:
+  isa-nrsfm demo --output faces
+
+Beside the files of 'isa-nrsfm fit', the folder then has the table, tracks.csv."""
+
+
+class RowRule(NamedTuple):
+    """Rows to leave out: those in which a column matches an expression."""
+
+    column: str
+    expression: re.Pattern[str]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    parser.add_argument(
+        "--version", action="version", version=f"{PROGRAM} {__version__}"
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    fit = commands.add_parser(
+        "fit",
+        help="fit a table",
+        **_manners(
+            "Fit basis shapes and coefficients to a table of landmarks.", _FIT_EXAMPLES
+        ),
+    )
+    _add_table_options(fit)
+    _add_folder_options(fit, required=True)
+    _add_method_options(fit)
+
+    transform = commands.add_parser(
+        "transform",
+        help="coefficients of new frames",
+        **_manners(
+            "Compute the coefficients of new frames with a fitted model.",
+            _TRANSFORM_EXAMPLES,
+        ),
+    )
+    transform.add_argument("model", metavar="MODEL", help="model.skops, written by fit")
+    _add_table_options(transform)
+    transform.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="the .csv, .tsv or .parquet file to write",
+    )
+
+    demo = commands.add_parser(
+        "demo",
+        help="fit an artificial table of faces",
+        **_manners(
+            "Fit an artificial table of faces and compare the result with the truth.",
+            _DEMO_EXAMPLES,
+        ),
+    )
+    _add_folder_options(demo, required=False)
+    return parser
+
+
+def _manners(description: str, epilog: str) -> dict[str, Any]:
+    """Return the settings of all parsers: help as it is written, exact options."""
+    return {
+        "description": description,
+        "epilog": epilog,
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+        "allow_abbrev": False,
+    }
+
+
+def _add_table_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what a table's rows and columns mean."""
+    group = parser.add_argument_group("table")
+    group.add_argument("table", metavar="TABLE", help="a .csv, .tsv or .parquet file")
+    group.add_argument(
+        "--columns",
+        metavar="PATTERN",
+        help="the landmark columns where their names are ambiguous: patterns of x and "
+        "y columns in turn, # for a number, * for any text, such as 'x_#,y_#' or "
+        "'*.px,*.py'",
+    )
+    group.add_argument(
+        "--skip-rows",
+        metavar="COLUMN=REGEX",
+        type=_row_rule,
+        action="append",
+        default=[],
+        help="leave out the rows in which the regular expression is found in the "
+        "column, such as 'name=^ir' for names that begin with ir; may be repeated",
+    )
+    group.add_argument(
+        "--zeros-missing",
+        action="store_true",
+        help="points at exactly (0, 0) are missing",
+    )
+
+
+def _add_method_options(parser: argparse.ArgumentParser) -> None:
+    """Add the parameters of the factorisation."""
+    defaults = AffineNRSfM().get_params()
+    group = parser.add_argument_group("method")
+    group.add_argument(
+        "-k",
+        "--n-components",
+        metavar="K",
+        type=_positive,
+        default=defaults["n_components"],
+        help="number of basis shapes (default: %(default)s)",
+    )
+    group.add_argument(
+        "--isa",
+        choices=["pooled", "fast"],
+        default="pooled",
+        help="independent subspace analysis: FastICA whose components are pooled into "
+        "triples (default), or FastISA from several starts",
+    )
+    group.add_argument(
+        "--n-init",
+        metavar="N",
+        type=_positive,
+        help=f"number of random starts (default: {PooledFastICA().n_init} of pooled, "
+        f"{FastISA().n_init} of fast)",
+    )
+    group.add_argument(
+        "--block-recovery",
+        choices=list(BLOCK_RECOVERIES),
+        default=defaults["block_recovery"],
+        help="how the block structure is found (default: %(default)s)",
+    )
+    group.add_argument(
+        "--refinement",
+        choices=["alternating", "none"],
+        default="alternating",
+        help="refinement of basis shapes and coefficients (default: %(default)s)",
+    )
+    group.add_argument(
+        "--no-scale-frames",
+        action="store_true",
+        help="let frames count by their size in the image; otherwise all count alike",
+    )
+    group.add_argument(
+        "--random-state",
+        metavar="SEED",
+        type=_seed,
+        default=0,
+        help="seed of the random starts (default: %(default)s)",
+    )
+    group.add_argument(
+        "--n-jobs",
+        metavar="N",
+        type=int,
+        help="processes for the random starts, -1 for all processors (default: 1)",
+    )
+
+
+def _add_folder_options(parser: argparse.ArgumentParser, *, required: bool) -> None:
+    """Add the options that say what is written where."""
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "-o",
+        "--output",
+        metavar="DIR",
+        required=required,
+        default=f"{PROGRAM}-demo",
+        help="folder for the results, created if absent"
+        + ("" if required else " (default: ./%(default)s)"),
+    )
+    group.add_argument(
+        "--no-figures", action="store_true", help="write no figures (png)"
+    )
+
+
+def _row_rule(text: str) -> RowRule:
+    """Read COLUMN=REGEX."""
+    column, equals, expression = text.partition("=")
+    if not (column.strip() and equals and expression):
+        raise argparse.ArgumentTypeError(
+            f"expected COLUMN=REGEX, such as 'name=^ir'; got {text!r}"
+        )
+    try:
+        return RowRule(column.strip(), re.compile(expression))
+    except re.error as error:
+        raise argparse.ArgumentTypeError(
+            f"{expression!r} is not a regular expression: {error}"
+        ) from error
+
+
+def _positive(text: str) -> int:
+    """Read a whole number of at least 1."""
+    return _whole_number(text, 1, 2**31 - 1)
+
+
+def _seed(text: str) -> int:
+    """Read a seed of a random number generator."""
+    return _whole_number(text, 0, 2**32 - 1)
+
+
+def _whole_number(text: str, smallest: int, largest: int) -> int:
+    """Read a whole number in a range."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = smallest - 1
+    if not smallest <= number <= largest:
+        raise argparse.ArgumentTypeError(
+            f"expected a whole number from {smallest} to {largest}; got {text!r}"
+        )
+    return number

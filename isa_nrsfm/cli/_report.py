@@ -1,0 +1,168 @@
+"""What a run reports, as data for the JSON file and as text for people."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm.cli._frames import Frames
+from isa_nrsfm.cli._outputs import component_names
+from isa_nrsfm.plotting._basis_shapes import energy_shares
+
+_LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
+_LABEL_WIDTH = 11
+_MOST_ROWS = 10
+
+
+def table_report(path: str, frames: Frames) -> dict[str, Any]:
+    """Describe the table and which of its rows and columns are used."""
+    return {
+        "path": str(Path(path).resolve()),
+        "n_rows": frames.n_rows,
+        "n_frames": int(np.count_nonzero(frames.usable)),
+        "n_points": len(frames.columns.points),
+        "columns": frames.columns.pattern,
+        "first_columns": list(frames.points.columns[:4]),
+        "last_columns": list(frames.points.columns[-2:]),
+        "absent_numbers": frames.columns.gaps,
+        "coordinates_not_used": frames.not_used,
+        "rows_left_out": [
+            {
+                "reason": out.reason,
+                "skipped_on_request": out.skipped,
+                "n_rows": len(out.rows),
+                "first_rows": out.rows[:_MOST_ROWS].tolist(),
+            }
+            for out in frames.left_out
+        ],
+    }
+
+
+def model_report(estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
+    """Describe a fitted model and how well it explains its table."""
+    off = np.asarray(estimator.reproject(X)) - np.asarray(X)
+    shares = energy_shares(estimator.motion_, estimator.basis_, estimator.alpha_)
+    names = component_names(len(estimator.basis_))
+    return {
+        "n_components": len(estimator.basis_),
+        "inverse_snr": estimator.inverse_snr_,
+        "rank_floor": estimator.rank_floor_,
+        "rms_point_error": np.sqrt(2 * np.mean(off**2)),
+        "n_iter": estimator.n_iter_,
+        "parameters": estimator.get_params(deep=True),
+        "alpha": [
+            {
+                "name": name,
+                "energy_share": share,
+                "mean": alpha.mean(),
+                "std": alpha.std(),
+                "min": alpha.min(),
+                "max": alpha.max(),
+            }
+            for name, share, alpha in zip(
+                names, shares, estimator.alpha_.T, strict=True
+            )
+        ],
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what the results depend on."""
+    found = {"isa_nrsfm": __version__, "python": platform.python_version()}
+    for library in _LIBRARIES:
+        try:
+            found[library] = version(library)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def fit_text(report: dict[str, Any], folder: Path) -> str:
+    """Lay the report of a fit out for people."""
+    table, model = report["table"], report["model"]
+    n_components = model["n_components"]
+    shapes = f"{n_components} basis shape{'s' * (n_components != 1)}"
+    fit = [
+        f"inverse SNR {_percent(model['inverse_snr'])} "
+        f"(no model with {shapes} is below {_percent(model['rank_floor'])})",
+        f"reprojected points are off by {model['rms_point_error']:.3g}, root mean "
+        "square, in the units of the table",
+        f"{report['seconds']['fit']:.1f} seconds",
+    ]
+    alpha = [f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"]
+    alpha += [
+        f"{row['name']:10} {100 * row['energy_share']:6.1f} % {row['mean']:7.2f} "
+        f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f}"
+        for row in model["alpha"]
+    ]
+    width = max(map(len, report["files"]))
+    files = [f"in {folder}"]
+    files += [
+        f"  {name:{width}}  {content.partition(';')[0].partition(': the image')[0]}"
+        for name, content in report["files"].items()
+    ]
+    title = (
+        f"{shapes} fitted to {table['n_frames']} frames of {table['n_points']} points"
+    )
+    sections = {
+        "Table": table_lines(table),
+        "Fit": fit,
+        "Alpha": alpha,
+        "Files": files,
+    }
+    return f"{title}\n\n{lay_out(sections)}"
+
+
+def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
+    """Say which rows and columns of a table are used, and what becomes of the rest."""
+    first, last = table["first_columns"], table["last_columns"]
+    lines = [
+        table["path"],
+        f"{table['n_points']} points in the columns {', '.join(first)}, ..., "
+        + ", ".join(last),
+    ]
+    if table["absent_numbers"]:
+        absent = ", ".join(map(str, table["absent_numbers"][:_MOST_ROWS]))
+        more = ", ..." if len(table["absent_numbers"]) > _MOST_ROWS else ""
+        lines.append(f"no points of the numbers {absent}{more} are in the table")
+    if table["coordinates_not_used"]:
+        listed = [
+            f"{pattern} ({n_points})"
+            for pattern, n_points in table["coordinates_not_used"].items()
+        ]
+        lines.append(f"coordinates not used: {'; '.join(listed)}")
+    counts = [(table["n_rows"], "rows")]
+    counts += [
+        (
+            out["n_rows"],
+            f"{'left out' if out['skipped_on_request'] else unusable}: {out['reason']}",
+        )
+        for out in table["rows_left_out"]
+    ]
+    counts.append((table["n_frames"], "used"))
+    width = len(str(table["n_rows"]))
+    return lines + [f"{count:{width}} {what}" for count, what in counts]
+
+
+def lay_out(sections: Mapping[str, Sequence[str]]) -> str:
+    """Write each section's lines beside its name."""
+    blocks = []
+    for name, lines in sections.items():
+        labels = [name.ljust(_LABEL_WIDTH)]
+        labels += [" " * _LABEL_WIDTH] * (len(lines) - 1)
+        blocks.append(
+            "\n".join(
+                (label + line).rstrip()
+                for label, line in zip(labels, lines, strict=True)
+            )
+        )
+    return "\n\n".join(blocks)
+
+
+def _percent(fraction: float) -> str:
+    """Write a fraction in percent."""
+    return f"{100 * fraction:.3g} %"

@@ -1,0 +1,326 @@
+"""Read tables of 2D landmarks from files, and take the landmarks out of them."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._landmark_names import find_landmark_columns, parse_coordinate
+from isa_nrsfm._optional import import_optional
+
+if TYPE_CHECKING:
+    import os
+
+    import pandas as pd
+
+_SEPARATORS = {".csv": ",", ".tsv": "\t"}
+_MISSING = ("", "na", "nan", "n/a", "null", "none")
+
+
+class LandmarkTable(NamedTuple):
+    """
+    A table split into its landmarks and its other columns.
+
+    Parameters
+    ----------
+    points : DataFrame of shape (n_frames, 2 * n_points)
+        The landmarks, float64, one row a frame, columns x0, y0, x1, y1, ... under
+        their names in the table. NaN marks a missing point.
+    other : DataFrame of shape (n_frames, n_other)
+        All other columns as they were.
+    """
+
+    points: "pd.DataFrame"
+    other: "pd.DataFrame"
+
+
+def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
+    r"""
+    Read a table from a csv, tsv or parquet file.
+
+    In csv and tsv files the first line names the columns. Columns that are named like
+    landmark coordinates become numbers where all their cells are numbers or
+    empty. All other columns stay text, exactly as it is written, so that
+    identifiers such as ``007`` survive.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) tells the format.
+
+    Returns
+    -------
+    DataFrame of shape (n_rows, n_columns)
+        The table. Its rows are numbered from 0.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is unknown, or if the file is empty, has columns of the same
+        name, has lines of different length, or is not what its suffix says.
+    OSError
+        If the file cannot be opened.
+
+    See Also
+    --------
+    landmark_table : Take the landmark columns out of the table.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from isa_nrsfm.io import read_table
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "faces.csv")
+    ...     _ = path.write_text("id,nose_x,nose_y\n007,1.5,2\n008,,")
+    ...     table = read_table(path)
+    >>> table
+        id  nose_x  nose_y
+    0  007     1.5     2.0
+    1  008     NaN     NaN
+    """
+    path = Path(path)
+    suffix = table_suffix(path)
+    if suffix == ".parquet":
+        return _read_parquet(path)
+    return _read_text(path, _SEPARATORS[suffix])
+
+
+def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
+    """
+    Write a table to a csv, tsv or parquet file, without its index.
+
+    Numbers are written with all their digits.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        The table.
+    path : str or path-like
+        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) tells the format.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is unknown.
+    OSError
+        If the file cannot be written.
+    """
+    suffix = table_suffix(path)
+    if suffix == ".parquet":
+        import_optional("pyarrow", extra="parquet")
+        frame.to_parquet(path, index=False)
+    else:
+        frame.to_csv(path, sep=_SEPARATORS[suffix], index=False)
+
+
+def landmark_table(
+    frame: "pd.DataFrame",
+    *,
+    columns: str | Sequence[str] | None = None,
+    missing: Literal["zeros"] | None = None,
+) -> LandmarkTable:
+    """
+    Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
+
+    Columns are recognised and ordered by their names, such as ``x00, y00``,
+    ``x_0, y_0``, ``0_x, 0_y``, ``nose_x, nose_y`` or ``nose.x, nose.y``, in whatever
+    order they are in the table. A third coordinate is left aside.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        The table.
+    columns : str or sequence of str, optional
+        The landmark columns, where their names alone do not say it: patterns of x and
+        y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
+        any text.
+    missing : {"zeros"}, optional
+        With "zeros", points at exactly (0, 0) are missing and become NaN.
+
+    Returns
+    -------
+    LandmarkTable
+        The landmarks, and the other columns.
+
+    Raises
+    ------
+    ValueError
+        If there is no set of landmark columns or more than one, if a point has only
+        one of two coordinates, or if a cell is neither a finite number nor empty.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from isa_nrsfm.io import landmark_table
+    >>> frame = pd.DataFrame({"id": ["a", "b"], "x1": [1, 0], "x2": [3, 0],
+    ...                       "y2": [4, 5], "y1": [2, 0]})
+    >>> points, other = landmark_table(frame, columns="x#,y#", missing="zeros")
+    >>> points
+        x1   y1   x2   y2
+    0  1.0  2.0  3.0  4.0
+    1  NaN  NaN  0.0  5.0
+    >>> list(other)
+    ['id']
+    """
+    pd = import_optional("pandas", extra="io")
+    if not isinstance(frame, pd.DataFrame):
+        raise ValueError(
+            f"a pandas DataFrame is needed; got {type(frame).__name__} "
+            "(polars tables have a method to_pandas)"
+        )
+    if missing not in (None, "zeros"):
+        raise ValueError(f'missing must be None or "zeros"; got {missing!r}')
+    found = find_landmark_columns(frame.columns, columns)
+    names = found.interleaved
+    _refuse_same_names([str(name) for name in frame.columns], "the table")
+    values = np.column_stack([_numbers(frame[name]) for name in names])
+    points = values.reshape(len(frame), len(names) // 2, 2)
+    if missing == "zeros":
+        points[(points == 0).all(axis=2)] = np.nan
+    return LandmarkTable(
+        pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
+        frame.drop(columns=names),
+    )
+
+
+def table_suffix(path: "str | os.PathLike[str]") -> str:
+    """Return the suffix of a table's file, or raise if it is none of a table."""
+    suffix = Path(path).suffix
+    if suffix.lower() not in (*_SEPARATORS, ".parquet"):
+        raise ValueError(
+            f"{path}: a table is a .csv, .tsv or .parquet file; got {suffix!r}"
+        )
+    return suffix.lower()
+
+
+def _read_text(path: Path, separator: str) -> "pd.DataFrame":
+    """Read a file of separated values."""
+    pd = import_optional("pandas", extra="io")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            header = _check_lines(csv.reader(file, delimiter=separator), path)
+        frame = pd.read_csv(
+            path,
+            sep=separator,
+            dtype=str,
+            index_col=False,
+            keep_default_na=False,
+            encoding="utf-8-sig",
+        )
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
+    except (csv.Error, pd.errors.ParserError) as error:
+        raise ValueError(f"{path} cannot be read as a table: {error}") from error
+    frame.columns = pd.Index(header)
+    for name in header:
+        if parse_coordinate(name) is not None:
+            values = _parsed(frame[name])
+            if values is not None:
+                frame[name] = values
+    return frame
+
+
+def _check_lines(lines: Any, path: Path) -> list[str]:
+    """
+    Return the header of a file, or raise if its lines do not make a table.
+
+    pandas fills short lines up, cuts long ones or renames equal columns.
+    """
+    header = next((line for line in lines if line), None)
+    if header is None:
+        raise ValueError(f"{path} is empty; a first line with column names is needed")
+    if len(header) == 1:
+        for separator, word in ((";", "semicolons"), ("\t", "tabs"), (",", "commas")):
+            if separator in header[0]:
+                raise ValueError(
+                    f"the columns of {path} are separated by {word}; commas are needed "
+                    "in a .csv file and tabs in a .tsv file"
+                )
+    n_lines = 0
+    for line in lines:
+        if line and len(line) != len(header):
+            raise ValueError(
+                f"line {lines.line_num} of {path} has {len(line)} values, but the "
+                f"header has {len(header)} names"
+            )
+        n_lines += bool(line)
+    if n_lines == 0:
+        raise ValueError(f"{path} has a header but no rows")
+    _refuse_same_names(header, str(path))
+    return header
+
+
+def _refuse_same_names(names: Sequence[str], where: str) -> None:
+    """Raise if two columns have the same name."""
+    seen: set[str] = set()
+    for name in map(str.strip, names):
+        if name and name in seen:
+            raise ValueError(f"{where} has more than one column called {name!r}")
+        seen.add(name)
+
+
+def _read_parquet(path: Path) -> "pd.DataFrame":
+    """Read a parquet file."""
+    pd = import_optional("pandas", extra="io")
+    pyarrow = import_optional("pyarrow", extra="parquet")
+    with path.open("rb"):  # opening errors as for text files
+        pass
+    try:
+        frame = pd.read_parquet(path)
+    except (pyarrow.ArrowException, ValueError) as error:
+        first_line = str(error).partition("\n")[0]
+        raise ValueError(f"{path} is not a parquet file: {first_line}") from error
+    if frame.empty:
+        raise ValueError(f"{path} has no rows")
+    return frame.reset_index(drop=True)
+
+
+def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
+    """Return the numbers written in a column of text, or None."""
+    text = column.str.strip()
+    text = text.where(~text.str.lower().isin(_MISSING), "nan")
+    # Python reads 1_000 as a number; in a table it is a mistake.
+    if text.str.contains("_", regex=False).any():
+        return None
+    try:
+        return text.to_numpy(dtype=object).astype(np.float64)
+    except ValueError:
+        return None
+
+
+def _numbers(column: "pd.Series") -> NDArray[np.float64]:
+    """Return a landmark column as finite numbers and NaN."""
+    pd = import_optional("pandas", extra="io")
+    types = pd.api.types
+    if types.is_bool_dtype(column) or types.is_complex_dtype(column):
+        raise ValueError(
+            f"column {column.name!r} should hold coordinates; got {column.dtype}"
+        )
+    if types.is_numeric_dtype(column):
+        values = column.to_numpy(dtype=np.float64, na_value=np.nan)
+    else:
+        values = _parsed_cells(column)
+    if np.isinf(values).any():
+        row = int(np.flatnonzero(np.isinf(values))[0])
+        raise ValueError(
+            f"column {column.name!r} is infinite in row {column.index[row]} "
+            "(counted from 0)"
+        )
+    return values
+
+
+def _parsed_cells(column: "pd.Series") -> NDArray[np.float64]:
+    """Return the numbers in a column of objects, or say which cell is none."""
+    text = column.astype(object).where(column.notna(), "").astype(str)
+    values = _parsed(text)
+    if values is not None:
+        return values
+    bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
+    raise ValueError(
+        f"column {column.name!r} should hold coordinates, but in row {text.index[bad]} "
+        f"(counted from 0) it has {text.iloc[bad]!r}"
+    )

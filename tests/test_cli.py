@@ -1,0 +1,583 @@
+"""The command line, run in this process and as an installed program."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import load_model, save_model
+
+N_FRAMES, N_COMPONENTS = 60, 2
+QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
+PROGRAM = str(Path(sys.executable).with_name("isa-nrsfm"))
+FIT_FILES = {"alpha.csv", "cameras.csv", "shapes.npz", "model.skops", "report.json"}
+FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def faces():
+    """Return a table of faces with a name for each row."""
+    bunch = make_face_tracks(N_FRAMES, n_components=N_COMPONENTS, random_state=0)
+    frame = pd.DataFrame(bunch.data, columns=bunch.feature_names)
+    frame.insert(
+        0, "name", [f"{'ir' if i % 10 == 9 else 'i'}{i:03d}" for i in range(60)]
+    )
+    frame["code"] = [f"{i:04d}" for i in range(N_FRAMES)]
+    return frame
+
+
+@pytest.fixture(scope="module")
+def table(faces, tmp_path_factory):
+    """Return the path of the table as a csv file."""
+    path = tmp_path_factory.mktemp("table") / "faces.csv"
+    faces.to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture(scope="module")
+def fitted(table, tmp_path_factory):
+    """Return the folder of a fit without figures."""
+    folder = tmp_path_factory.mktemp("fit") / "results"
+    options = ["--output", str(folder), "--no-figures", *QUICK]
+    assert main(["fit", str(table), *options]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs a command: exit code, output and errors."""
+
+    def run_command(*argv):
+        code = main([str(word) for word in argv])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run_command
+
+
+@pytest.fixture
+def fails(run):
+    """Return a function that runs a command that fails and returns its message."""
+
+    def message(*argv):
+        code, out, err = run(*argv)
+        assert code == 1
+        assert out == ""
+        last = err.splitlines()[-1]
+        assert last.startswith("isa-nrsfm: error: ")
+        assert "Traceback" not in err
+        return last
+
+    return message
+
+
+def test_fit_writes_what_it_says(run, table, faces, tmp_path):
+    folder = tmp_path / "new" / "results"
+    code, out, err = run("fit", table, "--output", folder, *QUICK)
+    assert (code, err) == (0, "")
+    assert {path.name for path in folder.iterdir()} == FIT_FILES | FIGURES
+    for name in FIGURES:
+        assert (folder / name).read_bytes().startswith(PNG)
+        assert name in out
+    assert out.startswith("2 basis shapes fitted to 60 frames of 68 points\n")
+    assert str(table) in out
+    assert all(len(line) <= 120 for line in out.splitlines())
+
+    report = json.loads((folder / "report.json").read_text())
+    assert report["table"]["n_rows"] == report["table"]["n_frames"] == N_FRAMES
+    assert report["table"]["rows_left_out"] == []
+    assert report["table"]["columns"] == "x_#,y_#"
+    assert report["model"]["parameters"]["isa__n_init"] == 2
+    assert report["versions"]["isa_nrsfm"] == __version__
+    assert report["warnings"] == []
+    assert set(report["files"]) == (FIT_FILES | FIGURES) - {"report.json"}
+    assert set(report["seconds"]) == {"read", "fit", "write"}
+    assert sum(row["energy_share"] for row in report["model"]["alpha"]) == (
+        pytest.approx(1)
+    )
+
+
+def test_tables_written_are_those_of_the_model(fitted, faces):
+    model = load_model(fitted / "model.skops")
+    X = faces[model.feature_names_in_]
+    alpha = pd.read_csv(fitted / "alpha.csv", dtype={"code": str})
+    assert list(alpha) == ["row", "name", "code", "alpha_1", "alpha_2"]
+    assert list(alpha["row"]) == list(range(N_FRAMES))
+    assert list(alpha["name"]) == list(faces["name"])
+    assert list(alpha["code"]) == list(faces["code"])
+    np.testing.assert_allclose(alpha[["alpha_1", "alpha_2"]], model.alpha_, rtol=1e-12)
+
+    cameras = pd.read_csv(fitted / "cameras.csv")
+    assert " ".join(cameras) == "row m00 m01 m02 m10 m11 m12 tx ty"
+    arrays = np.load(fitted / "shapes.npz", allow_pickle=False)
+    assert list(arrays["component_names"]) == ["alpha_1", "alpha_2"]
+    assert list(arrays["point_names"]) == [str(j) for j in range(68)]
+    shapes = arrays["mean_shape"] + np.tensordot(
+        alpha[["alpha_1", "alpha_2"]].to_numpy(), arrays["basis"], 1
+    )
+    motion = cameras.iloc[:, 1:7].to_numpy().reshape(-1, 2, 3)
+    images = shapes @ motion.swapaxes(1, 2) + cameras[["tx", "ty"]].to_numpy()[:, None]
+    np.testing.assert_allclose(
+        images.reshape(len(X), -1), model.reproject(X), rtol=1e-9
+    )
+
+    report = json.loads((fitted / "report.json").read_text())
+    assert report["model"]["inverse_snr"] == pytest.approx(model.inverse_snr_)
+    off = np.linalg.norm((images - X.to_numpy().reshape(images.shape)), axis=2)
+    assert report["model"]["rms_point_error"] == pytest.approx(np.sqrt(np.mean(off**2)))
+
+
+def test_model_does_not_depend_on_the_terminal_and_the_figures(fitted, faces):
+    model = load_model(fitted / "model.skops")
+    assert model.verbose == 0
+    again = AffineNRSfM(**model.get_params(deep=False)).fit(
+        faces[model.feature_names_in_]
+    )
+    np.testing.assert_array_equal(again.alpha_, model.alpha_)
+
+
+def test_options_reach_the_estimator(run, table, tmp_path):
+    options = "--isa fast --n-init 3 --block-recovery eigen --refinement none "
+    options += "--no-scale-frames --random-state 7 --n-jobs 1 --no-figures -k 1"
+    code, _, _ = run("fit", table, "-o", tmp_path, *options.split())
+    assert code == 0
+    model = load_model(tmp_path / "model.skops")
+    assert type(model.isa).__name__ == "FastISA"
+    assert (model.isa.n_init, model.n_components, model.random_state) == (3, 1, 7)
+    assert (model.block_recovery, model.refinement) == ("eigen", None)
+    assert (model.scale_frames, model.n_jobs) == (False, 1)
+
+
+def test_defaults_are_those_of_the_estimator(run, table, tmp_path):
+    assert run("fit", table, "-o", tmp_path, "--no-figures")[0] == 0
+    model = load_model(tmp_path / "model.skops")
+    expected = AffineNRSfM(random_state=0)
+    given = model.get_params(deep=False)
+    assert repr(given.pop("isa")) == "PooledFastICA()"
+    assert given == {
+        name: value
+        for name, value in expected.get_params(deep=False).items()
+        if name != "isa"
+    }
+
+
+def test_rows_left_out_are_counted_and_the_rest_keep_their_numbers(
+    run, faces, tmp_path
+):
+    faces = faces.copy()
+    x, y = ["x_5", "y_5"], ["x_7", "y_7"]
+    faces.loc[3, x] = 0.0
+    faces.loc[9, x] = 0.0  # an ir row
+    faces.loc[[4, 11], y] = np.nan
+    landmarks = [name for name in faces if name[:2] in ("x_", "y_")]
+    faces.loc[20, landmarks] = 31.0
+    path = tmp_path / "faces.csv"
+    faces.to_csv(path, index=False)
+    rules = ["--skip-rows", "name=^ir", "--skip-rows", "code = 1$|^nothing"]
+    code, out, err = run(
+        "fit",
+        path,
+        "-o",
+        tmp_path,
+        *rules[:2],
+        "--zeros-missing",
+        "--no-figures",
+        *QUICK,
+    )
+    assert (code, err) == (0, "")
+    for line in (
+        "60 rows",
+        " 6 left out: name matches '^ir'",
+        " 3 left out: missing points",
+        " 1 left out: all points in one place",
+        "50 used",
+    ):
+        assert f" {line}\n" in out
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [rows["first_rows"] for rows in report["table"]["rows_left_out"]] == [
+        [9, 19, 29, 39, 49, 59],
+        [3, 4, 11],
+        [20],
+    ]
+    out_rows = {3, 4, 11, 20, *range(9, 60, 10)}
+    alpha = pd.read_csv(tmp_path / "alpha.csv")
+    assert list(alpha["row"]) == [i for i in range(N_FRAMES) if i not in out_rows]
+    assert list(alpha["name"]) == list(faces["name"][alpha["row"]])
+    assert list(pd.read_csv(tmp_path / "cameras.csv")["row"]) == list(alpha["row"])
+
+
+def test_points_at_zero_are_pointed_out(run, faces, tmp_path):
+    faces = faces.copy()
+    faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0
+    faces.to_csv(tmp_path / "faces.csv", index=False)
+    code, _, err = run(
+        "fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", *QUICK
+    )
+    assert code == 0
+    assert err == (
+        "isa-nrsfm: warning: 2 points in 2 rows are at exactly (0, 0); if that marks "
+        "missing points, use --zeros-missing\n"
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["warnings"] == [err.removeprefix("isa-nrsfm: warning: ").strip()]
+
+
+def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path):
+    model = load_model(fitted / "model.skops")
+    landmarks = list(model.feature_names_in_)
+    new = faces.iloc[::-1].reset_index(drop=True)
+    new.loc[2, "x_3"] = np.nan
+    new["alpha_1"] = "mine"
+    shuffled = new[[*landmarks[1::2], "alpha_1", "name", *landmarks[0::2]]]
+    path, output = tmp_path / "new.parquet", tmp_path / "new-alpha.csv"
+    shuffled.to_parquet(path)
+    code, out, err = run(
+        "transform", fitted / "model.skops", path, "-o", output,
+        "--skip-rows", "name=^ir",
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    assert out.startswith("2 coefficients of 53 frames\n")
+    assert " 6 left out: name matches '^ir'" in out
+    assert " 1 without coefficients: missing points" in out
+    assert out.endswith("54 rows\n")
+    alpha = pd.read_csv(output)
+    assert list(alpha) == ["row", "alpha_1", "name", "alpha_1_", "alpha_2"]
+    assert list(alpha["name"]) == [n for n in new["name"] if not n.startswith("ir")]
+    assert list(new["name"][alpha["row"]]) == list(alpha["name"])
+    complete = alpha["row"] != 2
+    assert alpha.loc[~complete, ["alpha_1_", "alpha_2"]].isna().all(axis=None)
+    rows = N_FRAMES - 1 - alpha["row"][complete]
+    np.testing.assert_allclose(
+        alpha.loc[complete, ["alpha_1_", "alpha_2"]], model.alpha_[rows], atol=1e-9
+    )
+
+
+def test_transform_of_no_usable_row_is_empty(run, fitted, faces, tmp_path):
+    path, output = tmp_path / "new.csv", tmp_path / "alpha.tsv"
+    faces.assign(x_0="").to_csv(path, index=False)
+    code, out, _ = run("transform", fitted / "model.skops", path, "-o", output)
+    assert code == 0
+    assert "60 without coefficients: missing points" in out
+    assert out.endswith("60 rows\n")
+    assert pd.read_csv(output, sep="\t")["alpha_2"].isna().all()
+
+
+@pytest.mark.parametrize("layout", ["interleaved", "planar"])
+@pytest.mark.parametrize("named", [True, False])
+def test_transform_follows_the_layout_of_the_model(
+    run, faces, table, tmp_path, layout, named
+):
+    names = [f"{axis}_{j}" for j in range(68) for axis in "xy"]
+    if layout == "planar":
+        names = names[0::2] + names[1::2]
+    X = faces[names].rename(columns=lambda name: f" {name}")
+    model = AffineNRSfM(2, layout=layout, random_state=0)
+    model.fit(X if named else X.to_numpy())
+    save_model(model, tmp_path / "model.skops")
+    code, _, err = run(
+        "transform", tmp_path / "model.skops", table, "-o", tmp_path / "alpha.csv"
+    )
+    assert (code, err) == (0, "")
+    alpha = pd.read_csv(tmp_path / "alpha.csv")[["alpha_1", "alpha_2"]]
+    np.testing.assert_allclose(alpha, model.alpha_, atol=1e-9)
+
+
+def test_transform_names_the_difference_between_points(fails, fitted, faces, tmp_path):
+    model, path = fitted / "model.skops", tmp_path / "new.csv"
+    output = ["-o", tmp_path / "alpha.csv"]
+    faces.drop(columns=["x_3", "y_3"]).to_csv(path, index=False)
+    message = fails("transform", model, path, *output)
+    assert (
+        "not those of the model: 2 columns are only in the model (x_3, y_3)" in message
+    )
+    renamed = faces.rename(columns=lambda name: name.replace("_", ""))
+    renamed.to_csv(path, index=False)
+    message = fails("transform", model, path, *output)
+    assert "136 columns are only in the model (x_0, y_0, x_1, y_1, ...)" in message
+    assert "136 columns are only in the table (x0, y0, x1, y1, ...)" in message
+    assert "136 columns" in fails(
+        "transform", model, path, *output, "--columns", "x#,y#"
+    )
+    faces.assign(x_68=1.0, y_68=1.0).to_csv(path, index=False)
+    message = fails("transform", model, path, *output, "--columns", "x_#,y_#")
+    assert "2 columns are only in the table (x_68, y_68)" in message
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_transform_of_a_model_without_names_counts_points(fails, faces, tmp_path):
+    X = faces.drop(columns=["name", "code"]).to_numpy()[:, :40]
+    save_model(AffineNRSfM(1, random_state=0).fit(X), tmp_path / "model.skops")
+    faces.to_csv(tmp_path / "new.csv", index=False)
+    message = fails(
+        "transform", tmp_path / "model.skops", tmp_path / "new.csv",
+        "-o", tmp_path / "alpha.csv",
+    )  # fmt: skip
+    assert "the model has 20 points, the table has 68 (x_#,y_#)" in message
+
+
+def test_columns_choose_among_several_sets(run, fails, faces, tmp_path):
+    landmarks = [name for name in faces if name[:2] in ("x_", "y_")]
+    eyes = faces[landmarks].add_prefix("eye_")
+    path = tmp_path / "faces.csv"
+    pd.concat([faces, eyes], axis=1).to_csv(path, index=False)
+    message = fails("fit", path, "-o", tmp_path / "results")
+    assert "more than one set of landmark columns: 'x_#,y_#' (68 points: " in message
+    assert "'eye_x_#,eye_y_#' (68 points: eye_x_0 to eye_x_67)" in message
+    assert not (tmp_path / "results").exists()
+    code, out, _ = run(
+        "fit", path, "-o", tmp_path, "--columns", "eye_x_#,eye_y_#", "--no-figures",
+        *QUICK,
+    )  # fmt: skip
+    assert code == 0
+    assert "eye_x_0, eye_y_0, eye_x_1, eye_y_1, ..., eye_x_67, eye_y_67" in out
+    assert "coordinates not used: x_#,y_# (68)" in out
+
+
+def test_bad_tables_are_refused_in_one_line(fails, run, table, faces, tmp_path):
+    folder = ["-o", tmp_path / "results", "--no-figures"]
+    absent = tmp_path / "absent.csv"
+    assert f"{absent}: No such file" in fails("fit", absent, *folder)
+    (tmp_path / "folder.csv").mkdir()
+    assert "Is a directory" in fails("fit", tmp_path / "folder.csv", *folder)
+    (tmp_path / "ragged.csv").write_text("x0,y0\n1\n")
+    assert "line 2" in fails("fit", tmp_path / "ragged.csv", *folder)
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    assert "no landmark columns" in fails("fit", tmp_path / "other.csv", *folder)
+    faces.assign(x_3="?").to_csv(tmp_path / "text.csv", index=False)
+    assert "'x_3' should hold" in fails("fit", tmp_path / "text.csv", *folder)
+    assert "no column matches 'u#'" in fails(
+        "fit", table, *folder, "--columns", "u#,v#"
+    )
+    message = fails("fit", table, *folder, "--skip-rows", "nam=^i")
+    assert "no column 'nam'; its columns are name, x_0, y_0" in message
+    message = fails("fit", table, *folder, "--skip-rows", "name=^i")
+    assert "no row of" in message
+    assert "60 left out (name matches '^i')" in message
+    assert "at least 94 points" in fails("fit", table, *folder, "-k", "30")
+    message = fails(
+        "fit", table, *folder, "-k", "3", "--skip-rows", "code=[1-9].$|[4-9]$"
+    )
+    assert "at least 8 frames" in message
+
+
+def test_bad_models_are_refused_in_one_line(fails, table, fitted, tmp_path):
+    output = ["-o", tmp_path / "alpha.csv"]
+    absent = tmp_path / "absent.skops"
+    assert f"{absent}: No such file" in fails("transform", absent, table, *output)
+    assert "is not a model file" in fails("transform", table, table, *output)
+    message = fails(
+        "transform", fitted / "model.skops", table, "-o", tmp_path / "a.txt"
+    )
+    assert "a.txt: a table is a .csv, .tsv or .parquet file" in message
+
+
+def test_outputs_that_cannot_be_written_are_refused(
+    fails, run, table, fitted, faces, tmp_path
+):
+    message = fails("fit", table, "-o", table, *QUICK)
+    assert "File exists" in message or "Not a directory" in message
+    message = fails("fit", table, "-o", table / "results", *QUICK)
+    assert "Not a directory" in message
+    message = fails(
+        "transform", fitted / "model.skops", table, "-o", tmp_path / "no/a.csv"
+    )
+    assert "no" in message
+    copy = tmp_path / "alpha.csv"
+    faces.to_csv(copy, index=False)
+    for argv in (
+        ("fit", copy, "-o", tmp_path, *QUICK),
+        ("transform", fitted / "model.skops", copy, "-o", copy),
+    ):
+        assert "would be overwritten by the results" in fails(*argv)
+    pd.testing.assert_frame_equal(pd.read_csv(copy, dtype={"code": str}), faces)
+
+
+def test_old_figures_are_pointed_out(run, table, tmp_path):
+    (tmp_path / "basis_shapes.png").write_bytes(PNG)
+    _, _, err = run("fit", table, "-o", tmp_path, "--no-figures", *QUICK)
+    assert err.startswith("isa-nrsfm: warning: ")
+    assert "figures of an earlier run: basis_shapes.png" in err
+    assert (tmp_path / "basis_shapes.png").read_bytes() == PNG
+
+
+def test_missing_libraries_are_named_before_the_fit(
+    fails, table, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    message = fails("fit", table, "-o", tmp_path / "results", *QUICK)
+    assert 'pip install "isa-nrsfm[plot]"' in message
+    assert not (tmp_path / "results").exists()
+    monkeypatch.setitem(sys.modules, "skops.io", None)
+    message = fails("fit", table, "-o", tmp_path / "results", "--no-figures")
+    assert 'pip install "isa-nrsfm[share]"' in message
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["fit"],
+        ["fit", "t.csv"],
+        ["fit", "t.csv", "-o", "d", "-k", "0"],
+        ["fit", "t.csv", "-o", "d", "-k", "two"],
+        ["fit", "t.csv", "-o", "d", "--isa", "slow"],
+        ["fit", "t.csv", "-o", "d", "--random-state", "-1"],
+        ["fit", "t.csv", "-o", "d", "--skip-rows", "name"],
+        ["fit", "t.csv", "-o", "d", "--skip-rows", "name=["],
+        ["fit", "t.csv", "--out", "d"],
+        ["transform", "m.skops", "t.csv"],
+    ],
+)
+def test_wrong_usage_ends_with_code_2(argv, capsys):
+    with pytest.raises(SystemExit) as error:
+        main(argv)
+    assert error.value.code == 2
+    assert "usage: isa-nrsfm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("argv", [["--version"], ["--help"], ["fit", "--help"]])
+def test_version_and_help(argv, capsys):
+    with pytest.raises(SystemExit) as error:
+        main(argv)
+    assert error.value.code == 0
+    out = capsys.readouterr().out
+    assert (f"isa-nrsfm {__version__}\n" == out) == (argv == ["--version"])
+    assert ("example" in out) == (argv != ["--version"])
+
+
+def test_interruption_ends_with_code_130(run, table, tmp_path, monkeypatch):
+    def interrupt(*_args, **_keywords):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(AffineNRSfM, "fit", interrupt)
+    code, out, err = run("fit", table, "-o", tmp_path, "--no-figures")
+    assert (code, out, err) == (130, "", "isa-nrsfm: interrupted\n")
+
+
+def test_warnings_are_shown_once_and_in_one_line(run, table, tmp_path, monkeypatch):
+    import warnings
+
+    fit = AffineNRSfM.fit
+
+    def warn_and_fit(self, X, y=None):
+        for _ in range(2):
+            warnings.warn("a\n  long warning", UserWarning, stacklevel=1)
+        warnings.warn("for developers", DeprecationWarning, stacklevel=1)
+        return fit(self, X, y)
+
+    monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
+    code, _, err = run("fit", table, "-o", tmp_path, "--no-figures", *QUICK)
+    assert (code, err) == (0, "isa-nrsfm: warning: a long warning\n")
+
+
+def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("demo", "--no-figures")
+    assert (code, err) == (0, "")
+    folder = tmp_path / "isa-nrsfm-demo"
+    assert {path.name for path in folder.iterdir()} == FIT_FILES | {"tracks.csv"}
+    report = json.loads((folder / "report.json").read_text())
+    truth = report["truth"]
+    assert truth["shape_error"] < truth["mean_shape_error"]
+    assert [row["name"] for row in truth["basis"]][:2] == ["jaw open", "smile"]
+    assert truth["basis"][0]["similarity"] > 0.5
+    tracks = pd.read_csv(folder / "tracks.csv")
+    assert list(tracks)[:3] == ["frame", "x_0", "y_0"]
+    command = out[out.index("isa-nrsfm fit") :].split()[1:]
+    before = (folder / "alpha.csv").read_bytes()
+    assert run(*command)[0] == 0
+    assert (folder / "alpha.csv").read_bytes() == before
+
+
+def test_table_as_it_is_distributed(run, data_path, tmp_path):
+    table = data_path("raw/muct76-opencv.csv")
+    code, out, err = run(
+        "fit", table, "--skip-rows", "name=^ir", "--zeros-missing", "-k", "2",
+        "--n-init", "1", "--no-figures", "-o", tmp_path,
+    )  # fmt: skip
+    assert (code, err) == (0, "")
+    assert "3755 left out: name matches '^ir'" in out
+    assert " 840 left out: missing points" in out
+    alpha = pd.read_csv(tmp_path / "alpha.csv")
+    source = pd.read_csv(table)
+    assert len(alpha) == 2915
+    assert list(alpha["name"]) == list(source["name"][alpha["row"]])
+
+
+def test_program_reports_on_standard_output_only(table, tmp_path):
+    done = subprocess.run(
+        [PROGRAM, "fit", str(table), "-o", str(tmp_path), "--no-figures", *QUICK],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("2 basis shapes fitted to")
+
+
+def test_progress_is_shown_on_a_terminal(table, tmp_path):
+    reading, writing = pty.openpty()
+    done = subprocess.run(
+        [PROGRAM, "fit", str(table), "-o", str(tmp_path), "--no-figures", *QUICK],
+        stdout=subprocess.PIPE,
+        stderr=writing,
+        text=True,
+        check=True,
+    )
+    os.close(writing)
+    progress = os.read(reading, 100_000).decode()
+    os.close(reading)
+    assert "factorisation" in progress
+    assert "factorisation" not in done.stdout
+    assert done.stdout.startswith("2 basis shapes fitted to")
+    assert load_model(tmp_path / "model.skops").verbose == 0
+
+
+def test_package_runs_as_a_module():
+    done = subprocess.run(
+        [sys.executable, "-m", "isa_nrsfm", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == f"isa-nrsfm {__version__}\n"
+
+
+def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch, capfd):
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as stdout:
+        monkeypatch.setattr(sys, "stdout", stdout)
+        argv = ["transform", fitted / "model.skops", table, "-o", tmp_path / "a.csv"]
+        assert main([str(word) for word in argv]) == 141
+    assert capfd.readouterr() == ("", "")
+
+
+def test_signal_of_the_keyboard_stops_the_program(table, tmp_path):
+    folder = tmp_path / "results"
+    started = subprocess.Popen(
+        [PROGRAM, "fit", str(table), "-o", str(folder), "--isa=fast", "--n-init=99999"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 60
+    while not folder.exists() and started.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    time.sleep(0.5)
+    started.send_signal(signal.SIGINT)
+    out, err = started.communicate(timeout=60)
+    assert (started.returncode, out, err) == (130, "", "isa-nrsfm: interrupted\n")

@@ -1,0 +1,221 @@
+"""Tables of landmarks read from files and taken out of data frames."""
+
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from isa_nrsfm.io import LandmarkTable, landmark_table, read_table, write_table
+
+N_POINTS = 8
+NAMES = [f"{axis}{j}" for j in range(N_POINTS) for axis in "xy"]
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes text to a file and returns its path."""
+
+    def write_text(text, name="table.csv", encoding="utf-8"):
+        path = tmp_path / name
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write_text
+
+
+@pytest.fixture
+def frame():
+    """Return a table of landmarks with a column of names."""
+    values = np.random.default_rng(0).uniform(1, 600, (5, 2 * N_POINTS))
+    frame = pd.DataFrame(values, columns=NAMES)
+    frame.insert(0, "id", [f"{i:03d}" for i in range(5)])
+    return frame
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet", ".CSV"])
+def test_tables_survive_writing_and_reading(frame, tmp_path, suffix):
+    frame.loc[2, ["x1", "y1"]] = np.nan
+    path = tmp_path / f"table{suffix}"
+    write_table(frame, path)
+    pd.testing.assert_frame_equal(
+        read_table(path), frame, check_dtype=False, check_exact=True
+    )
+
+
+def test_text_stays_as_it_is_written(write):
+    path = write("id,AU01_r,x0,y0,nose_x\n007,0.50,1.5,2e1,NA\nNone,,1_0,,\n")
+    table = read_table(path)
+    assert list(table["id"]) == ["007", "None"]
+    assert list(table["AU01_r"]) == ["0.50", ""]
+    assert list(table["x0"]) == ["1.5", "1_0"]
+    np.testing.assert_array_equal(table["y0"], [20.0, np.nan])
+    assert table["nose_x"].isna().all()
+
+
+def test_byte_order_mark_blank_lines_and_quotes_are_understood(write):
+    path = write('\n"name, first",x0\r\n"a ""b""\nc",1\n\n', encoding="utf-8-sig")
+    table = read_table(path)
+    assert list(table) == ["name, first", "x0"]
+    assert table["name, first"][0] == 'a "b"\nc'
+    assert table["x0"][0] == 1
+
+
+def test_unnamed_index_column_is_kept(write):
+    table = read_table(write(",x0,y0\n0,1,2\n1,3,4\n"))
+    assert list(table) == ["", "x0", "y0"]
+    assert list(table[""]) == ["0", "1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("\n\n", "is empty"),
+        ("x0,y0\n", "a header but no rows"),
+        ("x0,y0\n1,2\n3\n", "line 3 of .* has 1 values, but the header has 2 names"),
+        ("x0,y0\n\n1,2,3\n", "line 3 of .* has 3 values, but the header has 2 names"),
+        ("x0,x0\n1,2\n", "more than one column called 'x0'"),
+        ("x0, x0\n1,2\n", "more than one column called 'x0'"),
+        ("x0;y0\n1;2\n", "separated by semicolons; commas are needed"),
+        ("x0\ty0\n1\t2\n", "separated by tabs"),
+        ("x0,y0\n1,\x00\n", r"in row 0 .* it has '\\x00'"),
+    ],
+)
+def test_files_that_are_no_tables_are_refused(write, text, message):
+    path = write(text)
+    with pytest.raises(ValueError, match=message):
+        landmark_table(read_table(path), columns="x#,y#")
+
+
+def test_wrong_encodings_and_formats_are_refused(write, tmp_path):
+    with pytest.raises(ValueError, match="not a text file in UTF-8"):
+        read_table(write("näme,x0\n1,2\n", encoding="latin-1"))
+    with pytest.raises(ValueError, match="is not a parquet file"):
+        read_table(write("x0,y0\n1,2\n", name="table.parquet"))
+    with pytest.raises(
+        ValueError, match=r"is a \.csv, \.tsv or \.parquet.*got '.xlsx'"
+    ):
+        read_table(tmp_path / "table.xlsx")
+    with pytest.raises(ValueError, match="got ''"):
+        write_table(pd.DataFrame({"a": [1]}), tmp_path / "table")
+    empty = tmp_path / "empty.parquet"
+    write_table(pd.DataFrame({"x0": []}), empty)
+    with pytest.raises(ValueError, match="has no rows"):
+        read_table(empty)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_files_that_do_not_open_raise_os_errors(tmp_path, suffix):
+    with pytest.raises(FileNotFoundError):
+        read_table(tmp_path / f"absent{suffix}")
+    folder = tmp_path / f"folder{suffix}"
+    folder.mkdir()
+    with pytest.raises(IsADirectoryError):
+        read_table(folder)
+
+
+def test_landmarks_and_other_columns_are_separated(frame):
+    shuffled = frame[["y3", "id", *(name for name in NAMES if name != "y3")]]
+    table = landmark_table(shuffled)
+    assert isinstance(table, LandmarkTable)
+    assert list(table.points) == NAMES
+    assert list(table.other) == ["id"]
+    np.testing.assert_array_equal(table.points, frame[NAMES])
+    pd.testing.assert_frame_equal(table.other, frame[["id"]])
+    assert (table.points.dtypes == np.float64).all()
+
+
+def test_result_does_not_depend_on_the_order_of_columns(frame):
+    planar = NAMES[0::2] + NAMES[1::2]
+    pd.testing.assert_frame_equal(
+        landmark_table(frame[planar]).points, landmark_table(frame).points
+    )
+
+
+def test_rows_keep_their_labels_and_names_lose_their_blanks(frame):
+    part = frame.iloc[[4, 1]].rename(columns={"x0": " x0 "})
+    points, other = landmark_table(part)
+    assert list(points.index) == [4, 1]
+    assert list(other.index) == [4, 1]
+    assert points.columns[0] == "x0"
+
+
+def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
+    frame.loc[0, ["x1", "y1"]] = 0.0
+    frame.loc[1, "x1"] = 0.0
+    kept = landmark_table(frame).points
+    assert not kept.isna().any(axis=None)
+    points = landmark_table(frame, missing="zeros").points
+    missing = np.zeros(points.shape, dtype=bool)
+    missing[0, 2:4] = True
+    np.testing.assert_array_equal(points.isna(), missing)
+    with pytest.raises(ValueError, match='None or "zeros"; got 0'):
+        landmark_table(frame, missing=0)
+
+
+def test_numbers_of_all_kinds_become_floats(frame):
+    frame["x0"] = pd.array([1, None, 3, 4, 5], dtype="Int64")
+    frame["y0"] = pd.Series(["1", " 2.5 ", "", "nan", None], dtype=object)
+    frame["x1"] = frame["x1"].astype(np.float32)
+    points = landmark_table(frame).points
+    np.testing.assert_array_equal(points["x0"], [1, np.nan, 3, 4, 5])
+    np.testing.assert_array_equal(points["y0"], [1, 2.5, np.nan, np.nan, np.nan])
+    assert (points.dtypes == np.float64).all()
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        (["1", "2", "3", "four", "5"], r"'x2' .* in row 3 \(counted.* has 'four'"),
+        (["1", "2", "1_000", "4", "5"], "in row 2 .* has '1_000'"),
+        (["1,5", "2", "3", "4", "5"], "in row 0 .* has '1,5'"),
+        ([1, 2, 3, 4, np.inf], "'x2' is infinite in row 4"),
+        (["1", "inf", "3", "4", "5"], "'x2' is infinite in row 1"),
+        ([True, False, True, True, True], "'x2' should hold coordinates; got bool"),
+        ([1j] * 5, "'x2' should hold coordinates; got complex128"),
+        (pd.date_range("2000", periods=5), "'x2' should hold coordinates, .* in row 0"),
+    ],
+)
+def test_cells_that_are_no_coordinates_are_named(frame, cells, message):
+    frame["x2"] = cells
+    with pytest.raises(ValueError, match=message):
+        landmark_table(frame)
+
+
+def test_row_in_the_message_is_the_row_of_the_whole_table(frame):
+    frame = frame.astype(object)
+    frame.loc[3, "y4"] = "?"
+    with pytest.raises(ValueError, match=r"'y4' .* in row 3 \(counted from 0\)"):
+        landmark_table(frame.iloc[2:])
+
+
+def test_other_input_is_refused(frame):
+    with pytest.raises(ValueError, match="DataFrame is needed; got ndarray"):
+        landmark_table(frame[NAMES].to_numpy())
+    with pytest.raises(ValueError, match="no landmark columns"):
+        landmark_table(frame[["id"]])
+    doubled = pd.concat([frame, frame[["id"]]], axis=1)
+    with pytest.raises(ValueError, match="more than one column called 'id'"):
+        landmark_table(doubled)
+
+
+def test_table_as_it_is_distributed(data_path):
+    table = read_table(data_path("raw/muct76-opencv.csv"))
+    assert table.shape == (7510, 138)
+    points, other = landmark_table(table, missing="zeros")
+    assert list(points)[-2:] == ["x67", "y67"]
+    assert list(other) == ["name", "tag"]
+    plain = ~other["name"].str.startswith("ir")
+    assert plain.sum() == 3755
+    assert points[plain].isna().any(axis=1).sum() == 840
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "getuid") or os.getuid() == 0, reason="needs a user"
+)
+def test_permissions_raise_os_errors(write):
+    path = write("x0,y0\n1,2\n")
+    path.chmod(0)
+    with pytest.raises(PermissionError):
+        read_table(path)
