@@ -206,7 +206,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
             warnings.simplefilter("always")
             ica.fit(Z.T)
         converged = not any(w.category is ConvergenceWarning for w in caught)
-        return orthogonalise(ica.components_), ica.n_iter_, converged
+        return orthogonalise(ica.components_[None])[0], ica.n_iter_, converged
 
 
 def _check_covariance(covariance: Any, n_signals: int) -> NDArray:

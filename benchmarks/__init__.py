@@ -1,0 +1,1 @@
+"""Measurements on real tables: ``python -m benchmarks.speed``, ``.accuracy``."""

@@ -1,0 +1,122 @@
+"""Axes, colours and marks that the figures have in common."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Vermilion, blue and black of the palette of Okabe and Ito, which people with any kind
+# of colour vision can tell apart; grey for what is only there to compare with.
+PLUS_COLOUR = "#D55E00"
+MINUS_COLOUR = "#0072B2"
+OBSERVED_COLOUR = "black"
+MEAN_COLOUR = "0.55"
+
+# Shapes of more points than this are drawn as clouds: no arrows, no joined points.
+MOST_SPARSE_POINTS = 400
+# Their points have this area together, each at least the smallest (square points).
+DENSE_AREA, SMALLEST_POINT = 2000.0, 0.15
+
+
+def check_axes(ax: Any, n_axes: int, content: str) -> NDArray:
+    """Return the given axes as a flat array of the wanted length.
+
+    Parameters
+    ----------
+    ax : matplotlib Axes or array-like of Axes
+        The axes that the caller wants to draw on.
+    n_axes : int
+        How many are needed.
+    content : str
+        What is drawn on them, for the message.
+    """
+    axes = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
+    if len(axes) != n_axes:
+        raise ValueError(f"ax must hold {n_axes} axes, {content}; got {len(axes)}")
+    return axes
+
+
+def check_names(names: Any, n_components: int) -> list[str]:
+    """Return one name a basis shape, by default the numbers from 1."""
+    if names is None:
+        return [str(k + 1) for k in range(n_components)]
+    names = [str(name) for name in names]
+    if len(names) != n_components:
+        raise ValueError(
+            f"component_names must hold {n_components} names, one a basis shape; "
+            f"got {len(names)}"
+        )
+    return names
+
+
+def hide_frame(ax: Any) -> None:
+    """Remove ticks and frame, but keep title and labels."""
+    ax.set(xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+
+
+def is_dense(points: NDArray) -> bool:
+    """Tell whether there are too many points to look at them one by one."""
+    return len(points) > MOST_SPARSE_POINTS
+
+
+def draw_points(ax: Any, points: NDArray, **kw: Any) -> Any:
+    """Draw points as a scatter; many of them small, and as pixels in vector files."""
+    style: dict[str, Any] = {"s": 6.0, "linewidths": 0}
+    if is_dense(points):
+        size = max(DENSE_AREA / len(points), SMALLEST_POINT)
+        style |= {"s": size, "rasterized": True}
+    return ax.scatter(points[:, 0], points[:, 1], **(style | kw))
+
+
+def draw_segments(ax: Any, segments: NDArray, **kw: Any) -> Any:
+    """Draw segments of shape (n_segments, 2, 2) as one collection of lines."""
+    from matplotlib.collections import LineCollection
+
+    style: dict[str, Any] = {"linewidths": 0.8, "capstyle": "round"}
+    return ax.add_collection(LineCollection(list(segments), **(style | kw)))
+
+
+def percent(fraction: float) -> str:
+    """Write a fraction as percent with two digits, three from 100 % on."""
+    value = 100.0 * fraction
+    if 0 < value < 1e-3:
+        return f"{value:.1e} %"
+    if 0 < value < 100:
+        value = float(f"{value:.1e}")  # first of all: 9.96 becomes 10
+    exponent = int(np.floor(np.log10(value))) if value > 0 else 1
+    return f"{value:.{max(1 - exponent, 0)}f} %"
+
+
+def wrap_title(title: str, axes: NDArray) -> str:
+    """Break a title in small print where it is wider than the axes it stands over."""
+    import textwrap
+
+    from matplotlib.font_manager import FontProperties
+
+    size = FontProperties(size="small").get_size_in_points() / 72  # inches
+    # Letters of the default font are 0.5 to 0.6 times as wide as it is high.
+    letters = max(int(row_width(axes) / (0.6 * size)), 8)
+    if len(title) <= letters:
+        return title
+    lines = title.replace(" (", "\n(").splitlines()
+    return "\n".join(textwrap.fill(line, letters) for line in lines)
+
+
+def row_width(axes: NDArray) -> float:
+    """Return the width in inches from the first of the axes to the last one."""
+    first, last = axes[0], axes[-1]
+    figure = first.figure
+    specs = [ax.get_subplotspec() for ax in (first, last)]
+    if figure.get_layout_engine() is None or None in specs:
+        left, right = first.get_position().x0, last.get_position().x1
+        share = right - left
+    else:  # the layout is yet to come: by the ratios of the columns
+        grid = specs[0].get_gridspec()
+        ratios = np.asarray(grid.get_width_ratios(), dtype=float)
+        columns = slice(specs[0].colspan.start, specs[-1].colspan.stop)
+        share = 0.97 * ratios[columns].sum() / ratios.sum()
+    # Axes that are not side by side: the first one's width has to do.
+    if share <= 0:
+        share = first.get_position().width
+    return share * figure.bbox.width / figure.dpi

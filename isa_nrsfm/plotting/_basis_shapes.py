@@ -1,0 +1,429 @@
+"""The mean shape and what each basis shape does to it, from two sides."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.plotting._axes import (
+    MEAN_COLOUR,
+    MINUS_COLOUR,
+    PLUS_COLOUR,
+    check_axes,
+    check_names,
+    draw_points,
+    draw_segments,
+    hide_frame,
+    is_dense,
+    percent,
+    wrap_title,
+)
+from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
+from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
+from isa_nrsfm.plotting._views import viewing_transform
+
+# Arrows that end where their points go, and are of the same width in all axes.
+ARROW_STYLE = {
+    "angles": "xy",
+    "scale_units": "xy",
+    "scale": 1.0,
+    "units": "inches",
+    "width": 0.008,
+    "headwidth": 3.8,
+    "headlength": 4.2,
+    "headaxislength": 3.8,
+    "minlength": 0.5,
+    "color": "0.15",
+    "zorder": 3,
+}
+
+
+def energy_shares(
+    motion: NDArray, basis: NDArray, alpha: NDArray, *, scale_frames: bool = True
+) -> NDArray:
+    """Return each basis shape's share of the energy of the deformations in the images.
+
+    The energy of basis shape k is the sum over the frames i of
+    ``||alpha_ik M_i B_k||^2``, relative to ``||M_i||^2`` where all frames count alike.
+    The shares sum to one, or are zero without any deformation.
+    """
+    squares = np.einsum("fua,fub->fab", motion, motion)
+    if scale_frames:
+        squares /= np.trace(squares, axis1=1, axis2=2)[:, None, None]
+    energy = np.einsum(
+        "kab,kab->k",
+        np.tensordot(alpha**2, squares, axes=(0, 0)),
+        np.einsum("kja,kjb->kab", basis, basis),
+    )
+    total = energy.sum()
+    return energy / total if total > 0 else energy
+
+
+class BasisShapeDisplay:
+    """
+    Mean shape and basis shapes from the front and from the side.
+
+    For each basis shape the mean shape is drawn with arrows to where its points drift,
+    between the shapes at both ends of the drift. Shapes of more than 400 points are
+    drawn as two clouds on either side of the mean, without arrows. All are drawn to
+    one scale, except basis shapes that drift out of all proportion: those are smaller,
+    and the title says by how much. It is recommended to use `from_estimator` to create
+    the display.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        The mean shape in the frame to be looked at: x points right, y along the
+        image's y, z is the depth.
+    basis : ndarray of shape (n_components, n_points, 3)
+        The basis shapes in the same frame, each as a drift by one standard deviation
+        of its coefficient.
+    energy_share : ndarray of shape (n_components,), default=None
+        The share of each basis shape, between 0 and 1, in the energy of the
+        deformations, for the titles.
+    component_names : list of str of length n_components, default=None
+        Names of the basis shapes. By default their numbers, from 1.
+    edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
+        Pairs of points to be joined. "auto" joins 68 points that look like a face in
+        the order of iBUG or of XM2VTS (as in MUCT), whichever has the shorter edges.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero: "upper" for images, whose y points down, "lower" for a y that
+        points up. "auto" is "lower" where 68 points of a face would stand on their
+        head otherwise.
+
+    Attributes
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        The mean shape.
+    basis : ndarray of shape (n_components, n_points, 3)
+        The basis shapes, in standard deviations of their coefficients.
+    energy_share : ndarray of shape (n_components,) or None
+        The share of each basis shape in the energy of the deformations.
+    component_names : list of str
+        The names of the basis shapes.
+    edges : ndarray of shape (n_edges, 2) or None
+        The pairs of points that are joined.
+    origin : {"upper", "lower"}
+        Where y is zero.
+    components_ : ndarray of shape (n_drawn,)
+        The basis shapes that are drawn.
+    axes_ : ndarray of shape (1 + n_drawn, 2)
+        The axes: the mean shape, then the basis shapes; front view, then side view.
+    figure_ : matplotlib Figure
+        The figure that holds them.
+    mean_ : list of matplotlib PathCollection
+        The points of the mean shape, one entry for each of the axes, in their order.
+    plus_, minus_ : list of matplotlib PathCollection
+        The points at the two ends of the drift, one entry for each of the axes of the
+        basis shapes.
+    arrows_ : list of matplotlib Quiver
+        The arrows from the mean shape, for the same axes; empty for dense shapes.
+
+    Raises
+    ------
+    ValueError
+        If the shapes of the arrays do not fit together, `edges` names points that do
+        not exist, or there is not one name a basis shape.
+
+    See Also
+    --------
+    ModeCovarianceDisplay : The mode covariance matrix.
+    ReprojectionDisplay : Observed against reprojected points.
+
+    Notes
+    -----
+    An affine factorisation leaves a 3x3 affinity of space open. `from_estimator`
+    chooses the one under which the cameras come nearest to scaled orthographic ones
+    [1]_, so that shapes have natural proportions, and turns the mean camera's view to
+    the front. Where the cameras go round the object and have no mean view, their axis
+    keeps its direction in the images and the front is where the object is broadest.
+    Depth is known up to its mirror image: the side view may show the left or the right
+    side.
+
+    References
+    ----------
+    .. [1] L. Quan, "Self-calibration of an affine camera from multiple views",
+       International Journal of Computer Vision 19, 93-105, 1996.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.plotting import BasisShapeDisplay
+    >>> rng = np.random.default_rng(0)
+    >>> mean_shape = rng.standard_normal((20, 3))
+    >>> basis = 0.1 * rng.standard_normal((2, 20, 3))
+    >>> display = BasisShapeDisplay(mean_shape=mean_shape, basis=basis).plot()
+    >>> display.axes_.shape
+    (3, 2)
+    """
+
+    def __init__(
+        self,
+        *,
+        mean_shape: ArrayLike,
+        basis: ArrayLike,
+        energy_share: ArrayLike | None = None,
+        component_names: list[str] | None = None,
+        edges: Edges = "auto",
+        origin: Origin = "auto",
+    ) -> None:
+        self.mean_shape = np.asarray(mean_shape, dtype=float)
+        self.basis = np.asarray(basis, dtype=float)
+        shape = self.mean_shape.shape
+        if len(shape) != 2 or shape[1] != 3 or self.basis.shape[1:] != shape:
+            raise ValueError(
+                "mean_shape must have shape (n_points, 3) and basis (n_components, "
+                f"n_points, 3); got {shape} and {self.basis.shape}"
+            )
+        n_components = len(self.basis)
+        self.energy_share = None
+        if energy_share is not None:
+            self.energy_share = np.asarray(energy_share, dtype=float)
+            if self.energy_share.shape != (n_components,):
+                raise ValueError(
+                    f"energy_share must hold {n_components} numbers, one a basis "
+                    f"shape; got shape {self.energy_share.shape}"
+                )
+        self.component_names = check_names(component_names, n_components)
+        self.edges = choose_edges(edges, self.mean_shape)
+        self.origin: Literal["upper", "lower"] = choose_origin(origin, self.mean_shape)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        *,
+        component_names: list[str] | None = None,
+        edges: Edges = "auto",
+        origin: Origin = "auto",
+        ax: Any = None,
+        **kw: Any,
+    ) -> BasisShapeDisplay:
+        """
+        Draw the mean shape and the basis shapes of a fitted estimator.
+
+        Parameters
+        ----------
+        estimator : AffineNRSfM
+            A fitted estimator.
+        component_names : list of str of length n_components, default=None
+            Names of the basis shapes. By default their numbers, from 1.
+        edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
+            Pairs of points to be joined. "auto" joins 68 points that look like a face
+            in the order of iBUG or of XM2VTS (as in MUCT).
+        origin : {"auto", "upper", "lower"}, default="auto"
+            Where y is zero: "upper" for images, whose y points down, "lower" for a y
+            that points up. "auto" is "lower" where 68 points of a face would stand on
+            their head otherwise.
+        ax : array-like of matplotlib Axes, default=None
+            Axes to draw on, two a shape. By default a new figure.
+        **kw : dict
+            Further arguments of `plot`.
+
+        Returns
+        -------
+        BasisShapeDisplay
+            The display, drawn.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            If the estimator is not fitted.
+        ValueError
+            If a parameter is not of the kind given above, or the number of names or of
+            axes is not that of the shapes.
+        """
+        check_is_fitted(estimator, "mean_shape_")
+        motion, alpha = estimator.motion_, estimator.alpha_
+        view = viewing_transform(motion, estimator.reference_motion_)
+        deviation = alpha.std(axis=0)[:, None, None]
+        display = cls(
+            mean_shape=estimator.mean_shape_ @ view.T,
+            basis=deviation * (estimator.basis_ @ view.T),
+            energy_share=energy_shares(
+                motion, estimator.basis_, alpha, scale_frames=estimator.scale_frames
+            ),
+            component_names=component_names,
+            edges=edges,
+            origin=origin,
+        )
+        return display.plot(ax, **kw)
+
+    def plot(
+        self,
+        ax: Any = None,
+        *,
+        n_std: float | ArrayLike = 2.0,
+        components: ArrayLike | None = None,
+        n_columns: int | None = None,
+        point_kw: dict[str, Any] | None = None,
+        edge_kw: dict[str, Any] | None = None,
+        arrow_kw: dict[str, Any] | None = None,
+    ) -> BasisShapeDisplay:
+        """
+        Draw the shapes.
+
+        Parameters
+        ----------
+        ax : array-like of matplotlib Axes, default=None
+            Axes to draw on, two a shape, the mean shape's first. By default a new
+            figure with a legend below.
+        n_std : float or array-like of shape (n_drawn,), default=2.0
+            How far the shapes drift to both sides, in standard deviations of the
+            coefficients. An array has a number for each basis shape that is drawn, to
+            show weak ones larger; the titles then tell it.
+        components : array-like of int, default=None
+            The basis shapes to draw. By default all of them.
+        n_columns : int, default=None
+            Shapes side by side in the new figure. By default as few as fit on a page.
+        point_kw : dict, default=None
+            Arguments for the scatters of points, before those chosen here.
+        edge_kw : dict, default=None
+            Arguments for the LineCollections of joined points.
+        arrow_kw : dict, default=None
+            Arguments for the quivers of arrows.
+
+        Returns
+        -------
+        BasisShapeDisplay
+            The display itself.
+
+        Raises
+        ------
+        ValueError
+            If there are not two axes a shape, `components` names a basis shape that
+            does not exist, or `n_std` is not one number or one a basis shape.
+        """
+        import_optional("matplotlib", extra="plot")
+        self.components_ = self._check_components(components)
+        n_drawn = len(self.components_)
+        amplitudes = np.asarray(n_std, dtype=float)
+        if amplitudes.shape not in ((), (n_drawn,)):
+            raise ValueError(
+                f"n_std must be a number or {n_drawn} numbers, one for each basis "
+                f"shape that is drawn; got shape {amplitudes.shape}"
+            )
+        drift = (
+            np.broadcast_to(amplitudes, n_drawn)[:, None, None]
+            * self.basis[self.components_]
+        )
+        mean = self.mean_shape
+        limits, reduction = block_limits(
+            [mean[None], *(np.stack([mean, mean + d, mean - d]) for d in drift)]
+        )
+        axes = ax
+        if ax is None:
+            axes = new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
+        self.axes_ = check_axes(axes, 2 + 2 * n_drawn, "two views a shape")
+        self.axes_ = self.axes_.reshape(-1, 2)
+        self.figure_ = self.axes_[0, 0].figure
+
+        labels = drift_labels(amplitudes)
+        point_kw, edge_kw = point_kw or {}, edge_kw or {}
+        arrow_kw = ARROW_STYLE | (arrow_kw or {})
+        self.mean_: list[Any] = []
+        self.minus_: list[Any] = []
+        self.plus_: list[Any] = []
+        self.arrows_: list[Any] = []
+        for block, pair in enumerate(self.axes_):
+            for view, axis in zip(VIEWS, pair, strict=True):
+                start = mean[:, view]
+                style = {"color": MEAN_COLOUR, "label": "mean shape"} | point_kw
+                self.mean_.append(self._draw(axis, start, style, edge_kw))
+                if block > 0:
+                    offset = drift[block - 1][:, view]
+                    style = {"color": MINUS_COLOUR, "label": labels[0]} | point_kw
+                    self.minus_.append(self._draw(axis, start - offset, style, edge_kw))
+                    style = {"color": PLUS_COLOUR, "label": labels[1]} | point_kw
+                    self.plus_.append(self._draw(axis, start + offset, style, edge_kw))
+                    if not is_dense(mean):
+                        arrows = axis.quiver(*start.T, *offset.T, **arrow_kw)
+                        self.arrows_.append(arrows)
+                hide_frame(axis)
+                x_limits, y_limits = limits[block, view]
+                axis.set(xlim=x_limits, ylim=y_limits, aspect=1.0, anchor="N")
+                axis.yaxis.set_inverted(self.origin == "upper")
+            title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
+            pair[0].set_title(title, loc="left", fontsize="small")
+        if ax is None:
+            self._add_legend()
+        return self
+
+    def _check_components(self, components: ArrayLike | None) -> NDArray[np.intp]:
+        """Return the numbers of the basis shapes to draw."""
+        n_components = len(self.basis)
+        if components is None:
+            return np.arange(n_components)
+        chosen = np.asarray(components)
+        if (
+            chosen.ndim != 1
+            or not chosen.size
+            or chosen.dtype.kind not in "iu"
+            or np.any((chosen < 0) | (chosen >= n_components))
+        ):
+            raise ValueError(
+                "components must be a list of numbers of basis shapes, from 0 to "
+                f"{n_components - 1}; got {components!r}"
+            )
+        return chosen.astype(np.intp)
+
+    def _draw(
+        self, axis: Any, points: NDArray, style: dict[str, Any], edge_kw: dict[str, Any]
+    ) -> Any:
+        """Draw one shape in one view; joined points are small."""
+        if self.edges is not None:
+            line_style = {"colors": style["color"]} | edge_kw
+            draw_segments(axis, points[self.edges], **line_style)
+            style = {"s": 2.0} | style
+        return draw_points(axis, points, **style)
+
+    def _title(self, block: int, amplitudes: NDArray, reduction: float) -> str:
+        """Return the title of the mean shape (0) or of a basis shape."""
+        if block == 0:
+            return "Mean shape, front and side"
+        k = self.components_[block - 1]
+        name = self.component_names[k]
+        notes = []
+        if self.energy_share is not None:
+            notes.append(f"{percent(self.energy_share[k])} of energy")
+        if amplitudes.ndim:
+            notes.append(f"±{amplitudes[block - 1]:g} s.d.")
+        if reduction > 1:
+            notes.append(f"drawn 1:{reduction:.2g}")
+        title = f"Basis shape {name}" if name == str(k + 1) else name
+        return f"{title} ({', '.join(notes)})" if notes else title
+
+    def _add_legend(self) -> None:
+        """Say below the figure which colour is which end of the drift."""
+        from matplotlib.lines import Line2D
+
+        dots = {"marker": "o", "linestyle": "none", "markersize": 3}
+        shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+        self.figure_.legend(
+            handles=[
+                Line2D(
+                    [],
+                    [],
+                    color=points.get_facecolor()[0],
+                    label=points.get_label(),
+                    **(dots if self.edges is None else {"linewidth": 1.5}),
+                )
+                for points in shown
+            ],
+            loc="outside lower center",
+            ncols=len(shown),
+            frameon=False,
+            fontsize="small",
+        )
+
+
+def drift_labels(amplitudes: NDArray) -> tuple[str, str]:
+    """Return what the legend calls the two ends of the drift."""
+    if amplitudes.ndim:
+        return "negative end of the drift", "positive end of the drift"
+    size = f"{amplitudes:g} standard deviations"
+    return f"\N{MINUS SIGN}{size}", f"+{size}"

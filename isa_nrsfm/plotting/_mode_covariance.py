@@ -1,0 +1,259 @@
+"""The mode covariance matrix as an image with its blocks."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.plotting._axes import check_axes, check_names
+
+BLOCK = 3  # directions of space, rows and columns of one basis shape's block
+LINEAR_SHARE = 0.02  # of the largest absolute value, where colours cease to be linear
+
+
+def correlations(covariance: NDArray) -> NDArray:
+    """Return the matrix of correlations; zero where a variance is zero."""
+    scale = np.sqrt(np.diag(covariance))
+    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0)
+    return covariance * np.outer(inverse, inverse)
+
+
+def asinh_ticks(largest: float, *, signed: bool) -> NDArray:
+    """Return zero and the powers of ten within the range of an asinh scale."""
+    # The lowest one is far enough from zero for both numbers to be readable.
+    lowest = np.ceil(np.log10(LINEAR_SHARE / 2 * largest))
+    powers = 10.0 ** np.arange(lowest, np.floor(np.log10(largest)) + 1)
+    return np.concatenate([-powers[::-1] if signed else [], [0.0], powers])
+
+
+class ModeCovarianceDisplay:
+    """
+    Mode covariance matrix with the 3x3 blocks of the basis shapes.
+
+    Where the independent subspaces are found, the energy lies in the blocks on the
+    diagonal. It is recommended to use `from_estimator` to create the display.
+
+    Parameters
+    ----------
+    mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
+        The symmetric covariance of the modes, the three of a basis shape side by side.
+    component_names : list of str of length n_components, default=None
+        Names of the basis shapes. By default their numbers, from 1.
+
+    Attributes
+    ----------
+    mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
+        The matrix, as given.
+    component_names : list of str
+        The names of the basis shapes.
+    off_block_share : float
+        Share, between 0 and 1, of the sum of squares of the matrix that lies outside
+        its diagonal blocks.
+    ax_ : matplotlib Axes
+        The axes with the image.
+    figure_ : matplotlib Figure
+        The figure that holds them.
+    im_ : matplotlib AxesImage
+        The image.
+    boundaries_ : matplotlib LineCollection
+        The lines between the blocks, vertical ones first.
+    colorbar_ : matplotlib Colorbar or None
+        The colour bar.
+
+    Raises
+    ------
+    ValueError
+        If the matrix is not square with three rows a basis shape, or there is not one
+        name a basis shape.
+
+    See Also
+    --------
+    BasisShapeDisplay : The basis shapes.
+    ReprojectionDisplay : Observed against reprojected points.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.plotting import ModeCovarianceDisplay
+    >>> covariance = np.kron(np.diag([2.0, 1.0]), np.eye(3))
+    >>> display = ModeCovarianceDisplay(mode_covariance=covariance)
+    >>> display.off_block_share
+    0.0
+    >>> display.plot().figure_
+    <Figure size ...>
+    """
+
+    def __init__(
+        self, *, mode_covariance: ArrayLike, component_names: list[str] | None = None
+    ) -> None:
+        matrix = np.asarray(mode_covariance, dtype=float)
+        n_modes = len(matrix) if matrix.ndim == 2 else 0
+        if not n_modes or matrix.shape != (n_modes, n_modes) or n_modes % BLOCK:
+            raise ValueError(
+                "mode_covariance must be a square matrix with three rows a basis "
+                f"shape; got shape {matrix.shape}"
+            )
+        self.mode_covariance = matrix
+        self.component_names = check_names(component_names, n_modes // BLOCK)
+
+    @property
+    def off_block_share(self) -> float:
+        """Share of the sum of squares that lies outside the diagonal blocks."""
+        squares = self.mode_covariance**2
+        blocks = np.kron(np.eye(len(self.component_names)), np.ones((BLOCK, BLOCK)))
+        total = squares.sum()
+        return float((squares * (1 - blocks)).sum() / total) if total > 0 else 0.0
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        *,
+        component_names: list[str] | None = None,
+        ax: Any = None,
+        **kw: Any,
+    ) -> ModeCovarianceDisplay:
+        """
+        Draw the mode covariance matrix of a fitted estimator.
+
+        Parameters
+        ----------
+        estimator : AffineNRSfM
+            A fitted estimator.
+        component_names : list of str of length n_components, default=None
+            Names of the basis shapes. By default their numbers, from 1.
+        ax : matplotlib Axes, default=None
+            Axes to draw on. By default a new figure.
+        **kw : dict
+            Further arguments of `plot`.
+
+        Returns
+        -------
+        ModeCovarianceDisplay
+            The display, drawn.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            If the estimator is not fitted.
+        ValueError
+            If the number of names is not that of the basis shapes, or `ax` is not one.
+        """
+        check_is_fitted(estimator, "mode_covariance_")
+        display = cls(
+            mode_covariance=estimator.mode_covariance_, component_names=component_names
+        )
+        return display.plot(ax, **kw)
+
+    def plot(
+        self,
+        ax: Any = None,
+        *,
+        absolute: bool = False,
+        normalize: bool = False,
+        scale: Literal["asinh", "linear"] | None = None,
+        colorbar: bool = True,
+        im_kw: dict[str, Any] | None = None,
+    ) -> ModeCovarianceDisplay:
+        """
+        Draw the matrix.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            Axes to draw on. By default a new figure.
+        absolute : bool, default=False
+            Whether to show absolute values, on a scale from zero. Otherwise blue is
+            negative, red positive and white zero.
+        normalize : bool, default=False
+            Whether to show correlations instead of covariances.
+        scale : {"asinh", "linear"}, default=None
+            How values become colours; "asinh" is linear up to 2 % of the largest
+            absolute value, and from there on logarithmic. By default "linear" for
+            correlations and "asinh" for covariances: the energy of basis shapes falls
+            quickly, and on a linear scale the first ones may be all that is seen.
+        colorbar : bool, default=True
+            Whether to add a colour bar.
+        im_kw : dict, default=None
+            Arguments for matplotlib's ``imshow``, before those chosen here.
+
+        Returns
+        -------
+        ModeCovarianceDisplay
+            The display itself.
+
+        Raises
+        ------
+        ValueError
+            If `ax` holds several axes, or `scale` is none of those above.
+        """
+        plt = import_optional("matplotlib.pyplot", extra="plot")
+        from matplotlib.collections import LineCollection
+        from matplotlib.colors import AsinhNorm, Normalize
+
+        if ax is None:
+            _, ax = plt.subplots(figsize=(4.4, 3.6), layout="compressed")
+        (self.ax_,) = check_axes(ax, 1, "the matrix")
+        self.figure_ = self.ax_.figure
+
+        values = self.mode_covariance
+        if normalize:
+            values = correlations(values)
+        label = "correlation" if normalize else "covariance"
+        if absolute:
+            values, label = np.abs(values), f"absolute {label}"
+        largest = np.abs(values).max() or 1.0
+        smallest = 0.0 if absolute else -largest
+        if scale is None:
+            scale = "linear" if normalize else "asinh"
+        norm: Normalize
+        if scale == "asinh":
+            norm = AsinhNorm(LINEAR_SHARE * largest, vmin=smallest, vmax=largest)
+        elif scale == "linear":
+            norm = Normalize(vmin=smallest, vmax=largest)
+        else:
+            raise ValueError(f'scale must be "asinh" or "linear"; got {scale!r}')
+        style = {
+            "cmap": "Greys" if absolute else "RdBu_r",
+            "norm": norm,
+            "interpolation": "nearest",
+        }
+        self.im_ = self.ax_.imshow(values, **(style | (im_kw or {})))
+
+        n_modes = len(values)
+        cuts = np.arange(BLOCK, n_modes, BLOCK) - 0.5
+        ends = [-0.5, n_modes - 0.5]
+        self.boundaries_ = self.ax_.add_collection(
+            LineCollection(
+                [[(cut, end) for end in ends] for cut in cuts]
+                + [[(end, cut) for end in ends] for cut in cuts],
+                colors="0.35",
+                linewidths=0.6,
+            )
+        )
+        centres = np.arange(len(self.component_names)) * BLOCK + (BLOCK - 1) / 2
+        self.ax_.set(
+            xticks=centres,
+            yticks=centres,
+            xticklabels=self.component_names,
+            yticklabels=self.component_names,
+            xlabel="basis shape",
+            ylabel="basis shape",
+        )
+        self.ax_.tick_params(length=0)
+        if max(map(len, self.component_names)) > 3:
+            plt.setp(self.ax_.get_xticklabels(), rotation=90)
+        self.colorbar_ = None
+        if colorbar:
+            self.colorbar_ = self.figure_.colorbar(self.im_, ax=self.ax_, label=label)
+            if scale == "asinh":
+                ticks = asinh_ticks(largest, signed=not absolute)
+                names = [f"{tick:g}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
+                self.colorbar_.set_ticks(ticks, labels=names)
+                self.colorbar_.minorticks_off()
+            self.colorbar_.outline.set_linewidth(0.6)
+        return self

@@ -1,0 +1,369 @@
+"""Observed points of some frames, and what the model makes of them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import _safe_indexing, check_random_state
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm._tracks import table_to_tracks, tracks_to_table
+from isa_nrsfm.metrics import inverse_snr
+from isa_nrsfm.plotting._axes import (
+    OBSERVED_COLOUR,
+    PLUS_COLOUR,
+    check_axes,
+    draw_points,
+    draw_segments,
+    hide_frame,
+    is_dense,
+    percent,
+)
+from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
+from isa_nrsfm.plotting._views import viewing_transform
+
+MOST_FRAMES = 6  # unless asked for
+PANEL_WIDTH, TITLE_HEIGHT, LEGEND_HEIGHT = 2.3, 0.4, 0.3  # inches
+
+
+def choose_frames(
+    n_rows: int, n_frames: int | None, frames: ArrayLike | None, random_state: Any
+) -> NDArray[np.intp]:
+    """Return the rows to draw: the given ones, or random ones in ascending order."""
+    if frames is not None:
+        rows = np.asarray(frames)
+        if rows.ndim != 1 or not rows.size or rows.dtype.kind not in "iu":
+            raise ValueError(
+                f"frames must be a list of row numbers of X; got {frames!r}"
+            )
+        if rows.min() < 0 or rows.max() >= n_rows:
+            raise ValueError(
+                f"frames must be rows 0 to {n_rows - 1} of X; "
+                f"got {rows.min()} to {rows.max()}"
+            )
+        return rows.astype(np.intp)
+    if n_frames is None:
+        n_frames = min(MOST_FRAMES, n_rows)
+    if not 1 <= n_frames <= n_rows:
+        raise ValueError(
+            f"n_frames must be between 1 and the {n_rows} rows of X; got {n_frames}"
+        )
+    rng = check_random_state(random_state)
+    return np.sort(rng.choice(n_rows, size=n_frames, replace=False))
+
+
+class ReprojectionDisplay:
+    """
+    Observed against reprojected points, one panel a frame.
+
+    It is recommended to use `from_estimator` to create the display.
+
+    Parameters
+    ----------
+    observed : ndarray of shape (n_frames, n_points, 2)
+        The points of the frames, NaN where a point was not seen.
+    reprojected : ndarray of shape (n_frames, n_points, 2)
+        The same points as the model has them.
+    frames : ndarray of shape (n_frames,), default=None
+        Their row numbers. By default 0, 1, ...
+    frame_names : list of str of length n_frames, default=None
+        Names of the frames, for the titles. By default their row numbers.
+    edges : {"auto"}, None or array-like of shape (n_edges, 2), default=None
+        Pairs of points to be joined. "auto" joins 68 points that look like a face in
+        the order of iBUG or of XM2VTS, judged by the first frame.
+    origin : {"auto", "upper", "lower"}, default="upper"
+        Where y is zero: "upper" for images, whose y points down, "lower" for a y that
+        points up. "auto" is "lower" where 68 points of a face would stand on their
+        head otherwise, judged by the first frame.
+
+    Attributes
+    ----------
+    observed : ndarray of shape (n_frames, n_points, 2)
+        The points of the frames.
+    reprojected : ndarray of shape (n_frames, n_points, 2)
+        The same points as the model has them.
+    frames : ndarray of shape (n_frames,)
+        The row numbers.
+    frame_names : list of str
+        The names of the frames.
+    inverse_snr : ndarray of shape (n_frames,)
+        For each frame the squared error of its observed points relative to their
+        squared distance from their centroid, a fraction.
+    edges : ndarray of shape (n_edges, 2) or None
+        The pairs of points that are joined.
+    origin : {"upper", "lower"}
+        Where y is zero.
+    axes_ : ndarray of shape (n_frames,)
+        The axes, one a frame.
+    figure_ : matplotlib Figure
+        The figure that holds them.
+    observed_ : list of matplotlib PathCollection
+        The observed points, one entry a frame.
+    reprojected_ : list of matplotlib PathCollection
+        The reprojected points, one entry a frame.
+    errors_ : list of matplotlib LineCollection
+        The segments from observed to reprojected points, one entry a frame; empty
+        for dense shapes, of more than 400 points.
+    edges_ : list of matplotlib LineCollection
+        The joined reprojected points, one entry a frame; empty without edges.
+
+    Raises
+    ------
+    ValueError
+        If the shapes of the arrays do not fit together, `edges` names points that do
+        not exist, or no point of a frame was seen.
+
+    See Also
+    --------
+    BasisShapeDisplay : The basis shapes.
+    ModeCovarianceDisplay : The mode covariance matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.plotting import ReprojectionDisplay
+    >>> observed = np.array([[[0.0, 0.0], [4.0, 0.0], [2.0, 3.0]]])
+    >>> display = ReprojectionDisplay(observed=observed, reprojected=1.1 * observed)
+    >>> display.inverse_snr.round(6)
+    array([0.01])
+    >>> display.plot().figure_
+    <Figure size ...>
+    """
+
+    def __init__(
+        self,
+        *,
+        observed: ArrayLike,
+        reprojected: ArrayLike,
+        frames: ArrayLike | None = None,
+        frame_names: list[str] | None = None,
+        edges: Edges = None,
+        origin: Origin = "upper",
+    ) -> None:
+        self.observed = np.asarray(observed, dtype=float)
+        self.reprojected = np.asarray(reprojected, dtype=float)
+        shape = self.observed.shape
+        if len(shape) != 3 or shape[2] != 2 or self.reprojected.shape != shape:
+            raise ValueError(
+                "observed and reprojected must both have shape (n_frames, n_points, "
+                f"2); got {shape} and {self.reprojected.shape}"
+            )
+        self.frames = np.arange(shape[0]) if frames is None else np.asarray(frames)
+        if self.frames.shape != shape[:1]:
+            raise ValueError(
+                f"frames must name the {shape[0]} frames; got shape {self.frames.shape}"
+            )
+        self.frame_names = list(map(str, self.frames))
+        if frame_names is not None:
+            self.frame_names = list(frame_names)
+            if len(self.frame_names) != len(self.frames):
+                raise ValueError(
+                    f"frame_names must hold {len(self.frames)} names, one a frame; "
+                    f"got {len(self.frame_names)}"
+                )
+        self.edges = choose_edges(edges, self.reprojected[0])
+        self.origin: Literal["upper", "lower"] = choose_origin(
+            origin, self.reprojected[0]
+        )
+        self.inverse_snr = np.array(
+            [
+                inverse_snr(tracks_to_table(seen[None]), tracks_to_table(fitted[None]))
+                for seen, fitted in zip(self.observed, self.reprojected, strict=True)
+            ]
+        )
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        X: Any,
+        *,
+        n_frames: int | None = None,
+        frames: ArrayLike | None = None,
+        random_state: Any = None,
+        edges: Edges = "auto",
+        origin: Origin = "auto",
+        ax: Any = None,
+        **kw: Any,
+    ) -> ReprojectionDisplay:
+        """
+        Draw some frames of a table, as observed and as a fitted estimator has them.
+
+        Parameters
+        ----------
+        estimator : AffineNRSfM
+            A fitted estimator.
+        X : array-like of shape (n_rows, 2 * n_points)
+            A table of landmarks in the estimator's layout. The titles name the rows
+            of a pandas DataFrame by its index.
+        n_frames : int, default=None
+            How many rows to draw at random, without repetition. By default 6, or all
+            rows of a shorter table.
+        frames : array-like of int, default=None
+            The rows to draw, in place of random ones.
+        random_state : int, RandomState instance or None, default=None
+            Determines the random rows. Pass an int for the same rows at each call.
+        edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
+            Pairs of points to be joined. "auto" joins 68 points whose mean shape looks
+            like a face in the order of iBUG or of XM2VTS.
+        origin : {"auto", "upper", "lower"}, default="auto"
+            Where y is zero: "upper" for images, whose y points down, "lower" for a y
+            that points up. "auto" is "lower" where 68 points of a face would stand on
+            their head otherwise.
+        ax : array-like of matplotlib Axes, default=None
+            Axes to draw on, one a frame. By default a new figure.
+        **kw : dict
+            Further arguments of `plot`.
+
+        Returns
+        -------
+        ReprojectionDisplay
+            The display, drawn.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            If the estimator is not fitted.
+        ValueError
+            If there are no such rows in `X` or fewer than `n_frames`, no point of a row
+            was seen, there are not as many axes as frames, or `edges` or `origin`
+            is not of the kind given above.
+        """
+        check_is_fitted(estimator, "mean_shape_")
+        rows = choose_frames(len(X), n_frames, frames, random_state)
+        table = _safe_indexing(X, rows)
+        view = viewing_transform(estimator.motion_, estimator.reference_motion_)
+        mean_shape = estimator.mean_shape_ @ view.T
+        layout = estimator.layout
+        labelled = hasattr(X, "iloc")  # pandas: rows have names
+        display = cls(
+            observed=table_to_tracks(np.asarray(table, dtype=float), layout),
+            reprojected=table_to_tracks(
+                np.asarray(estimator.reproject(table), dtype=float), layout
+            ),
+            frames=rows,
+            frame_names=[str(name) for name in X.index[rows]] if labelled else None,
+            edges=choose_edges(edges, mean_shape),
+            origin=choose_origin(origin, mean_shape),
+        )
+        return display.plot(ax, **kw)
+
+    def plot(
+        self,
+        ax: Any = None,
+        *,
+        n_columns: int | None = None,
+        observed_kw: dict[str, Any] | None = None,
+        reprojected_kw: dict[str, Any] | None = None,
+        edge_kw: dict[str, Any] | None = None,
+    ) -> ReprojectionDisplay:
+        """
+        Draw the frames.
+
+        Parameters
+        ----------
+        ax : array-like of matplotlib Axes, default=None
+            Axes to draw on, one a frame. By default a new figure with a legend below.
+        n_columns : int, default=None
+            Columns of panels of the new figure. By default 3 or fewer.
+        observed_kw : dict, default=None
+            Arguments for the scatter of observed points, before those chosen here.
+        reprojected_kw : dict, default=None
+            Arguments for the scatter of reprojected points.
+        edge_kw : dict, default=None
+            Arguments for the LineCollection of the joined reprojected points.
+
+        Returns
+        -------
+        ReprojectionDisplay
+            The display itself.
+
+        Raises
+        ------
+        ValueError
+            If there are not as many axes as frames.
+        """
+        plt = import_optional("matplotlib.pyplot", extra="plot")
+        n_frames = len(self.frames)
+        new_figure = ax is None
+        if new_figure:
+            n_columns = min(3, n_frames) if n_columns is None else n_columns
+            n_rows = -(-n_frames // n_columns)
+            height = self._panel_height() + TITLE_HEIGHT
+            figure, ax = plt.subplots(
+                n_rows,
+                n_columns,
+                squeeze=False,
+                figsize=(PANEL_WIDTH * n_columns, height * n_rows + LEGEND_HEIGHT),
+                layout="constrained",
+            )
+            for unused in ax.ravel()[n_frames:]:
+                figure.delaxes(unused)
+            ax = ax.ravel()[:n_frames]
+        self.axes_ = check_axes(ax, n_frames, "one a frame")
+        self.figure_ = self.axes_[0].figure
+        self.observed_: list[Any] = []
+        self.reprojected_: list[Any] = []
+        self.errors_: list[Any] = []
+        self.edges_: list[Any] = []
+        for i, axes in enumerate(self.axes_):
+            self._plot_frame(
+                axes, i, observed_kw or {}, reprojected_kw or {}, edge_kw or {}
+            )
+        if new_figure:
+            self.figure_.legend(
+                handles=[self.observed_[0], self.reprojected_[0]],
+                loc="outside lower center",
+                ncols=2,
+                frameon=False,
+                fontsize="small",
+                markerscale=4.0 if is_dense(self.observed[0]) else 1.0,
+            )
+        return self
+
+    def _panel_height(self) -> float:
+        """Return the height of panels that suits most frames, in inches."""
+        points = np.concatenate([self.observed, self.reprojected], axis=1)
+        width, height = np.moveaxis(
+            np.nanmax(points, axis=1) - np.nanmin(points, axis=1), -1, 0
+        )
+        aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
+        return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
+
+    def _plot_frame(
+        self,
+        axes: Any,
+        i: int,
+        observed_kw: dict[str, Any],
+        reprojected_kw: dict[str, Any],
+        edge_kw: dict[str, Any],
+    ) -> None:
+        """Draw one frame."""
+        observed, reprojected = self.observed[i], self.reprojected[i]
+        if self.edges is not None:
+            style = {"colors": PLUS_COLOUR, "linewidths": 0.6, "alpha": 0.6}
+            self.edges_.append(
+                draw_segments(axes, reprojected[self.edges], **(style | edge_kw))
+            )
+        circles = {"s": 14.0, "facecolors": "none", "edgecolors": OBSERVED_COLOUR}
+        style = {"color": OBSERVED_COLOUR}
+        if not is_dense(observed):
+            style = circles | {"linewidths": 0.6}
+            error = np.stack([observed, reprojected], axis=1)
+            line_style = {"colors": OBSERVED_COLOUR, "linewidths": 0.6}
+            self.errors_.append(draw_segments(axes, error, **line_style))
+        style |= {"label": "observed"} | observed_kw
+        self.observed_.append(draw_points(axes, observed, **style))
+        style = {"color": PLUS_COLOUR, "label": "reprojected", "zorder": 2.5}
+        style |= reprojected_kw
+        self.reprojected_.append(draw_points(axes, reprojected, **style))
+        hide_frame(axes)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.yaxis.set_inverted(self.origin == "upper")
+        axes.set_title(
+            f"frame {self.frame_names[i]}\ninverse SNR {percent(self.inverse_snr[i])}",
+            fontsize="small",
+        )
