@@ -34,6 +34,10 @@ def test_curves_name_each_point_at_most_once_but_for_closed_ends_and_corners():
     for closing in ((36, 41), (42, 47), (48, 59), (60, 67)):
         assert closing[::-1] in map(tuple, IBUG.edges.tolist())
 
+    # The inner edges of both lips end in the corners of the mouth.
+    for corner in ((48, 60), (62, 54), (54, 63), (65, 48)):
+        assert corner in map(tuple, XM2VTS.edges.tolist())
+
 
 @pytest.mark.parametrize(
     ("name", "order"),

@@ -38,6 +38,14 @@ def test_all_shapes_are_inside_the_limits():
     assert_allclose(extent[4], reduction[4] * extent[0])
 
 
+def test_one_wild_basis_shape_of_two_is_drawn_smaller():
+    mean = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    blocks = [np.stack([s * mean]) for s in (1.0, 1.1, 30.0)]
+    _, reduction = block_limits(blocks)
+    assert_array_equal(reduction[:2], 1)
+    assert reduction[2] == pytest.approx(30 / 1.1, rel=0.05)
+
+
 def test_large_drifts_alone_are_no_reason_for_another_scale():
     rng = np.random.default_rng(1)
     mean = rng.standard_normal((20, 3))

@@ -143,6 +143,8 @@ def test_faces_are_upright(faces, estimator):
 def test_points_have_equal_units_in_both_directions():
     display = random_display().plot()
     display.figure_.canvas.draw()
+    sizes = [ax.bbox.size for ax in display.axes_]
+    assert_allclose(sizes, sizes[:1] * 4)
     for ax, points in zip(display.axes_, display.observed, strict=True):
         pixels = ax.transData.transform(points)
         ratio = np.ptp(pixels, axis=0) / np.ptp(points, axis=0)

@@ -12,7 +12,7 @@ MINUS_COLOUR = "#0072B2"
 OBSERVED_COLOUR = "black"
 MEAN_COLOUR = "0.55"
 
-# Shapes of more points than this are drawn as clouds: no arrows, no joined points.
+# Shapes of more points than this are drawn as clouds of small points, without arrows.
 MOST_SPARSE_POINTS = 400
 # Their points have this area together, each at least the smallest (square points).
 DENSE_AREA, SMALLEST_POINT = 2000.0, 0.15

@@ -23,7 +23,7 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     Return what part of space to draw each block of shapes in, and how much smaller.
 
     All blocks are drawn to one scale, except those whose extent, relative to that of
-    the first one, is more than twice the median of the other ones.
+    the first one, is more than twice the median.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     low, high = low - margin, high + margin
     extent = high - low
     size = np.max(extent / extent[0], axis=1)
-    common = size <= MOST_DRIFT * np.median(size[1:])
+    common = size <= MOST_DRIFT * np.median(size)
     low[common], high[common] = low[common].min(axis=0), high[common].max(axis=0)
     frame = (high - low)[0]
     reduction = np.maximum(np.max((high - low) / frame, axis=1), 1.0)
