@@ -22,7 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._camera import reference_camera
 from isa_nrsfm._frame_fit import FrameFit, compose, fit_frames, project
-from isa_nrsfm._gauge import canonical_gauge, reorder_blocks
+from isa_nrsfm._gauge import canonical_gauge, image_energies, reorder_blocks
 from isa_nrsfm._paper import run_paper_pipeline
 from isa_nrsfm._tracks import (
     LAYOUTS,
@@ -131,6 +131,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         as in the fit.
     rank_floor_ : float
         The least inverse SNR that any model of rank 3K + 3 reaches.
+    energy_share_ : ndarray of shape (n_components,)
+        Share of each basis shape in the energy of the deformations in the images,
+        ``sum_i ||alpha_ik M_i B_k||_F^2``, frames scaled as in the fit.
     mode_covariance_ : ndarray of shape (3 * n_components, 3 * n_components)
         Covariance over the images of the 3K independent directions, 3x3 blocks in
         the order of `basis_`.
@@ -298,9 +301,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         # The coefficients are those that transform gives, from the stored shapes.
         frames = fit_frames(centred, translation, self.mean_shape_, self.basis_)
         self.inverse_snr_ = self._inverse_snr(centred, frames)
-        self.reference_motion_ = reference_camera(
-            frames.motion / sizes[:, None, None], sizes
-        ).astype(X.dtype)
+        cameras = frames.motion / sizes[:, None, None]
+        energy = image_energies(cameras, self.basis_, frames.alpha)
+        self.energy_share_ = energy / (energy.sum() or 1.0)
+        self.reference_motion_ = reference_camera(cameras, sizes).astype(X.dtype)
         self.reference_translation_ = translation.mean(axis=0).astype(X.dtype)
         self.motion_, self.translation_, self.alpha_ = as_type(frames, X.dtype)
         report("gauge, cameras and coefficients")

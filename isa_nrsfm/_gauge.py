@@ -99,16 +99,36 @@ def canonical_gauge(
         do not vary) and a third moment that is not negative. A basis shape without
         motion becomes zero.
     """
-    G = basis.transpose(0, 2, 1) @ basis
-    seen = np.einsum("kcd,irc,ird->ik", G, motion, motion, optimize=True)
-    order = np.argsort(-np.sum(alpha**2 * seen, axis=0), kind="stable")
-
+    order = np.argsort(-image_energies(motion, basis, alpha), kind="stable")
     deviation = alpha.std(axis=0)
     constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
     size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
     scaled = (orientations(alpha.T) * size)[:, None, None] * basis
     space = canonical_space(mean_shape, motion).T
     return Gauge(mean_shape @ space, scaled[order] @ space, order)
+
+
+def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
+    """
+    Return how much each basis shape moves the points in the images.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (n_components,)
+        ``sum_i ||alpha_ik M_i B_k||_F^2``.
+    """
+    cameras = motion.transpose(0, 2, 1) @ motion
+    weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
+    return np.einsum("kab,kab->k", weighted, basis.transpose(0, 2, 1) @ basis)
 
 
 def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:

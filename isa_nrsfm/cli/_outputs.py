@@ -129,16 +129,12 @@ def write_figures(
         ReprojectionDisplay,
     )
 
-    frames = ReprojectionDisplay.from_estimator(
-        estimator, points, random_state=random_state
-    )
-    # Its titles count the frames of the fit; the rows of the table are better known.
-    plt.close(frames.figure_)
-    frames.frames = points.index.to_numpy()[frames.frames]
     figures = (
         BasisShapeDisplay.from_estimator(estimator).figure_,
         ModeCovarianceDisplay.from_estimator(estimator).figure_,
-        frames.plot().figure_,
+        ReprojectionDisplay.from_estimator(
+            estimator, points, random_state=random_state
+        ).figure_,
     )
     for name, figure in zip(FIGURES, figures, strict=True):
         figure.savefig(folder / name, dpi=150)

@@ -11,7 +11,6 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names
-from isa_nrsfm.plotting._basis_shapes import energy_shares
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
@@ -45,7 +44,6 @@ def table_report(path: str, frames: Frames) -> dict[str, Any]:
 def model_report(estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
     off = np.asarray(estimator.reproject(X)) - np.asarray(X)
-    shares = energy_shares(estimator.motion_, estimator.basis_, estimator.alpha_)
     names = component_names(len(estimator.basis_))
     return {
         "n_components": len(estimator.basis_),
@@ -64,7 +62,7 @@ def model_report(estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
                 "max": alpha.max(),
             }
             for name, share, alpha in zip(
-                names, shares, estimator.alpha_.T, strict=True
+                names, estimator.energy_share_, estimator.alpha_.T, strict=True
             )
         ],
     }

@@ -42,27 +42,6 @@ ARROW_STYLE = {
 }
 
 
-def energy_shares(
-    motion: NDArray, basis: NDArray, alpha: NDArray, *, scale_frames: bool = True
-) -> NDArray:
-    """Return each basis shape's share of the energy of the deformations in the images.
-
-    The energy of basis shape k is the sum over the frames i of
-    ``||alpha_ik M_i B_k||^2``, relative to ``||M_i||^2`` where all frames count alike.
-    The shares sum to one, or are zero without any deformation.
-    """
-    squares = np.einsum("fua,fub->fab", motion, motion)
-    if scale_frames:
-        squares /= np.trace(squares, axis1=1, axis2=2)[:, None, None]
-    energy = np.einsum(
-        "kab,kab->k",
-        np.tensordot(alpha**2, squares, axes=(0, 0)),
-        np.einsum("kja,kjb->kab", basis, basis),
-    )
-    total = energy.sum()
-    return energy / total if total > 0 else energy
-
-
 class BasisShapeDisplay:
     """
     Mean shape and basis shapes from the front and from the side.
@@ -238,15 +217,12 @@ class BasisShapeDisplay:
             axes is not that of the shapes.
         """
         check_is_fitted(estimator, "mean_shape_")
-        motion, alpha = estimator.motion_, estimator.alpha_
-        view = viewing_transform(motion, estimator.reference_motion_)
-        deviation = alpha.std(axis=0)[:, None, None]
+        view = viewing_transform(estimator.motion_, estimator.reference_motion_)
+        deviation = estimator.alpha_.std(axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
             basis=deviation * (estimator.basis_ @ view.T),
-            energy_share=energy_shares(
-                motion, estimator.basis_, alpha, scale_frames=estimator.scale_frames
-            ),
+            energy_share=estimator.energy_share_,
             component_names=component_names,
             edges=edges,
             origin=origin,

@@ -9,6 +9,8 @@ the affinity under which the cameras are as nearly as possible scaled orthograph
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._camera import DEGENERATE_MEAN
+
 # The smallest eigenvalue, relative to the largest, down to which a symmetric matrix is
 # taken for positive definite.
 SMALLEST_EIGENVALUE = 1e-10
@@ -18,9 +20,6 @@ SMALLEST_SINGULAR_VALUE = 1e-6
 # The upgrade is trusted while no axis of space is stretched, relative to another one,
 # by more than this: a depth that cameras hardly show is stretched without limit.
 LARGEST_STRETCH = 20.0
-# Cameras have no common view where the smaller singular value of their mean is below
-# this share of a camera's row.
-SMALLEST_SHARED_VIEW = 0.2
 
 # Unknowns of a symmetric 3x3 matrix: its diagonal, and sqrt(2) times the entries above
 # it, so that the norm of the six is the Frobenius norm of the matrix.
@@ -143,7 +142,7 @@ def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
-    if not shared[1] < SMALLEST_SHARED_VIEW * row <= shared[0]:
+    if not shared[1] < DEGENERATE_MEAN * row <= shared[0]:
         left, _, right = np.linalg.svd(reference, full_matrices=False)
         return left @ right
     across = np.eye(3) - np.outer(right[0], right[0])
