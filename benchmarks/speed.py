@@ -35,9 +35,7 @@ def seconds(function, repeats=1):
 def paired_ratio(candidate, reference, repeats=1):
     """Return ratios candidate / reference: minimum, median, maximum; and seconds."""
     candidate(), reference()  # not counted
-    pairs = [
-        (seconds(candidate), seconds(reference, repeats)) for _ in range(N_PAIRS)
-    ]
+    pairs = [(seconds(candidate), seconds(reference, repeats)) for _ in range(N_PAIRS)]
     ratios = [a / b for a, b in pairs]
     return (*np.percentile(ratios, [0, 50, 100]), *np.median(pairs, axis=0))
 
@@ -49,10 +47,15 @@ def measured(X, scale_frames):
     return measurement_matrix(centred / sizes[:, None, None])
 
 
+def heading(rows, candidate, reference):
+    """Print the heading of a table of ratios."""
+    print(f"{rows:22}{'min':>8}{'median':>8}{'max':>8}{candidate:>10}{reference:>9}")
+
+
 def fits():
     """Print whole fits relative to a thin SVD of the same W."""
     print("whole fit, relative to numpy.linalg.svd(W, full_matrices=False)")
-    print(f"{'table':22}{'min':>8}{'median':>8}{'max':>8}{'fit ms':>10}{'SVD ms':>9}")
+    heading("table", "fit ms", "SVD ms")
     for case in CASES:
         X = load_table(case)
         if X is None:
@@ -78,7 +81,7 @@ def fastisa_iteration():
     """Print a FastISA step of one start relative to an SVD of a 27 x 27 matrix."""
     print("\nFastISA, 68 samples, 27 signals: per start and iteration, relative to")
     print("numpy.linalg.svd of one 27 x 27 matrix")
-    print(f"{'signals':22}{'min':>8}{'median':>8}{'max':>8}{'step us':>10}{'SVD us':>9}")
+    heading("signals", "step us", "SVD us")
     random = np.random.default_rng(0)
     matrix = random.normal(size=(27, 27))
     tables = {"Laplace, artificial": random.laplace(size=(68, 27))}

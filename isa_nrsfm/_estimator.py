@@ -281,7 +281,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 f"the refinement did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
         paper = fit_frames(centred, translation, result.mean_shape, result.basis)
         gauge = canonical_gauge(
@@ -378,7 +378,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ndarray of shape (n_frames, n_points, 3)
             Shapes in the space of `mean_shape_`, without camera.
         """
-        return compose(self.mean_shape_, self.basis_, self.decompose(X).alpha)
+        alpha = self.decompose(X).alpha
+        return compose(self.mean_shape_, self.basis_, alpha)
 
     def reproject(self, X: Any) -> NDArray:
         """
@@ -429,11 +430,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             motion = self.reference_motion_
         if translation is None:
             translation = self.reference_translation_
-        motion, translation = np.asarray(motion), np.asarray(translation)
         n_frames, n_components = len(alpha), len(self.basis_)
-        check_shape("alpha", alpha, (n_frames, n_components))
-        check_shape("motion", motion, (n_frames, 2, 3), (2, 3))
-        check_shape("translation", translation, (n_frames, 2), (2,))
+        alpha = checked("alpha", alpha, (n_frames, n_components))
+        motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
+        translation = checked("translation", translation, (n_frames, 2), (2,))
         shapes = compose(self.mean_shape_, self.basis_, alpha)
         return tracks_to_table(project(shapes, motion, translation), self.layout)
 
@@ -469,6 +469,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         """Return the unfitted strategy, with what it leaves open filled in."""
         isa = PooledFastICA() if self.isa is None else clone(self.isa)
         params = isa.get_params(deep=False)
+        if params.get("subspace_size", 3) != 3:
+            raise ValueError(
+                "isa must have subspace_size=3, a dimension of space each; got "
+                f"subspace_size={params['subspace_size']}"
+            )
         if params.get("random_state", 0) is None:
             random_state = check_random_state(self.random_state)
             isa.set_params(random_state=random_state.randint(np.iinfo(np.int32).max))
@@ -504,11 +509,19 @@ def as_type(frames: FrameFit, dtype: Any) -> tuple[NDArray, NDArray, NDArray]:
     return motion, translation, alpha
 
 
-def check_shape(name: str, array: NDArray, *allowed: tuple[int, ...]) -> None:
-    """Refuse an array of another shape."""
+def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
+    """Return a finite array of one of the allowed shapes, or say what came."""
+    array = check_array(
+        values,
+        dtype=[np.float64, np.float32],
+        input_name=name,
+        ensure_2d=False,
+        allow_nd=True,
+    )
     if array.shape not in allowed:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
+    return array
 
 
 class StageReport:

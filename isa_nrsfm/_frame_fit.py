@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from isa_nrsfm._camera import rigid_cameras
 from isa_nrsfm._tracks import measurement_matrix
 
+# A basis shape whose image has less than this share of the energy that the camera could
+# show of it is seen end on: its image is rounding errors.
+UNSEEN = 1e-14
+
 
 class FrameFit(NamedTuple):
     """
@@ -64,7 +68,9 @@ def fit_frames(
     seen = np.einsum("irkc,irc->ik", P, motion)
     G = basis.transpose(0, 2, 1) @ basis
     energy = np.einsum("kcd,irc,ird->ik", G, motion, motion, optimize=True)
-    alpha = np.divide(seen, energy, where=energy > 0, out=np.zeros_like(seen))
+    largest = np.einsum("kcc,ird,ird->ik", G, motion, motion, optimize=True)
+    visible = energy > UNSEEN * largest
+    alpha = np.divide(seen, energy, where=visible, out=np.zeros_like(seen))
     return FrameFit(motion, translation, alpha)
 
 

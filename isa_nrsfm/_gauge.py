@@ -54,6 +54,11 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     return rotation @ whitening
 
 
+# A basis shape with less than this share of the rigid motion's energy in the images
+# holds rounding errors only.
+NO_MOTION = 1e-20
+
+
 class Gauge(NamedTuple):
     """
     Canonical shapes.
@@ -99,11 +104,15 @@ def canonical_gauge(
         do not vary) and a third moment that is not negative. A basis shape without
         motion becomes zero.
     """
-    order = np.argsort(-image_energies(motion, basis, alpha), kind="stable")
+    energy = image_energies(motion, basis, alpha)
+    order = np.argsort(-energy, kind="stable")
+    rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
+    moving = energy > NO_MOTION * rigid
     deviation = alpha.std(axis=0)
     constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
     size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
-    scaled = (orientations(alpha.T) * size)[:, None, None] * basis
+    factors = np.where(moving, orientations(alpha.T) * size, 0.0)
+    scaled = factors[:, None, None] * basis
     space = canonical_space(mean_shape, motion).T
     return Gauge(mean_shape @ space, scaled[order] @ space, order)
 

@@ -24,6 +24,11 @@ from isa_nrsfm._block_structure import (
 from isa_nrsfm._factorisation import factorise
 from isa_nrsfm._refinement import refine_alternating
 
+# Fixed-point iterations from random starts are chaotic at first: rounding errors, such
+# as other orders of summation make, could lead them elsewhere. The signals, of unit
+# variance, are rounded by far more than those and far less than they are known, and the
+# samples are sorted, so that the order of frames and points makes no difference.
+SIGNAL_DECIMALS = 5
 # Eigenvectors of the lifted motion that the refinement starts from.
 N_LIFTED_STARTS = 2
 
@@ -158,6 +163,13 @@ def _independent_subspaces(
         fit_params["covariance"] = products.gram * scale
     if has_fit_parameter(isa, "criterion"):
         fit_params["criterion"] = partial(structure_energies, moments)
-    isa.fit(signals.T, **fit_params)
+    samples = np.round(signals.T, SIGNAL_DECIMALS)
+    isa.fit(samples[np.lexsort(samples.T)], **fit_params)
+    n_signals = len(signals)
+    if isa.components_.shape != (n_signals, n_signals):
+        raise ValueError(
+            f"isa must give components_ of shape {(n_signals, n_signals)}; "
+            f"got {isa.components_.shape}"
+        )
     U, _, Vt = np.linalg.svd(isa.components_)  # the signals are white
     return U @ Vt

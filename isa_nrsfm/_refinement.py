@@ -97,7 +97,7 @@ def refine_alternating(
 
 
 def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
-    """Return the start of highest energy after some alternations, all at once."""
+    """Return the start of highest energy after some alternations, if it has any."""
     norms = np.linalg.norm(starts, axis=(1, 2), keepdims=True)
     E = (starts / np.where(norms > 0, norms, 1.0))[norms.ravel() > 0]
     if not len(E) or not P.any():
@@ -111,7 +111,8 @@ def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
         E = np.divide(E, norm, where=norm > 0, out=np.zeros_like(E))
     a, q = P @ E.reshape(-1, 9).T, packed_inner(rigid, E @ E.swapaxes(1, 2))
     energy = np.sum(np.divide(a**2, q, where=q > 0, out=np.zeros_like(a)), axis=0)
-    return E[np.argmax(energy)]
+    best = np.argmax(energy)
+    return E[best] if energy[best] > 0 else None
 
 
 def _maximise(

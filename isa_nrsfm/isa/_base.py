@@ -10,7 +10,6 @@ from sklearn.base import (
     BaseEstimator,
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
-    _fit_context,
 )
 from sklearn.utils._param_validation import Interval
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -35,25 +34,8 @@ class BaseSubspaceAnalysis(
 
     subspace_size: int
 
-    @_fit_context(prefer_skip_nested_validation=True)
-    def fit(self, signals: Any, y: Any = None, **fit_params: Any) -> Self:
-        """
-        Find the independent subspaces.
-
-        Parameters
-        ----------
-        signals : array-like of shape (n_samples, n_signals)
-            The signals, one a column.
-        y : None
-            Ignored.
-        **fit_params : dict
-            What the strategy takes in addition.
-
-        Returns
-        -------
-        object
-            The fitted strategy.
-        """
+    def _fit(self, signals: Any, **fit_params: Any) -> Self:
+        """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(
             self,
             signals,
@@ -74,7 +56,7 @@ class BaseSubspaceAnalysis(
         return self
 
     @abstractmethod
-    def _unmix(self, Z: NDArray, whitening: NDArray, **fit_params: Any) -> NDArray:
+    def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         """Return the orthogonal matrix that unmixes white signals Z, one a row."""
 
     def transform(self, signals: Any) -> NDArray:
@@ -112,15 +94,20 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     Z : ndarray of shape (n_signals, n_samples)
         White signals, ``Z Z^T = n_samples I``.
     whitening : ndarray of shape (n_signals, n_signals)
-        Symmetric, ``Z = whitening @ centred.T``.
+        ``Z = whitening @ centred.T``; symmetric after the signals have been divided by
+        their standard deviations.
     """
     n_samples, n_signals = centred.shape
-    variance, axes = np.linalg.eigh(centred.T @ centred / n_samples)
+    scale = centred.std(axis=0)
+    varies = scale > DEPENDENT * np.abs(centred).max(axis=0)
+    scale = np.where(varies, scale, 1.0)
+    standard = centred / scale
+    variance, axes = np.linalg.eigh(standard.T @ standard / n_samples)
     rank = int(np.sum(variance > DEPENDENT * variance[-1]))
     if rank < n_signals:
         raise ValueError(
             f"{n_signals} linearly independent signals are needed; got rank {rank} "
             f"in n_samples={n_samples} samples"
         )
-    whitening = (axes / np.sqrt(variance)) @ axes.T
+    whitening = (axes / np.sqrt(variance)) @ axes.T / scale
     return np.ascontiguousarray(whitening @ centred.T), whitening

@@ -29,7 +29,7 @@ class SqrtDensity(BaseEstimator):
     Parameters
     ----------
     eps : float, default=0.1
-        Smooths the density at the origin.
+        Smooths the density at the origin; above zero.
 
     References
     ----------
@@ -60,7 +60,7 @@ class SqrtDensity(BaseEstimator):
         ndarray
             F at each energy.
         """
-        return -np.sqrt(energy + self.eps)
+        return -np.sqrt(energy + self._checked_eps())
 
     def derivatives(self, energy: NDArray) -> tuple[NDArray, NDArray]:
         """
@@ -78,5 +78,11 @@ class SqrtDensity(BaseEstimator):
         dg : ndarray
             F'' at each energy.
         """
-        root = 1.0 / np.sqrt(energy + self.eps)
+        root = 1.0 / np.sqrt(energy + self._checked_eps())
         return -0.5 * root, 0.25 * root**2 * root
+
+    def _checked_eps(self) -> float:
+        """Return eps, or say that it is not positive."""
+        if not self.eps > 0:
+            raise ValueError(f"eps must be above zero; got {self.eps}")
+        return self.eps

@@ -2,11 +2,12 @@
 
 import warnings
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import NDArray
+from sklearn.base import _fit_context
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import HasMethods, Interval
@@ -132,7 +133,32 @@ class FastISA(BaseSubspaceAnalysis):
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    def _unmix(self, Z: NDArray, whitening: NDArray, **fit_params: Any) -> NDArray:
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, signals: Any, y: Any = None) -> Self:
+        """
+        Find the independent subspaces.
+
+        Parameters
+        ----------
+        signals : array-like of shape (n_samples, n_signals)
+            The signals, one a column.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        FastISA
+            The fitted strategy.
+
+        Raises
+        ------
+        ValueError
+            If the number of signals is not a multiple of `subspace_size`, or the
+            signals are linearly dependent.
+        """
+        return self._fit(signals)
+
+    def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         density = SqrtDensity() if self.density is None else self.density
         random_state = check_random_state(self.random_state)
         n_signals = len(Z)
@@ -166,7 +192,7 @@ class FastISA(BaseSubspaceAnalysis):
                 f"FastISA did not converge in max_iter={self.max_iter} steps: its "
                 "best start still moves; increase max_iter or tol",
                 ConvergenceWarning,
-                stacklevel=3,
+                stacklevel=5,
             )
         self.log_likelihoods_ = log_likelihoods
         self.log_likelihood_ = float(log_likelihoods[best])

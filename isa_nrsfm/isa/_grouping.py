@@ -95,7 +95,7 @@ def value_gains(
     """
     # with_b[a, b]: value of the subspace of a with a replaced by b. It depends only
     # on who shares the subspace with a: one swap changes two subspaces.
-    with_b = np.empty((n_signals, n_signals))
+    with_b = np.zeros((n_signals, n_signals))
     mates_before = np.zeros((n_signals, n_signals), dtype=bool)
     everyone = np.arange(n_signals)
 
@@ -103,8 +103,9 @@ def value_gains(
         mates = assignment[:, None] == assignment
         for a in np.flatnonzero((mates != mates_before).any(axis=1)):
             rest = np.flatnonzero(mates[a] & (everyone != a))
-            groups = np.column_stack([np.tile(rest, (n_signals, 1)), everyone])
-            with_b[a] = value(groups)
+            instead = np.flatnonzero(~mates[a] | (everyone == a))
+            groups = np.column_stack([np.tile(rest, (len(instead), 1)), instead])
+            with_b[a, instead] = value(groups)
         mates_before[:] = mates
         own = np.diag(with_b)
         gain = with_b - own[:, None]

@@ -3,10 +3,11 @@
 import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import _fit_context
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
@@ -114,6 +115,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         self.tol = tol
         self.random_state = random_state
 
+    @_fit_context(prefer_skip_nested_validation=True)
     def fit(
         self,
         signals: Any,
@@ -121,7 +123,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         *,
         covariance: Any = None,
         criterion: Criterion | None = None,
-    ) -> "PooledFastICA":
+    ) -> Self:
         """
         Find the independent components and pool them.
 
@@ -148,8 +150,14 @@ class PooledFastICA(BaseSubspaceAnalysis):
         -------
         PooledFastICA
             The fitted strategy.
+
+        Raises
+        ------
+        ValueError
+            If the number of signals is not a multiple of `subspace_size`, the signals
+            are linearly dependent, or `covariance` is not a symmetric matrix of theirs.
         """
-        return super().fit(signals, y, covariance=covariance, criterion=criterion)
+        return self._fit(signals, covariance=covariance, criterion=criterion)
 
     def _unmix(
         self,
@@ -158,7 +166,6 @@ class PooledFastICA(BaseSubspaceAnalysis):
         *,
         covariance: Any = None,
         criterion: Criterion | None = None,
-        **_: Any,
     ) -> NDArray:
         n_signals = len(Z)
         if covariance is not None:
@@ -175,13 +182,14 @@ class PooledFastICA(BaseSubspaceAnalysis):
             if covariance is None:
                 W, value = _pool_by_likelihood(W, Z, groupings)
             else:
-                whitened = whitening @ covariance @ whitening
+                whitened = whitening @ covariance @ whitening.T
                 W, value = _pool_by_covariance(W, W @ whitened @ W.T, groupings)
             if criterion is not None:
                 value = float(np.sum(criterion(_subspaces(W @ whitening, in_order))))
             runs.append((value, W, n_iter, converged))
-        self.criteria_ = np.array([value for value, *_ in runs])
-        _, W, self.n_iter_, converged = runs[int(np.argmax(self.criteria_))]
+        self.criteria_ = np.array([run[0] for run in runs])
+        _, W, n_iter, converged = runs[int(np.argmax(self.criteria_))]
+        self.n_iter_ = n_iter
         if criterion is not None:
             W = _regroup(W, W @ whitening, in_order, criterion)
         if not converged:
@@ -189,7 +197,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
                 f"FastICA did not converge in max_iter={self.max_iter} steps; increase "
                 "max_iter or tol, or try another fun",
                 ConvergenceWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
         return W
 

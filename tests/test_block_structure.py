@@ -1,0 +1,403 @@
+"""Block structure: what the three methods and the lifted motion say they find."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import (
+    measurements,
+    permute_frames,
+    random_rotation,
+    rotate_frames,
+    structured_motion,
+)
+
+from isa_nrsfm._block_structure import (
+    BLOCK_RECOVERIES,
+    LIFT_RIDGE,
+    frame_products,
+    leading_blocks,
+    lifted_blocks,
+    lifted_moments,
+    pack,
+    packed_inner,
+    recover_blocks,
+    structure_energies,
+    unpack,
+)
+from isa_nrsfm._factorisation import factorise
+
+ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
+
+
+def direction(D):
+    """Return matrices of unit norm, of a sign that depends only on the direction."""
+    flat = D.reshape(len(D), 9) / np.linalg.norm(D, axis=(1, 2))[:, None]
+    largest = np.abs(flat).argmax(axis=1)
+    return (flat * np.sign(flat[np.arange(len(flat)), largest])[:, None]).reshape(
+        D.shape
+    )
+
+
+def block(scene, k):
+    """Return M_0 (I, 2, 3) and the motion of subspace k (I, 2, 3)."""
+    M_0 = scene.rigid.reshape(-1, 2, 3)
+    return M_0, scene.motion.reshape(len(M_0), 2, -1)[:, :, 3 * k : 3 * k + 3]
+
+
+def constrained_cost(scene, k, D):
+    """Return min over alpha of ``sum_i ||M_ik D - alpha_i M_0^i||^2``, ||D|| = 1."""
+    D = D / np.linalg.norm(D)
+    cost = 0.0
+    for M_0, M in zip(*block(scene, k), strict=True):
+        target = (M @ D).ravel()
+        alpha = np.linalg.lstsq(M_0.reshape(-1, 1), target)[0]
+        cost += np.sum((target - M_0.ravel() * alpha) ** 2)
+    return cost
+
+
+def explained_share(scene, k, D):
+    """Return the share of the energy of M_k D that cameras alpha_i M_0^i explain."""
+    M_0, M = block(scene, k)
+    moved = M @ D
+    inner = np.sum(moved * M_0, axis=(1, 2))
+    return np.sum(inner**2 / np.sum(M_0**2, axis=(1, 2))) / np.sum(moved**2)
+
+
+def published_irls(scene, k, n_frames, n_iter=50):
+    """Return D by the published iteration, with a dense least squares each time."""
+    M_0, M = block(scene, k)
+    columns = np.einsum("irc,de->irecd", M, np.eye(3))
+    of_D = columns.reshape(6 * n_frames, 9)  # d(M D) by D, row major
+    of_alpha = np.zeros((6 * n_frames, n_frames))
+    for i in range(n_frames):
+        of_alpha[6 * i : 6 * i + 6, i] = -M_0[i].ravel()
+    A = np.hstack([of_D, of_alpha[:, 1:]])
+    alpha_1 = 1.0 / 3.0
+    for _ in range(n_iter):
+        d = np.linalg.lstsq(A, -alpha_1 * of_alpha[:, 0])[0][:9]
+        alpha_1 /= np.linalg.norm(d)
+    return d.reshape(3, 3)
+
+
+class TestProducts:
+    def test_definitions(self):
+        scene = structured_motion(0, noise=0.3)
+        products = frame_products(scene.rigid, scene.motion)
+        M_0 = scene.rigid.reshape(-1, 2, 3)
+        for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
+            assert_allclose(products.cross[i], M_0[i].T @ M_i, atol=1e-13)
+            assert_allclose(unpack(products.rigid[i]), M_0[i].T @ M_0[i], atol=1e-13)
+        assert_allclose(products.gram, scene.motion.T @ scene.motion, atol=1e-12)
+
+    def test_rotated_products_are_those_of_the_rotated_motion(self):
+        scene = structured_motion(0, noise=0.3)
+        A = random_rotation(1, 9)
+        rotated = frame_products(scene.rigid, scene.motion).rotated(A.T)
+        expected = frame_products(scene.rigid, scene.motion @ A)
+        for got, wanted in zip(rotated, expected, strict=True):
+            assert_allclose(got, wanted, atol=1e-12)
+
+    def test_blocks(self):
+        scene = structured_motion(0, noise=0.3)
+        blocks = frame_products(scene.rigid, scene.motion).blocks()
+        assert blocks.shape == (3, 25, 9)
+        for k in range(3):
+            M_0, M = block(scene, k)
+            expected = (M_0.transpose(0, 2, 1) @ M).reshape(25, 9)
+            assert_allclose(blocks[k], expected, atol=1e-13)
+
+    def test_rotation_of_single_frames_changes_nothing(self):
+        scene = structured_motion(0, noise=0.3)
+        rotated = frame_products(
+            rotate_frames(scene.rigid, 1), rotate_frames(scene.motion, 1)
+        )
+        expected = frame_products(scene.rigid, scene.motion)
+        for got, wanted in zip(rotated, expected, strict=True):
+            assert_allclose(got, wanted, atol=1e-12)
+
+    def test_packed_symmetric_matrices(self):
+        A = np.random.default_rng(0).normal(size=(5, 3, 3))
+        symmetric = A + A.transpose(0, 2, 1)
+        assert_array_equal(unpack(pack(symmetric)), symmetric)
+        inner = np.einsum("iab,jab->ij", symmetric[:2], symmetric)
+        assert_allclose(packed_inner(pack(symmetric[:2]), symmetric), inner)
+
+
+@ALL_METHODS
+class TestAllMethods:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_exact_data(self, method, seed):
+        scene = structured_motion(seed)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        assert D.shape == (3, 3, 3)
+        assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
+        assert_allclose(direction(D), direction(np.linalg.inv(scene.E)), atol=1e-8)
+
+    def test_exact_data_say_the_coefficients(self, method):
+        scene = structured_motion(0)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        for k in range(3):
+            M_0, M = block(scene, k)
+            scale = np.sum((M @ D[k]) * M_0, axis=(1, 2)) / np.sum(M_0**2, axis=(1, 2))
+            ratio = scale / scene.alpha[:, k]
+            assert_allclose(ratio, ratio[0], rtol=1e-6)
+            assert constrained_cost(scene, k, D[k]) < 1e-18
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units(self, method, unit):
+        scene = structured_motion(0, noise=0.3)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        for factors in ((unit, unit), (1.0, unit), (unit, 1.0)):
+            products = frame_products(
+                factors[0] * scene.rigid, factors[1] * scene.motion
+            )
+            other = recover_blocks(products, method)
+            assert_allclose(direction(other), direction(D), atol=1e-7)
+
+    def test_subspaces_are_separate(self, method):
+        scene = structured_motion(0, noise=0.3)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        for k in range(3):
+            part = scene.motion[:, 3 * k : 3 * k + 3]
+            alone = recover_blocks(frame_products(scene.rigid, part), method)
+            assert_allclose(direction(alone)[0], direction(D)[k], atol=1e-10)
+
+    def test_rotation_inside_a_subspace_turns_the_solution(self, method):
+        scene = structured_motion(0, n_blocks=1, noise=0.3)
+        R = random_rotation(1)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        turned = recover_blocks(frame_products(scene.rigid, scene.motion @ R), method)
+        assert_allclose(direction(R @ turned), direction(D), atol=1e-9)
+
+    def test_subspace_without_motion(self, method):
+        scene = structured_motion(0, noise=0.3)
+        motion = scene.motion.copy()
+        motion[:, 3:6] = 0
+        D = recover_blocks(frame_products(scene.rigid, motion), method)
+        assert_array_equal(D[1], 0)
+        assert_allclose(np.linalg.norm(D[[0, 2]], axis=(1, 2)), 1)
+
+    @pytest.mark.parametrize("n_moving", [1, 2])
+    def test_subspace_that_moves_in_fewer_directions(self, method, n_moving):
+        scene = structured_motion(0, noise=0.3)
+        motion = scene.motion.copy()
+        motion[:, n_moving:3] = 0
+        D = recover_blocks(frame_products(scene.rigid, motion), method)
+        assert np.isfinite(D).all()
+        assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
+
+    @pytest.mark.parametrize("n_flat", [1, 2])
+    def test_flat_rigid_object(self, method, n_flat):
+        scene = structured_motion(0, noise=0.3)
+        rigid = scene.rigid.copy()
+        rigid[:, 3 - n_flat :] = 0
+        D = recover_blocks(frame_products(rigid, scene.motion), method)
+        assert np.isfinite(D).all()
+        assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
+
+    def test_frames_that_do_not_see_the_rigid_object(self, method):
+        scene = structured_motion(0, noise=0.3)
+        rigid = scene.rigid.copy()
+        rigid[:6] = 0  # the first frame is one of them
+        D = recover_blocks(frame_products(rigid, scene.motion), method)
+        assert np.isfinite(D).all()
+        assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
+
+    def test_repeated_frames(self, method):
+        scene = structured_motion(0, n_frames=12, noise=0.3)
+        rigid, motion = np.tile(scene.rigid, (3, 1)), np.tile(scene.motion, (3, 1))
+        D = recover_blocks(frame_products(rigid, motion), method)
+        assert np.isfinite(D).all()
+        if method != "irls":  # which holds one of the three equal frames only
+            once = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+            assert_allclose(direction(D), direction(once), atol=1e-10)
+
+
+class TestSingleMethods:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_eigen_has_the_least_constrained_cost(self, seed):
+        scene = structured_motion(seed, noise=0.5)
+        products = frame_products(scene.rigid, scene.motion)
+        solutions = {m: recover_blocks(products, m) for m in BLOCK_RECOVERIES}
+        random = np.random.default_rng(seed).normal(size=(50, 3, 3))
+        for k in range(3):
+            least = constrained_cost(scene, k, solutions["eigen"][k])
+            for method in ("irls", "generalized_eigen"):
+                assert least <= constrained_cost(scene, k, solutions[method][k])
+            assert least < min(constrained_cost(scene, k, D) for D in random)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_generalized_eigen_explains_the_largest_share(self, seed):
+        scene = structured_motion(seed, noise=0.5)
+        products = frame_products(scene.rigid, scene.motion)
+        solutions = {m: recover_blocks(products, m) for m in BLOCK_RECOVERIES}
+        random = np.random.default_rng(seed).normal(size=(50, 3, 3))
+        for k in range(3):
+            largest = explained_share(scene, k, solutions["generalized_eigen"][k])
+            for method in ("irls", "eigen"):
+                assert largest >= explained_share(scene, k, solutions[method][k])
+            assert largest > max(explained_share(scene, k, D) for D in random)
+
+    @pytest.mark.parametrize(
+        ("method", "objective"),
+        [("eigen", constrained_cost), ("generalized_eigen", explained_share)],
+    )
+    def test_gradient_vanishes(self, method, objective):
+        scene = structured_motion(0, noise=0.5)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)[1]
+        value = objective(scene, 1, D)
+        for step in 1e-5 * np.eye(9).reshape(9, 3, 3):
+            slope = objective(scene, 1, D + step) - objective(scene, 1, D - step)
+            assert abs(slope) / 2e-5 < 1e-7 * max(value, 1.0)
+
+    @pytest.mark.parametrize("method", ["eigen", "generalized_eigen"])
+    def test_order_of_frames_is_irrelevant(self, method):
+        scene = structured_motion(0, noise=0.5)
+        rigid, _ = permute_frames(scene.rigid, 1)
+        motion, _ = permute_frames(scene.motion, 1)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        permuted = recover_blocks(frame_products(rigid, motion), method)
+        assert_allclose(direction(permuted), direction(D), atol=1e-10)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_irls_is_the_fixed_point_of_the_published_iteration(self, seed):
+        scene = structured_motion(seed, noise=0.5)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), "irls")
+        published = np.array([published_irls(scene, k, 25) for k in range(3)])
+        assert_allclose(np.linalg.norm(published, axis=(1, 2)), 1)
+        assert_allclose(direction(D), direction(published), atol=1e-9)
+
+    def test_irls_depends_on_the_first_frame(self):
+        scene = structured_motion(0, noise=0.5)
+        rigid, motion = np.roll(scene.rigid, 2, axis=0), np.roll(scene.motion, 2, 0)
+        D = recover_blocks(frame_products(scene.rigid, scene.motion), "irls")
+        rolled = recover_blocks(frame_products(rigid, motion), "irls")
+        assert np.abs(direction(rolled) - direction(D)).max() > 1e-3
+
+    def test_irls_where_the_first_frame_says_nothing(self):
+        scene = structured_motion(0, noise=0.5)
+        motion = scene.motion.copy()
+        motion[:2] = 0
+        products = frame_products(scene.rigid, motion)
+        expected = recover_blocks(products, "generalized_eigen")
+        assert_allclose(recover_blocks(products, "irls"), expected)
+
+    def test_generalized_eigen_stays_in_directions_that_move(self):
+        scene = structured_motion(0, n_blocks=1, noise=0.5)
+        R = random_rotation(3)
+        motion = (scene.motion * [1.0, 0.5, 0.0]) @ R
+        D = recover_blocks(frame_products(scene.rigid, motion), "generalized_eigen")[0]
+        assert_allclose(R[2] @ D, 0, atol=1e-12)
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    def test_shark_where_the_exact_minimiser_collapses(self, load_data, scale_frames):
+        # The block has rank two: a D that lies in the third direction costs nothing
+        # and explains nothing.
+        W = measurements(load_data("shark_torresani")["W2d"], scale_frames)
+        f = factorise(W, 1)
+        scene = structured_motion(0)._replace(rigid=f.rigid_motion, motion=f.motion)
+        products = frame_products(f.rigid_motion, f.motion)
+        D = {m: recover_blocks(products, m)[0] for m in BLOCK_RECOVERIES}
+        energy = np.sum(f.motion**2)
+        assert constrained_cost(scene, 0, D["eigen"]) < 1e-20 * energy
+        assert constrained_cost(scene, 0, D["generalized_eigen"]) > 1e-3 * energy
+
+        def explained(D):
+            """Return the energy ``sum_i ||alpha_i M_0^i E||^2`` for E = D^+."""
+            M_0, M = block(scene, 0)
+            image = M_0 @ np.linalg.pinv(D, rcond=1e-9)
+            inner = np.sum(image * M, axis=(1, 2))
+            return np.sum(inner**2 / np.sum(image**2, axis=(1, 2))) / energy
+
+        assert explained(D["eigen"]) < 1e-20
+        assert explained(D["generalized_eigen"]) > 0.3
+
+
+class TestLiftedMotion:
+    def lifted(self, rigid, motion):
+        """Return L_i (I, 3, n_signals), frame by frame."""
+        M_0 = rigid.reshape(-1, 2, 3)
+        L = []
+        for A, M in zip(M_0, motion.reshape(len(M_0), 2, -1), strict=True):
+            ridge = LIFT_RIDGE * np.trace(A.T @ A)
+            L.append(np.linalg.solve(A.T @ A + ridge * np.eye(3), A.T @ M))
+        return np.array(L)
+
+    def test_moments_by_plain_loops(self):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        L = self.lifted(scene.rigid, scene.motion)
+        assert_allclose(moments, np.einsum("iam,ibn->abmn", L, L), atol=1e-12)
+
+    def test_blocks_are_moments_of_the_turned_lifted_motion(self):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        subspaces = random_rotation(1, 9).reshape(3, 3, 9)
+        L = self.lifted(scene.rigid, scene.motion)
+        got = lifted_blocks(moments, subspaces)
+        for k in range(3):
+            flat = (L @ subspaces[k].T).reshape(-1, 9)
+            assert_allclose(got[k], flat.T @ flat, atol=1e-12)
+
+    def test_leading_blocks_are_eigenvectors_by_decreasing_eigenvalue(self):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        subspaces = random_rotation(1, 9).reshape(3, 3, 9)
+        E = leading_blocks(moments, subspaces, 3)
+        assert E.shape == (3, 3, 3, 3)
+        for k, matrix in enumerate(lifted_blocks(moments, subspaces)):
+            vectors = E[k].reshape(3, 9)
+            assert_allclose(vectors @ vectors.T, np.eye(3), atol=1e-12)
+            values = np.sort(np.linalg.eigvalsh(matrix))[::-1][:3]
+            assert_allclose(vectors @ matrix, values[:, None] * vectors, atol=1e-10)
+
+    def test_energies_are_the_largest_eigenvalues(self):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        subspaces = random_rotation(1, 9).reshape(3, 3, 9)
+        E = leading_blocks(moments, subspaces, 1).reshape(3, 9)
+        blocks = lifted_blocks(moments, subspaces)
+        assert_allclose(
+            structure_energies(moments, subspaces),
+            np.einsum("ka,kab,kb->k", E, blocks, E),
+        )
+
+    def test_energies_do_not_depend_on_the_basis_of_a_subspace(self):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        subspaces = random_rotation(1, 9).reshape(3, 3, 9)
+        turned = random_rotation(2) @ subspaces
+        assert_allclose(
+            structure_energies(moments, turned), structure_energies(moments, subspaces)
+        )
+
+    def test_true_subspaces_have_more_structure_than_random_ones(self):
+        scene = structured_motion(0, n_frames=100)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        true = structure_energies(moments, np.eye(9).reshape(3, 3, 9)).sum()
+        for seed in range(30):
+            random = random_rotation(seed, 9).reshape(3, 3, 9)
+            assert structure_energies(moments, random).sum() < true
+
+    def test_leading_block_is_nearly_the_true_one(self):
+        scene = structured_motion(0, n_frames=200)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        E = leading_blocks(moments, np.eye(9).reshape(3, 3, 9), 1)[:, 0]
+        cosine = np.sum(E * scene.E, axis=(1, 2)) / np.linalg.norm(scene.E, axis=(1, 2))
+        assert np.abs(cosine).min() > 0.95
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units(self, unit):
+        scene = structured_motion(0, noise=0.3)
+        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        other = lifted_moments(frame_products(unit * scene.rigid, unit * scene.motion))
+        assert_allclose(other, moments, atol=1e-12)
+
+    def test_flat_rigid_object_and_frames_that_do_not_see_it(self):
+        scene = structured_motion(0, noise=0.3)
+        rigid = scene.rigid * [1.0, 1.0, 0.0]
+        rigid[:4] = 0
+        moments = lifted_moments(frame_products(rigid, scene.motion))
+        assert np.isfinite(moments).all()
+        E = leading_blocks(moments, np.eye(9).reshape(3, 3, 9), 2)
+        assert_allclose(np.linalg.norm(E, axis=(2, 3)), 1)

@@ -1,0 +1,204 @@
+"""Conventions of the code: style, types, docstrings, public names, imports."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from numpydoc.validate import validate
+from packaging.version import Version
+
+import isa_nrsfm
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "isa_nrsfm"
+FOLDERS = ["isa_nrsfm", "tests", "benchmarks"]
+OPTIONAL = ["matplotlib", "pandas", "polars", "pyarrow", "skops"]
+# Where everybody finds names; each has __all__.
+PUBLIC_MODULES = [
+    "isa_nrsfm",
+    "isa_nrsfm.cli",
+    "isa_nrsfm.datasets",
+    "isa_nrsfm.io",
+    "isa_nrsfm.isa",
+    "isa_nrsfm.metrics",
+    "isa_nrsfm.plotting",
+]
+# Not every docstring needs an extended summary, a See Also section or an example.
+NOT_NEEDED = {"ES01", "SA01", "EX01"}
+
+
+def public_objects():
+    """Return the public classes and functions by where they are found first."""
+    objects = {}
+    for module in PUBLIC_MODULES:
+        for name in importlib.import_module(module).__all__:
+            item = getattr(sys.modules[module], name)
+            if inspect.isclass(item) or inspect.isfunction(item):
+                objects.setdefault(item, f"{module}.{name}")
+    return {path: item for item, path in objects.items()}
+
+
+def documented_names():
+    """Return the public objects and the public members that they define."""
+    names = []
+    for path, item in public_objects().items():
+        names.append(path)
+        for owner in inspect.getmro(item) if inspect.isclass(item) else ():
+            if owner.__module__.startswith("isa_nrsfm"):
+                names += [
+                    f"{path}.{name}"
+                    for name, member in vars(owner).items()
+                    if not name.startswith("_")
+                    and (
+                        inspect.isfunction(member)
+                        or isinstance(member, property | classmethod | staticmethod)
+                    )
+                ]
+    return sorted(set(names))
+
+
+def source_files():
+    """Return the paths of the modules, relative to the root."""
+    files = sorted(PACKAGE.rglob("*.py"))
+    return [str(file.relative_to(ROOT)) for file in files]
+
+
+def run(*command):
+    """Return the exit status and the output of a command at the root."""
+    done = subprocess.run(
+        [sys.executable, *command], cwd=ROOT, capture_output=True, text=True
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=" ".join)
+def test_ruff_has_no_complaints(command):
+    status, output = run("-m", "ruff", *command, *FOLDERS)
+    assert status == 0, output
+
+
+def test_mypy_has_no_complaints():
+    status, output = run("-m", "mypy")
+    assert status == 0, output
+
+
+@pytest.mark.parametrize("name", documented_names())
+def test_docstrings_are_complete(name):
+    errors = [e for e in validate(name)["errors"] if e[0] not in NOT_NEEDED]
+    item = public_objects().get(name)
+    if hasattr(item, "_fields"):
+        # The fields of a named tuple may be documented as attributes.
+        sections = item.__doc__.partition("Attributes\n")[2]
+        if all(f"    {field} : " in sections for field in item._fields):
+            errors = [e for e in errors if e[0] != "PR01"]
+    assert errors == []
+
+
+@pytest.mark.parametrize("module", PUBLIC_MODULES)
+def test_public_names_exist_and_are_listed(module):
+    imported = importlib.import_module(module)
+    names = imported.__all__
+    assert len(set(names)) == len(names)
+    assert all(hasattr(imported, name) for name in names)
+    assert imported.__doc__
+    # What a module imports from the package for others is listed, and what it lists
+    # has no underscore.
+    assert all(not name.startswith("_") or name == "__version__" for name in names)
+    if imported.__file__.endswith("__init__.py"):
+        tree = ast.parse(Path(imported.__file__).read_text(encoding="utf-8"))
+        brought_in = {
+            alias.asname or alias.name
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        assert brought_in == set(names) - {"__version__"}
+
+
+def test_no_public_module_is_forgotten():
+    public = {
+        name
+        for _, name, _ in pkgutil.walk_packages(isa_nrsfm.__path__, "isa_nrsfm.")
+        if not any(part.startswith("_") for part in name.split("."))
+    }
+    assert public | {"isa_nrsfm"} == set(PUBLIC_MODULES)
+
+
+@pytest.mark.parametrize("file", source_files())
+def test_functions_have_docstrings_and_types(file):
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree), "the module has no docstring"
+    inner = {
+        id(child)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        for child in ast.walk(node)
+        if child is not node and isinstance(child, ast.FunctionDef)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            assert ast.get_docstring(node), node.name
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        where = f"{file}:{node.lineno} {node.name}"
+        arguments = [
+            *node.args.posonlyargs,
+            *node.args.args,
+            *node.args.kwonlyargs,
+            *filter(None, [node.args.vararg, node.args.kwarg]),
+        ]
+        untyped = [
+            a.arg
+            for a in arguments
+            if a.annotation is None and a.arg not in ("self", "cls")
+        ]
+        assert untyped == [], where
+        assert node.returns is not None or node.name == "__init__", where
+        exempt = (
+            node.name in ("__init__", "__call__")
+            or node.name == "_unmix"  # documented where it is declared
+            or id(node) in inner
+            or any(ast.unparse(d) == "overload" for d in node.decorator_list)
+        )
+        assert exempt or ast.get_docstring(node), where
+
+
+@pytest.mark.parametrize("file", source_files())
+def test_modules_keep_no_state(file):
+    # The names that a module assigns are constants and types, and no function
+    # assigns them anew.
+    tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Global)]
+    for node in tree.body:
+        for target in node.targets if isinstance(node, ast.Assign) else ():
+            for name in ast.walk(target):
+                if isinstance(name, ast.Name):
+                    is_dunder = name.id.startswith("__")
+                    assert is_dunder or name.id.strip("_")[0].isupper(), name.id
+
+
+def test_every_module_can_be_imported_without_optional_libraries():
+    modules = [
+        name
+        for _, name, _ in pkgutil.walk_packages(isa_nrsfm.__path__, "isa_nrsfm.")
+        if not name.endswith("__main__")
+    ]
+    code = (
+        "import importlib, sys\n"
+        f"sys.modules.update(dict.fromkeys({OPTIONAL}))\n"
+        f"for name in {modules}:\n"
+        "    importlib.import_module(name)\n"
+    )
+    status, output = run("-W", "error", "-c", code)
+    assert status == 0, output
+
+
+def test_version():
+    version = Version(isa_nrsfm.__version__)
+    assert str(version) == isa_nrsfm.__version__
+    assert not version.is_devrelease

@@ -1,0 +1,870 @@
+"""AffineNRSfM: attributes, the model's formula, methods, input and parameters."""
+
+import copy
+import pickle
+import warnings
+
+import joblib
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import BaseEstimator, clone
+from sklearn.decomposition import FastICA
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.linear_model import LogisticRegression
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import load_model, save_model
+
+N_FRAMES, N_POINTS, K = 90, 68, 3
+FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
+TABLE = FACES.data
+
+
+# The run of FastICA that is kept may be one that goes round in a cycle; it says so.
+may_not_converge = pytest.mark.filterwarnings(
+    "ignore:FastICA did not converge:sklearn.exceptions.ConvergenceWarning"
+)
+
+
+def estimator(n_components=K, **params):
+    """Return an estimator with few starts."""
+    params = {"isa": FastISA(n_init=3), "random_state": 0} | params
+    return AffineNRSfM(n_components, **params)
+
+
+def planar(table):
+    """Return an interleaved table as a planar one."""
+    return np.hstack([table[:, 0::2], table[:, 1::2]])
+
+
+def tracks_of(table, layout="interleaved"):
+    """Return the points of a table, (n_frames, n_points, 2), by hand."""
+    if layout == "planar":
+        half = table.shape[1] // 2
+        return np.stack([table[:, :half], table[:, half:]], axis=2)
+    return np.stack([table[:, 0::2], table[:, 1::2]], axis=2)
+
+
+def model_tracks(model, motion, translation, alpha):
+    """Return the tracks that the documented formula gives, frame by frame."""
+    return np.stack(
+        [
+            (model.mean_shape_ + np.tensordot(a, model.basis_, 1)) @ M.T + t
+            for M, t, a in zip(motion, translation, alpha, strict=True)
+        ]
+    )
+
+
+def frame_weights(tracks, scale_frames):
+    """Return the documented weight of each frame in the inverse SNR."""
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    return (
+        1 / np.mean(centred**2, axis=(1, 2)) if scale_frames else np.ones(len(tracks))
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    return estimator().fit(TABLE)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        {},
+        {"scale_frames": False},
+        {"layout": "planar"},
+        {"layout": "planar", "scale_frames": False, "refinement": None},
+        {"refinement": None},
+        {"isa": PooledFastICA(n_init=3)},
+        {"block_recovery": "eigen"},
+        {"block_recovery": "irls", "refinement": None},
+        {"n_components": 1},
+        {"n_components": 6},
+    ],
+    ids=str,
+)
+def variant(request):
+    """Return a fitted model, its training table and another table."""
+    fitted = estimator(**request.param)
+    table, new = TABLE, make_face_tracks(30, n_components=5, random_state=1).data
+    if fitted.layout == "planar":
+        table, new = planar(table), planar(new)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return fitted.fit(table), table, new
+
+
+# --- attributes ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n_components", [1, 4])
+def test_attributes_have_the_documented_shapes_and_types(dtype, n_components):
+    model = estimator(n_components).fit(TABLE.astype(dtype))
+    in_type_of_the_table = {
+        "mean_shape_": (N_POINTS, 3),
+        "basis_": (n_components, N_POINTS, 3),
+        "alpha_": (N_FRAMES, n_components),
+        "motion_": (N_FRAMES, 2, 3),
+        "translation_": (N_FRAMES, 2),
+        "reference_motion_": (2, 3),
+        "reference_translation_": (2,),
+    }
+    for name, shape in in_type_of_the_table.items():
+        assert getattr(model, name).shape == shape, name
+        assert getattr(model, name).dtype == dtype, name
+    assert model.mode_covariance_.shape == (3 * n_components, 3 * n_components)
+    assert model.singular_values_.shape == (3 * n_components + 3,)
+    assert type(model.inverse_snr_) is float
+    assert type(model.rank_floor_) is float
+    assert type(model.n_iter_) is int
+    assert model.n_features_in_ == 2 * N_POINTS
+    assert isinstance(model.isa_, FastISA)
+    assert not hasattr(model, "feature_names_in_")
+
+
+def test_every_attribute_is_documented(model):
+    fitted = {name for name in vars(model) if name.endswith("_")}
+    documented = {
+        name for name in dir(model) if f"\n    {name} : " in type(model).__doc__
+    }
+    assert fitted <= documented
+    documented = {name for name in documented if name.endswith("_")}
+    assert documented - fitted == set()
+
+
+def test_defaults_are_the_documented_ones():
+    model = AffineNRSfM(n_components=2, random_state=0).fit(TABLE)
+    assert isinstance(model.isa_, PooledFastICA)
+    assert model.refinement == "alternating"
+    assert model.layout == "interleaved"
+    assert model.scale_frames is True
+
+
+def test_inputs_of_other_types_are_fitted_in_double_precision():
+    table = np.round(TABLE).astype(np.int32)
+    model = estimator().fit(table)
+    assert model.alpha_.dtype == np.float64
+    assert_array_equal(model.alpha_, estimator().fit(table.astype(float)).alpha_)
+    assert_array_equal(model.alpha_, estimator().fit(table.tolist()).alpha_)
+
+
+def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(variant):
+    model, table, _ = variant
+    tracks = tracks_of(table, model.layout)
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    weights = frame_weights(tracks, model.scale_frames)
+    W = np.vstack(list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1)))
+    S = np.linalg.svd(W, compute_uv=False)
+    rank = 3 * model.n_components + 3
+    assert_allclose(model.rank_floor_, np.sum(S[rank:] ** 2) / np.sum(S**2), rtol=1e-9)
+    assert 0 < model.rank_floor_ < model.inverse_snr_ < 1
+    if model.scale_frames:
+        assert_allclose(model.singular_values_, S[:rank], rtol=1e-9)
+    else:  # in the unit of the table or as a ratio: their proportions are the same
+        ratio = model.singular_values_ / S[:rank]
+        assert_allclose(ratio, ratio[0], rtol=1e-9)
+
+
+def test_mode_covariance_is_that_of_the_subspaces_in_the_order_of_the_basis(variant):
+    # Block k has the trace ||W P_k||^2 / 2I with P_k the projector on the subspace that
+    # the three coordinates of basis shape k span, and all blocks have it together.
+    model, table, _ = variant
+    C = model.mode_covariance_
+    assert_allclose(C, C.T, atol=1e-12 * np.abs(C).max())
+    assert np.linalg.eigvalsh(C)[0] > -1e-12 * np.trace(C)
+    tracks = tracks_of(table, model.layout)
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    if model.scale_frames:
+        weights = frame_weights(tracks, True)
+    else:
+        weights = np.full(len(tracks), 1 / np.mean(centred**2))
+    W = np.vstack(list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1)))
+    for k, shape in enumerate(model.basis_):
+        Q = np.linalg.qr(shape)[0]
+        block = C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+        assert_allclose(np.trace(block), np.sum((W @ Q) ** 2) / len(W), rtol=1e-6)
+
+
+def test_basis_shapes_are_orthogonal_as_those_of_the_paper(variant):
+    # B_k B_l^T = 0 for k != l, the mean shape included.
+    model, *_ = variant
+    shapes = np.concatenate([model.mean_shape_[None], model.basis_])
+    assert_allclose(shapes.mean(axis=1), 0, atol=1e-12)
+    for k, one in enumerate(shapes):
+        for other in shapes[:k]:
+            size = np.linalg.norm(one) * np.linalg.norm(other)
+            assert np.abs(one.T @ other).max() < 1e-10 * size
+
+
+# --- the formula --------------------------------------------------------------------
+
+
+def test_decompose_of_the_fitted_table_gives_the_attributes(variant):
+    model, table, _ = variant
+    frames = model.decompose(table)
+    assert isinstance(frames, Decomposition)
+    assert frames._fields == ("motion", "translation", "alpha")
+    assert_allclose(frames.motion, model.motion_, rtol=1e-12)
+    assert_allclose(frames.translation, model.translation_, rtol=1e-12)
+    assert_allclose(frames.alpha, model.alpha_, rtol=1e-10, atol=1e-10)
+    assert_allclose(model.transform(table), model.alpha_, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("which", ["fitted", "new"])
+def test_methods_follow_the_formula(variant, which):
+    model, table, new = variant
+    table = table if which == "fitted" else new
+    motion, translation, alpha = model.decompose(table)
+    assert_allclose(model.transform(table), alpha, rtol=1e-12)
+
+    shapes = model.reconstruct(table)
+    assert shapes.shape == (len(table), N_POINTS, 3)
+    assert_allclose(
+        shapes, model.mean_shape_ + np.einsum("ik,kjc->ijc", alpha, model.basis_)
+    )
+    expected = model_tracks(model, motion, translation, alpha)
+    scale = np.abs(table).max()
+    for result in (
+        model.reproject(table),
+        model.inverse_transform(alpha, motion, translation),
+    ):
+        assert result.shape == table.shape
+        assert_allclose(
+            tracks_of(result, model.layout), expected, atol=1e-12 * scale, rtol=0
+        )
+
+    tracks = tracks_of(table, model.layout)
+    weights = frame_weights(tracks, model.scale_frames)
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    noise = np.sum((tracks - expected) ** 2, axis=(1, 2)) @ weights
+    signal = np.sum(centred**2, axis=(1, 2)) @ weights
+    assert_allclose(-model.score(table), noise / signal, rtol=1e-8)
+    if which == "fitted":
+        assert_allclose(model.score(table), -model.inverse_snr_, rtol=1e-12)
+        assert noise / signal < 0.01
+
+
+@pytest.mark.parametrize("which", ["fitted", "new"])
+def test_frames_are_linear_least_squares_fits(variant, which):
+    # Camera: the rigid fit to the mean shape. Coefficients: the fit that follows.
+    model, table, new = variant
+    table = table if which == "fitted" else new
+    motion, translation, alpha = model.decompose(table)
+    tracks = tracks_of(table, model.layout)
+    for i in range(0, len(table), 7):
+        assert_allclose(translation[i], tracks[i].mean(axis=0), rtol=1e-12)
+        centred = tracks[i] - tracks[i].mean(axis=0)
+        M = np.linalg.lstsq(model.mean_shape_, centred)[0].T
+        assert_allclose(motion[i], M, atol=1e-10 * np.abs(M).max())
+        design = (model.basis_ @ M.T).reshape(len(model.basis_), -1).T
+        rest = (centred - model.mean_shape_ @ M.T).ravel()
+        best = np.linalg.lstsq(design, rest)[0]
+        assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
+
+
+def test_frames_are_fitted_by_themselves(model):
+    new = make_face_tracks(12, n_components=5, random_state=1).data
+    together = model.decompose(new)
+    for i in range(len(new)):
+        alone = model.decompose(new[i : i + 1])
+        for one, all_ in zip(alone, together, strict=True):
+            assert_allclose(one[0], all_[i], rtol=1e-10, atol=1e-12)
+
+
+def test_reconstructed_fitted_table_is_the_table_at_the_rank_of_the_truth():
+    # Nothing but the model itself is in a table that the model has made.
+    made = estimator(2).fit(TABLE)
+    table = made.reproject(TABLE)
+    assert_allclose(made.score(table), 0, atol=1e-25)
+    assert_allclose(made.transform(table), made.alpha_, atol=1e-10)
+    again = estimator(2).fit(table)
+    assert again.rank_floor_ < 1e-20
+
+
+def test_inverse_transform_takes_the_mean_view_by_default(model):
+    sizes = 1 / np.sqrt(frame_weights(tracks_of(TABLE), True))
+    mean_view = np.mean(model.motion_ / sizes[:, None, None], axis=0)
+    assert_allclose(
+        model.reference_motion_, mean_view * np.sqrt(np.mean(sizes**2)), atol=1e-10
+    )
+    assert_allclose(model.reference_translation_, model.translation_.mean(axis=0))
+
+    alpha = model.alpha_[:4]
+    table = model.inverse_transform(alpha)
+    camera = [model.reference_motion_] * 4
+    position = [model.reference_translation_] * 4
+    expected = model_tracks(model, camera, position, alpha)
+    assert_allclose(tracks_of(table), expected, rtol=1e-12)
+    for motion, translation in [
+        (model.reference_motion_, None),
+        (None, model.reference_translation_.tolist()),
+        (camera, model.reference_translation_),
+        (model.reference_motion_, position),
+    ]:
+        assert_allclose(
+            model.inverse_transform(alpha, motion, translation), table, rtol=1e-12
+        )
+    # The same coefficients come out again: the table is made by the model.
+    assert_allclose(model.transform(table), alpha, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "method", ["transform", "decompose", "reconstruct", "reproject"]
+)
+def test_single_precision_is_kept(method):
+    table = TABLE.astype(np.float32)
+    model = estimator().fit(table)
+    result = getattr(model, method)(table)
+    for array in result if isinstance(result, tuple) else (result,):
+        assert array.dtype == np.float32
+    assert model.inverse_transform(model.alpha_).dtype == np.float32
+    assert model.fit_transform(table).dtype == np.float32
+    # Cameras and coefficients are computed in double precision from shapes that were
+    # rounded to single precision.
+    assert_allclose(model.transform(table), model.alpha_, atol=1e-5)
+    reference = estimator().fit(table.astype(float))
+    assert_allclose(model.alpha_, reference.alpha_, atol=1e-4)
+    assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-4)
+
+
+def test_fit_transform_returns_a_copy_of_alpha():
+    model = estimator()
+    alpha = model.fit_transform(TABLE)
+    assert_array_equal(alpha, model.alpha_)
+    alpha[:] = 0
+    assert np.all(model.alpha_.std(axis=0) > 0.9)
+    assert model.fit(TABLE, y=None) is model
+
+
+# --- kinds of tables ----------------------------------------------------------------
+
+
+def frozen(table):
+    table = table.copy()
+    table.setflags(write=False)
+    return table
+
+
+def memory_mapped(table, folder):
+    joblib.dump(table, folder / "table")
+    return joblib.load(folder / "table", mmap_mode="r")
+
+
+TABLE_KINDS = {
+    "read-only": lambda folder: frozen(TABLE),
+    "memory map": lambda folder: memory_mapped(TABLE, folder),
+    "Fortran order": lambda folder: np.asfortranarray(TABLE),
+    "every other row": lambda folder: np.repeat(TABLE, 2, axis=0)[::2],
+    "every other column": lambda folder: np.repeat(TABLE, 2, axis=1)[:, ::2],
+    "backwards": lambda folder: TABLE[::-1].copy()[::-1],
+    "pandas": lambda folder: pd.DataFrame(TABLE),
+    "pandas with names": lambda folder: pd.DataFrame(
+        TABLE, columns=FACES.feature_names
+    ),
+    "polars": lambda folder: pl.DataFrame(TABLE, schema=FACES.feature_names),
+    "big endian": lambda folder: TABLE.astype(">f8"),
+}
+
+
+@pytest.mark.parametrize("kind", TABLE_KINDS)
+@may_not_converge
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
+def test_results_do_not_depend_on_how_the_table_is_kept(kind, isa, tmp_path):
+    before = TABLE.copy()
+    table = TABLE_KINDS[kind](tmp_path)
+    model = estimator(isa=isa).fit(table)
+    assert_array_equal(TABLE, before)
+    reference = estimator(isa=isa).fit(TABLE)
+    assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
+    assert_allclose(model.basis_, reference.basis_, atol=1e-10)
+    # New tables may be of another kind than the fitted one, in the same order.
+    if kind not in ("pandas with names", "polars"):
+        assert_allclose(model.transform(TABLE), reference.alpha_, atol=1e-9)
+        assert_allclose(reference.transform(table), reference.alpha_, atol=1e-9)
+
+
+@may_not_converge
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
+def test_planar_tables_equal_interleaved_ones(isa):
+    model = estimator(isa=isa, layout="planar").fit(planar(TABLE))
+    reference = estimator(isa=isa).fit(TABLE)
+    assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
+    assert_allclose(model.basis_, reference.basis_, atol=1e-10)
+    assert_allclose(
+        model.reproject(planar(TABLE)), planar(reference.reproject(TABLE)), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("frame", [pd.DataFrame, pl.DataFrame])
+def test_names_of_dataframes_are_kept_and_compared(frame):
+    names = list(FACES.feature_names)
+    table = frame({name: TABLE[:, j] for j, name in enumerate(names)})
+    model = estimator().fit(table)
+    assert model.feature_names_in_.tolist() == names
+    assert_allclose(model.transform(table), model.alpha_, atol=1e-10)
+    with pytest.raises(ValueError, match="feature names should match"):
+        model.transform(table[names[2:4] + names[:2] + names[4:]])
+    with pytest.warns(UserWarning, match="does not have valid feature names"):
+        model.transform(TABLE)
+
+
+# --- errors -------------------------------------------------------------------------
+
+
+def with_value(value):
+    table = TABLE.copy()
+    table[7, 3] = value
+    return table
+
+
+def with_equal_points(*rows):
+    table = TABLE.copy()
+    table[list(rows)] = np.tile([300.0, 200.0], N_POINTS)
+    return table
+
+
+BAD_TABLES = {
+    "odd number of columns": (
+        TABLE[:, :-1],
+        "must have two columns per point .* even number; got n_features=135",
+    ),
+    "missing values": (with_value(np.nan), "X contains NaN"),
+    "infinite values": (with_value(np.inf), "X contains infinity"),
+    "minus infinity": (with_value(-np.inf), "X contains infinity"),
+    "equal points": (
+        with_equal_points(5, 11),
+        r"all points are equal in 2 frame\(s\), the first is row 5",
+    ),
+    "one point": (TABLE[:, :2], "needs at least 13 points, X has 1;"),
+    "six points": (TABLE[:, :12], "at least 7 points are needed for n_components=1"),
+    "too few points": (
+        TABLE[:, :24],
+        "n_components=3 needs at least 13 points, X has 12; with 12 points the largest "
+        "possible n_components is 2",
+    ),
+    "too few frames": (
+        TABLE[:7],
+        r"n_components=3 needs at least 8 frames \(rows\), X has n_samples=7",
+    ),
+    "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
+    "one dimension": (TABLE[0], "Expected 2D array, got 1D array"),
+    "three dimensions": (FACES.tracks, "with dim 3|expected <= 2"),
+    "text": (np.full(TABLE.shape, "a"), "could not convert|not compatible"),
+    "complex numbers": (TABLE + 1j, "Complex data not supported"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_bad_tables_are_refused(name):
+    table, message = BAD_TABLES[name]
+    with pytest.raises(ValueError, match=message):
+        estimator().fit(table)
+
+
+@pytest.mark.parametrize("method", ["transform", "decompose", "reproject", "score"])
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (with_value(np.nan), "X contains NaN"),
+        (with_value(np.inf), "X contains infinity"),
+        (with_equal_points(0, 1, 2), r"all points are equal in 3 frame\(s\), .* row 0"),
+        (TABLE[:, :-2], "X has 134 features, but AffineNRSfM is expecting 136"),
+        (TABLE[:0], r"0 sample\(s\)"),
+    ],
+)
+def test_bad_new_tables_are_refused(model, method, table, message):
+    with pytest.raises(ValueError, match=message):
+        getattr(model, method)(table)
+
+
+def test_smallest_tables_are_fitted_and_smaller_ones_are_not():
+    rng = np.random.default_rng(0)
+    for n_components, n_frames in [(1, 5), (2, 7), (3, 8), (4, 10), (9, 18)]:
+        n_points = 3 * n_components + 4
+        table = rng.normal(size=(n_frames, 2 * n_points))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            model = estimator(n_components).fit(table)
+        assert np.isfinite(model.alpha_).all()
+        assert model.rank_floor_ < 1e-25
+        with pytest.raises(ValueError, match=f"at least {n_points} points"):
+            estimator(n_components).fit(table[:, 2:])
+        with pytest.raises(ValueError, match=f"at least {n_frames} frames"):
+            estimator(n_components).fit(table[1:])
+
+
+def test_k_is_never_changed():
+    model = estimator(6).fit(make_face_tracks(60, n_components=2, noise=0).data)
+    assert model.n_components == 6
+    assert len(model.basis_) == 6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([[0.0, 0.0]],), r"alpha must have shape \(1, 3\); got \(1, 2\)"),
+        (([[0.0, 0.0, np.nan]],), "alpha contains NaN"),
+        (([0.0, 0.0, 0.0],), "Expected 2D array"),
+        (
+            (np.zeros((4, 3)), np.zeros((3, 2, 3))),
+            r"motion must have shape \(4, 2, 3\) or \(2, 3\); got \(3, 2, 3\)",
+        ),
+        (
+            (np.zeros((4, 3)), np.zeros((3, 2))),
+            r"motion must have shape .*; got \(3, 2\)",
+        ),
+        (
+            (np.zeros((4, 3)), None, np.zeros((1, 2))),
+            r"translation must have shape \(4, 2\) or \(2,\); got \(1, 2\)",
+        ),
+    ],
+)
+def test_bad_arguments_of_inverse_transform_are_refused(model, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        model.inverse_transform(*arguments)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+@pytest.mark.parametrize("argument", ["motion", "translation"])
+def test_cameras_that_are_not_finite_numbers_are_refused(model, argument, broken):
+    value = np.zeros({"motion": (2, 3), "translation": (2,)}[argument])
+    value[..., 0] = broken
+    with pytest.raises(ValueError, match=argument):
+        model.inverse_transform(model.alpha_, **{argument: value})
+
+
+def test_names_that_contradict_the_layout_are_refused():
+    interleaved = pd.DataFrame(TABLE, columns=FACES.feature_names)
+    order = list(interleaved)[0::2] + list(interleaved)[1::2]
+    planar_table = interleaved[order]
+    with pytest.raises(
+        ValueError,
+        match=r"layout='planar' contradicts the column names \(x_0, y_0, x_1, y_1, "
+        r"...\), whose order is interleaved",
+    ):
+        estimator(layout="planar").fit(interleaved)
+    with pytest.raises(ValueError, match=r"layout='interleaved' .* order is planar"):
+        estimator().fit(planar_table)
+    shuffled = interleaved[order[1:] + order[:1]]
+    for layout in ("interleaved", "planar"):
+        with pytest.raises(ValueError, match="neither interleaved nor planar"):
+            estimator(layout=layout).fit(shuffled)
+    assert_allclose(
+        estimator(layout="planar").fit(planar_table).alpha_,
+        estimator().fit(interleaved).alpha_,
+        atol=1e-9,
+    )
+
+
+def test_names_that_say_nothing_are_not_read():
+    names = [f"column {j}" for j in range(2 * N_POINTS)]
+    model = estimator().fit(pd.DataFrame(TABLE, columns=names))
+    assert model.feature_names_in_.tolist() == names
+
+
+def test_methods_need_a_fitted_model():
+    for method in (
+        "transform",
+        "decompose",
+        "reconstruct",
+        "reproject",
+        "score",
+        "inverse_transform",
+    ):
+        with pytest.raises(NotFittedError):
+            getattr(estimator(), method)(TABLE)
+    with pytest.raises(NotFittedError):
+        estimator().get_feature_names_out()
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"n_components": 0},
+        {"n_components": 2.0},
+        {"isa": "fastisa"},
+        {"isa": object()},
+        {"block_recovery": "best"},
+        {"refinement": "joint"},
+        {"refinement": False},
+        {"layout": "xy"},
+        {"scale_frames": "yes"},
+        {"max_iter": 0},
+        {"tol": -1e-9},
+        {"random_state": "seed"},
+        {"n_jobs": 1.5},
+        {"verbose": -1},
+    ],
+    ids=str,
+)
+def test_bad_parameters_are_refused(params):
+    (name,) = params
+    with pytest.raises(ValueError, match=f"The '{name}' parameter of AffineNRSfM must"):
+        estimator(**params).fit(TABLE)
+
+
+# --- parameters ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block_recovery", ["generalized_eigen", "eigen", "irls"])
+@pytest.mark.parametrize("refinement", ["alternating", None])
+@pytest.mark.parametrize("isa", [FastISA(n_init=3), PooledFastICA(n_init=3)], ids=str)
+def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
+    block_recovery, refinement, isa
+):
+    model = estimator(block_recovery=block_recovery, refinement=refinement, isa=isa)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model.fit(TABLE)
+    S = model.singular_values_
+    rigid = 1 - np.sum(S[:3] ** 2) / np.sum(S**2) * (1 - model.rank_floor_)
+    assert model.rank_floor_ < model.inverse_snr_ < rigid
+    if refinement is None:
+        assert model.n_iter_ == 1
+        refined = clone(model).set_params(refinement="alternating")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            refined.fit(TABLE)
+        assert refined.inverse_snr_ <= model.inverse_snr_ * (1 + 1e-9)
+    else:
+        assert model.inverse_snr_ < 0.5 * rigid
+
+
+def test_refinement_that_is_cut_short_says_so():
+    with pytest.warns(
+        ConvergenceWarning, match="converge in max_iter=1 steps"
+    ) as caught:
+        model = estimator(4, max_iter=1, tol=0).fit(TABLE)
+    assert model.n_iter_ == 1
+    assert np.isfinite(model.inverse_snr_)
+    assert {warning.filename for warning in caught} == {__file__}
+
+
+def test_layout_warning_points_to_the_caller():
+    with pytest.warns(UserWarning, match="layout='planar' explains") as caught:
+        estimator().fit(planar(TABLE))
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_frames_count_by_their_size_or_alike():
+    # The frames of the second half deform in another way and are ten times as large.
+    other = make_face_tracks(N_FRAMES, n_components=8, noise=0.05, random_state=3).data
+    table = np.vstack([TABLE, 10 * other])
+    halves = {}
+    for scale_frames in (True, False):
+        model = estimator(scale_frames=scale_frames).fit(table)
+        halves[scale_frames] = [-model.score(TABLE), -model.score(10 * other)]
+    assert halves[False][0] > halves[True][0]
+    assert halves[False][1] < halves[True][1]
+
+
+@may_not_converge
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=9)], ids=["pooled", "fast"])
+def test_same_seed_gives_the_same_result_to_the_bit(isa):
+    first, second, other = (
+        estimator(isa=isa, random_state=seed).fit(TABLE) for seed in (4, 4, 5)
+    )
+    for name, value in vars(first).items():
+        if isinstance(value, np.ndarray | float | int):
+            assert_array_equal(value, getattr(second, name), err_msg=name)
+    assert first.isa_.random_state != other.isa_.random_state
+    from_instance = estimator(isa=isa, random_state=np.random.RandomState(4))
+    assert_array_equal(from_instance.fit(TABLE).alpha_, first.alpha_)
+
+
+def test_fitting_again_forgets_the_first_table(model):
+    again = estimator().fit(make_face_tracks(40, n_components=2, random_state=9).data)
+    again.fit(TABLE)
+    assert_array_equal(again.alpha_, model.alpha_)
+
+
+@may_not_converge
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=9)], ids=["pooled", "fast"])
+def test_results_do_not_depend_on_n_jobs(isa):
+    first, second = (estimator(isa=isa, n_jobs=n).fit(TABLE) for n in (1, 2))
+    assert_array_equal(first.alpha_, second.alpha_)
+    assert_array_equal(first.basis_, second.basis_)
+
+
+@may_not_converge
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
+def test_results_do_not_depend_on_the_threads_of_blas(isa):
+    table = make_face_tracks(2000, n_components=4, random_state=0).data
+    models = []
+    for n_threads in (1, 2):
+        with threadpool_limits(n_threads, user_api="blas"):
+            used = {p["num_threads"] for p in threadpool_info() if "blas" in p.values()}
+            models.append(estimator(4, isa=isa).fit(table))
+        if used != {n_threads}:
+            pytest.skip(f"BLAS uses {used} threads instead of {n_threads}")
+    assert_allclose(models[0].alpha_, models[1].alpha_, atol=1e-8)
+    assert_allclose(models[0].basis_, models[1].basis_, atol=1e-8)
+
+
+def test_strategy_gets_what_it_leaves_open():
+    isa = FastISA(n_init=2)
+    model = estimator(isa=isa, n_jobs=1).fit(TABLE)
+    assert isa.random_state is None  # a clone is fitted
+    assert not hasattr(isa, "components_")
+    assert isinstance(model.isa_.random_state, int | np.integer)
+    assert model.isa_.n_jobs == 1
+    assert model.isa_.n_init == 2
+
+
+def test_strategy_keeps_what_it_says_itself():
+    models = [
+        estimator(isa=FastISA(n_init=2, random_state=7, n_jobs=1), n_jobs=2),
+        estimator(isa=FastISA(n_init=2, random_state=7), random_state=1),
+        estimator(isa=FastISA(n_init=2, random_state=7), random_state=None),
+    ]
+    alphas = [model.fit(TABLE).alpha_ for model in models]
+    assert all(model.isa_.random_state == 7 for model in models)
+    assert models[0].isa_.n_jobs == 1
+    assert_array_equal(alphas[0], alphas[1])
+    assert_array_equal(alphas[0], alphas[2])
+
+
+class Given(BaseEstimator):
+    """A strategy of its own that takes the signals as they are."""
+
+    def __init__(self, rows=None):
+        self.rows = rows
+
+    def fit(self, signals):
+        self.shape_ = signals.shape
+        self.whiteness_ = signals.T @ signals / len(signals)
+        n_signals = signals.shape[1]
+        self.components_ = np.eye(self.rows or n_signals, n_signals)
+        return self
+
+
+def test_strategies_of_others_can_be_used():
+    model = estimator(2, isa=Given()).fit(TABLE)
+    assert model.isa_.shape_ == (N_POINTS, 6)
+    assert_allclose(model.isa_.whiteness_, np.eye(6), atol=1e-5)
+    assert model.inverse_snr_ < 0.01
+    model = estimator(2, isa=FastICA(max_iter=2000)).fit(TABLE)
+    assert isinstance(model.isa_, FastICA)
+    assert model.inverse_snr_ < 0.01
+
+
+@pytest.mark.parametrize("subspace_size", [1, 2, 6])
+@pytest.mark.parametrize("strategy", [FastISA, PooledFastICA])
+def test_strategies_with_other_subspaces_are_refused(strategy, subspace_size):
+    isa = strategy(subspace_size, n_init=2)
+    with pytest.raises(ValueError, match="subspace_size"):
+        estimator(2, isa=isa).fit(TABLE)
+
+
+def test_strategies_with_too_few_components_are_refused():
+    with pytest.raises(ValueError, match="components_"):
+        estimator(2, isa=Given(rows=5)).fit(TABLE)
+
+
+def test_verbose_prints_a_line_for_each_stage(capsys):
+    estimator().fit(TABLE)
+    assert capsys.readouterr().out == ""
+    estimator(verbose=1).fit(TABLE)
+    lines = capsys.readouterr().out.splitlines()
+    assert any("factorisation" in line for line in lines)
+    assert any(line.startswith("[FastISA] 3/3 starts") for line in lines)
+    assert all(line.startswith(("[AffineNRSfM]", "[FastISA]")) for line in lines)
+
+
+# --- scikit-learn -------------------------------------------------------------------
+
+
+def test_pipeline_ends_in_a_classifier():
+    labels = FACES.strength[:, 0] > np.median(FACES.strength[:, 0])
+    pipeline = make_pipeline(estimator(4), LogisticRegression())
+    pipeline.fit(TABLE, labels)
+    assert pipeline.score(TABLE, labels) > 0.8
+    assert pipeline[:-1].get_feature_names_out().tolist() == [
+        f"affinenrsfm{k}" for k in range(4)
+    ]
+
+
+def test_grid_search_over_own_and_nested_parameters():
+    grid = {"n_components": [1, 3], "isa__n_init": [1, 2]}
+    search = GridSearchCV(AffineNRSfM(isa=FastISA(), random_state=0), grid, cv=3)
+    search.fit(TABLE)
+    scores = search.cv_results_["mean_test_score"]
+    assert np.isfinite(scores).all()
+    assert search.best_params_["n_components"] == 3
+    assert search.best_estimator_.isa_.n_init == search.best_params_["isa__n_init"]
+    assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
+    assert_allclose(search.score(TABLE), -search.best_estimator_.inverse_snr_)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.FitFailedWarning")
+@pytest.mark.filterwarnings("ignore:One or more of the test scores:UserWarning")
+def test_grid_search_leaves_out_what_is_impossible():
+    search = GridSearchCV(estimator(), {"n_components": [1, 2, 5]}, cv=2)
+    search.fit(TABLE[:, :24])
+    assert np.isnan(search.cv_results_["mean_test_score"]).tolist() == [
+        False,
+        False,
+        True,
+    ]
+    assert search.best_params_["n_components"] in (1, 2)
+
+
+COPIES = {
+    "pickle": lambda model, path: pickle.loads(pickle.dumps(model)),
+    "deepcopy": lambda model, path: copy.deepcopy(model),
+    "joblib": lambda model, path: joblib.load(joblib.dump(model, path)[0]),
+    "skops": lambda model, path: (save_model(model, path), load_model(path))[1],
+}
+
+
+@pytest.mark.parametrize("way", COPIES)
+@pytest.mark.parametrize("isa", [PooledFastICA(n_init=2), FastISA(n_init=2)], ids=str)
+def test_copies_give_the_same_to_the_bit(way, isa, tmp_path):
+    model = estimator(2, isa=isa).fit(TABLE)
+    loaded = COPIES[way](model, tmp_path / "model")
+    assert_array_equal(loaded.transform(TABLE), model.transform(TABLE))
+    assert_array_equal(loaded.reproject(TABLE), model.reproject(TABLE))
+    assert_array_equal(loaded.basis_, model.basis_)
+    assert loaded.score(TABLE) == model.score(TABLE)
+    assert_array_equal(clone(loaded).fit(TABLE).alpha_, model.alpha_)
+
+
+def test_clone_is_unfitted_and_has_the_parameters(model):
+    copied = clone(model)
+    assert not [name for name in vars(copied) if name.endswith("_")]
+    assert copied.get_params(deep=False).keys() == model.get_params(deep=False).keys()
+    assert copied.isa is not model.isa
+    assert copied.isa.n_init == 3
+    copied.set_params(isa__n_init=5, n_components=1)
+    assert (copied.isa.n_init, model.isa.n_init) == (5, 3)
+
+
+@pytest.mark.parametrize(("library", "frame"), [("pandas", pd), ("polars", pl)])
+def test_output_in_dataframes(library, frame):
+    table = frame.DataFrame(
+        {name: TABLE[:, j] for j, name in enumerate(FACES.feature_names)}
+    )
+    model = estimator().set_output(transform=library)
+    for alpha in (model.fit_transform(table), model.transform(table)):
+        assert isinstance(alpha, frame.DataFrame)
+        assert list(alpha.columns) == ["affinenrsfm0", "affinenrsfm1", "affinenrsfm2"]
+        assert_allclose(alpha.to_numpy(), model.alpha_, atol=1e-10)
+    assert isinstance(model.alpha_, np.ndarray)
+    # What is not the coefficients stays an array.
+    assert isinstance(model.decompose(table).alpha, np.ndarray)
+    assert isinstance(model.reproject(table), np.ndarray)
+    assert_allclose(model.inverse_transform(model.transform(table)).shape, TABLE.shape)
+
+
+def test_names_of_the_output(model):
+    names = ["affinenrsfm0", "affinenrsfm1", "affinenrsfm2"]
+    assert model.get_feature_names_out().tolist() == names

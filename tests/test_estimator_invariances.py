@@ -1,0 +1,270 @@
+"""What the coefficients do not depend on, and the gauge of the shapes."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+
+# The warning about the layout has tests of its own.
+pytestmark = pytest.mark.filterwarnings("ignore:layout=:UserWarning")
+
+STRATEGIES = {"pooled": PooledFastICA(n_init=8), "fast": FastISA(n_init=4)}
+
+# The fixed-point iterations of ICA and ISA stop at some distance from their limit and
+# amplify rounding errors on their way: the results agree to less than rounding level.
+ALPHA_TOLERANCE = 1e-5
+SHAPE_TOLERANCE = 1e-6
+
+
+def estimator(isa, scale_frames=True):
+    """Return an estimator."""
+    return AffineNRSfM(4, isa=isa, scale_frames=scale_frames, random_state=0)
+
+
+def faces(load_data, name):
+    """Return the tracks of complete frames, a subset of a real table or synthetic."""
+    if name == "synthetic":
+        return make_face_tracks(200, random_state=0).tracks
+    tracks = load_data(name)["W2d"].astype(float)
+    tracks = tracks[~np.isnan(tracks).any(axis=(1, 2))]
+    return tracks[:: len(tracks) // 200]
+
+
+def table_of(tracks):
+    return tracks.reshape(len(tracks), -1)
+
+
+def rotations(angle):
+    """Return rotations of the image, (..., 2, 2)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def turn_one(tracks, rng):
+    turned = tracks.copy()
+    turned[17] = turned[17] @ rotations(2.0)
+    return turned
+
+
+def mirror_one(tracks, rng):
+    mirrored = tracks.copy()
+    mirrored[17] *= [1, -1]
+    return mirrored
+
+
+def angles(tracks, rng):
+    return rng.uniform(0, 2 * np.pi, len(tracks))
+
+
+IMAGE_CHANGES = {
+    "image moved": lambda tracks, rng: tracks + np.array([300.0, -2000.0]),
+    "frames moved": lambda tracks, rng: (
+        tracks + rng.normal(0, 500, (len(tracks), 1, 2))
+    ),
+    "image turned": lambda tracks, rng: tracks @ rotations(1.0),
+    "image mirrored": lambda tracks, rng: tracks * [-1, 1],
+    "axes exchanged": lambda tracks, rng: tracks[:, :, ::-1],
+    "one frame turned": turn_one,
+    "one frame mirrored": mirror_one,
+    "frames turned": lambda tracks, rng: tracks @ rotations(angles(tracks, rng)),
+    "other unit": lambda tracks, rng: tracks / 25.4,
+    "tiny unit": lambda tracks, rng: tracks * 1e-9,
+    "huge unit": lambda tracks, rng: tracks * 1e9,
+}
+SIZE_CHANGES = {
+    "one frame rescaled": lambda tracks, rng: (
+        tracks * np.where(np.arange(len(tracks)) == 17, 0.01, 1.0)[:, None, None]
+    ),
+    "frames rescaled": lambda tracks, rng: (
+        tracks * np.exp(rng.normal(size=(len(tracks), 1, 1)))
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=["ict_bu3dfe_like_68", "muct_68", "synthetic"])
+def tracks(request, load_data):
+    return faces(load_data, request.param)
+
+
+@pytest.fixture(scope="module", params=STRATEGIES)
+def isa(request):
+    return STRATEGIES[request.param]
+
+
+@pytest.fixture(scope="module")
+def model(tracks, isa):
+    return estimator(isa).fit(table_of(tracks))
+
+
+@pytest.fixture(scope="module")
+def unscaled(tracks, isa):
+    return estimator(isa, scale_frames=False).fit(table_of(tracks))
+
+
+def all_shapes(model):
+    """Return mean and basis shapes, (K + 1, J, 3)."""
+    return np.concatenate([model.mean_shape_[None], model.basis_])
+
+
+def assert_shapes_agree(shapes, expected):
+    """Compare shapes up to one orthogonal transform of space."""
+    U, _, Vt = np.linalg.svd(shapes.reshape(-1, 3).T @ expected.reshape(-1, 3))
+    tolerance = SHAPE_TOLERANCE * np.abs(expected).max()
+    assert_allclose(shapes @ U @ Vt, expected, atol=tolerance, rtol=0)
+
+
+def assert_models_agree(model, expected):
+    assert_allclose(model.alpha_, expected.alpha_, atol=ALPHA_TOLERANCE, rtol=0)
+    assert_shapes_agree(all_shapes(model), all_shapes(expected))
+    assert_allclose(model.inverse_snr_, expected.inverse_snr_, rtol=1e-6)
+
+
+# --- invariances --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", [*IMAGE_CHANGES, *SIZE_CHANGES])
+def test_coefficients_do_not_depend_on_the_images_placement(tracks, model, isa, change):
+    changed = (IMAGE_CHANGES | SIZE_CHANGES)[change](tracks, np.random.default_rng(0))
+    assert_models_agree(estimator(isa).fit(table_of(changed)), model)
+    # The model of the first table gives the coefficients of the second one.
+    assert_allclose(model.transform(table_of(changed)), model.alpha_, atol=1e-9)
+
+
+@pytest.mark.parametrize("change", ["frames moved", "one frame turned", "tiny unit"])
+def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, isa, change):
+    changed = IMAGE_CHANGES[change](tracks, np.random.default_rng(0))
+    fitted = estimator(isa, scale_frames=False).fit(table_of(changed))
+    assert_models_agree(fitted, unscaled)
+
+
+def test_frames_may_change_places(tracks, model, isa):
+    order = np.random.default_rng(0).permutation(len(tracks))
+    permuted = estimator(isa).fit(table_of(tracks[order]))
+    assert_allclose(permuted.alpha_, model.alpha_[order], atol=ALPHA_TOLERANCE)
+    assert_shapes_agree(all_shapes(permuted), all_shapes(model))
+
+
+def test_points_may_change_places(tracks, model, isa):
+    order = np.random.default_rng(0).permutation(tracks.shape[1])
+    permuted = estimator(isa).fit(table_of(tracks[:, order]))
+    assert_allclose(permuted.alpha_, model.alpha_, atol=ALPHA_TOLERANCE)
+    assert_shapes_agree(all_shapes(permuted), all_shapes(model)[:, order])
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize(
+    "change", ["image moved", "one frame turned", "other unit", "points change places"]
+)
+@pytest.mark.parametrize(
+    ("name", "n_components"),
+    [("synthetic", 3), ("ict_bu3dfe_like_68", 9), ("akhter_drink", 3)],
+)
+def test_default_estimator_is_invariant(load_data, name, n_components, change):
+    original = faces(load_data, name)
+    order = np.arange(original.shape[1])
+    if change == "points change places":
+        order = np.random.default_rng(0).permutation(order)
+        changed = original[:, order]
+    else:
+        changed = IMAGE_CHANGES[change](original, np.random.default_rng(0))
+    first, second = (
+        AffineNRSfM(n_components, random_state=0).fit(table_of(each))
+        for each in (original, changed)
+    )
+    assert_allclose(second.alpha_, first.alpha_, atol=ALPHA_TOLERANCE, rtol=0)
+    assert_shapes_agree(all_shapes(second), all_shapes(first)[:, order])
+
+
+def test_moved_and_turned_images_move_and_turn_the_cameras(tracks, model, isa):
+    R, t = rotations(0.3), np.array([20.0, -30.0])
+    moved = estimator(isa).fit(table_of(2.0 * tracks @ R.T + t))
+    assert_allclose(
+        moved.translation_, 2 * model.translation_ @ R.T + t, rtol=1e-9, atol=1e-9
+    )
+    # x and y of the shapes turn with the mean camera, and so their product does.
+    cameras = moved.motion_ @ np.swapaxes(all_shapes(moved)[:, None], -1, -2)
+    expected = 2 * R @ (model.motion_ @ np.swapaxes(all_shapes(model)[:, None], -1, -2))
+    tolerance = 1e-5 * np.abs(expected).max()
+    assert_allclose(cameras, expected, atol=tolerance, rtol=0)
+    # The mean view is upright in both: it has no part that turns.
+    for fitted in (model, moved):
+        view = fitted.reference_motion_
+        assert_allclose(view[0, 1], view[1, 0], atol=1e-9 * np.abs(view).max())
+
+
+# --- gauge --------------------------------------------------------------------------
+
+
+def third_moment(values):
+    return np.mean(values**3, axis=0)
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+def test_gauge(tracks, model, unscaled, scale_frames):
+    fitted = model if scale_frames else unscaled
+    assert_allclose(all_shapes(fitted).mean(axis=1), 0, atol=1e-12)
+    n_points = len(fitted.mean_shape_)
+    second = fitted.mean_shape_.T @ fitted.mean_shape_ / n_points
+    assert_allclose(second, np.eye(3), atol=1e-12)
+    assert third_moment(fitted.mean_shape_[:, 2]) > 0
+
+    assert_allclose(fitted.alpha_.std(axis=0), 1, rtol=1e-9)
+    assert np.all(third_moment(fitted.alpha_) > 0)
+
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+    motion = fitted.motion_ / (sizes if scale_frames else 1.0)
+    images = fitted.basis_[:, None] @ np.swapaxes(motion, 1, 2)
+    energy = np.sum(fitted.alpha_.T[:, :, None, None] ** 2 * images**2, axis=(1, 2, 3))
+    assert np.all(np.diff(energy) < 0)
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+def test_x_and_y_are_the_axes_of_the_mean_camera(tracks, model, unscaled, scale_frames):
+    fitted = model if scale_frames else unscaled
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+    mean = np.mean(fitted.motion_ / (sizes if scale_frames else 1.0), axis=0)
+    mean /= np.abs(mean).max()
+    assert_allclose(mean[:, 2], 0, atol=1e-10)
+    assert_allclose(mean[:, :2], mean[:, :2].T, atol=1e-10)
+    assert np.linalg.eigvalsh(mean[:, :2])[0] > 0.2
+    # Right and down in the mean image are right and down in the mean shape.
+    image = np.mean(centred / sizes, axis=0)
+    for axis in (0, 1):
+        assert np.corrcoef(image[:, axis], fitted.mean_shape_[:, axis])[0, 1] > 0.95
+
+
+def test_axes_are_principal_axes_where_cameras_have_no_common_view():
+    # Cameras that look from everywhere, frames at any angle: their mean is nothing.
+    rng = np.random.default_rng(0)
+    made = make_nonrigid_tracks(400, 30, n_components=2, noise=0.01, random_state=0)
+    turned = made.tracks @ rotations(angles(made.tracks, rng))
+    for scale_frames in (True, False):
+        fitted = AffineNRSfM(
+            2, isa=FastISA(n_init=2), scale_frames=scale_frames, random_state=0
+        ).fit(table_of(turned))
+        centred = turned - turned.mean(axis=1, keepdims=True)
+        sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+        motion = fitted.motion_ / (sizes if scale_frames else 1.0)
+        mean = np.linalg.svd(motion.mean(axis=0), compute_uv=False)
+        assert mean[1] < 0.2 * np.sqrt(np.mean(np.sum(motion**2, axis=(1, 2))) / 2)
+        second = np.mean(np.swapaxes(motion, 1, 2) @ motion, axis=0)
+        assert_allclose(second, np.diag(np.diag(second)), atol=1e-9 * second.max())
+        assert np.all(np.diff(np.diag(second)) < 0)
+        assert np.all(third_moment(fitted.mean_shape_) > 0)
+        # The reference camera looks along the third axis.
+        reference = fitted.reference_motion_
+        assert_allclose(reference[:, 2], 0)
+        assert_allclose(reference[[0, 1], [1, 0]], 0)
+        assert np.all(reference[[0, 1], [0, 1]] > 0)
+
+
+def test_new_coefficients_are_in_the_gauge_of_the_fit(tracks, model):
+    # Not standardised again: the variance of some frames is what it is.
+    some = np.argsort(model.alpha_[:, 0])[-20:]
+    alpha = model.transform(table_of(tracks[some]))
+    assert_allclose(alpha, model.alpha_[some], atol=1e-10)
+    assert alpha[:, 0].std() < 0.9

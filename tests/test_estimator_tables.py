@@ -1,0 +1,347 @@
+"""AffineNRSfM on real and degenerate tables: layouts, accuracy, finite numbers."""
+
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from sklearn.exceptions import ConvergenceWarning
+
+from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+
+REAL_TABLES = [
+    "akhter_drink",
+    "akhter_pickup",
+    "akhter_yoga",
+    "expressions_dlib_68",
+    "faces_wild_68_combined",
+    "flag_mocap_30x250",
+    "hands_kazuhito_21",
+    "ict_bu3dfe_like_68",
+    "muct_68",
+    "shark_torresani",
+]
+FAST = FastISA(n_init=2)
+
+
+def real_tracks(load_data, name):
+    """Return the tracks of the frames with all points."""
+    tracks = load_data(name)["W2d"].astype(float)
+    return tracks[~np.isnan(tracks).any(axis=(1, 2))]
+
+
+def table_of(tracks, layout="interleaved"):
+    """Return the table of tracks."""
+    if layout == "planar":
+        tracks = tracks.transpose(0, 2, 1)
+    return tracks.reshape(len(tracks), -1)
+
+
+def messages_of_fit(table, **params):
+    """Return the texts of the warnings of a fit, but for those of ISA."""
+    params = {"refinement": None} | params
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        AffineNRSfM(1, isa=FAST, random_state=0, **params).fit(table)
+    return [str(w.message) for w in caught if w.category is not ConvergenceWarning]
+
+
+# --- layout -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+@pytest.mark.parametrize("name", REAL_TABLES)
+def test_right_layout_gives_no_warning_and_the_wrong_one_does(
+    load_data, name, scale_frames
+):
+    tracks = real_tracks(load_data, name)
+    for right, wrong in (("interleaved", "planar"), ("planar", "interleaved")):
+        table = table_of(tracks, right)
+        assert messages_of_fit(table, layout=right, scale_frames=scale_frames) == []
+        (message,) = messages_of_fit(table, layout=wrong, scale_frames=scale_frames)
+        assert message.startswith(f"layout='{right}' explains the table much better")
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+@pytest.mark.parametrize("move", [[5000.0, 0.0], [-3000.0, 4000.0]])
+@pytest.mark.parametrize("name", ["ict_bu3dfe_like_68", "akhter_drink", "akhter_yoga"])
+def test_layout_is_judged_wherever_the_object_is(load_data, name, move, scale_frames):
+    tracks = real_tracks(load_data, name)
+    moved = tracks + np.array(move) * np.std(tracks[0]) / 100
+    params = {"scale_frames": scale_frames}
+    assert messages_of_fit(table_of(moved), **params) == []
+    assert len(messages_of_fit(table_of(moved, "planar"), **params)) == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_synthetic_tables_in_the_wrong_layout_give_a_warning(seed):
+    for tracks in (
+        make_face_tracks(40, random_state=seed).tracks,
+        make_nonrigid_tracks(100, noise=0.02, random_state=seed).tracks,
+    ):
+        assert messages_of_fit(table_of(tracks)) == []
+        assert len(messages_of_fit(table_of(tracks, "planar"))) == 1
+
+
+# --- degenerate tables --------------------------------------------------------------
+
+
+def assert_finite(model):
+    for name, value in vars(model).items():
+        if name.endswith("_") and isinstance(value, np.ndarray | float):
+            assert np.isfinite(value).all(), name
+
+
+def fitted(tracks, n_components, **params):
+    """Return the model of tracks; warnings of ISA's convergence do not count."""
+    params = {"isa": FAST, "random_state": 0} | params
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model = AffineNRSfM(n_components, **params).fit(table_of(tracks))
+    assert_finite(model)
+    table = table_of(tracks)
+    assert np.isfinite(model.reproject(table)).all()
+    assert_allclose(model.transform(table), model.alpha_, atol=1e-9)
+    assert model.rank_floor_ <= model.inverse_snr_ + 1e-25
+    assert model.mean_shape_.shape == (tracks.shape[1], 3)
+    assert model.basis_.shape == (n_components, tracks.shape[1], 3)
+    assert np.isfinite(model.inverse_transform(np.zeros((2, n_components)))).all()
+    return model
+
+
+def assert_zero_from(model, first):
+    """Assert that the basis shapes from `first` on have no motion."""
+    assert np.all(model.basis_[first:] == 0)
+    assert np.all(model.alpha_[:, first:] == 0)
+    assert np.all(model.mode_covariance_[3 * first :] == 0)
+    assert_allclose(model.alpha_[:, :first].std(axis=0), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
+@pytest.mark.parametrize("refinement", ["alternating", None])
+@pytest.mark.parametrize("n_components", range(1, 7))
+def test_shark_has_one_basis_shape_of_rank_two(
+    load_data, n_components, refinement, isa
+):
+    tracks = real_tracks(load_data, "shark_torresani")
+    model = fitted(tracks, n_components, isa=isa, refinement=refinement)
+    assert model.rank_floor_ < 1e-25
+    assert np.linalg.matrix_rank(model.basis_[0], tol=1e-6) == 2
+    assert_zero_from(model, 1)
+    one = fitted(tracks, 1, isa=isa, refinement=refinement)
+    assert_allclose(model.inverse_snr_, one.inverse_snr_, rtol=1e-6)
+
+
+@pytest.mark.parametrize("block_recovery", ["generalized_eigen", "eigen", "irls"])
+@pytest.mark.parametrize("refinement", ["alternating", None])
+def test_shark_with_all_methods(load_data, block_recovery, refinement):
+    tracks = real_tracks(load_data, "shark_torresani")
+    params = {"block_recovery": block_recovery, "refinement": refinement}
+    model = fitted(tracks, 2, **params)
+    assert np.all(model.basis_[1] == 0)
+    assert np.all(model.alpha_[:, 1] == 0)
+    S = model.singular_values_
+    rigid = np.sum(S[3:] ** 2) / np.sum(S**2)
+    assert model.inverse_snr_ <= rigid * (1 + 1e-9)
+    if refinement == "alternating":
+        assert_allclose(model.inverse_snr_, fitted(tracks, 2).inverse_snr_, rtol=1e-6)
+
+
+def test_basis_shape_of_rounding_errors_is_zero(load_data):
+    # Without refinement "eigen" may pick the direction in which the block of the
+    # shark does not move. What is left of it is not to be blown up to unit variance.
+    tracks = real_tracks(load_data, "shark_torresani")
+    model = fitted(tracks, 1, block_recovery="eigen", refinement=None)
+    if np.linalg.norm(model.basis_[0]) < 1e-9 * np.linalg.norm(model.mean_shape_):
+        assert np.all(model.basis_ == 0)
+        assert np.all(model.alpha_ == 0)
+
+
+def cameras(rng, n_frames):
+    return rng.normal(size=(n_frames, 2, 3))
+
+
+def seen(shapes, motion, rng):
+    """Return the tracks of shapes, at random positions."""
+    position = rng.normal(size=(len(motion), 1, 2))
+    return shapes @ motion.transpose(0, 2, 1) + position
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 5])
+@pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
+def test_rigid_objects_have_no_basis_shapes(flat, n_components):
+    rng = np.random.default_rng(0)
+    shape = rng.normal(size=(20, 3)) * flat
+    tracks = seen(shape, cameras(rng, 40), rng)
+    model = fitted(tracks, n_components)
+    assert model.inverse_snr_ < 1e-25
+    assert_zero_from(model, 0)
+    rank = sum(flat)
+    second = np.linalg.eigvalsh(model.mean_shape_.T @ model.mean_shape_ / 20)
+    assert_allclose(second, [0] * (3 - rank) + [1] * rank, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_flat_objects_that_deform_in_their_plane(dtype):
+    rng = np.random.default_rng(0)
+    shape, basis = rng.normal(size=(2, 20, 3)) * [1, 1, 0]
+    alpha = rng.normal(size=(40, 1, 1))
+    tracks = seen(shape + 0.2 * alpha * basis, cameras(rng, 40), rng).astype(dtype)
+    for n_components in (1, 3):
+        model = fitted(tracks, n_components)
+        assert model.inverse_snr_ < 0.02
+        assert model.singular_values_[4] < 1e-5 * model.singular_values_[0]
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 5])
+@pytest.mark.parametrize("n_different", [1, 2, 3])
+def test_repeated_frames(n_different, n_components):
+    rng = np.random.default_rng(0)
+    tracks = rng.normal(size=(n_different, 20, 2))
+    model = fitted(np.repeat(tracks, 15, axis=0), n_components)
+    assert model.rank_floor_ < 1e-25
+    for i in range(n_different):
+        same = model.alpha_[15 * i : 15 * i + 15]
+        assert_allclose(same, same[:1].repeat(15, axis=0), atol=1e-9)
+    # 3 K + 3 directions hold the two rows of each different frame.
+    if n_different == 1:
+        assert_zero_from(model, 0)
+
+
+def test_repeated_points_change_nothing_but_their_number():
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    once = fitted(tracks, 2)
+    twice = fitted(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 2)
+    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-4)
+    assert_allclose(twice.basis_[:, 68:], twice.basis_[:, 67::-1], atol=1e-9)
+    # More points than the table has directions: those left over are empty.
+    few = np.tile(tracks[:, ::10], (1, 5, 1))
+    model = fitted(few, 4)
+    assert model.rank_floor_ < 1e-25
+    assert_zero_from(model, 1)
+
+
+def test_frames_repeated_as_often_as_others_change_nothing():
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    once, twice = fitted(tracks, 2), fitted(np.tile(tracks, (2, 1, 1)), 2)
+    assert_allclose(twice.alpha_, np.tile(once.alpha_, (2, 1)), atol=1e-6)
+    assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-6)
+
+
+@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
+def test_tables_of_integers(isa):
+    tracks = make_face_tracks(60, n_components=2, noise=0, random_state=0).tracks
+    exact, rounded = (
+        fitted(each, 2, isa=isa) for each in (tracks, np.round(tracks).astype(int))
+    )
+    coarse = fitted(np.round(tracks / 40).astype(np.int8), 2, isa=isa)
+    assert exact.rank_floor_ < 1e-20 < rounded.rank_floor_ < coarse.rank_floor_
+    assert exact.inverse_snr_ < 0.05
+    assert coarse.inverse_snr_ < 0.05
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 3, 6])
+@pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_smallest_tables(n_components, isa, dtype):
+    rng = np.random.default_rng(n_components)
+    n_frames = -(-8 * (n_components + 2) // 5)
+    tracks = rng.normal(size=(n_frames, 3 * n_components + 4, 2)).astype(dtype)
+    model = fitted(tracks, n_components, isa=isa)
+    if dtype == np.float64:
+        assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
+
+
+def test_cameras_that_never_turn():
+    # Depth is not seen at all: the rigid part is filled up with deformation.
+    rng = np.random.default_rng(0)
+    shape, basis = rng.normal(size=(2, 20, 3))
+    alpha = rng.normal(size=(40, 1, 1))
+    motion = np.broadcast_to(np.eye(2, 3), (40, 2, 3))
+    for n_components in (1, 3):
+        model = fitted(seen(shape + 0.2 * alpha * basis, motion, rng), n_components)
+        assert model.inverse_snr_ < 1e-3
+
+
+def test_frames_that_are_lines_or_tiny():
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    tracks[3] *= [1, 0]
+    tracks[5] = tracks[5].mean(axis=0) + 1e-7 * tracks[5]
+    tracks[7] = tracks[7, :1]
+    tracks[7, 0] += 1.0
+    for scale_frames in (True, False):
+        fitted(tracks, 2, scale_frames=scale_frames)
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
+def test_any_unit_is_fitted(scale):
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    model = fitted(tracks * scale, 2)
+    assert_allclose(model.inverse_snr_, fitted(tracks, 2).inverse_snr_, rtol=1e-6)
+
+
+def test_two_places_only():
+    rng = np.random.default_rng(0)
+    tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
+    model = fitted(tracks, 1)
+    assert model.inverse_snr_ < 1e-25
+    # ... on the diagonal of the image: in the other layout all points are equal.
+    diagonal = np.repeat(rng.normal(size=(40, 2, 1)), 10, axis=1) * [1, 1]
+    assert fitted(diagonal, 1).inverse_snr_ < 1e-25
+
+
+# --- accuracy -----------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("name", "n_components", "params", "percent"),
+    [
+        ("shark_torresani", 1, {"scale_frames": False}, 0.160),
+        ("shark_torresani", 1, {"scale_frames": False, "isa": FastISA()}, 0.160),
+        ("ict_bu3dfe_like_68", 9, {}, 0.108),
+        ("akhter_drink", 3, {}, 0.150),
+        ("faces_wild_68_combined", 9, {}, 0.360),
+    ],
+    ids=lambda value: str(value),
+)
+def test_inverse_snr_of_known_tables(
+    load_data, name, n_components, params, percent, seed
+):
+    table = table_of(real_tracks(load_data, name))
+    model = AffineNRSfM(n_components, random_state=seed, **params).fit(table)
+    assert round(100 * model.inverse_snr_, 3) <= percent
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("name", ["akhter_yoga", "ict_bu3dfe_like_68", "muct_68"])
+def test_one_basis_shape_needs_no_independence(load_data, name):
+    # There is one subspace only: neither strategy nor seed have a say.
+    table = table_of(real_tracks(load_data, name))
+    values = [
+        AffineNRSfM(1, isa=isa, random_state=seed).fit(table).inverse_snr_
+        for isa in (PooledFastICA(n_init=2), FastISA(n_init=2))
+        for seed in (0, 1)
+    ]
+    assert_allclose(values, values[0], rtol=1e-5)
+
+
+def test_strategies_explain_more_than_a_rigid_shape_does(load_data):
+    table = table_of(real_tracks(load_data, "ict_bu3dfe_like_68")[::5])
+    values = [
+        AffineNRSfM(9, isa=isa, random_state=0).fit(table).inverse_snr_
+        for isa in (PooledFastICA(n_init=4), FastISA(n_init=4))
+    ]
+    rigid = make_rigid(table)
+    assert max(values) < 0.5 * rigid
+
+
+def make_rigid(table):
+    """Return the inverse SNR of a rigid object."""
+    tracks = table.reshape(len(table), -1, 2)
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    centred /= np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+    S = np.linalg.svd(np.vstack(list(centred.transpose(0, 2, 1))), compute_uv=False)
+    return np.sum(S[3:] ** 2) / np.sum(S**2)

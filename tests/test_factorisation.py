@@ -1,0 +1,206 @@
+"""Rigid and non-rigid factorisation: identities, invariances, missing rank."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import measurements, permute_frames, rotate_frames
+
+from isa_nrsfm._factorisation import factorise, orientations
+
+SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
+
+
+def centred_matrix(seed, n_frames, n_points):
+    rng = np.random.default_rng(seed)
+    W = rng.exponential(size=(2 * n_frames, n_points)) @ np.diag(
+        rng.exponential(size=n_points)
+    )
+    return W - W.mean(axis=1, keepdims=True)
+
+
+def low_rank(seed, rank, n_frames=30, n_points=20):
+    """Return a centred matrix of a given rank with different singular values."""
+    rng = np.random.default_rng(seed)
+    shape = rng.exponential(size=(rank, n_points))
+    shape -= shape.mean(axis=1, keepdims=True)
+    return rng.normal(size=(2 * n_frames, rank)) @ shape
+
+
+def approximation(f):
+    return f.rigid_motion @ f.rigid_shape + f.motion @ f.signals
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("K", [1, 3])
+class TestIdentities:
+    def test_best_approximation_of_rank_3K_plus_3(self, size, K):
+        W = centred_matrix(0, *size)
+        U, S, Vt = np.linalg.svd(W, full_matrices=False)
+        rank = 3 * K + 3
+        best = (U[:, :rank] * S[:rank]) @ Vt[:rank]
+        assert_allclose(approximation(factorise(W, K)), best, atol=1e-12)
+
+    def test_rigid_part_is_the_best_of_rank_three(self, size, K):
+        W = centred_matrix(0, *size)
+        U, S, Vt = np.linalg.svd(W, full_matrices=False)
+        f = factorise(W, K)
+        best = (U[:, :3] * S[:3]) @ Vt[:3]
+        assert_allclose(f.rigid_motion @ f.rigid_shape, best, atol=1e-12)
+
+    def test_shapes(self, size, K):
+        n_frames, n_points = size
+        f = factorise(centred_matrix(0, *size), K)
+        assert f.rigid_motion.shape == (2 * n_frames, 3)
+        assert f.rigid_shape.shape == (3, n_points)
+        assert f.motion.shape == (2 * n_frames, 3 * K)
+        assert f.signals.shape == (3 * K, n_points)
+        assert f.singular_values.shape == (min(2 * n_frames, n_points),)
+
+    def test_shape_and_signals_are_centred_and_white_together(self, size, K):
+        f = factorise(centred_matrix(0, *size), K)
+        rows = np.vstack([f.rigid_shape, f.signals])
+        assert_allclose(rows.mean(axis=1), 0, atol=1e-13)
+        assert_allclose(rows @ rows.T / size[1], np.eye(3 * K + 3), atol=1e-13)
+
+    def test_motion_columns_are_orthogonal_and_ordered(self, size, K):
+        f = factorise(centred_matrix(0, *size), K)
+        M = np.hstack([f.rigid_motion, f.motion])
+        gram = M.T @ M
+        norms = np.sqrt(np.diag(gram) * size[1])
+        assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-12 * gram.max())
+        assert_allclose(norms, f.singular_values[: 3 * K + 3])
+
+    def test_singular_values(self, size, K):
+        W = centred_matrix(0, *size)
+        f = factorise(W, K)
+        S = np.linalg.svd(W, compute_uv=False)
+        assert_allclose(f.singular_values, S, atol=1e-12 * S[0])
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units(self, size, K, unit):
+        W = centred_matrix(0, *size)
+        f, g = factorise(W, K), factorise(unit * W, K)
+        assert_allclose(g.rigid_shape, f.rigid_shape, atol=1e-11)
+        assert_allclose(g.signals, f.signals, atol=1e-10)
+        assert_allclose(g.motion / unit, f.motion, atol=1e-11)
+        assert_allclose(g.singular_values / unit, f.singular_values, atol=1e-12)
+
+    def test_rotation_of_single_frames_turns_the_motion_only(self, size, K):
+        W = centred_matrix(0, *size)
+        f, g = factorise(W, K), factorise(rotate_frames(W, 1), K)
+        assert_allclose(g.rigid_shape, f.rigid_shape, atol=1e-11)
+        assert_allclose(g.signals, f.signals, atol=1e-10)
+        assert_allclose(g.rigid_motion, rotate_frames(f.rigid_motion, 1), atol=1e-11)
+        assert_allclose(g.motion, rotate_frames(f.motion, 1), atol=1e-11)
+
+    def test_permutation_of_frames_permutes_the_motion_only(self, size, K):
+        W = centred_matrix(0, *size)
+        permuted, order = permute_frames(W, 1)
+        f, g = factorise(W, K), factorise(permuted, K)
+        rows = (2 * order[:, None] + [0, 1]).ravel()
+        assert_allclose(g.signals, f.signals, atol=1e-10)
+        assert_allclose(g.rigid_motion, f.rigid_motion[rows], atol=1e-11)
+        assert_allclose(g.motion, f.motion[rows], atol=1e-11)
+
+    def test_permutation_of_points_permutes_the_shapes_only(self, size, K):
+        W = centred_matrix(0, *size)
+        order = np.random.default_rng(1).permutation(size[1])
+        f, g = factorise(W, K), factorise(W[:, order], K)
+        assert_allclose(g.rigid_shape, f.rigid_shape[:, order], atol=1e-11)
+        assert_allclose(g.signals, f.signals[:, order], atol=1e-10)
+        assert_allclose(g.motion, f.motion, atol=1e-11)
+
+    def test_input_stays_as_it_is(self, size, K):
+        W = centred_matrix(0, *size)
+        before = W.copy()
+        factorise(W, K)
+        assert_array_equal(W, before)
+
+
+class TestMissingRank:
+    @pytest.mark.parametrize("rank", range(1, 13))
+    @pytest.mark.parametrize("K", [1, 2, 3])
+    def test_only_directions_above_rounding_errors_are_used(self, rank, K):
+        W = low_rank(rank, rank)
+        f = factorise(W, K)
+        used = min(rank, 3 * K + 3)
+        n_signals = 3 * max(1, -(-(used - 3) // 3))
+        assert f.signals.shape == (n_signals, 20)
+        assert f.motion.shape == (60, n_signals)
+
+        # The motion of what is added is exactly zero, the signals stay white.
+        assert_array_equal(f.motion[:, max(used - 3, 0) :], 0)
+        assert np.all(np.linalg.norm(f.motion[:, : max(used - 3, 0)], axis=0) > 0)
+        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+        assert_allclose(f.signals @ f.signals.T / 20, np.eye(n_signals), atol=1e-12)
+        assert_allclose(f.rigid_shape @ f.signals.T, 0, atol=1e-11)
+
+        expected = np.diag(np.repeat([1.0, 0.0], [min(rank, 3), max(3 - rank, 0)]))
+        assert_allclose(f.rigid_shape @ f.rigid_shape.T / 20, expected, atol=1e-12)
+        assert_array_equal(f.rigid_shape[rank:], 0)
+        if rank <= 3 * K + 3:
+            assert_allclose(approximation(f), W, atol=1e-12)
+
+    @pytest.mark.parametrize("rank", range(1, 7))
+    def test_as_few_points_as_possible(self, rank):
+        f = factorise(low_rank(rank, rank, n_points=7), 1)
+        assert_allclose(f.signals @ f.signals.T / 7, np.eye(3), atol=1e-12)
+        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+
+    def test_weak_directions_stay_centred(self):
+        # Rounding errors of the centring, 1e-16, are 1e-7 of a direction of 1e-9.
+        W = 1e3 * low_rank(0, 3) + 1e-6 * low_rank(1, 3)
+        f = factorise(W, 1)
+        assert 1e-10 < f.singular_values[5] / f.singular_values[0] < 1e-8
+        assert np.linalg.norm(f.motion[:, 2]) > 0
+        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+
+    def test_repeated_frames(self):
+        W = np.tile(centred_matrix(0, 4, 25), (5, 1))  # of rank 8
+        f = factorise(W, 2)
+        assert f.signals.shape == (6, 25)
+        assert_array_equal(f.motion[:, 5], 0)
+        assert_allclose(approximation(f), W, atol=1e-12)
+
+    @pytest.mark.parametrize(("K", "n_signals"), [(1, 3), (2, 3), (4, 3)])
+    def test_shark_has_two_non_rigid_directions(self, load_data, K, n_signals):
+        W = measurements(load_data("shark_torresani")["W2d"])
+        f = factorise(W, K)
+        assert f.signals.shape == (n_signals, 91)
+        assert np.linalg.norm(f.motion[:, 1]) > 1e-3
+        assert_array_equal(f.motion[:, 2], 0)
+        assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
+        assert_allclose(f.signals @ f.signals.T / 91, np.eye(3), atol=1e-12)
+        assert_allclose(approximation(f), W, atol=1e-12)
+
+
+class TestOrientations:
+    def test_sign_of_the_third_moment(self):
+        rows = np.array([[2.0, -1.0, -1.0], [-2.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
+        assert_array_equal(orientations(rows), [1, -1, 1])
+
+    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("unit", [1e-250, 1e-9, 1e9, 1e250])
+    def test_opposite_rows_permutations_and_units(self, seed, unit):
+        rng = np.random.default_rng(seed)
+        rows = rng.normal(size=(6, 11))
+        signs = orientations(rows)
+        assert_array_equal(orientations(-rows), -signs)
+        assert_array_equal(orientations(unit * rows), signs)
+        assert_array_equal(orientations(rows[:, rng.permutation(11)]), signs)
+        assert_array_equal(orientations(signs[:, None] * rows), 1)
+
+    def test_rows_without_third_moment(self):
+        rows = np.array([[1.0, -3.0, 3.0, -1.0], [3.0, 1.0, -1.0, -3.0]])
+        assert_array_equal(orientations(rows), [-1, 1])
+        assert_array_equal(orientations(-rows), [1, -1])
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_third_moments_of_rounding_errors_do_not_decide(self, seed):
+        half = np.random.default_rng(seed).normal(size=(5, 9))
+        rows = np.hstack([half, -half[:, ::-1]])
+        extreme = rows[np.arange(5), np.abs(rows).argmax(axis=1)]
+        assert_array_equal(orientations(rows), np.sign(extreme))
+
+    def test_zero_rows(self):
+        assert_array_equal(orientations(np.zeros((2, 5))), 1)

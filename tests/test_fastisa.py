@@ -1,0 +1,250 @@
+"""FastISA: recovery, optimality, what the result may not depend on."""
+
+import warnings
+
+import numpy as np
+import pytest
+from joblib import parallel_config
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import random_rotation, spherical_sources
+from sklearn.exceptions import ConvergenceWarning
+
+from isa_nrsfm import FastISA
+from isa_nrsfm.isa import SqrtDensity
+from isa_nrsfm.isa._base import whiten
+from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise
+from isa_nrsfm.metrics import subspace_distance
+
+
+def mixed(seed, n_samples=3000, n_subspaces=4, size=3):
+    """Return signals of independent spherical sources, and the true unmixing."""
+    sources = spherical_sources(seed, n_samples, n_subspaces, size)
+    A = random_rotation(seed, n_subspaces * size)
+    return sources @ A.T, A.T
+
+
+def few_samples(seed=0):
+    """Return signals of the size of landmark data: 68 points, 9 subspaces."""
+    return mixed(seed, 68, 9)[0]
+
+
+class CauchyDensity:
+    """Another density: ``F(u) = -log(1 + u)``."""
+
+    def log_density(self, energy):
+        return -np.log1p(energy)
+
+    def derivatives(self, energy):
+        root = 1.0 / (1.0 + energy)
+        return -root, root**2
+
+
+class TestRecovery:
+    @pytest.mark.parametrize("seed", range(6))
+    def test_spherical_heavy_tailed_sources(self, seed):
+        signals, unmixing = mixed(seed)
+        isa = FastISA(n_init=2, random_state=seed).fit(signals)
+        assert subspace_distance(isa.components_, unmixing) < 0.05
+
+    @pytest.mark.parametrize("size", [1, 2, 3, 4])
+    def test_any_size_of_subspaces(self, size):
+        signals, unmixing = mixed(0, n_subspaces=3, size=size)
+        isa = FastISA(size, n_init=2, random_state=0).fit(signals)
+        assert subspace_distance(isa.components_, unmixing, size) < 0.06
+
+    def test_radii_by_a_student_distribution(self):
+        rng = np.random.default_rng(0)
+        directions = rng.normal(size=(3000, 4, 3))
+        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+        sources = (directions * rng.standard_t(5, size=(3000, 4, 1))).reshape(3000, 12)
+        A = random_rotation(0, 12)
+        isa = FastISA(n_init=2, random_state=0).fit(sources @ A.T)
+        assert subspace_distance(isa.components_, A.T) < 0.06
+
+    def test_another_density(self):
+        signals, unmixing = mixed(0)
+        isa = FastISA(n_init=2, density=CauchyDensity(), random_state=0).fit(signals)
+        assert subspace_distance(isa.components_, unmixing) < 0.06
+
+    def test_general_mixing(self):
+        signals, unmixing = mixed(0)
+        A = np.random.default_rng(1).normal(size=(12, 12))
+        isa = FastISA(n_init=2, random_state=0).fit(signals @ A.T)
+        assert subspace_distance(isa.components_ @ A, unmixing) < 0.05
+
+
+class TestOptimality:
+    def test_relative_gradient_vanishes(self):
+        signals, _ = mixed(0, 3000, n_subspaces=3)
+        isa = FastISA(n_init=1, tol=1e-13, random_state=0).fit(signals)
+        Y = isa.transform(signals).T
+        u = np.repeat(np.sum(Y.reshape(3, 3, -1) ** 2, axis=1), 3, axis=0)
+        G = -0.5 / np.sqrt(u + 0.1) * Y @ Y.T / 3000
+        assert np.linalg.norm(G - G.T) < 1e-5 * np.linalg.norm(G)
+
+    def test_default_tolerance_is_near_to_the_optimum(self):
+        signals, _ = mixed(0, 3000, n_subspaces=3)
+        near = FastISA(n_init=1, random_state=0).fit(signals)
+        exact = FastISA(n_init=1, tol=1e-13, random_state=0).fit(signals)
+        assert subspace_distance(near.components_, exact.components_) < 0.01
+        assert_allclose(near.log_likelihood_, exact.log_likelihood_, atol=1e-4)
+
+    def test_not_below_the_likelihood_of_the_truth(self):
+        signals, unmixing = mixed(0)
+        isa = FastISA(n_init=2, random_state=0).fit(signals)
+        Z, whitening = whiten(signals - signals.mean(axis=0))
+        truth = orthogonalise((unmixing @ np.linalg.inv(whitening))[None])
+        assert isa.log_likelihood_ > log_likelihood(truth, Z, 3, SqrtDensity())[0]
+
+    def test_likelihood_is_that_of_the_sources(self):
+        signals = few_samples()
+        isa = FastISA(n_init=4, random_state=0).fit(signals)
+        u = np.sum(isa.transform(signals).reshape(68, 9, 3) ** 2, axis=2)
+        expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
+        assert_allclose(isa.log_likelihood_, expected)
+
+    def test_largest_likelihood_is_kept(self):
+        isa = FastISA(n_init=12, random_state=0).fit(few_samples())
+        assert isa.log_likelihoods_.shape == isa.n_iters_.shape == (12,)
+        assert np.ptp(isa.log_likelihoods_) > 1e-3
+        best = isa.log_likelihoods_.argmax()
+        assert isa.log_likelihood_ == isa.log_likelihoods_[best]
+        assert isa.n_iter_ == isa.n_iters_[best]
+
+    def test_most_starts_converge_with_few_samples(self):
+        n_iters = np.concatenate(
+            [
+                FastISA(n_init=8, random_state=seed).fit(few_samples(seed)).n_iters_
+                for seed in range(3)
+            ]
+        )
+        # A start that does not converge has taken all 500 steps of an iteration.
+        assert np.mean(n_iters < 500) > 0.7
+
+
+class TestInvariances:
+    def test_n_jobs_change_no_bit(self):
+        signals = few_samples()
+        one, two = (
+            FastISA(n_init=9, random_state=0, n_jobs=n_jobs).fit(signals)
+            for n_jobs in (1, 2)
+        )
+        assert_array_equal(two.components_, one.components_)
+        assert_array_equal(two.log_likelihoods_, one.log_likelihoods_)
+        assert_array_equal(two.n_iters_, one.n_iters_)
+
+    def test_threads_change_no_bit(self):
+        signals, _ = mixed(0, 500)
+        one = FastISA(n_init=17, random_state=0).fit(signals)
+        with parallel_config(backend="threading", n_jobs=3):
+            three = FastISA(n_init=17, random_state=0).fit(signals)
+        assert_array_equal(three.components_, one.components_)
+        assert_array_equal(three.log_likelihoods_, one.log_likelihoods_)
+
+    @pytest.mark.parametrize("n_init", [1, 8, 9])
+    def test_fewer_starts_are_the_first_of_more(self, n_init):
+        signals = few_samples()
+        more = FastISA(n_init=10, random_state=0).fit(signals)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            fewer = FastISA(n_init=n_init, random_state=0).fit(signals)
+        assert_array_equal(fewer.log_likelihoods_, more.log_likelihoods_[:n_init])
+        assert_array_equal(fewer.n_iters_, more.n_iters_[:n_init])
+
+    def test_seeds(self):
+        signals = few_samples()
+        first, same, other = (
+            FastISA(n_init=2, random_state=seed).fit(signals) for seed in (0, 0, 3)
+        )
+        assert_array_equal(same.components_, first.components_)
+        assert np.abs(other.components_ - first.components_).max() > 1e-3
+        generator = FastISA(n_init=2, random_state=np.random.RandomState(0))
+        assert_array_equal(generator.fit(signals).components_, first.components_)
+
+    def test_seeds_agree_where_samples_are_many(self):
+        signals, _ = mixed(0, n_subspaces=3)
+        results = [
+            FastISA(n_init=1, tol=1e-10, random_state=seed).fit(signals).components_
+            for seed in range(3)
+        ]
+        for other in results[1:]:
+            assert subspace_distance(results[0], other) < 1e-4
+
+    def test_order_of_samples(self):
+        signals, _ = mixed(0, 1000)
+        order = np.random.default_rng(0).permutation(1000)
+        first = FastISA(n_init=2, random_state=0).fit(signals)
+        other = FastISA(n_init=2, random_state=0).fit(signals[order])
+        assert_allclose(other.components_, first.components_, atol=1e-8)
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units_and_offset(self, unit):
+        signals, _ = mixed(0, 1000)
+        first = FastISA(n_init=2, random_state=0).fit(signals)
+        other = FastISA(n_init=2, random_state=0).fit(unit * (signals + 1.0))
+        assert_allclose(unit * other.components_, first.components_, atol=1e-8)
+        assert_allclose(other.log_likelihood_, first.log_likelihood_)
+
+    def test_general_mixing_leaves_the_subspaces(self):
+        signals, _ = mixed(0, n_subspaces=3)
+        A = np.random.default_rng(1).normal(size=(9, 9))
+        first = FastISA(n_init=1, tol=1e-10, random_state=0).fit(signals)
+        other = FastISA(n_init=1, tol=1e-10, random_state=0).fit(signals @ A.T)
+        distance = subspace_distance(other.components_ @ A, first.components_)
+        assert distance < 1e-4
+        assert_allclose(other.log_likelihood_, first.log_likelihood_, atol=1e-8)
+
+
+class TestEdges:
+    def test_one_subspace(self):
+        signals, _ = mixed(0, 200, n_subspaces=1)
+        isa = FastISA(n_init=2, random_state=0).fit(signals)
+        assert isa.components_.shape == (3, 3)
+        assert_allclose(
+            np.cov(isa.transform(signals).T, bias=True), np.eye(3), atol=1e-12
+        )
+
+    def test_one_signal(self):
+        isa = FastISA(1, n_init=1, random_state=0).fit([[1.0], [2.0], [6.0]])
+        assert_allclose(np.abs(isa.transform([[3.0]])), 0, atol=1e-12)
+
+    def test_hardly_more_samples_than_signals(self):
+        signals = np.random.default_rng(0).normal(size=(14, 12))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            isa = FastISA(n_init=2, random_state=0).fit(signals)
+        assert np.isfinite(isa.components_).all()
+
+    def test_repeated_samples(self):
+        signals = few_samples()
+        once = FastISA(n_init=2, random_state=0).fit(signals)
+        twice = FastISA(n_init=2, random_state=0).fit(np.vstack([signals, signals]))
+        assert_allclose(twice.log_likelihood_, once.log_likelihood_, atol=1e-6)
+
+    def test_not_converged(self):
+        with pytest.warns(
+            ConvergenceWarning,
+            match="FastISA did not converge in max_iter=1 steps: its best start still "
+            "moves; increase max_iter or tol",
+        ):
+            isa = FastISA(n_init=2, max_iter=1, random_state=0).fit(few_samples())
+        assert_array_equal(isa.n_iters_, 2)  # one of either iteration
+
+    def test_verbose_prints_a_line_for_each_batch(self, capsys):
+        isa = FastISA(n_init=10, random_state=0, verbose=1).fit(few_samples())
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) == 2
+        assert lines[-1] == f"[FastISA] 10/10 starts, best {isa.log_likelihood_:.6g}"
+
+    def test_quiet_by_default(self, capsys):
+        FastISA(n_init=2, random_state=0).fit(few_samples())
+        assert capsys.readouterr().out == ""
+
+    @pytest.mark.parametrize("density", [3, "sqrt", object()])
+    def test_something_that_is_no_density(self, density):
+        with pytest.raises(ValueError, match="The 'density' parameter of FastISA"):
+            FastISA(density=density).fit(few_samples())
+
+    def test_density_with_a_negative_eps(self):
+        with pytest.raises(ValueError, match=r"eps must be above zero; got -1.0"):
+            FastISA(n_init=1, density=SqrtDensity(eps=-1.0)).fit(few_samples())

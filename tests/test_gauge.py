@@ -1,0 +1,293 @@
+"""The canonical space, order, scale and sign."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import permute_frames, random_rotation, rotate_frames
+
+from isa_nrsfm._camera import mean_view
+from isa_nrsfm._frame_fit import compose, fit_frames, project
+from isa_nrsfm._gauge import (
+    canonical_gauge,
+    canonical_space,
+    image_energies,
+    reorder_blocks,
+)
+
+
+class Scene:
+    """A shape with a skewed depth, and cameras that see it from about one side."""
+
+    def __init__(self, seed=0, n_frames=30, spread=0.3, flat=0):
+        rng = np.random.default_rng(seed)
+        self.mean_shape = rng.exponential(size=(25, 3))
+        self.mean_shape[:, 3 - flat :] = 0
+        self.mean_shape -= self.mean_shape.mean(axis=0)
+        self.basis = rng.normal(size=(3, 25, 3))
+        self.basis -= self.basis.mean(axis=1, keepdims=True)
+        self.motion = np.eye(2, 3) + spread * rng.normal(size=(n_frames, 2, 3))
+        self.alpha = rng.exponential(size=(n_frames, 3)) * [1.0, 5.0, 0.2]
+        if flat:
+            self.motion[:, :, 3 - flat :] = 0
+
+    def canonical(self):
+        gauge = canonical_gauge(self.mean_shape, self.basis, self.motion, self.alpha)
+        A = canonical_space(self.mean_shape, self.motion)
+        return gauge, self.motion @ np.linalg.inv(A)
+
+    def scattered(self):
+        """Give each frame a view of its own."""
+        rotations = [random_rotation(seed) for seed in range(len(self.motion))]
+        self.motion = np.array([R[:2] for R in rotations]) @ np.diag([1.0, 2.0, 3.0])
+        return self
+
+
+def coefficients(scene, gauge):
+    """Return alpha for the canonical basis, from the order and the scales."""
+    A = canonical_space(scene.mean_shape, scene.motion)
+    before = scene.basis[gauge.order] @ A.T
+    ratio = np.sum(gauge.basis * before, axis=(1, 2)) / np.sum(before**2, axis=(1, 2))
+    assert_allclose(gauge.basis, ratio[:, None, None] * before, atol=1e-10)
+    return scene.alpha[:, gauge.order] / ratio
+
+
+class TestSpace:
+    def test_mean_shape_is_white_and_centred(self):
+        gauge, _ = Scene().canonical()
+        B = gauge.mean_shape
+        assert_allclose(B.mean(axis=0), 0, atol=1e-13)
+        assert_allclose(B.T @ B / len(B), np.eye(3), atol=1e-13)
+
+    def test_rows_of_the_mean_camera_are_in_the_plane_of_x_and_y(self):
+        _, motion = Scene().canonical()
+        view = mean_view(motion)
+        assert_allclose(view[:, 2], 0, atol=1e-13)
+        # As near to the axes as can be: no rotation in the plane brings them nearer.
+        assert_allclose(view[0, 1], view[1, 0], atol=1e-13)
+        assert np.trace(view[:, :2]) > 0
+        assert np.linalg.det(view[:, :2]) > 0
+
+    def test_images_stay_as_they_are(self):
+        scene = Scene()
+        A = canonical_space(scene.mean_shape, scene.motion)
+        before = scene.motion @ scene.mean_shape.T
+        after = (scene.motion @ np.linalg.inv(A)) @ (scene.mean_shape @ A.T).T
+        assert_allclose(after, before, atol=1e-12)
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_depth_is_skewed_to_the_positive_side(self, seed):
+        gauge, _ = Scene(seed).canonical()
+        assert np.sum(gauge.mean_shape[:, 2] ** 3) > 0
+
+    def test_scattered_views_have_their_principal_axes(self):
+        scene = Scene(n_frames=300).scattered()
+        gauge, motion = scene.canonical()
+        assert mean_view(motion) is None
+        B = gauge.mean_shape
+        assert_allclose(B.T @ B / len(B), np.eye(3), atol=1e-13)
+        second = np.einsum("irc,ird->cd", motion, motion)
+        assert_allclose(second, np.diag(np.diag(second)), atol=1e-10 * second.max())
+        assert np.all(np.diff(np.diag(second)) < 0)
+        assert np.all(np.sum(B**3, axis=0) > 0)
+
+    @pytest.mark.parametrize("scattered", [False, True])
+    @pytest.mark.parametrize("mirrored", [False, True])
+    def test_any_affinity_before_leads_to_the_same_space(self, scattered, mirrored):
+        scene = Scene(n_frames=300)
+        if scattered:
+            scene.scattered()
+        expected, expected_motion = scene.canonical()
+        A = np.random.default_rng(1).normal(size=(3, 3))
+        A[0] *= np.sign(np.linalg.det(A)) * (-1 if mirrored else 1)
+        scene.mean_shape, scene.basis = scene.mean_shape @ A.T, scene.basis @ A.T
+        scene.motion = scene.motion @ np.linalg.inv(A)
+        gauge, motion = scene.canonical()
+        assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-10)
+        assert_allclose(gauge.basis, expected.basis, atol=1e-8)
+        assert_allclose(motion, expected_motion, atol=1e-10)
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units_of_space(self, unit):
+        expected, expected_motion = Scene().canonical()
+        scene = Scene()
+        scene.mean_shape, scene.basis = unit * scene.mean_shape, unit * scene.basis
+        scene.motion = scene.motion / unit
+        gauge, motion = scene.canonical()
+        assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-12)
+        assert_allclose(gauge.basis, expected.basis, atol=1e-11)
+        assert_allclose(motion, expected_motion, atol=1e-12)
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units_of_the_cameras(self, unit):
+        expected, _ = Scene().canonical()
+        scene = Scene()
+        scene.motion = unit * scene.motion
+        gauge, _ = scene.canonical()
+        assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-12)
+        assert_allclose(gauge.basis, expected.basis, atol=1e-11)
+
+    def test_rotated_images_of_scattered_views(self):
+        # Where no view is common, rotating single images changes nothing.
+        scene = Scene(n_frames=300).scattered()
+        expected, _ = scene.canonical()
+        rows = rotate_frames(scene.motion.reshape(-1, 3), 1)
+        scene.motion = rows.reshape(-1, 2, 3)
+        assert mean_view(scene.canonical()[1]) is None
+        assert_allclose(scene.canonical()[0].basis, expected.basis, atol=1e-10)
+
+    def test_order_of_frames(self):
+        scene = Scene()
+        expected, _ = scene.canonical()
+        rows, order = permute_frames(scene.motion.reshape(-1, 3), 1)
+        scene.motion, scene.alpha = rows.reshape(-1, 2, 3), scene.alpha[order]
+        gauge, _ = scene.canonical()
+        assert_allclose(gauge.basis, expected.basis, atol=1e-11)
+
+    def test_order_of_points(self):
+        scene = Scene()
+        expected, _ = scene.canonical()
+        order = np.random.default_rng(1).permutation(25)
+        scene.mean_shape, scene.basis = scene.mean_shape[order], scene.basis[:, order]
+        gauge, _ = scene.canonical()
+        assert_allclose(gauge.mean_shape, expected.mean_shape[order], atol=1e-11)
+        assert_allclose(gauge.basis, expected.basis[:, order], atol=1e-11)
+
+    @pytest.mark.parametrize("flat", [1, 2])
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    def test_flat_object(self, flat, unit):
+        scene = Scene(flat=flat)
+        R = random_rotation(4)
+        scene.mean_shape, scene.motion = unit * scene.mean_shape @ R, scene.motion @ R
+        gauge, motion = scene.canonical()
+        B = gauge.mean_shape
+        variances = np.sort(np.linalg.eigvalsh(B.T @ B / len(B)))[::-1]
+        assert_allclose(variances, [1.0] * (3 - flat) + [0.0] * flat, atol=1e-9)
+        assert_allclose(
+            motion @ B.T, scene.motion @ scene.mean_shape.T, atol=1e-8 * unit
+        )
+        assert np.isfinite(gauge.basis).all()
+
+
+class TestBasis:
+    def test_images_stay_as_they_are(self):
+        scene = Scene()
+        gauge, motion = scene.canonical()
+        alpha = coefficients(scene, gauge)
+        before = compose(scene.mean_shape, scene.basis, scene.alpha)
+        after = compose(gauge.mean_shape, gauge.basis, alpha)
+        assert_allclose(
+            project(after, motion, np.zeros(2)),
+            project(before, scene.motion, np.zeros(2)),
+            atol=1e-10,
+        )
+
+    def test_coefficients_have_unit_variance_and_are_skewed_to_the_positive_side(self):
+        scene = Scene()
+        gauge, _ = scene.canonical()
+        alpha = coefficients(scene, gauge)
+        assert_allclose(alpha.std(axis=0), 1)
+        assert np.all(np.sum(alpha**3, axis=0) > 0)
+
+    def test_ordered_by_energy_in_the_images(self):
+        scene = Scene()
+        gauge, motion = scene.canonical()
+        alpha = coefficients(scene, gauge)
+        energies = [
+            np.sum((alpha[:, k, None, None] * (motion @ gauge.basis[k].T)) ** 2)
+            for k in range(3)
+        ]
+        assert_array_equal(np.argsort(energies)[::-1], [0, 1, 2])
+        assert sorted(gauge.order) == [0, 1, 2]
+
+    def test_energies_by_plain_loops(self):
+        scene = Scene()
+        expected = [
+            sum(
+                np.sum((a * M @ B.T) ** 2)
+                for a, M in zip(scene.alpha[:, k], scene.motion, strict=True)
+            )
+            for k, B in enumerate(scene.basis)
+        ]
+        energies = image_energies(scene.motion, scene.basis, scene.alpha)
+        assert_allclose(energies, expected)
+
+    def test_order_signs_and_scales_before_do_not_matter(self):
+        scene = Scene()
+        expected, _ = scene.canonical()
+        factors = np.array([-3.0, 1e-6, 1e6])
+        order = np.array([2, 0, 1])
+        scene.basis = (factors[:, None, None] * scene.basis)[order]
+        scene.alpha = (scene.alpha / factors)[:, order]
+        gauge, _ = scene.canonical()
+        assert_allclose(gauge.basis, expected.basis, rtol=1e-9, atol=1e-10)
+        assert_array_equal(order[gauge.order], expected.order)
+
+    def test_coefficients_that_do_not_vary_have_unit_mean_square(self):
+        scene = Scene()
+        scene.alpha[:, 1] = -7.0
+        gauge, _ = scene.canonical()
+        alpha = coefficients(scene, gauge)
+        k = int(np.flatnonzero(gauge.order == 1)[0])
+        assert_allclose(alpha[:, k], 1)
+
+    def test_basis_shape_without_motion(self):
+        scene = Scene()
+        scene.alpha[:, 1] = 0
+        gauge, _ = scene.canonical()
+        assert_array_equal(gauge.basis[2], 0)
+        assert gauge.order[2] == 1
+        assert np.isfinite(gauge.basis).all()
+
+    def test_basis_shape_whose_motion_is_rounding_errors(self):
+        scene = Scene()
+        scene.basis[1] *= 1e-15
+        gauge, _ = scene.canonical()
+        assert_array_equal(gauge.basis[2], 0)
+        assert gauge.order[2] == 1
+
+    def test_weak_basis_shape(self):
+        scene = Scene()
+        scene.basis[1] *= 1e-6
+        gauge, _ = scene.canonical()
+        assert np.abs(gauge.basis[2]).max() > 1e-7
+
+    def test_basis_shape_of_zeros(self):
+        scene = Scene()
+        scene.basis[0] = 0
+        gauge, _ = scene.canonical()
+        assert_array_equal(gauge.basis[2], 0)
+        assert gauge.order[2] == 0
+
+    def test_a_gauge_applied_twice(self):
+        scene = Scene()
+        gauge, motion = scene.canonical()
+        alpha = coefficients(scene, gauge)
+        again = canonical_gauge(gauge.mean_shape, gauge.basis, motion, alpha)
+        assert_allclose(again.mean_shape, gauge.mean_shape, atol=1e-12)
+        assert_allclose(again.basis, gauge.basis, atol=1e-10)
+        assert_array_equal(again.order, [0, 1, 2])
+
+    def test_frame_fits_to_the_canonical_shapes(self):
+        # The rigid cameras of the canonical shapes are the canonical cameras.
+        scene = Scene()
+        gauge, motion = scene.canonical()
+        tracks = project(gauge.mean_shape, motion, np.zeros(2))
+        fitted = fit_frames(tracks, np.zeros((30, 2)), gauge.mean_shape, gauge.basis)
+        assert_allclose(fitted.motion, motion, atol=1e-12)
+
+
+class TestReorderBlocks:
+    def test_by_hand(self):
+        matrix = np.arange(81.0).reshape(9, 9)
+        order = np.array([2, 0, 1])
+        got = reorder_blocks(matrix, order)
+        for a in range(3):
+            for b in range(3):
+                expected = matrix[
+                    3 * order[a] : 3 * order[a] + 3, 3 * order[b] : 3 * order[b] + 3
+                ]
+                assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)
+
+    def test_in_order(self):
+        matrix = np.arange(36.0).reshape(6, 6)
+        assert_array_equal(reorder_blocks(matrix, np.arange(2)), matrix)

@@ -1,0 +1,296 @@
+"""AffineNRSfM on random small tables: invariances, finite numbers, errors."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import BaseEstimator
+from sklearn.exceptions import ConvergenceWarning
+
+from isa_nrsfm import AffineNRSfM, FastISA
+
+few_examples = settings(max_examples=25, deadline=None, derandomize=True, database=None)
+seeds = st.integers(0, 2**32 - 1)
+scaled = st.booleans()
+
+
+class AsTheyCome(BaseEstimator):
+    """A strategy that leaves the signals as they are.
+
+    The iterations of the others amplify rounding errors on tables of noise; with it
+    the results are as exact as the rest of the method is.
+    """
+
+    def fit(self, signals):
+        self.components_ = np.eye(signals.shape[1])
+        return self
+
+
+def fit(tracks, n_components, isa=None, **params):
+    """Return the model of tracks; warnings of convergence and layout do not count."""
+    isa = AsTheyCome() if isa is None else isa
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        # Tables of noise look alike in both layouts.
+        warnings.filterwarnings("ignore", message="layout=", category=UserWarning)
+        model = AffineNRSfM(n_components, isa=isa, random_state=0, **params)
+        return model.fit(tracks.reshape(len(tracks), -1))
+
+
+@st.composite
+def tables(draw):
+    """Return tracks of a deforming object with noise, and K."""
+    rng = np.random.default_rng(draw(seeds))
+    n_components = draw(st.integers(1, 2))
+    n_points = draw(st.integers(3 * n_components + 6, 22))
+    n_frames = draw(st.integers(4 * n_components + 12, 40))
+    shape, *basis = rng.normal(size=(n_components + 1, n_points, 3))
+    alpha = 0.4 * rng.normal(size=(n_frames, n_components)) ** 3
+    shapes = shape + np.tensordot(alpha, basis, axes=1)
+    motion = np.eye(2, 3) + 0.5 * rng.normal(size=(n_frames, 2, 3))
+    position = 3 * rng.normal(size=(n_frames, 1, 2))
+    noise = 0.02 * rng.normal(size=(n_frames, n_points, 2))
+    return shapes @ motion.transpose(0, 2, 1) + position + noise, n_components
+
+
+def rotations(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def all_shapes(model):
+    return np.concatenate([model.mean_shape_[None], model.basis_])
+
+
+def assert_same(model, expected, frames=slice(None), points=slice(None)):
+    """Compare coefficients, and shapes up to an orthogonal transform of space."""
+    size = np.abs(expected.alpha_).max()
+    assert_allclose(model.alpha_, expected.alpha_[frames], atol=1e-6 * size, rtol=0)
+    shapes, truth = all_shapes(model), all_shapes(expected)[:, points]
+    U, _, Vt = np.linalg.svd(shapes.reshape(-1, 3).T @ truth.reshape(-1, 3))
+    assert_allclose(shapes @ U @ Vt, truth, atol=1e-6 * np.abs(truth).max(), rtol=0)
+
+
+# --- invariances --------------------------------------------------------------------
+
+
+@few_examples
+@given(tables(), seeds, scaled, st.floats(-9, 9), st.booleans())
+def test_similarities_of_the_image(table, seed, scale_frames, exponent, mirrored):
+    tracks, n_components = table
+    rng = np.random.default_rng(seed)
+    R = rotations(rng.uniform(0, 2 * np.pi)) * ([1, -1] if mirrored else [1, 1])
+    changed = 10.0**exponent * (tracks @ R + 50 * rng.normal(size=2))
+    first, second = (
+        fit(each, n_components, scale_frames=scale_frames) for each in (tracks, changed)
+    )
+    assert_same(second, first)
+    assert_allclose(second.inverse_snr_, first.inverse_snr_, rtol=1e-6)
+
+
+@few_examples
+@given(tables(), seeds)
+def test_similarities_of_single_frames(table, seed):
+    tracks, n_components = table
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, len(tracks))
+    size = np.exp(rng.normal(size=(len(tracks), 1, 1)))
+    changed = size * (tracks @ rotations(angle)) + rng.normal(size=(len(tracks), 1, 2))
+    first = fit(tracks, n_components)
+    assert_same(fit(changed, n_components), first)
+    alpha = first.transform(changed.reshape(len(tracks), -1))
+    assert_allclose(alpha, first.alpha_, atol=1e-8 * np.abs(alpha).max())
+
+
+@few_examples
+@given(tables(), seeds, st.integers(0, 11), scaled)
+def test_rotation_of_one_frame(table, seed, frame, scale_frames):
+    tracks, n_components = table
+    changed = tracks.copy()
+    changed[frame] @= rotations(np.random.default_rng(seed).uniform(0, 2 * np.pi))
+    first, second = (
+        fit(each, n_components, scale_frames=scale_frames) for each in (tracks, changed)
+    )
+    assert_same(second, first)
+
+
+@few_examples
+@given(tables(), seeds, scaled)
+def test_order_of_frames_and_points(table, seed, scale_frames):
+    tracks, n_components = table
+    rng = np.random.default_rng(seed)
+    frames, points = (rng.permutation(n) for n in tracks.shape[:2])
+    first = fit(tracks, n_components, scale_frames=scale_frames)
+    changed = fit(tracks[frames][:, points], n_components, scale_frames=scale_frames)
+    assert_same(changed, first, frames, points)
+
+
+@few_examples
+@given(tables(), scaled)
+def test_layouts_are_two_ways_to_write_the_same(table, scale_frames):
+    tracks, n_components = table
+    first = fit(tracks, n_components, scale_frames=scale_frames)
+    planar = tracks.transpose(0, 2, 1)
+    second = fit(planar, n_components, layout="planar", scale_frames=scale_frames)
+    assert_same(second, first)
+    table = planar.reshape(len(planar), -1)
+    assert_allclose(
+        second.reproject(table).reshape(planar.shape).transpose(0, 2, 1).ravel(),
+        first.reproject(tracks.reshape(len(tracks), -1)).ravel(),
+        atol=1e-6 * np.abs(tracks).max(),
+    )
+
+
+# --- formula ------------------------------------------------------------------------
+
+
+@few_examples
+@given(tables(), seeds, scaled)
+def test_tables_that_the_model_makes_are_taken_apart_again(table, seed, scale_frames):
+    tracks, n_components = table
+    model = fit(tracks, n_components, scale_frames=scale_frames)
+    rng = np.random.default_rng(seed)
+    alpha = rng.normal(size=(7, n_components))
+    motion = np.eye(2, 3) + 0.5 * rng.normal(size=(7, 2, 3))
+    translation = 10 * rng.normal(size=(7, 2))
+    made = model.inverse_transform(alpha, motion, translation)
+    shapes = model.mean_shape_ + np.einsum("ik,kjc->ijc", alpha, model.basis_)
+    expected = np.einsum("ijc,irc->ijr", shapes, motion) + translation[:, None]
+    assert_allclose(made.reshape(7, -1, 2), expected, atol=1e-12 * np.abs(made).max())
+    found = model.decompose(made)
+    assert_allclose(found.motion, motion, atol=1e-8)
+    assert_allclose(found.translation, translation, atol=1e-8)
+    assert_allclose(found.alpha, alpha, atol=1e-7)
+    assert_allclose(model.reproject(made), made, atol=1e-7 * np.abs(made).max())
+    assert -1e-12 < model.score(made) <= 0
+
+
+@few_examples
+@given(tables(), scaled)
+def test_fitted_table(table, scale_frames):
+    tracks, n_components = table
+    X = tracks.reshape(len(tracks), -1)
+    model = fit(tracks, n_components, scale_frames=scale_frames)
+    assert_allclose(model.transform(X), model.alpha_, atol=1e-10)
+    assert_allclose(model.transform(X[3:4]), model.alpha_[3:4], atol=1e-8)
+    assert_allclose(model.score(X), -model.inverse_snr_, rtol=1e-12)
+    assert 0 <= model.rank_floor_ <= model.inverse_snr_ < 1
+    assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
+    assert np.all(np.mean(model.alpha_**3, axis=0) > -1e-6)
+    second = model.mean_shape_.T @ model.mean_shape_ / tracks.shape[1]
+    assert_allclose(second, np.eye(3), atol=1e-10)
+    assert_array_equal(
+        fit(tracks, n_components, scale_frames=scale_frames).alpha_, model.alpha_
+    )
+
+
+# --- degenerate tables --------------------------------------------------------------
+
+
+@few_examples
+@given(seeds, st.integers(1, 3), st.integers(1, 2), scaled)
+def test_tables_of_small_integers_give_finite_numbers(
+    seed, largest, n_components, scale_frames
+):
+    rng = np.random.default_rng(seed)
+    size = (rng.integers(8, 14), rng.integers(10, 14), 2)
+    tracks = rng.integers(0, largest + 1, size)
+    assume(np.all(np.any(tracks != tracks[:, :1], axis=(1, 2))))
+    for isa in (None, FastISA(n_init=1)):
+        model = fit(tracks, n_components, isa, scale_frames=scale_frames)
+        for name, value in vars(model).items():
+            if name.endswith("_") and isinstance(value, np.ndarray | float):
+                assert np.isfinite(value).all(), name
+        assert model.inverse_snr_ < 1
+        assert np.isfinite(model.reproject(tracks.reshape(len(tracks), -1))).all()
+
+
+@few_examples
+@given(seeds, st.integers(0, 4), st.integers(1, 3))
+def test_tables_of_low_rank_give_finite_numbers(seed, rank, n_components):
+    rng = np.random.default_rng(seed)
+    W = rng.normal(size=(40, rank + 1)) @ rng.normal(size=(rank + 1, 16))
+    tracks = W.reshape(20, 2, 16).transpose(0, 2, 1)
+    model = fit(tracks, n_components)
+    assert np.isfinite(model.alpha_).all()
+    assert np.isfinite(model.basis_).all()
+    used = max(rank + 1 - 3, 0)
+    n_empty = max(n_components - -(-used // 3), 0)
+    assert np.all(model.alpha_[:, n_components - n_empty :] == 0)
+    assert np.all(model.basis_[n_components - n_empty :] == 0)
+
+
+# --- errors -------------------------------------------------------------------------
+
+
+@few_examples
+@given(st.integers(5, 12), st.integers(0, 20), seeds)
+def test_odd_numbers_of_columns_are_refused(n_frames, half, seed):
+    X = np.random.default_rng(seed).normal(size=(n_frames, 2 * half + 3))
+    with pytest.raises(ValueError, match=f"even number; got n_features={2 * half + 3}"):
+        AffineNRSfM(1).fit(X)
+
+
+@few_examples
+@given(st.integers(2, 30), st.integers(1, 20), st.integers(1, 6), seeds)
+def test_tables_are_refused_if_and_only_if_they_are_too_small(
+    n_frames, n_points, n_components, seed
+):
+    tracks = np.random.default_rng(seed).normal(size=(n_frames, n_points, 2))
+    largest = (n_points - 4) // 3
+    smallest = int(np.ceil(8 * (n_components + 2) / 5))
+    if n_components > largest:
+        message = (
+            f"largest possible n_components is {largest}$"
+            if largest > 0
+            else "at least 7 points are needed for n_components=1$"
+        )
+        with pytest.raises(ValueError, match=message):
+            fit(tracks, n_components)
+    elif n_frames < smallest:
+        with pytest.raises(ValueError, match=f"at least {smallest} frames"):
+            fit(tracks, n_components)
+    else:
+        assert fit(tracks, n_components).basis_.shape == (n_components, n_points, 3)
+
+
+@few_examples
+@given(
+    tables(),
+    st.sampled_from([np.nan, np.inf, -np.inf]),
+    st.integers(0, 11),
+    st.integers(0, 8),
+    st.integers(0, 1),
+)
+def test_values_that_are_no_numbers_are_refused(table, value, frame, point, axis):
+    tracks, n_components = table
+    broken = tracks.copy()
+    broken[frame, point, axis] = value
+    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
+        fit(broken, n_components)
+    model = fit(tracks, n_components)
+    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
+        model.transform(broken.reshape(len(broken), -1))
+
+
+@few_examples
+@given(
+    tables(),
+    st.sets(st.integers(0, 15), min_size=1),
+    st.floats(-1e6, 1e6),
+    st.sampled_from([np.float32, np.float64]),
+)
+def test_frames_of_equal_points_are_refused(table, rows, value, dtype):
+    tracks, n_components = table
+    assume(max(rows) < len(tracks))
+    broken = tracks.astype(dtype)
+    broken[sorted(rows)] = np.array([value, -3.0 * value], dtype)
+    message = rf"equal in {len(rows)} frame\(s\), the first is row {min(rows)}$"
+    with pytest.raises(ValueError, match=message):
+        fit(broken, n_components)
+    model = fit(tracks, n_components)
+    with pytest.raises(ValueError, match=message):
+        model.decompose(broken.reshape(len(broken), -1))

@@ -1,0 +1,402 @@
+"""Alternating refinement: optimality, monotone energies, degenerate blocks."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import (
+    measurements,
+    permute_frames,
+    random_rotation,
+    rotate_frames,
+    structured_motion,
+)
+
+from isa_nrsfm._block_structure import (
+    frame_products,
+    leading_blocks,
+    lifted_moments,
+    recover_blocks,
+)
+from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._refinement import _state, _steps, refine_alternating
+from isa_nrsfm.isa import PooledFastICA
+
+
+def frames(rigid, motion):
+    """Return M_0 (I, 2, 3) and M (I, 2, n_signals)."""
+    return rigid.reshape(-1, 2, 3), motion.reshape(len(rigid) // 2, 2, -1)
+
+
+def explained(M_0, M, E):
+    """Return ``f(E) = sum_i <M_i, M_0^i E>^2 / ||M_0^i E||^2``."""
+    image = M_0 @ E
+    return np.sum(np.sum(M * image, axis=(1, 2)) ** 2 / np.sum(image**2, axis=(1, 2)))
+
+
+def alternate(M_0, M, E, n_steps):
+    """Return E and the energies of plain alternating least squares."""
+    energies = [explained(M_0, M, E)]
+    for _ in range(n_steps):
+        image = M_0 @ E
+        alpha = np.sum(M * image, axis=(1, 2)) / np.sum(image**2, axis=(1, 2))
+        A = (alpha[:, None, None] * M_0).reshape(-1, 3)
+        E = np.linalg.lstsq(A, M.reshape(-1, 3))[0]
+        energies.append(explained(M_0, M, E))
+    return E, np.array(energies)
+
+
+def gradient(M_0, M, E):
+    """Return R - A E, half the gradient of f."""
+    image = M_0 @ E
+    alpha = np.sum(M * image, axis=(1, 2)) / np.sum(image**2, axis=(1, 2))
+    R = np.einsum("i,ira,irb->ab", alpha, M_0, M)
+    A = np.einsum("i,ira,irb->ab", alpha**2, M_0, M_0)
+    return R - A @ E, np.linalg.norm(R)
+
+
+def differences(function, E, step):
+    """Return central finite differences of a function of a 3x3 matrix."""
+    columns = []
+    for direction in step * np.eye(9).reshape(9, 3, 3):
+        columns.append((function(E + direction) - function(E - direction)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def random_starts(seed, n_blocks, n_starts=1):
+    return np.random.default_rng(seed).normal(size=(n_blocks, n_starts, 3, 3))
+
+
+def refine(rigid, motion, starts, max_iter=500, tol=1e-14):
+    products = frame_products(rigid, motion)
+    return refine_alternating(products, starts, max_iter=max_iter, tol=tol)
+
+
+def same_up_to_sign(A, B, **tolerance):
+    sign = np.sign(np.sum(A * B, axis=(1, 2)))[:, None, None]
+    assert_allclose(sign * A, B, **tolerance)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return structured_motion(0, n_frames=40, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def result(scene):
+    return refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+
+
+class TestOptimum:
+    @pytest.mark.parametrize("seed", range(5))
+    def test_exact_motion_is_recovered(self, seed):
+        exact = structured_motion(seed)
+        starts = random_starts(seed, 3, 8)
+        result = refine(exact.rigid, exact.motion, starts)
+        assert result.converged
+        norm = np.linalg.norm(exact.E, axis=(1, 2), keepdims=True)
+        same_up_to_sign(result.E, exact.E / norm, atol=1e-8)
+        assert_allclose(result.energy.sum(), np.sum(exact.motion**2), rtol=1e-13)
+
+        M_0, M = frames(exact.rigid, exact.motion)
+        for k in range(3):
+            image = M_0 @ result.E[k]
+            inner = np.sum(image * M[:, :, 3 * k : 3 * k + 3], axis=(1, 2))
+            ratio = inner / np.sum(image**2, axis=(1, 2)) / exact.alpha[:, k]
+            assert_allclose(ratio, ratio[0], rtol=1e-6)
+
+    def test_blocks_have_unit_norm_and_the_energy_they_say(self, scene):
+        result = refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+        M_0, M = frames(scene.rigid, scene.motion)
+        assert_allclose(np.linalg.norm(result.E, axis=(1, 2)), 1)
+        for k in range(3):
+            energy = explained(M_0, M[:, :, 3 * k : 3 * k + 3], result.E[k])
+            assert_allclose(result.energy[k], energy, rtol=1e-13)
+
+    def test_gradient_vanishes(self, scene):
+        result = refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+        M_0, M = frames(scene.rigid, scene.motion)
+        for k in range(3):
+            part = M[:, :, 3 * k : 3 * k + 3]
+            half, size = gradient(M_0, part, result.E[k])
+            assert np.linalg.norm(half) < 1e-6 * size
+            slopes = differences(lambda E: explained(M_0, part, E), result.E[k], 1e-5)  # noqa: B023
+            assert_allclose(slopes, 0, atol=1e-6 * result.energy[k])
+
+    @pytest.mark.parametrize("seed", range(6))
+    def test_not_below_plain_alternation_from_the_same_start(self, scene, seed):
+        starts = random_starts(seed, 3)
+        result = refine(scene.rigid, scene.motion, starts)
+        M_0, M = frames(scene.rigid, scene.motion)
+        for k in range(3):
+            part = M[:, :, 3 * k : 3 * k + 3]
+            _, energies = alternate(M_0, part, starts[k, 0], 500)
+            assert result.energy[k] >= energies[-1] * (1 - 1e-9)
+
+    def test_best_of_the_starts_is_taken(self, scene):
+        starts = random_starts(0, 3, 12)
+        together = refine(scene.rigid, scene.motion, starts)
+        single = [
+            refine(scene.rigid, scene.motion, starts[:, s : s + 1]).energy
+            for s in range(12)
+        ]
+        # Trial steps are few, so the best start may be missed, but not by much.
+        assert np.all(together.energy >= 0.99 * np.max(single, axis=0))
+        assert np.all(together.energy >= np.median(single, axis=0) * (1 - 1e-9))
+
+    def test_a_start_at_the_optimum_stays_there(self, scene):
+        first = refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+        again = refine(scene.rigid, scene.motion, first.E[:, None])
+        same_up_to_sign(again.E, first.E, atol=1e-6)
+        assert_allclose(again.energy, first.energy, rtol=1e-12)
+        assert again.n_iter <= 3
+
+    def test_energies_rise_with_every_step(self, scene):
+        starts = random_starts(3, 3)
+        energies = np.array(
+            [refine(scene.rigid, scene.motion, starts, n).energy for n in range(1, 15)]
+        )
+        assert np.all(np.diff(energies, axis=0) >= -1e-13 * energies[-1])
+        assert np.all(energies[-1] > energies[0])
+
+    def test_few_steps_do_not_converge(self, scene):
+        result = refine(scene.rigid, scene.motion, random_starts(3, 3), max_iter=1)
+        assert not result.converged
+        assert result.n_iter == 1
+
+    def test_tolerance_is_kept(self, scene):
+        starts = random_starts(3, 3, 4)
+        best = refine(scene.rigid, scene.motion, starts)
+        for tol in (1e-3, 1e-6, 1e-10):
+            result = refine(scene.rigid, scene.motion, starts, tol=tol)
+            assert result.converged
+            assert result.n_iter <= best.n_iter
+            assert np.all(result.energy >= best.energy * (1 - 5 * tol))
+
+
+class TestDerivatives:
+    """The model behind the Newton step, against finite differences."""
+
+    def setup_method(self):
+        scene = structured_motion(1, n_frames=40, n_blocks=1, noise=0.3)
+        self.M_0, self.M = frames(scene.rigid, scene.motion)
+        products = frame_products(scene.rigid, scene.motion)
+        self.P, self.rigid = products.blocks()[0], products.rigid
+        self.optimum = refine(scene.rigid, scene.motion, random_starts(0, 1, 4)).E[0]
+        self.near = self.optimum + 0.05 * random_starts(1, 1)[0, 0]
+
+    def value(self, E):
+        return explained(self.M_0, self.M, E)
+
+    def test_sums_over_the_frames(self):
+        state = _state(self.P, self.rigid, self.near)
+        half, _ = gradient(self.M_0, self.M, state.E)
+        assert_allclose(state.R - state.A @ state.E, half, atol=1e-10)
+        assert_allclose(state.energy, self.value(self.near))
+
+    def test_gradient(self):
+        state = _state(self.P, self.rigid, self.near)
+        slopes = differences(self.value, state.E, 1e-5).reshape(3, 3)
+        half = state.R - state.A @ state.E
+        assert_allclose(2 * half, slopes, atol=1e-7 * self.value(self.near))
+
+    def test_newton_step_solves_the_quadratic_model(self):
+        # So near to the optimum that the gradient has no part along E itself, where
+        # f does not change.
+        near = self.optimum + 1e-4 * random_starts(1, 1)[0, 0]
+        state = _state(self.P, self.rigid, near)
+        hessian = differences(
+            lambda E: gradient(self.M_0, self.M, E)[0].ravel(), state.E, 1e-6
+        )
+        _, newton, gain = _steps(self.P, self.rigid, state)
+        half = (state.R - state.A @ state.E).ravel()
+        assert_allclose(-hessian @ newton.ravel(), half, atol=1e-3 * abs(half).max())
+        assert_allclose(gain, half @ newton.ravel(), rtol=1e-10)
+
+    def test_newton_steps_converge_quadratically(self):
+        distances = []
+        for size in (1e-2, 1e-3):
+            near = self.optimum + size * random_starts(1, 1)[0, 0]
+            state = _state(self.P, self.rigid, near)
+            _, newton, _ = _steps(self.P, self.rigid, state)
+            after = state.E + newton
+            after *= np.sign(np.sum(after * self.optimum)) / np.linalg.norm(after)
+            distances.append(np.linalg.norm(after - self.optimum))
+        assert distances[0] < 0.1 * 1e-2
+        assert distances[1] < 0.03 * distances[0]
+
+    def test_promised_gain_comes_true(self):
+        state = _state(self.P, self.rigid, self.near)
+        _, newton, gain = _steps(self.P, self.rigid, state)
+        small = 1e-4
+        rise = self.value(state.E + small * newton) - self.value(state.E)
+        assert_allclose(rise / small, 2 * gain, rtol=1e-2)
+
+    def test_plain_step_is_that_of_alternation(self):
+        state = _state(self.P, self.rigid, self.near)
+        plain, _, _ = _steps(self.P, self.rigid, state)
+        expected, _ = alternate(self.M_0, self.M, state.E, 1)
+        assert_allclose(state.E + plain, expected, atol=1e-10)
+
+    def test_alternation_never_lowers_the_energy(self):
+        for seed in range(10):
+            _, energies = alternate(self.M_0, self.M, random_starts(seed, 1)[0, 0], 30)
+            assert np.all(np.diff(energies) >= -1e-12 * energies[-1])
+
+
+class TestInvariances:
+    def test_rotation_of_single_frames(self, scene, result):
+        rigid, motion = rotate_frames(scene.rigid, 1), rotate_frames(scene.motion, 1)
+        other = refine(rigid, motion, random_starts(0, 3, 4))
+        same_up_to_sign(other.E, result.E, atol=1e-6)
+
+    def test_order_of_frames(self, scene, result):
+        rigid, _ = permute_frames(scene.rigid, 1)
+        motion, _ = permute_frames(scene.motion, 1)
+        other = refine(rigid, motion, random_starts(0, 3, 4))
+        same_up_to_sign(other.E, result.E, atol=1e-6)
+
+    def test_order_of_subspaces(self, scene, result):
+        order = [2, 0, 1]
+        motion = scene.motion.reshape(-1, 3, 3)[:, order].reshape(-1, 9)
+        other = refine(scene.rigid, motion, random_starts(0, 3, 4)[order])
+        same_up_to_sign(other.E, result.E[order], atol=1e-6)
+
+    @pytest.mark.parametrize("unit", [1e-9, 1e9])
+    def test_units(self, scene, result, unit):
+        for of_rigid, of_motion in ((unit, unit), (1.0, unit), (unit, 1.0)):
+            other = refine(
+                of_rigid * scene.rigid,
+                of_motion * scene.motion,
+                random_starts(0, 3, 4),
+            )
+            same_up_to_sign(other.E, result.E, atol=1e-6)
+            assert_allclose(other.energy / of_motion**2, result.energy)
+
+    def test_scale_and_sign_of_the_starts(self, scene, result):
+        factors = np.array([1e-6, -1.0, 1e6, -7.0])[:, None, None]
+        other = refine(scene.rigid, scene.motion, factors * random_starts(0, 3, 4))
+        same_up_to_sign(other.E, result.E, atol=1e-6)
+
+    def test_rotation_inside_a_subspace(self, scene, result):
+        R = random_rotation(5)
+        motion = (scene.motion.reshape(-1, 3, 3) @ R).reshape(-1, 9)
+        other = refine(scene.rigid, motion, random_starts(0, 3, 4) @ R)
+        same_up_to_sign(other.E, result.E @ R, atol=1e-6)
+
+
+class TestDegenerate:
+    def test_subspace_without_motion(self, scene):
+        motion = scene.motion.copy()
+        motion[:, 3:6] = 0
+        result = refine(scene.rigid, motion, random_starts(0, 3, 4))
+        assert result.converged
+        assert_array_equal(result.E[1], 0)
+        assert result.energy[1] == 0
+        full = refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+        assert_allclose(result.energy[[0, 2]], full.energy[[0, 2]])
+
+    def test_no_motion_at_all(self, scene):
+        result = refine(scene.rigid, 0 * scene.motion, random_starts(0, 3, 4))
+        assert result.converged
+        assert_array_equal(result.E, 0)
+        assert_array_equal(result.energy, 0)
+
+    def test_zero_starts_are_passed_over(self, scene):
+        starts = random_starts(0, 3, 4)
+        padded = np.concatenate([np.zeros((3, 1, 3, 3)), starts], axis=1)
+        result = refine(scene.rigid, scene.motion, padded)
+        expected = refine(scene.rigid, scene.motion, starts)
+        assert_allclose(result.energy, expected.energy)
+
+    def test_only_zero_starts(self, scene):
+        result = refine(scene.rigid, scene.motion, np.zeros((3, 2, 3, 3)))
+        assert_array_equal(result.E, 0)
+
+    def test_start_that_explains_nothing(self, scene):
+        # The motion lies in the first direction, the start in the last.
+        motion = scene.motion * ([1.0, 0.0, 0.0] * 3)
+        starts = np.zeros((3, 1, 3, 3))
+        starts[:, 0, :, 2] = 1.0
+        result = refine(scene.rigid, motion, starts)
+        assert np.isfinite(result.E).all()
+        assert_array_equal(result.energy, 0)
+
+    @pytest.mark.parametrize("n_moving", [1, 2])
+    def test_subspace_that_moves_in_fewer_directions(self, scene, n_moving):
+        motion = scene.motion.copy()
+        motion[:, n_moving:3] = 0
+        result = refine(scene.rigid, motion, random_starts(0, 3, 4))
+        assert_allclose(result.E[0, :, n_moving:], 0, atol=1e-9)
+        assert_allclose(np.linalg.norm(result.E, axis=(1, 2)), 1)
+
+    @pytest.mark.parametrize("n_flat", [1, 2])
+    def test_flat_rigid_object(self, scene, n_flat):
+        rigid = scene.rigid.copy()
+        rigid[:, 3 - n_flat :] = 0
+        result = refine(rigid, scene.motion, random_starts(0, 3, 4))
+        assert np.isfinite(result.E).all()
+        assert np.all(result.energy > 0)
+
+    def test_frames_that_do_not_see_the_rigid_object(self, scene):
+        rigid = scene.rigid.copy()
+        rigid[:8] = 0
+        result = refine(rigid, scene.motion, random_starts(0, 3, 4))
+        without = refine(rigid[8:], scene.motion[8:], random_starts(0, 3, 4))
+        assert_allclose(result.energy, without.energy)
+
+    def test_repeated_frames(self, scene):
+        rigid, motion = np.tile(scene.rigid, (3, 1)), np.tile(scene.motion, (3, 1))
+        result = refine(rigid, motion, random_starts(0, 3, 4))
+        once = refine(scene.rigid, scene.motion, random_starts(0, 3, 4))
+        assert_allclose(result.energy, 3 * once.energy)
+
+    def test_shark_reaches_the_best_of_random_starts(self, load_data):
+        f = factorise(measurements(load_data("shark_torresani")["W2d"], False), 1)
+        products = frame_products(f.rigid_motion, f.motion)
+        D = recover_blocks(products, "generalized_eigen")
+        start = np.linalg.pinv(D, rcond=1e-9)[:, None]
+        result = refine_alternating(products, start, max_iter=200, tol=1e-10)
+        best = refine(f.rigid_motion, f.motion, random_starts(0, 1, 30)).energy
+        assert_allclose(result.energy, best, rtol=1e-6)
+        assert_allclose(result.E[0, :, 2], 0, atol=1e-9)
+
+        total = np.sum(f.singular_values**2)
+        inverse_snr = (np.sum(f.motion**2) - result.energy.sum()) * 91 / total
+        assert_allclose(inverse_snr, 0.00160, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore:FastICA did not converge")
+@pytest.mark.parametrize(
+    ("name", "step", "K", "shortfall"),
+    [
+        ("ict_bu3dfe_like_68", 4, 3, 1e-8),
+        ("akhter_drink", 1, 3, 0.01),
+        ("faces_wild_68_combined", 8, 3, 0.01),
+    ],
+)
+def test_starts_of_the_pipeline_against_random_ones(
+    load_data, name, step, K, shortfall
+):
+    # The energy has mild local maxima: the few starts may miss one per cent of it.
+    W = measurements(load_data(name)["W2d"][::step])
+    f = factorise(W, K)
+    products = frame_products(f.rigid_motion, f.motion)
+    isa = PooledFastICA(n_init=2, random_state=0)
+    components = isa.fit(f.signals.T, covariance=products.gram).components_
+    U, _, Vt = np.linalg.svd(components)
+    moments = lifted_moments(products)
+    products = products.rotated(U @ Vt)
+
+    E = np.linalg.pinv(recover_blocks(products, "generalized_eigen"), rcond=1e-9)
+    lifted = leading_blocks(moments, (U @ Vt).reshape(K, 3, -1), 2)
+    identity = np.broadcast_to(np.eye(3), (K, 1, 3, 3))
+    starts = np.concatenate([E[:, None], lifted, identity], axis=1)
+    result = refine_alternating(products, starts, max_iter=200, tol=1e-10)
+    assert result.converged
+
+    best = np.zeros(K)
+    for seed in range(15):
+        random = random_starts(seed, K)
+        other = refine_alternating(products, random, max_iter=200, tol=1e-10)
+        best = np.maximum(best, other.energy)
+    assert result.energy.sum() >= best.sum() * (1 - shortfall)
