@@ -31,6 +31,7 @@ from isa_nrsfm._tracks import (
     check_names,
     check_size,
     measurement_matrix,
+    relative_precision,
     table_to_tracks,
     tracks_to_table,
     warn_if_other_layout,
@@ -270,6 +271,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             measurement_matrix(centred / sizes[:, None, None]),
             self.n_components,
             self.isa_,
+            precision=relative_precision(tracks, sizes),
             block_recovery=self.block_recovery,
             refinement=self.refinement,
             max_iter=self.max_iter,
@@ -292,8 +294,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         )
         self.mean_shape_ = gauge.mean_shape.astype(X.dtype)
         self.basis_ = gauge.basis.astype(X.dtype)
-        self.mode_covariance_ = reorder_blocks(result.mode_covariance, gauge.order)
-        self.singular_values_ = result.singular_values
+        unit = 1.0 if self.scale_frames else sizes[0]
+        covariance = reorder_blocks(result.mode_covariance, gauge.order)
+        self.mode_covariance_ = unit**2 * covariance
+        self.singular_values_ = unit * result.singular_values
         self.rank_floor_ = result.rank_floor
         self.n_iter_ = result.n_iter
         self._n_features_out = self.n_components

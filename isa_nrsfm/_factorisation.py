@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
-# A direction whose singular value is below this share of the first holds rounding
-# errors only: it has less than 1e-20 of the energy.
+# A direction whose singular value is below this share of the first is null, whatever
+# the precision of the table: it has less than 1e-20 of the energy.
 NULL_DIRECTION = 1e-10
 
 
@@ -45,7 +45,7 @@ class Factorisation(NamedTuple):
     singular_values: NDArray
 
 
-def factorise(W: NDArray, n_components: int) -> Factorisation:
+def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factorisation:
     """
     Return the rigid and the non-rigid factors of a measurement matrix.
 
@@ -55,6 +55,8 @@ def factorise(W: NDArray, n_components: int) -> Factorisation:
         Measurement matrix, rows centred.
     n_components : int
         K, the number of basis shapes.
+    precision : float, default=0.0
+        Rounding error of the entries of W, relative to their root mean square.
 
     Returns
     -------
@@ -66,7 +68,8 @@ def factorise(W: NDArray, n_components: int) -> Factorisation:
     # The left singular vectors are W V / S: the triangular factor has S and V.
     R = np.linalg.qr(W, mode="r") if len(W) > n_points else W
     _, S, Vt = np.linalg.svd(R, full_matrices=False)
-    rank = int(np.sum(S[: 3 * n_components + 3] > NULL_DIRECTION * S[0]))
+    null = max(NULL_DIRECTION, precision) * S[0]
+    rank = int(np.sum(S[: 3 * n_components + 3] > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
 

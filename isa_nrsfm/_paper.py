@@ -74,6 +74,7 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
+    precision: float = 0.0,
 ) -> PaperResult:
     """
     Run the stages of the paper on a measurement matrix.
@@ -96,6 +97,8 @@ def run_paper_pipeline(
         Tolerance of the refinement.
     report : callable
         Is told what has been done.
+    precision : float, default=0.0
+        Rounding error of the entries of W, relative to their root mean square.
 
     Returns
     -------
@@ -103,7 +106,7 @@ def run_paper_pipeline(
         Shapes before a gauge is chosen.
     """
     n_rows, n_points = W.shape
-    factors = factorise(W, n_components)
+    factors = factorise(W, n_components, precision)
     report("factorisation")
 
     products = frame_products(factors.rigid_motion, factors.motion)

@@ -85,7 +85,7 @@ def refine_alternating(
     n_blocks = len(starts)
     E = np.zeros((n_blocks, 3, 3))
     energy = np.zeros(n_blocks)
-    n_iter = np.zeros(n_blocks, dtype=int)
+    n_iter = np.ones(n_blocks, dtype=int)
     converged = np.ones(n_blocks, dtype=bool)
     for k, P in enumerate(products.blocks()):
         best = _best_start(P, products.rigid, starts[k])

@@ -1,6 +1,9 @@
 """Fixtures shared by all tests."""
 
 import os
+
+os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before scipy is imported
+
 from pathlib import Path
 
 import matplotlib

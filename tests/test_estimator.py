@@ -29,7 +29,7 @@ TABLE = FACES.data
 
 # The run of FastICA that is kept may be one that goes round in a cycle; it says so.
 may_not_converge = pytest.mark.filterwarnings(
-    "ignore:FastICA did not converge:sklearn.exceptions.ConvergenceWarning"
+    "ignore::sklearn.exceptions.ConvergenceWarning"
 )
 
 
@@ -183,10 +183,7 @@ def test_mode_covariance_is_that_of_the_subspaces_in_the_order_of_the_basis(vari
     assert np.linalg.eigvalsh(C)[0] > -1e-12 * np.trace(C)
     tracks = tracks_of(table, model.layout)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
-    if model.scale_frames:
-        weights = frame_weights(tracks, True)
-    else:
-        weights = np.full(len(tracks), 1 / np.mean(centred**2))
+    weights = frame_weights(tracks, model.scale_frames)
     W = np.vstack(list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1)))
     for k, shape in enumerate(model.basis_):
         Q = np.linalg.qr(shape)[0]

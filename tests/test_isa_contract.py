@@ -1,6 +1,7 @@
 """scikit-learn's own checks for the strategies of independent subspace analysis.
 
-With subspaces of one signal any number of columns will do, so no check may fail.
+With subspaces of one signal any number of columns will do, so no check may fail that
+feeds linearly independent signals.
 """
 
 import pytest
@@ -15,7 +16,11 @@ from isa_nrsfm import FastISA, PooledFastICA
     [
         FastISA(subspace_size=1, n_init=2),
         PooledFastICA(subspace_size=1, n_init=2),
-    ]
+    ],
+    expected_failed_checks=lambda estimator: {
+        "check_array_api_input": "feeds signals that depend on each other",
+    },
+    xfail_strict=True,
 )
 def test_scikit_learn_checks(estimator, check):
     check(estimator)

@@ -12,6 +12,7 @@ from sklearn.base import (
     TransformerMixin,
 )
 from sklearn.utils._param_validation import Interval
+from sklearn.utils.parallel import _threadpool_controller_decorator
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 # Signals whose smallest variance is below this share of the largest are dependent.
@@ -34,6 +35,8 @@ class BaseSubspaceAnalysis(
 
     subspace_size: int
 
+    # Threads cost more than they give on matrices of this size.
+    @_threadpool_controller_decorator(limits=1, user_api="blas")
     def _fit(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(

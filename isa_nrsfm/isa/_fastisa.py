@@ -16,11 +16,17 @@ from sklearn.utils.parallel import Parallel, delayed
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
 from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
-from isa_nrsfm.isa._grouping import likelihood_gains, swap_until_best
+from isa_nrsfm.isa._grouping import (
+    likelihood_gains,
+    rows_by_subspace,
+    swap_until_best,
+)
 
 # Starts that are iterated together: enough to make numpy's overhead small, few enough
 # that their arrays stay in the cache.
 BATCH_SIZE = 8
+# The single components are a start only: inside a subspace they may not be determined.
+ICA_TOL = 1e-4
 
 
 class FastISA(BaseSubspaceAnalysis):
@@ -192,7 +198,7 @@ class FastISA(BaseSubspaceAnalysis):
                 f"FastISA did not converge in max_iter={self.max_iter} steps: its "
                 "best start still moves; increase max_iter or tol",
                 ConvergenceWarning,
-                stacklevel=5,
+                stacklevel=6,
             )
         self.log_likelihoods_ = log_likelihoods
         self.log_likelihood_ = float(log_likelihoods[best])
@@ -210,12 +216,14 @@ def _run(
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return unmixing, likelihood, steps and convergence of a batch of starts."""
-    W, n_iter_ica, _ = iterate(starts, Z, 1, density, max_iter=max_iter, tol=tol)
+    W, n_iter_ica, _ = iterate(
+        starts, Z, 1, density, max_iter=max_iter, tol=max(tol, ICA_TOL)
+    )
     n_signals = len(Z)
     first = np.repeat(np.arange(n_signals // subspace_size), subspace_size)
     for r in range(len(W)):
         assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
-        W[r] = W[r][np.argsort(assignment, kind="stable")]
+        W[r] = W[r][rows_by_subspace(assignment)]
     W, n_iter, converged = iterate(
         W, Z, subspace_size, density, max_iter=max_iter, tol=tol
     )

@@ -40,6 +40,12 @@ def swap_until_best(
         assignment[[a, b]] = assignment[[b, a]]
 
 
+def rows_by_subspace(assignment: NDArray) -> NDArray:
+    """Return the signals by subspaces, those in the order of their first signals."""
+    _, first, group = np.unique(assignment, return_index=True, return_inverse=True)
+    return np.argsort(first[group], kind="stable")
+
+
 def covariance_gains(
     covariance: NDArray,
 ) -> Callable[[NDArray], tuple[NDArray, float]]:

@@ -19,6 +19,7 @@ from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise
 from isa_nrsfm.isa._grouping import (
     covariance_gains,
     likelihood_gains,
+    rows_by_subspace,
     swap_until_best,
     value_gains,
 )
@@ -42,7 +43,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
     ----------
     subspace_size : int, default=3
         Dimension of each subspace; the number of signals must be a multiple of it.
-    n_init : int, default=20
+    n_init : int, default=16
         Number of runs of FastICA from different starts. With few samples the runs end
         in different places; the best by the criterion of `fit` is kept.
     fun : {"exp", "logcosh", "cube"}, default="exp"
@@ -102,7 +103,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         self,
         subspace_size: int = 3,
         *,
-        n_init: int = 20,
+        n_init: int = 16,
         fun: str = "exp",
         max_iter: int = 200,
         tol: float = 1e-4,
@@ -197,7 +198,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
                 f"FastICA did not converge in max_iter={self.max_iter} steps; increase "
                 "max_iter or tol, or try another fun",
                 ConvergenceWarning,
-                stacklevel=5,
+                stacklevel=6,
             )
         return W
 
@@ -232,7 +233,7 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
 
 def _subspaces(components: NDArray, assignment: NDArray) -> NDArray:
     """Return the rows of each subspace, (n_subspaces, subspace_size, n_signals)."""
-    rows = components[np.argsort(assignment, kind="stable")]
+    rows = components[rows_by_subspace(assignment)]
     return rows.reshape(assignment.max() + 1, -1, components.shape[1])
 
 
@@ -248,8 +249,7 @@ def _pool_by_covariance(
         return float(energy[assignment[:, None] == assignment].sum())
 
     pooled = max((swap_until_best(first, gains) for first in groupings), key=inside)
-    rows = np.argsort(pooled, kind="stable")
-    return W[rows], inside(pooled) / total if total > 0 else 1.0
+    return W[rows_by_subspace(pooled)], inside(pooled) / total if total > 0 else 1.0
 
 
 def _pool_by_likelihood(
@@ -264,7 +264,7 @@ def _pool_by_likelihood(
         return float(log_likelihood(W[rows], Z, subspace_size, density))
 
     pooled = [swap_until_best(first, gains) for first in groupings]
-    rows = max((np.argsort(a, kind="stable") for a in pooled), key=likelihood)
+    rows = max((rows_by_subspace(a) for a in pooled), key=likelihood)
     return W[rows], likelihood(rows)
 
 
@@ -277,4 +277,4 @@ def _regroup(
         return criterion(components[groups])
 
     gains = value_gains(value, len(W))
-    return W[np.argsort(swap_until_best(assignment, gains), kind="stable")]
+    return W[rows_by_subspace(swap_until_best(assignment, gains))]
