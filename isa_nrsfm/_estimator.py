@@ -28,6 +28,7 @@ from isa_nrsfm._tracks import (
     LAYOUTS,
     Layout,
     centred_tracks,
+    check_complete,
     check_names,
     check_size,
     measurement_matrix,
@@ -255,9 +256,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             self,
             X,
             dtype=[np.float64, np.float32],
+            ensure_all_finite="allow-nan",
             ensure_min_samples=2,
             ensure_min_features=2,
         )
+        check_complete(X)
         check_names(getattr(self, "feature_names_in_", None), self.layout)
         tracks = table_to_tracks(X, self.layout)
         check_size(len(tracks), tracks.shape[1], self.n_components)

@@ -13,7 +13,7 @@ from isa_nrsfm._tracks import measurement_matrix
 
 # A basis shape whose image has less than this share of the energy that the camera could
 # show of it is seen end on: its image is rounding errors.
-UNSEEN = 1e-14
+UNSEEN = 1e-28
 
 
 class FrameFit(NamedTuple):
@@ -66,9 +66,11 @@ def fit_frames(
     stacked = basis.transpose(1, 0, 2).reshape(n_points, -1)
     P = (W @ stacked).reshape(len(centred), 2, n_components, 3)
     seen = np.einsum("irkc,irc->ik", P, motion)
-    G = basis.transpose(0, 2, 1) @ basis
-    energy = np.einsum("kcd,irc,ird->ik", G, motion, motion, optimize=True)
-    largest = np.einsum("kcc,ird,ird->ik", G, motion, motion, optimize=True)
+    # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
+    R = np.linalg.qr(basis, mode="r")
+    images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
+    energy = np.einsum("ikrd,ikrd->ik", images, images)
+    largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
     visible = energy > UNSEEN * largest
     alpha = np.divide(seen, energy, where=visible, out=np.zeros_like(seen))
     return FrameFit(motion, translation, alpha)

@@ -22,7 +22,7 @@ from isa_nrsfm._block_structure import FrameProducts, packed_inner, unpack
 # Alternations from every start before the best one is taken on.
 N_TRIAL_STEPS = 6
 # A Newton step is at most this many times the alternation step along any direction.
-LARGEST_GAIN = 50.0
+LARGEST_GAIN = 1e4
 
 
 class Refinement(NamedTuple):
@@ -122,14 +122,15 @@ def _maximise(
     state = _state(P, rigid, E)
     for n_iter in range(1, max_iter + 1):
         plain, newton, gain = _steps(P, rigid, state)
-        if gain <= tol * state.energy:
-            return state.E, state.energy, n_iter, True
+        converged = gain <= tol * state.energy
         tried = _state(P, rigid, state.E + newton)
         if not tried.energy > state.energy:
             tried = _state(P, rigid, state.E + plain)
         if not tried.energy > state.energy:  # rounding errors only
             return state.E, state.energy, n_iter, True
         state = tried
+        if converged:
+            return state.E, state.energy, n_iter, True
     return state.E, state.energy, max_iter, False
 
 
@@ -164,8 +165,11 @@ def _steps(P: NDArray, rigid: NDArray, state: _State) -> tuple[NDArray, NDArray,
     w = P - 2.0 * alpha[:, None] * Q_E.reshape(-1, 9)
     weighted = np.divide(w, q[:, None], where=q[:, None] > 0, out=np.zeros_like(w))
     lengthen = np.kron(whitening, np.eye(3))
-    curvature, modes = np.linalg.eigh(lengthen @ (w.T @ weighted) @ lengthen)
-    # Along the scale of E, and where A vanishes, there is nothing to gain.
+    # f does not depend on the scale of E, which is left alone.
+    scale = (whitening @ A @ E).ravel()
+    across = np.eye(9) - np.outer(scale, scale) / (scale @ scale)
+    shorten = lengthen @ across
+    curvature, modes = np.linalg.eigh(shorten.T @ (w.T @ weighted) @ shorten)
     gains = 1.0 / np.maximum(np.abs(1.0 - curvature), 1.0 / LARGEST_GAIN)
     along = modes.T @ gradient.ravel()
     newton = (modes @ (gains * along)).reshape(3, 3)

@@ -434,7 +434,7 @@ BAD_TABLES = {
         TABLE[:, :-1],
         "must have two columns per point .* even number; got n_features=135",
     ),
-    "missing values": (with_value(np.nan), "X contains NaN"),
+    "missing values": (with_value(np.nan), r"missing \(NaN\)"),
     "infinite values": (with_value(np.inf), "X contains infinity"),
     "minus infinity": (with_value(-np.inf), "X contains infinity"),
     "equal points": (

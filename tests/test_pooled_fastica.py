@@ -213,8 +213,7 @@ class TestComponents:
     def test_not_converged(self):
         with pytest.warns(
             ConvergenceWarning,
-            match="FastICA did not converge in max_iter=1 steps; increase max_iter or "
-            "tol, or try another fun",
+            match="FastICA did not converge in max_iter=1 steps in the run that is",
         ):
             PooledFastICA(n_init=2, max_iter=1, random_state=0).fit(
                 spherical_sources(0, 68, 9)

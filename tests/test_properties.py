@@ -20,8 +20,9 @@ scaled = st.booleans()
 class AsTheyCome(BaseEstimator):
     """A strategy that leaves the signals as they are.
 
-    The iterations of the others amplify rounding errors on tables of noise; with it
-    the results are as exact as the rest of the method is.
+    The iterations of the others amplify rounding errors on tables of noise, and the
+    refinement of subspaces that are no deformations ends at nearly singular blocks;
+    without both the results are as exact as the rest of the method is.
     """
 
     def fit(self, signals):
@@ -36,6 +37,7 @@ def fit(tracks, n_components, isa=None, **params):
         warnings.simplefilter("ignore", ConvergenceWarning)
         # Tables of noise look alike in both layouts.
         warnings.filterwarnings("ignore", message="layout=", category=UserWarning)
+        params = {"refinement": None} | params
         model = AffineNRSfM(n_components, isa=isa, random_state=0, **params)
         return model.fit(tracks.reshape(len(tracks), -1))
 
@@ -50,7 +52,7 @@ def tables(draw):
     shape, *basis = rng.normal(size=(n_components + 1, n_points, 3))
     alpha = 0.4 * rng.normal(size=(n_frames, n_components)) ** 3
     shapes = shape + np.tensordot(alpha, basis, axes=1)
-    motion = np.eye(2, 3) + 0.5 * rng.normal(size=(n_frames, 2, 3))
+    motion = np.eye(2, 3) + 0.3 * rng.normal(size=(n_frames, 2, 3))
     position = 3 * rng.normal(size=(n_frames, 1, 2))
     noise = 0.02 * rng.normal(size=(n_frames, n_points, 2))
     return shapes @ motion.transpose(0, 2, 1) + position + noise, n_components
@@ -154,7 +156,7 @@ def test_tables_that_the_model_makes_are_taken_apart_again(table, seed, scale_fr
     model = fit(tracks, n_components, scale_frames=scale_frames)
     rng = np.random.default_rng(seed)
     alpha = rng.normal(size=(7, n_components))
-    motion = np.eye(2, 3) + 0.5 * rng.normal(size=(7, 2, 3))
+    motion = np.eye(2, 3) + 0.3 * rng.normal(size=(7, 2, 3))
     translation = 10 * rng.normal(size=(7, 2))
     made = model.inverse_transform(alpha, motion, translation)
     shapes = model.mean_shape_ + np.einsum("ik,kjc->ijc", alpha, model.basis_)
@@ -269,10 +271,10 @@ def test_values_that_are_no_numbers_are_refused(table, value, frame, point, axis
     tracks, n_components = table
     broken = tracks.copy()
     broken[frame, point, axis] = value
-    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
+    with pytest.raises(ValueError, match=r"(missing \(NaN\)|X contains infinity)"):
         fit(broken, n_components)
     model = fit(tracks, n_components)
-    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
+    with pytest.raises(ValueError, match=r"(missing \(NaN\)|X contains infinity)"):
         model.transform(broken.reshape(len(broken), -1))
 
 

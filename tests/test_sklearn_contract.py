@@ -126,7 +126,8 @@ def test_checks_fail_because_their_tables_are_refused():
     failed = [result for result in results if result["status"] == "failed"]
     names = {result["check_name"] for result in failed}
     skipped = {r["check_name"] for r in results if r["status"] == "skipped"}
-    assert names | skipped == set(NARROW_TABLE_CHECKS) | skipped
+    generated = {result["check_name"] for result in results}
+    assert names | skipped == (set(NARROW_TABLE_CHECKS) & generated) | skipped
     for result in failed:
         error = result["exception"]
         while not isinstance(error, ValueError):

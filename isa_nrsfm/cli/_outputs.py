@@ -25,7 +25,8 @@ FIGURES = {
 TABLES = {
     "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
-    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty",
+    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; "
+    "inverse_snr is the energy of the reprojection error relative to the frame's",
 }
 ARRAYS = {
     "shapes.npz": "mean_shape, basis, point_names, component_names; the shape of a "
@@ -81,6 +82,13 @@ def beside_other_columns(
     for name in names:
         while names[name] in taken:
             names[name] += "_"
+    renamed = [f"{new} (not {name})" for name, new in names.items() if new != name]
+    if renamed:
+        warnings.warn(
+            f"the table has columns named like results, which are called "
+            f"{', '.join(renamed)}",
+            stacklevel=2,
+        )
     row = pd.Series(results.index, index=results.index, name=names["row"])
     return pd.concat([row, other, results.rename(columns=names)], axis=1)
 
@@ -103,6 +111,7 @@ def write_results(
         columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
     )
     cameras.insert(0, "row", points.index)
+    cameras["inverse_snr"] = inverse_snr_of_frames(estimator, points.to_numpy())
     write_table(cameras, folder / "cameras.csv")
 
     np.savez(
@@ -115,6 +124,16 @@ def write_results(
         reference_translation=estimator.reference_translation_,
     )
     save_model(estimator, folder / "model.skops")
+
+
+def inverse_snr_of_frames(estimator: AffineNRSfM, X: np.ndarray) -> np.ndarray:
+    """Return the inverse SNR of each frame of a fitted interleaved table."""
+    observed = X.reshape(len(X), -1, 2)
+    fitted = estimator.inverse_transform(
+        estimator.alpha_, estimator.motion_, estimator.translation_
+    ).reshape(observed.shape)
+    centred = observed - observed.mean(axis=1, keepdims=True)
+    return np.sum((observed - fitted) ** 2, (1, 2)) / np.sum(centred**2, (1, 2))
 
 
 def write_figures(

@@ -195,8 +195,9 @@ class PooledFastICA(BaseSubspaceAnalysis):
             W = _regroup(W, W @ whitening, in_order, criterion)
         if not converged:
             warnings.warn(
-                f"FastICA did not converge in max_iter={self.max_iter} steps; increase "
-                "max_iter or tol, or try another fun",
+                f"FastICA did not converge in max_iter={self.max_iter} steps in the "
+                "run that is kept: its sources may be ill determined; try "
+                "PooledFastICA with another fun or larger n_init or max_iter",
                 ConvergenceWarning,
                 stacklevel=6,
             )
