@@ -274,7 +274,7 @@ def test_values_that_are_no_numbers_are_refused(table, value, frame, point, axis
     with pytest.raises(ValueError, match=r"(missing \(NaN\)|X contains infinity)"):
         fit(broken, n_components)
     model = fit(tracks, n_components)
-    with pytest.raises(ValueError, match=r"(missing \(NaN\)|X contains infinity)"):
+    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
         model.transform(broken.reshape(len(broken), -1))
 
 
