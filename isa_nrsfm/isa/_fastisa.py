@@ -24,7 +24,7 @@ from isa_nrsfm.isa._grouping import (
 
 # Starts that are iterated together: enough to make numpy's overhead small, few enough
 # that their arrays stay in the cache.
-BATCH_SIZE = 8
+BATCH_SIZE = 16
 # The single components are a start only: inside a subspace they may not be determined.
 ICA_TOL = 1e-4
 
