@@ -685,7 +685,7 @@ def test_fitting_again_forgets_the_first_table(model):
 
 
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=9)], ids=["pooled", "fast"])
+@pytest.mark.parametrize("isa", [None, FastISA(n_init=18)], ids=["pooled", "fast"])
 def test_results_do_not_depend_on_n_jobs(isa):
     first, second = (estimator(isa=isa, n_jobs=n).fit(TABLE) for n in (1, 2))
     assert_array_equal(first.alpha_, second.alpha_)
