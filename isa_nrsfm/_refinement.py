@@ -103,16 +103,23 @@ def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
     if not len(E) or not P.any():
         return None
     for _ in range(N_TRIAL_STEPS):
-        a, q = P @ E.reshape(-1, 9).T, packed_inner(rigid, E @ E.swapaxes(1, 2))
-        alpha = np.divide(a, q, where=q > 0, out=np.zeros_like(a))
+        _, _, alpha = _coefficients(P, rigid, E)
         A, R = unpack((alpha**2).T @ rigid), (alpha.T @ P).reshape(-1, 3, 3)
         E = np.linalg.pinv(A, hermitian=True) @ R
         norm = np.linalg.norm(E, axis=(1, 2), keepdims=True)
         E = np.divide(E, norm, where=norm > 0, out=np.zeros_like(E))
-    a, q = P @ E.reshape(-1, 9).T, packed_inner(rigid, E @ E.swapaxes(1, 2))
-    energy = np.sum(np.divide(a**2, q, where=q > 0, out=np.zeros_like(a)), axis=0)
+    a, _, alpha = _coefficients(P, rigid, E)
+    energy = np.sum(alpha * a, axis=0)
     best = np.argmax(energy)
     return E[best] if energy[best] > 0 else None
+
+
+def _coefficients(
+    P: NDArray, rigid: NDArray, E: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return ``<M_ik, M_0^i E>``, ``||M_0^i E||^2`` and their ratio for each E."""
+    a, q = P @ E.reshape(-1, 9).T, packed_inner(rigid, E @ E.swapaxes(1, 2))
+    return a, q, np.divide(a, q, where=q > 0, out=np.zeros_like(a))
 
 
 def _maximise(
@@ -137,8 +144,7 @@ def _maximise(
 def _state(P: NDArray, rigid: NDArray, E: NDArray) -> _State:
     """Return the coefficients that are best for E, and their sums."""
     E = E / np.linalg.norm(E)
-    a, q = P @ E.ravel(), packed_inner(rigid, E @ E.T)
-    alpha = np.divide(a, q, where=q > 0, out=np.zeros_like(a))
+    a, q, alpha = (each[:, 0] for each in _coefficients(P, rigid, E[None]))
     A, R = unpack(alpha**2 @ rigid), (alpha @ P).reshape(3, 3)
     return _State(E, float(alpha @ a), alpha, q, A, R)
 

@@ -76,10 +76,7 @@ def inverse_snr(
     """
     if layout not in LAYOUTS:
         raise ValueError(f"layout must be one of {LAYOUTS}; got {layout!r}")
-    truth, seen, fitted = _paired_tracks(X, X_hat, layout)
-    truth, fitted = _centre_seen(truth, seen), _centre_seen(fitted, seen)
-    energy = np.sum(truth**2, axis=(1, 2))
-    error = np.sum((truth - fitted) ** 2, axis=(1, 2))
+    energy, error, seen = frame_energies(X, X_hat, layout)
     if scale_frames:
         used = seen.any(axis=1)
         flat = np.flatnonzero(used & (energy == 0))
@@ -93,6 +90,16 @@ def inverse_snr(
     if not energy.sum() > 0:
         raise ValueError("X has no energy: all seen points are equal in every frame")
     return float(error.sum() / energy.sum())
+
+
+def frame_energies(
+    X: ArrayLike, X_hat: ArrayLike, layout: Layout
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return each frame's energy, that of its error, and the mask of seen points."""
+    truth, seen, fitted = _paired_tracks(X, X_hat, layout)
+    truth, fitted = _centre_seen(truth, seen), _centre_seen(fitted, seen)
+    energy = np.sum(truth**2, axis=(1, 2))
+    return energy, np.sum((truth - fitted) ** 2, axis=(1, 2)), seen
 
 
 def _paired_tracks(

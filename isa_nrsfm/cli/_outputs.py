@@ -12,6 +12,7 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm.io import save_model, write_table
+from isa_nrsfm.metrics import frame_energies
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -111,7 +112,8 @@ def write_results(
         columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
     )
     cameras.insert(0, "row", points.index)
-    cameras["inverse_snr"] = inverse_snr_of_frames(estimator, points.to_numpy())
+    energy, error, _ = frame_energies(points, fitted_table(estimator), estimator.layout)
+    cameras["inverse_snr"] = error / energy
     write_table(cameras, folder / "cameras.csv")
 
     np.savez(
@@ -126,14 +128,11 @@ def write_results(
     save_model(estimator, folder / "model.skops")
 
 
-def inverse_snr_of_frames(estimator: AffineNRSfM, X: np.ndarray) -> np.ndarray:
-    """Return the inverse SNR of each frame of a fitted interleaved table."""
-    observed = X.reshape(len(X), -1, 2)
-    fitted = estimator.inverse_transform(
+def fitted_table(estimator: AffineNRSfM) -> np.ndarray:
+    """Return the table that a model was fitted to, as the model has it."""
+    return estimator.inverse_transform(
         estimator.alpha_, estimator.motion_, estimator.translation_
-    ).reshape(observed.shape)
-    centred = observed - observed.mean(axis=1, keepdims=True)
-    return np.sum((observed - fitted) ** 2, (1, 2)) / np.sum(centred**2, (1, 2))
+    )
 
 
 def write_figures(

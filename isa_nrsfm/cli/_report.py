@@ -10,7 +10,7 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm.cli._frames import Frames
-from isa_nrsfm.cli._outputs import component_names
+from isa_nrsfm.cli._outputs import component_names, fitted_table
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
@@ -43,7 +43,7 @@ def table_report(path: str, frames: Frames) -> dict[str, Any]:
 
 def model_report(estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
-    off = np.asarray(estimator.reproject(X)) - np.asarray(X)
+    off = fitted_table(estimator) - np.asarray(X)
     names = component_names(len(estimator.basis_))
     return {
         "n_components": len(estimator.basis_),

@@ -73,7 +73,7 @@ def covariance_gains(
         member = assignment[:, None] == np.arange(assignment.max() + 1)
         shared = energy @ member  # of a signal with each subspace
         there = shared[:, assignment]  # of signal a with the subspace of b
-        leave = diagonal - there[np.arange(len(energy)), np.arange(len(energy))]
+        leave = diagonal - np.diag(there)
         gain = there - energy + leave[:, None]
         return gain + gain.T, total
 

@@ -171,6 +171,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         n_signals = len(Z)
         if covariance is not None:
             covariance = _check_covariance(covariance, n_signals)
+            covariance = whitening @ covariance @ whitening.T
         random_state = check_random_state(self.random_state)
         starts = random_state.standard_normal((self.n_init, n_signals, n_signals))
         in_order = np.arange(n_signals) // self.subspace_size
@@ -181,12 +182,12 @@ class PooledFastICA(BaseSubspaceAnalysis):
         for start in starts:
             W, n_iter, converged = self._fastica(Z, start)
             if covariance is None:
-                W, value = _pool_by_likelihood(W, Z, groupings)
+                W, value = _pool_by_likelihood(W, Z, groupings, self.subspace_size)
             else:
-                whitened = whitening @ covariance @ whitening.T
-                W, value = _pool_by_covariance(W, W @ whitened @ W.T, groupings)
+                W, value = _pool_by_covariance(W, W @ covariance @ W.T, groupings)
             if criterion is not None:
-                value = float(np.sum(criterion(_subspaces(W @ whitening, in_order))))
+                rows = (W @ whitening).reshape(-1, self.subspace_size, n_signals)
+                value = float(np.sum(criterion(rows)))
             runs.append((value, W, n_iter, converged))
         self.criteria_ = np.array([run[0] for run in runs])
         _, W, n_iter, converged = runs[int(np.argmax(self.criteria_))]
@@ -232,12 +233,6 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
     return covariance
 
 
-def _subspaces(components: NDArray, assignment: NDArray) -> NDArray:
-    """Return the rows of each subspace, (n_subspaces, subspace_size, n_signals)."""
-    rows = components[rows_by_subspace(assignment)]
-    return rows.reshape(assignment.max() + 1, -1, components.shape[1])
-
-
 def _pool_by_covariance(
     W: NDArray, covariance: NDArray, groupings: list[NDArray]
 ) -> tuple[NDArray, float]:
@@ -254,12 +249,11 @@ def _pool_by_covariance(
 
 
 def _pool_by_likelihood(
-    W: NDArray, Z: NDArray, groupings: list[NDArray]
+    W: NDArray, Z: NDArray, groupings: list[NDArray], subspace_size: int
 ) -> tuple[NDArray, float]:
     """Return the rows of W by subspaces, and the log-likelihood."""
     density = SqrtDensity()
     gains = likelihood_gains(W @ Z, density)
-    subspace_size = int(np.sum(groupings[0] == 0))
 
     def likelihood(rows: NDArray) -> float:
         return float(log_likelihood(W[rows], Z, subspace_size, density))
