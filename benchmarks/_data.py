@@ -26,6 +26,8 @@ CASES = (
     Case("MUCT-68 K=9", "muct_68", 9, True),
     Case("faces_wild K=9", "faces_wild_68_combined", 9, True),
 )
+DRINK, PICKUP, YOGA, HANDS, ICT, MUCT, FACES = CASES[1:]
+SHARK = tuple(Case(f"shark K={K}", "shark_torresani", K, True) for K in range(1, 7))
 
 
 def data_folder():
@@ -35,13 +37,27 @@ def data_folder():
     return Path(named) if named else checkout.parent / "shared" / "data"
 
 
-def load_table(case):
-    """Return the complete rows of a data set as a table, or None where it is absent."""
+def load_arrays(case):
+    """Return the arrays of a data set by name, or None where it is absent."""
     path = data_folder() / f"{case.file}.npz"
     if not path.is_file():
         print(f"{case.title}: skipped, no {path.name} in the folder ISA_NRSFM_DATA")
         return None
     with np.load(path, allow_pickle=False) as data:
-        tracks = data["W2d"]
-    complete = ~np.isnan(tracks).any(axis=(1, 2))
-    return tracks[complete].reshape(complete.sum(), -1)
+        return dict(data)
+
+
+def load_table(case, complete=True):
+    """Return the rows of a data set as a table, or None where it is absent."""
+    arrays = load_arrays(case)
+    if arrays is None:
+        return None
+    tracks = arrays["W2d"]
+    if complete:
+        tracks = tracks[~np.isnan(tracks).any(axis=(1, 2))]
+    return as_table(tracks)
+
+
+def as_table(tracks):
+    """Return tracks (n_frames, n_points, 2) as an interleaved table."""
+    return tracks.reshape(len(tracks), -1)

@@ -1,19 +1,22 @@
-"""Time fits and iterations as ratios to an SVD in the same run, one BLAS thread.
+"""
+Time fits as ratios to an SVD in the same run, and new frames; one BLAS thread.
 
-Run ``python -m benchmarks.speed``. Each ratio is taken pair by pair, reference and
-candidate in turn, so that it holds on a machine whose speed drifts.
+Run ``python -m benchmarks.speed [section ...] [--seeds N] [--pairs N]``. Each ratio is
+taken pair by pair, reference and candidate in turn, so that it holds on a machine whose
+speed drifts.
 """
 
 import time
-import warnings
+from functools import partial
 
 import numpy as np
-from sklearn.exceptions import ConvergenceWarning
-from threadpoolctl import threadpool_limits
 
-from benchmarks._data import CASES, load_table
+from benchmarks._command import run
+from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._frame_posterior import _descend, _frame_blocks, _problem
+from isa_nrsfm._frame_products import whitened
 from isa_nrsfm._tracks import (
     centred_tracks,
     measurement_matrix,
@@ -21,7 +24,12 @@ from isa_nrsfm._tracks import (
     weighting_sizes,
 )
 
-N_PAIRS = 7
+# Random starts against which the fit of a frame is held, and how far they are spread,
+# in standard deviations of the coefficients.
+N_STARTS = 20
+SPREAD = 1.5
+# A start finds something better if it lowers the objective by this share.
+BETTER = 1e-6
 
 
 def seconds(function, repeats=1):
@@ -32,10 +40,10 @@ def seconds(function, repeats=1):
     return (time.perf_counter() - start) / repeats
 
 
-def paired_ratio(candidate, reference, repeats=1):
+def paired_ratio(candidate, reference, n_pairs, repeats=1):
     """Return ratios candidate / reference: minimum, median, maximum; and seconds."""
     candidate(), reference()  # not counted
-    pairs = [(seconds(candidate), seconds(reference, repeats)) for _ in range(N_PAIRS)]
+    pairs = [(seconds(candidate), seconds(reference, repeats)) for _ in range(n_pairs)]
     ratios = [a / b for a, b in pairs]
     return (*np.percentile(ratios, [0, 50, 100]), *np.median(pairs, axis=0))
 
@@ -52,35 +60,134 @@ def heading(rows, candidate, reference):
     print(f"{rows:22}{'min':>8}{'median':>8}{'max':>8}{candidate:>10}{reference:>9}")
 
 
-def fits():
-    """Print whole fits relative to a thin SVD of the same W."""
-    print("whole fit, relative to numpy.linalg.svd(W, full_matrices=False)")
-    heading("table", "fit ms", "SVD ms")
-    for case in CASES:
-        X = load_table(case)
-        if X is None:
+def fits(options):
+    """Whole fits, relative to numpy.linalg.svd(W, full_matrices=False)."""
+    for refinement in ("joint", "alternating"):
+        heading(refinement, "fit ms", "SVD ms")
+        for case in CASES:
+            X = load_table(case)
+            if X is None:
+                continue
+            W = measured(X, case.scale_frames)
+            model = AffineNRSfM(
+                case.n_components,
+                refinement=refinement,
+                scale_frames=case.scale_frames,
+                random_state=0,
+            )
+            least, median, most, fit, svd = paired_ratio(
+                lambda model=model, X=X: model.fit(X),
+                lambda W=W: np.linalg.svd(W, full_matrices=False),
+                options.pairs,
+            )
+            print(
+                f"{case.title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
+                f"{1e3 * fit:10.1f}{1e3 * svd:9.1f}",
+                flush=True,
+            )
+
+
+def with_holes(X, share, seed=0):
+    """Return a table with a share of its points missing at random."""
+    tracks = X.reshape(len(X), -1, 2).astype(float)
+    hidden = np.random.default_rng(seed).random(tracks.shape[:2]) < share
+    return np.where(hidden[..., None], np.nan, tracks).reshape(X.shape)
+
+
+def half_fitted(case, seed=0):
+    """Return a fit of half of the frames of a table and the other half, or None."""
+    X = load_table(case)
+    if X is None:
+        return None
+    order = np.random.default_rng(seed).permutation(len(X))
+    train, test = order[: len(X) // 2], order[len(X) // 2 :]
+    model = AffineNRSfM(case.n_components, random_state=seed).fit(X[train])
+    return model, X[test]
+
+
+def frames_per_second(model, X, n_times):
+    """Return the most frames a second of some calls of transform."""
+    return len(X) / min(seconds(lambda: model.transform(X)) for _ in range(n_times))
+
+
+def seconds_of_a_frame(model, X):
+    """Return the median seconds of transform for single frames."""
+    rows = (X[i : i + 1] for i in range(100))
+    return np.median([seconds(partial(model.transform, row)) for row in rows])
+
+
+def new_frames(options):
+    """Frames a second of transform for frames that were not in the fit."""
+    print(
+        f"{'':22}{'complete':>10}{'20 % missing':>14}{'one frame, ms':>15}{'holed':>8}"
+    )
+    for case in (FACES, MUCT, DRINK, YOGA):
+        fitted = half_fitted(case)
+        if fitted is None:
             continue
-        W = measured(X, case.scale_frames)
-        model = AffineNRSfM(
-            case.n_components,
-            refinement="alternating",
-            scale_frames=case.scale_frames,
-            random_state=0,
+        model, X = fitted
+        holes = with_holes(X, 0.2)
+        model.transform(X), model.transform(holes)  # not counted
+        whole, holed = (
+            frames_per_second(model, table, options.pairs) for table in (X, holes)
         )
-        least, median, most, fit, svd = paired_ratio(
-            lambda model=model, X=X: model.fit(X),
-            lambda W=W: np.linalg.svd(W, full_matrices=False),
-        )
+        single, some = (seconds_of_a_frame(model, table) for table in (X, holes))
         print(
-            f"{case.title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
-            f"{1e3 * fit:10.1f}{1e3 * svd:9.1f}"
+            f"{case.title:22}{whole:10.0f}{holed:14.0f}{1e3 * single:15.2f}"
+            f"{1e3 * some:8.2f}",
+            flush=True,
         )
 
 
-def fastisa_iteration():
-    """Print a FastISA step of one start relative to an SVD of a 27 x 27 matrix."""
-    print("\nFastISA, 68 samples, 27 signals: per start and iteration, relative to")
-    print("numpy.linalg.svd of one 27 x 27 matrix")
+def found_by_search(model, tracks, seed):
+    """
+    Return the objective of frames in their fit, and the least from random starts.
+
+    Both are in units of the noise variance: minus twice the log posterior.
+    """
+    frames = model._frames
+    posterior = frames.posterior(tracks)
+    found = np.full(len(tracks), np.inf)
+    rng = np.random.default_rng(seed)
+    missing = np.isnan(tracks).any(axis=2)
+    white, _ = whitened(frames.shapes)
+    blocks = _frame_blocks(tracks, np.where(missing, 0.0, 1.0), white)
+    variance = np.full(len(tracks), frames.noise_variance)
+    for block, products in blocks:
+        problem = _problem(products, variance[block], np.zeros((3, 3)), tracks.shape[1])
+        for start in range(N_STARTS):
+            alpha = SPREAD * rng.normal(size=(model.n_components, len(block)))
+            minima = _descend(problem, alpha, np.full(len(block), start))
+            objective = products.energy - minima.explained
+            found[block] = np.minimum(found[block], objective)
+    return posterior.objective / frames.noise_variance, found / frames.noise_variance
+
+
+def optima(options):
+    """Share of new frames where 20 random starts find no better fit than transform."""
+    print(f"{'':34}{'frames':>8}{'share %':>9}{'largest gain':>14}")
+    for case in (FACES, MUCT, DRINK, YOGA):
+        for seed in range(options.seeds):
+            fitted = half_fitted(case, seed)
+            if fitted is None:
+                break
+            model, X = fitted
+            X = X[:1000]
+            for share in (0.0, 0.2, 0.4):
+                tracks = with_holes(X, share, seed).reshape(len(X), -1, 2)
+                centred, _ = centred_tracks(tracks)
+                unit = centred / weighting_sizes(centred, True)[:, None, None]
+                fit, found = found_by_search(model, unit, seed)
+                best = found >= fit - BETTER * np.abs(fit)
+                print(
+                    f"{case.title:16}{100 * share:4.0f} % missing    {len(X):8}"
+                    f"{100 * best.mean():9.2f}{np.max(fit - found):14.3g}",
+                    flush=True,
+                )
+
+
+def fastisa_iteration(options):
+    """FastISA, 68 x 27: a step of one start, relative to an SVD of a 27 x 27 matrix."""
     heading("signals", "step us", "SVD us")
     random = np.random.default_rng(0)
     matrix = random.normal(size=(27, 27))
@@ -94,6 +201,7 @@ def fastisa_iteration():
         least, median, most, fit, svd = paired_ratio(
             lambda isa=isa, signals=signals: isa.fit(signals),
             lambda: np.linalg.svd(matrix),
+            options.pairs,
             repeats=2000,
         )
         print(
@@ -102,8 +210,13 @@ def fastisa_iteration():
         )
 
 
+SECTIONS = {
+    "fits": fits,
+    "new_frames": new_frames,
+    "optima": optima,
+    "fastisa": fastisa_iteration,
+}
+
 if __name__ == "__main__":
-    with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fits()
-        fastisa_iteration()
+    pairs = {"type": int, "default": 5, "help": "pairs that are timed (default 5)"}
+    run(__doc__, SECTIONS, n_seeds=1, options={"pairs": pairs})

@@ -21,24 +21,57 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._camera import reference_camera
-from isa_nrsfm._frame_fit import FrameFit, compose, fit_frames, project
-from isa_nrsfm._gauge import canonical_gauge, image_energies, reorder_blocks
-from isa_nrsfm._paper import run_paper_pipeline
+from isa_nrsfm._completion import complete_tracks
+from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
+from isa_nrsfm._frame_fit import (
+    FrameFit,
+    PosteriorFrames,
+    RigidFrames,
+    compose,
+    project,
+)
+from isa_nrsfm._frame_posterior import spread_starts
+from isa_nrsfm._gauge import (
+    canonical_gauge,
+    image_energies,
+    mode_covariance,
+    reorder_blocks,
+)
+from isa_nrsfm._held_out import held_out_error
+from isa_nrsfm._independent_gauge import (
+    INDEPENDENCE,
+    FrameMap,
+    independent_gauge,
+)
+from isa_nrsfm._joint_fit import fit_jointly
+from isa_nrsfm._paper import PaperResult, run_paper_pipeline
+from isa_nrsfm._robust import LOSSES, gross_outliers, robust_sizes
 from isa_nrsfm._tracks import (
     LAYOUTS,
     Layout,
     centred_tracks,
-    check_complete,
+    check_frames,
     check_names,
+    check_points,
     check_size,
+    clean_tracks,
     measurement_matrix,
     relative_precision,
     table_to_tracks,
     tracks_to_table,
+    usable_frames,
     warn_if_other_layout,
     weighting_sizes,
 )
 from isa_nrsfm.isa import PooledFastICA
+
+# Tolerances where none is given: for each frame, of minus twice the log likelihood, and
+# for the paper's refinement, of the energy that it explains.
+JOINT_TOL, PAPER_TOL = 0.05, 1e-10
+# Steps of the paper's refinement where its result is only a start.
+PAPER_STEPS = 200
+# Coefficients of frames from which the fit of a frame starts besides zero.
+N_STARTS = 8
 
 
 class Decomposition(NamedTuple):
@@ -90,20 +123,42 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         direction in which the subspace hardly moves, and "irls" depends on which
         frame comes first; the default does neither. With `refinement` all three
         lead to nearly the same result, because it starts from more places.
-    refinement : {"alternating", None}, default="alternating"
-        "alternating" is the paper's alternating least squares for basis shapes and
-        coefficients, with the rigid cameras held.
+    refinement : {"joint", "alternating", None}, default="joint"
+        "joint" finds the cameras, shapes and noise variance of greatest marginal
+        likelihood, the coefficients being drawn from a normal distribution; it starts
+        from the paper's result and recovers the true shapes as far as the images
+        determine them. "alternating" is the paper's alternating least squares for
+        basis shapes and coefficients, with the rigid cameras held.
+    independence : {"shapes", "coefficients", None}, default="shapes"
+        What fixes the basis of the joint refinement, which any mixing of its basis
+        shapes leaves as likely: "shapes" makes these independent of each other over the
+        points, as the paper assumes, "coefficients" makes their coefficients
+        independent over the frames, and None takes the principal axes of the
+        deformation. Shapes of frames, reprojection and score do not depend on it.
+    loss : {"linear", "huber", "cauchy"}, default="linear"
+        How points count that are far from the model: with "huber" from 1.5 and with
+        "cauchy" from 2.5 standard deviations of the noise, which is estimated from the
+        median, less than by their square. Only for the joint refinement.
+    stiffness : float or None, default=None
+        Price of what the basis shapes move in the images, added to minus twice the log
+        likelihood: ``stiffness * sum_ik ||M_i B_k||_F^2`` for frames of size one. With
+        free affine cameras large deformations, as in motion capture, can hardly be told
+        from camera motion and drift away without it; on faces it is not needed. None
+        chooses between 0 and 300 by what it does to the cameras, which should be close
+        to scaled orthographic ones.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
         Whether each centred frame is divided by the root mean square of its
         coordinates before the fit, so that photos of any resolution count alike;
         the scale is given back to `motion_`. With False frames count by their size.
-    max_iter : int, default=200
+    max_iter : int, default=1000
         The most steps of the refinement.
-    tol : float, default=1e-10
-        The refinement has converged when a step would gain less than this share of
-        the energy it explains.
+    tol : float or None, default=None
+        The joint refinement has converged when two successive steps each lower minus
+        twice the log likelihood by less than tol for each frame (0.05 by default), and
+        the alternating one when a step would gain less than this share of the energy
+        it explains (1e-10 by default).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
     n_jobs : int or None, default=None
@@ -123,22 +178,42 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         deviation of `alpha_` each. Those the table has no motion for are zero.
     alpha_ : ndarray of shape (n_frames, n_components)
         Coefficients of the frames, with unit variance over the frames and a third
-        moment that is not negative.
+        moment that is not negative; after the joint refinement with mean zero.
+    alpha_std_ : ndarray of shape (n_frames, n_components)
+        Their posterior standard deviations, shapes and noise being known (joint
+        refinement only).
     motion_ : ndarray of shape (n_frames, 2, 3)
         Affine cameras, in the units of the table.
     translation_ : ndarray of shape (n_frames, 2)
-        Centroids of the frames, in the units of the table.
+        Images of the origin of the shapes, in the units of the table: the centroids of
+        complete frames.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
-        as in the fit.
+        as in the fit; of the points that are seen.
     rank_floor_ : float
-        The least inverse SNR that any model of rank 3K + 3 reaches.
+        The least inverse SNR that any model of rank 3K + 3 reaches, missing points
+        being filled in.
+    noise_variance_ : float
+        Variance of the noise of a coordinate; of frames of size one where frames are
+        scaled (joint refinement only, as are the next four).
+    stiffness_ : float
+        The stiffness that was used.
+    reliability_ : ndarray of shape (n_components,)
+        Shares of the variance of the coefficients that are not uncertainty, along
+        uncorrelated directions, decreasing.
+    objective_history_ : ndarray of shape (n_iter_ + 1,)
+        Minus twice the log marginal likelihood plus the price of the stiffness, before
+        the refinement and after each of its steps; it never rises.
+    gradient_norm_ : float
+        Norm of its gradient at the end, in the metric of its curvature and relative to
+        the root of the number of coordinates.
     energy_share_ : ndarray of shape (n_components,)
         Share of each basis shape in the energy of the deformations in the images,
         ``sum_i ||alpha_ik M_i B_k||_F^2``, frames scaled as in the fit.
     mode_covariance_ : ndarray of shape (3 * n_components, 3 * n_components)
         Covariance over the images of the 3K independent directions, 3x3 blocks in
-        the order of `basis_`.
+        the order of `basis_`; after the joint refinement ``(1 / 2I) sum_i (alpha_i
+        alpha_i^T) (x) (M_i^T M_i)``. Of frames of size one where frames are scaled.
     singular_values_ : ndarray of shape (3 * n_components + 3,)
         Largest singular values of W, decreasing.
     reference_motion_ : ndarray of shape (2, 3)
@@ -147,9 +222,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     reference_translation_ : ndarray of shape (2,)
         Its translation, the mean centroid.
     isa_ : object
-        The fitted strategy.
+        The fitted strategy, of the paper's pipeline.
     n_iter_ : int
-        Steps of the refinement.
+        Steps of the refinement; of a large table those with all of its frames.
     n_features_in_ : int
         Number of columns.
     feature_names_in_ : ndarray of shape (n_features_in_,)
@@ -165,6 +240,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     Affine cameras determine the shapes up to one affinity of space and one scale a
     frame. The affinity is fixed as said above; angles and proportions in depth are
     not those of the object.
+
+    Points that are missing are NaN, in `fit` and everywhere else. A point of which only
+    one coordinate is missing counts as missing, with a warning. Rows of which too
+    little is seen to determine a camera are refused by `fit` and have NaN elsewhere.
 
     References
     ----------
@@ -190,11 +269,14 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         "n_components": [Interval(Integral, 1, None, closed="left")],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
         "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
-        "refinement": [StrOptions({"alternating"}), None],
+        "refinement": [StrOptions({"joint", "alternating"}), None],
+        "independence": [StrOptions(set(INDEPENDENCE)), None],
+        "loss": [StrOptions(set(LOSSES))],
+        "stiffness": [None, Interval(Real, 0, None, closed="left")],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="left")],
+        "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
@@ -206,11 +288,14 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         *,
         isa: Any = None,
         block_recovery: str = "generalized_eigen",
-        refinement: str | None = "alternating",
+        refinement: str | None = "joint",
+        independence: str | None = "shapes",
+        loss: str = "linear",
+        stiffness: float | None = None,
         layout: Layout = "interleaved",
         scale_frames: bool = True,
-        max_iter: int = 200,
-        tol: float = 1e-10,
+        max_iter: int = 1000,
+        tol: float | None = None,
         random_state: Any = None,
         n_jobs: int | None = None,
         verbose: int = 0,
@@ -219,6 +304,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.isa = isa
         self.block_recovery = block_recovery
         self.refinement = refinement
+        self.independence = independence
+        self.loss = loss
+        self.stiffness = stiffness
         self.layout = layout
         self.scale_frames = scale_frames
         self.max_iter = max_iter
@@ -247,9 +335,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Raises
         ------
         ValueError
-            If X has an odd number of columns, missing or infinite values, too few
-            points or frames for `n_components`, a frame whose points are all equal,
-            or column names that contradict `layout`.
+            If X has an odd number of columns, infinite values, too few points or
+            frames for `n_components`, a frame whose points are all equal, that shows
+            fewer than four points or some on one line only, a point that is seen in too
+            few frames, or column names that contradict `layout`; or if `loss` is not
+            linear without the joint refinement.
         """
         report = StageReport(self.verbose)
         X = validate_data(
@@ -260,61 +350,65 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             ensure_min_samples=2,
             ensure_min_features=2,
         )
-        check_complete(X)
-        check_names(getattr(self, "feature_names_in_", None), self.layout)
-        tracks = table_to_tracks(X, self.layout)
+        if self.refinement != "joint" and self.loss != "linear":
+            raise ValueError(
+                f"loss={self.loss!r} needs refinement='joint'; "
+                f"got refinement={self.refinement!r}"
+            )
+        names = getattr(self, "feature_names_in_", None)
+        check_names(names, self.layout)
+        tracks = clean_tracks(table_to_tracks(X, self.layout), self.layout, names)
         check_size(len(tracks), tracks.shape[1], self.n_components)
+        check_frames(tracks)
+        check_points(tracks, self.n_components, self.layout, names)
         centred, translation = centred_tracks(tracks)
         warn_if_other_layout(X, self.layout, self.scale_frames)
-        sizes = weighting_sizes(centred, self.scale_frames)
+        sizes = self._sizes(centred)
+        unit = centred / sizes[:, None, None]
+        self._frame_sizes = sizes
+        self._unit = 1.0 if self.scale_frames else float(sizes[0])
+        outliers = np.zeros(unit.shape[:2], dtype=bool)
+        if self.loss != "linear":
+            outliers = gross_outliers(unit)
+        used, _ = centred_tracks(np.where(outliers[..., None], np.nan, unit))
+        completion = complete_tracks(used, np.ones(len(unit)), self.n_components)
+        W = measurement_matrix(completion.centred)
         report("table")
 
         self.isa_ = self._strategy()
+        joint = self.refinement == "joint"
         result = run_paper_pipeline(
-            measurement_matrix(centred / sizes[:, None, None]),
+            W,
             self.n_components,
             self.isa_,
             precision=relative_precision(tracks, sizes),
             block_recovery=self.block_recovery,
-            refinement=self.refinement,
-            max_iter=self.max_iter,
-            tol=self.tol,
+            refinement="alternating" if joint else self.refinement,
+            max_iter=PAPER_STEPS if joint else self.max_iter,
+            tol=PAPER_TOL if joint or self.tol is None else self.tol,
             report=report,
         )
-        if not result.converged:
-            warnings.warn(
-                f"the refinement did not converge in max_iter={self.max_iter} steps; "
-                "increase max_iter or tol",
-                ConvergenceWarning,
-                stacklevel=3,
-            )
-        paper = fit_frames(centred, translation, result.mean_shape, result.basis)
-        gauge = canonical_gauge(
-            result.mean_shape,
-            result.basis,
-            paper.motion / sizes[:, None, None],
-            paper.alpha,
-        )
-        self.mean_shape_ = gauge.mean_shape.astype(X.dtype)
-        self.basis_ = gauge.basis.astype(X.dtype)
-        unit = 1.0 if self.scale_frames else sizes[0]
-        covariance = reorder_blocks(result.mode_covariance, gauge.order)
-        self.mode_covariance_ = unit**2 * covariance
-        self.singular_values_ = unit * result.singular_values
+        self.singular_values_ = self._unit * result.singular_values
         self.rank_floor_ = result.rank_floor
-        self.n_iter_ = result.n_iter
         self._n_features_out = self.n_components
-
-        # The coefficients are those that transform gives, from the stored shapes.
-        frames = fit_frames(centred, translation, self.mean_shape_, self.basis_)
-        self.inverse_snr_ = self._inverse_snr(centred, frames)
+        if joint:
+            frames = self._refine_jointly(unit, sizes, outliers, W, result, X.dtype)
+            report("joint refinement, gauge and coefficients")
+        else:
+            frames = self._keep(centred, sizes, completion.centred, result, X.dtype)
+            report("gauge and coefficients")
+        frames = frames._replace(translation=frames.translation + translation)
+        self.inverse_snr_ = self._inverse_snr(tracks, sizes, frames)
         cameras = frames.motion / sizes[:, None, None]
         energy = image_energies(cameras, self.basis_, frames.alpha)
         self.energy_share_ = energy / (energy.sum() or 1.0)
         self.reference_motion_ = reference_camera(cameras, sizes).astype(X.dtype)
-        self.reference_translation_ = translation.mean(axis=0).astype(X.dtype)
-        self.motion_, self.translation_, self.alpha_ = as_type(frames, X.dtype)
-        report("gauge, cameras and coefficients")
+        self.reference_translation_ = frames.translation.mean(axis=0).astype(X.dtype)
+        self.motion_, self.translation_, self.alpha_, deviation = as_type(
+            frames, X.dtype
+        )
+        if joint:
+            self.alpha_std_ = deviation
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -349,7 +443,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Returns
         -------
         ndarray of shape (n_frames, n_components)
-            Coefficients; those of the fitted table are `alpha_`.
+            Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
+            too little is seen.
         """
         return self.decompose(X).alpha
 
@@ -369,7 +464,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             alpha (n_frames, n_components).
         """
         X = self._validated(X)
-        return Decomposition(*as_type(self._fit_frames(X)[1], X.dtype))
+        return Decomposition(*as_type(self._fit_frames(X)[2], X.dtype)[:3])
 
     def reconstruct(self, X: Any) -> NDArray:
         """
@@ -390,7 +485,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
 
     def reproject(self, X: Any) -> NDArray:
         """
-        Return a table as the model sees it.
+        Return a table as the model sees it, missing points filled in.
 
         Parameters
         ----------
@@ -400,10 +495,12 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Returns
         -------
         ndarray of shape (n_frames, 2 * n_points)
-            Points of the fitted shapes in the fitted cameras.
+            Points of the fitted shapes in the fitted cameras. NaN for rows of which too
+            little is seen.
         """
         motion, translation, alpha = self.decompose(X)
-        return self.inverse_transform(alpha, motion, translation)
+        shapes = compose(self.mean_shape_, self.basis_, alpha)
+        return tracks_to_table(project(shapes, motion, translation), self.layout)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -446,10 +543,12 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
 
     def score(self, X: Any, y: Any = None) -> float:
         """
-        Return minus the inverse SNR of the reprojection of a table.
+        Return minus the inverse SNR of points held out of the fit of their frame.
 
-        The reprojection improves with every basis shape: to choose `n_components`,
-        score tables that were not fitted and look where it stops improving.
+        The points are divided into five parts, always the same. Each is predicted from
+        the others, frame by frame. Unlike the reprojection of the points that are
+        fitted, this gets worse with too many basis shapes, and so it serves to choose
+        `n_components`.
 
         Parameters
         ----------
@@ -461,15 +560,61 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Returns
         -------
         float
-            ``-||W - What||_F^2 / ||W||_F^2``, with W the centred tracks, scaled as in
-            the fit; larger is better.
+            ``-sum ||m - mhat||^2 / sum ||m - centroid_i||^2`` over all points, frames
+            scaled as in the fit; larger is better. Points whose frame the others do not
+            determine are left out.
         """
-        return -self._inverse_snr(*self._fit_frames(self._validated(X)))
+        tracks, sizes, usable = self._prepared(self._validated(X))
+        error = held_out_error(
+            self._frames,
+            self.mean_shape_,
+            self.basis_,
+            tracks[usable],
+            sizes[usable],
+        )
+        return -error
+
+    def diagnostics(self) -> Diagnostics:
+        """
+        Tell how far the fitted table determines the answer.
+
+        Returns
+        -------
+        Diagnostics
+            Named tuple of camera_singular_values, deformation_amplitude, reliability,
+            effective_frames and weak_deviations.
+
+        Raises
+        ------
+        ValueError
+            If the model was not refined jointly: the paper's pipeline knows no noise.
+
+        Warns
+        -----
+        UserWarning
+            If the table does not support so many basis shapes, or hardly determines
+            the part of them that cameras absorb.
+        """
+        check_is_fitted(self)
+        if not hasattr(self, "noise_variance_"):
+            raise ValueError(
+                "diagnostics needs a model with refinement='joint'; "
+                f"got refinement={self.refinement!r}"
+            )
+        return diagnose(
+            self.mean_shape_.astype(np.float64),
+            self.basis_.astype(np.float64),
+            self.motion_ / self._frame_sizes[:, None, None],
+            self.alpha_.astype(np.float64),
+            self.noise_variance_ / self._unit**2,
+            self.reliability_,
+        )
 
     def __sklearn_tags__(self) -> Any:
         """Return the estimator's tags."""
         tags = super().__sklearn_tags__()
         tags.transformer_tags.preserves_dtype = ["float64", "float32"]
+        tags.input_tags.allow_nan = True
         return tags
 
     def _strategy(self) -> Any:
@@ -490,30 +635,152 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             isa.set_params(verbose=self.verbose)
         return isa
 
+    def _random_state(self) -> np.random.RandomState:
+        """Return the generator of the joint refinement's starts."""
+        seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
+        return np.random.RandomState(seed)
+
+    def _keep(
+        self,
+        centred: NDArray,
+        sizes: NDArray,
+        completed: NDArray,
+        result: PaperResult,
+        dtype: Any,
+    ) -> FrameFit:
+        """Set the shapes of the paper's pipeline and return the fit of the frames."""
+        paper = RigidFrames(result.mean_shape, result.basis)
+        rigid = paper.fit(completed, np.ones(len(completed)))
+        gauge = canonical_gauge(
+            result.mean_shape, result.basis, rigid.motion, rigid.alpha
+        )
+        self.mean_shape_ = gauge.mean_shape.astype(dtype)
+        self.basis_ = gauge.basis.astype(dtype)
+        covariance = reorder_blocks(result.mode_covariance, gauge.order)
+        self.mode_covariance_ = self._unit**2 * covariance
+        self._converged(result.converged, result.n_iter)
+        # The coefficients are those that transform gives, from the stored shapes.
+        frames = RigidFrames(self.mean_shape_, self.basis_)
+        self._frames: RigidFrames | PosteriorFrames = frames
+        return frames.fit(centred, sizes)
+
+    def _refine_jointly(
+        self,
+        unit: NDArray,
+        sizes: NDArray,
+        outliers: NDArray,
+        W: NDArray,
+        result: PaperResult,
+        dtype: Any,
+    ) -> FrameFit:
+        """Set the shapes of the joint refinement and return the fit of the frames."""
+        shapes = np.concatenate([result.mean_shape[None], result.basis])
+        fitted = fit_jointly(
+            unit,
+            outliers,
+            W,
+            result.factors,
+            shapes.transpose(0, 2, 1),
+            loss=self.loss,
+            stiffness=self.stiffness,
+            random_state=self._random_state(),
+            max_iter=self.max_iter,
+            tol=JOINT_TOL if self.tol is None else self.tol,
+        )
+        frames = PosteriorFrames(
+            fitted.shapes,
+            fitted.noise_variance,
+            spread_starts(fitted.alpha, N_STARTS),
+            self.loss,
+            FrameMap.identity(self.n_components),
+        )
+        posterior = frames.posterior(unit)
+        self.reliability_ = reliabilities(posterior.alpha, posterior.covariance)
+        gauge = independent_gauge(
+            fitted.shapes, posterior.motion, posterior.alpha, self.independence
+        )
+        frames = frames._replace(gauge=gauge.frames)
+        self._frames = frames
+        self.mean_shape_ = gauge.mean_shape.astype(dtype)
+        self.basis_ = gauge.basis.astype(dtype)
+        self.noise_variance_ = self._unit**2 * fitted.noise_variance
+        self.stiffness_ = fitted.stiffness
+        self.objective_history_ = fitted.history
+        self.gradient_norm_ = fitted.gradient_norm
+        self._converged(fitted.converged, len(fitted.history) - 1)
+        shown = frames.shown(posterior, sizes)
+        covariance = mode_covariance(shown.motion / sizes[:, None, None], shown.alpha)
+        self.mode_covariance_ = self._unit**2 * covariance
+        return shown
+
+    def _converged(self, converged: bool, n_iter: int) -> None:
+        """Set the number of steps, and warn where they were too few."""
+        self.n_iter_ = n_iter
+        if not converged:
+            warnings.warn(
+                f"the refinement did not converge in max_iter={self.max_iter} steps; "
+                "increase max_iter or tol",
+                ConvergenceWarning,
+                stacklevel=5,
+            )
+
     def _validated(self, X: Any) -> NDArray:
         """Return a table for the fitted model as an array."""
         check_is_fitted(self)
-        return validate_data(self, X, dtype=[np.float64, np.float32], reset=False)
+        return validate_data(
+            self,
+            X,
+            dtype=[np.float64, np.float32],
+            ensure_all_finite="allow-nan",
+            reset=False,
+        )
 
-    def _fit_frames(self, X: NDArray) -> tuple[NDArray, FrameFit]:
-        """Return the centred tracks of a valid table and the fit of its frames."""
-        centred, translation = centred_tracks(table_to_tracks(X, self.layout))
-        return centred, fit_frames(centred, translation, self.mean_shape_, self.basis_)
+    def _sizes(self, centred: NDArray) -> NDArray:
+        """Return what frames are divided by before they are compared."""
+        if self.loss == "linear":
+            return weighting_sizes(centred, self.scale_frames)
+        sizes = robust_sizes(centred)
+        return (
+            sizes
+            if self.scale_frames
+            else np.full_like(sizes, np.sqrt(np.mean(sizes**2)))
+        )
 
-    def _inverse_snr(self, centred: NDArray, frames: FrameFit) -> float:
+    def _prepared(self, X: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return tracks of a valid table, sizes of its frames, and which are usable."""
+        names = getattr(self, "feature_names_in_", None)
+        tracks = clean_tracks(table_to_tracks(X, self.layout), self.layout, names)
+        usable = usable_frames(tracks)
+        sizes = np.full(len(tracks), self._unit)
+        if self.scale_frames and usable.any():
+            sizes[usable] = self._sizes(centred_tracks(tracks[usable])[0])
+        return tracks, sizes, usable
+
+    def _fit_frames(self, X: NDArray) -> tuple[NDArray, NDArray, FrameFit]:
+        """Return tracks of a valid table, sizes of its frames and their fit."""
+        tracks, sizes, usable = self._prepared(X)
+        frames = FrameFit.unknown(len(tracks), self.n_components)
+        if usable.any():
+            centred, translation = centred_tracks(tracks[usable])
+            fit = self._frames.fit(centred, sizes[usable])
+            fit = fit._replace(translation=fit.translation + translation)
+            for whole, part in zip(frames, fit, strict=True):
+                whole[usable] = part
+        return tracks, sizes, frames
+
+    def _inverse_snr(self, tracks: NDArray, sizes: NDArray, frames: FrameFit) -> float:
         """Return the inverse SNR of fitted frames, weighted as in the fit."""
         shapes = compose(self.mean_shape_, self.basis_, frames.alpha)
-        residual = centred - project(shapes, frames.motion, np.zeros(2))
-        weights = weighting_sizes(centred, self.scale_frames) ** -2.0
-        noise = np.einsum("ijc,ijc,i->", residual, residual, weights, optimize=True)
-        signal = np.einsum("ijc,ijc,i->", centred, centred, weights, optimize=True)
-        return float(noise / signal)
+        model = project(shapes, frames.motion, frames.translation)
+        centred, _ = centred_tracks(tracks)
+        scale = sizes[:, None, None]
+        noise = np.nansum(((tracks - model) / scale) ** 2)
+        return float(noise / np.nansum((centred / scale) ** 2))
 
 
-def as_type(frames: FrameFit, dtype: Any) -> tuple[NDArray, NDArray, NDArray]:
-    """Return motion, translation and alpha in the type of the table."""
-    motion, translation, alpha = (part.astype(dtype, copy=False) for part in frames)
-    return motion, translation, alpha
+def as_type(frames: FrameFit, dtype: Any) -> FrameFit:
+    """Return a fit in the type of the table."""
+    return FrameFit(*(part.astype(dtype, copy=False) for part in frames))
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

@@ -1,6 +1,8 @@
-"""Camera and coefficients of single frames for given shapes.
+"""Camera, position and coefficients of single frames for given shapes.
 
 Each frame is fitted by itself: the result of a frame does not depend on the others.
+There are two models of a frame: `RigidFrames`, the paper's, takes the camera of the
+rigid fit, `PosteriorFrames` the most probable camera and coefficients.
 """
 
 from typing import NamedTuple
@@ -9,71 +11,268 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._camera import rigid_cameras
-from isa_nrsfm._tracks import measurement_matrix
+from isa_nrsfm._frame_posterior import FramePosterior, fit_posterior
+from isa_nrsfm._independent_gauge import FrameMap
+from isa_nrsfm._robust import distant_points, robust_weights
+from isa_nrsfm._tracks import measurement_matrix, seen_points
 
 # A basis shape whose image has less than this share of the energy that the camera could
 # show of it is seen end on: its image is rounding errors.
 UNSEEN = 1e-28
+# Rounds of a robust fit, and the change of the weights that ends them.
+REWEIGHTINGS = 50
+SETTLED = 1e-4
 
 
 class FrameFit(NamedTuple):
     """
-    Cameras, positions and coefficients of frames.
+    Cameras, positions and coefficients of frames; NaN where a frame shows too little.
 
     Attributes
     ----------
     motion : ndarray of shape (n_frames, 2, 3)
         Cameras, in the units of the table per unit of the shapes.
     translation : ndarray of shape (n_frames, 2)
-        Image of the origin, which is the centroid of the points.
+        Image of the origin, which is the centroid of the points of the mean shape.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the basis shapes.
+    alpha_std : ndarray of shape (n_frames, n_components)
+        Their standard deviations; NaN where the model of the frames knows no noise.
     """
 
     motion: NDArray
     translation: NDArray
     alpha: NDArray
+    alpha_std: NDArray
+
+    @classmethod
+    def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":
+        """Return a fit that is NaN."""
+        return cls(
+            np.full((n_frames, 2, 3), np.nan),
+            np.full((n_frames, 2), np.nan),
+            np.full((n_frames, n_components), np.nan),
+            np.full((n_frames, n_components), np.nan),
+        )
 
 
-def fit_frames(
-    centred: NDArray, translation: NDArray, mean_shape: NDArray, basis: NDArray
-) -> FrameFit:
+class RigidFrames(NamedTuple):
     """
-    Return the camera of the rigid fit and the coefficients of least squares.
+    The paper's model of a frame: rigid camera, coefficients by least squares.
 
-    Parameters
+    Attributes
     ----------
-    centred : ndarray of shape (n_frames, n_points, 2)
-        Tracks, centred over the points.
-    translation : ndarray of shape (n_frames, 2)
-        The centroids.
     mean_shape : ndarray of shape (n_points, 3)
         Centred.
     basis : ndarray of shape (n_components, n_points, 3)
         Centred basis shapes, orthogonal to each other and to the mean shape as the
         paper's are: ``B_k B_l^T = 0`` (3x3) for different k and l. The least squares
-        then separate.
+        then separate where no point is missing.
+    """
+
+    mean_shape: NDArray
+    basis: NDArray
+
+    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+        """
+        Return the camera of the rigid fit and the coefficients of least squares.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks, in any place; NaN where a point is missing.
+        sizes : ndarray of shape (n_frames,)
+            Not used: the fit does not depend on the unit of a frame.
+
+        Returns
+        -------
+        FrameFit
+            ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or
+            zero where camera i does not see basis shape k at all; the least squares
+            solution of least norm otherwise.
+        """
+        fit = FrameFit.unknown(len(tracks), len(self.basis))
+        seen = seen_points(tracks)
+        complete = np.asarray(seen.all(axis=1))
+        _fill(fit, complete, self._separately(tracks[complete]))
+        for i in np.flatnonzero(~complete):
+            _fill(fit, np.array([i]), self._together(tracks[i, seen[i]], seen[i]))
+        return fit
+
+    def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of complete frames."""
+        translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
+        W = measurement_matrix(tracks - translation[:, None])
+        motion = rigid_cameras(W, self.mean_shape)
+        n_components, n_points, _ = self.basis.shape
+        stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
+        P = (W @ stacked).reshape(len(tracks), 2, n_components, 3)
+        along = np.einsum("irkc,irc->ik", P, motion)
+        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
+        R = np.linalg.qr(self.basis, mode="r")
+        images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
+        energy = np.einsum("ikrd,ikrd->ik", images, images)
+        largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
+        visible = energy > UNSEEN * largest
+        alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
+        return motion, translation, alpha
+
+    def _together(
+        self, points: NDArray, seen: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of a frame of which some points are seen."""
+        centre, centroid = points.mean(axis=0), self.mean_shape[seen].mean(axis=0)
+        W = (points - centre).T
+        motion = rigid_cameras(W, self.mean_shape[seen] - centroid)
+        basis = self.basis[:, seen]
+        middles = basis.mean(axis=1)
+        images = (basis - middles[:, None]) @ motion[0].T
+        rest = W.T - (self.mean_shape[seen] - centroid) @ motion[0].T
+        alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
+        translation = centre - motion[0] @ (centroid + alpha @ middles)
+        return motion, translation[None], alpha[None]
+
+
+class PosteriorFrames(NamedTuple):
+    """
+    The joint refinement's model of a frame: all of it at once, with a prior.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Shapes with coefficients that are drawn from N(0, I), rows centred.
+    noise_variance : float
+        Variance of a coordinate of a frame of size one.
+    starts : ndarray of shape (n_starts, n_components)
+        Coefficients to start from where zero leads nowhere.
+    loss : {"linear", "huber", "cauchy"}
+        How points count that are far from the model.
+    gauge : FrameMap
+        Takes the coefficients to the basis that is shown.
+    """
+
+    shapes: NDArray
+    noise_variance: float
+    starts: NDArray
+    loss: str
+    gauge: FrameMap
+
+    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+        """
+        Return the most probable camera, position and coefficients.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks, in any place; NaN where a point is missing.
+        sizes : ndarray of shape (n_frames,)
+            Sizes of the frames.
+
+        Returns
+        -------
+        FrameFit
+            As of `fit_posterior`, in the gauge; with a robust loss the weights agree
+            with the fit.
+        """
+        return self.shown(self.posterior(tracks / sizes[:, None, None]), sizes)
+
+    def shown(self, posterior: FramePosterior, sizes: NDArray) -> FrameFit:
+        """
+        Return a fit of frames of size one in their sizes and in the gauge.
+
+        Parameters
+        ----------
+        posterior : FramePosterior
+            The fit.
+        sizes : ndarray of shape (n_frames,)
+            Sizes of the frames.
+
+        Returns
+        -------
+        FrameFit
+            The same fit.
+        """
+        motion, alpha, deviation = self.gauge.apply(
+            posterior.motion, posterior.alpha, posterior.covariance
+        )
+        translation = posterior.translation * sizes[:, None]
+        return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
+
+    def posterior(self, tracks: NDArray) -> FramePosterior:
+        """Return the fit of frames of size one, before the gauge."""
+        if self.loss == "linear":
+            return fit_posterior(
+                tracks, self.shapes, self.noise_variance, starts=self.starts
+            )
+        weights = np.where(distant_points(tracks), 0.0, 1.0)
+        fit = fit_posterior(
+            tracks,
+            self.shapes,
+            self.noise_variance,
+            weights=weights,
+            starts=self.starts,
+        )
+        seen = seen_points(tracks)
+        changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
+        for _ in range(REWEIGHTINGS):
+            part = tracks[changing]
+            distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
+            distance = np.where(seen[changing], distance, np.inf)
+            new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
+            unsettled = np.abs(new - weights[changing]).max(axis=1) > SETTLED
+            weights[changing] = new
+            changing = changing[unsettled]
+            if not len(changing):
+                break
+            refit = fit_posterior(
+                tracks[changing],
+                self.shapes,
+                self.noise_variance,
+                weights=weights[changing],
+                initial=fit.alpha[changing],
+            )
+            for whole, values in zip(fit, refit, strict=True):
+                whole[changing] = values
+        return fit
+
+
+def distances(
+    tracks: NDArray,
+    shapes: NDArray,
+    motion: NDArray,
+    translation: NDArray,
+    alpha: NDArray,
+) -> NDArray:
+    """
+    Return how far the points of frames are from a model of them.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks; NaN where a point is missing.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    translation : ndarray of shape (n_frames, 2)
+        Positions.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
 
     Returns
     -------
-    FrameFit
-        ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2``, or zero where camera i does not
-        see basis shape k at all.
+    ndarray of shape (n_frames, n_points)
+        Distances in the images; NaN where a point is missing.
     """
-    W = measurement_matrix(centred)
-    motion = rigid_cameras(W, mean_shape)
-    n_components, n_points, _ = basis.shape
-    stacked = basis.transpose(1, 0, 2).reshape(n_points, -1)
-    P = (W @ stacked).reshape(len(centred), 2, n_components, 3)
-    seen = np.einsum("irkc,irc->ik", P, motion)
-    # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
-    R = np.linalg.qr(basis, mode="r")
-    images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
-    energy = np.einsum("ikrd,ikrd->ik", images, images)
-    largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
-    visible = energy > UNSEEN * largest
-    alpha = np.divide(seen, energy, where=visible, out=np.zeros_like(seen))
-    return FrameFit(motion, translation, alpha)
+    stacked = shapes.transpose(0, 2, 1)
+    model = project(compose(stacked[0], stacked[1:], alpha), motion, translation)
+    return np.linalg.norm(tracks - model, axis=2)
+
+
+def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:
+    """Set camera, position and coefficients of some frames."""
+    for whole, part in zip(fit, values, strict=False):
+        whole[frames] = part
 
 
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:

@@ -71,11 +71,17 @@ class Gauge(NamedTuple):
         Basis shapes in the canonical space, order and scale.
     order : ndarray of int, shape (n_components,)
         Where each basis shape was before.
+    factors : ndarray of shape (n_components,)
+        What it has been multiplied by, zero for those without motion.
+    space : ndarray of shape (3, 3)
+        The affinity of `canonical_space`.
     """
 
     mean_shape: NDArray
     basis: NDArray
     order: NDArray
+    factors: NDArray
+    space: NDArray
 
 
 def canonical_gauge(
@@ -113,8 +119,10 @@ def canonical_gauge(
     size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
     factors = np.where(moving, orientations(alpha.T) * size, 0.0)
     scaled = factors[:, None, None] * basis
-    space = canonical_space(mean_shape, motion).T
-    return Gauge(mean_shape @ space, scaled[order] @ space, order)
+    space = canonical_space(mean_shape, motion)
+    return Gauge(
+        mean_shape @ space.T, scaled[order] @ space.T, order, factors[order], space
+    )
 
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
@@ -138,6 +146,28 @@ def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     cameras = motion.transpose(0, 2, 1) @ motion
     weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
     return np.einsum("kab,kab->k", weighted, basis.transpose(0, 2, 1) @ basis)
+
+
+def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
+    """
+    Return the mode covariance matrix of given cameras and coefficients.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (3 * n_components, 3 * n_components)
+        ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``, what the covariance over
+        the images of Brandt et al. (2018), section 3.3, is for motion that has block
+        structure.
+    """
+    blocks = np.einsum("ik,irc->irkc", alpha, motion).reshape(2 * len(alpha), -1)
+    return blocks.T @ blocks / len(blocks)
 
 
 def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:

@@ -247,7 +247,10 @@ def names_layout(
         coordinate = parse_coordinate(name)
         if coordinate is None:
             return None
-        coordinates.append((coordinate.axis, coordinate.memberships[0]))
+        (x, y, _), key = coordinate.memberships[0]
+        # The pattern without its axis letter: that of x and y may differ in case.
+        letter = next(i for i, (a, b) in enumerate(zip(x, y, strict=True)) if a != b)
+        coordinates.append((coordinate.axis, (x[:letter], x[letter + 1 :], key)))
     axes = [axis for axis, _ in coordinates]
     points = [point for _, point in coordinates]
     if 0 not in axes or 1 not in axes:

@@ -21,7 +21,7 @@ from isa_nrsfm._block_structure import (
     recover_blocks,
     structure_energies,
 )
-from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._factorisation import Factorisation, factorise
 from isa_nrsfm._refinement import refine_alternating
 
 # Fixed-point iterations from random starts are chaotic at first: rounding errors, such
@@ -53,6 +53,8 @@ class PaperResult(NamedTuple):
         Steps of the refinement, 1 without one.
     converged : bool
         Whether it has converged.
+    factors : Factorisation
+        Of W.
     """
 
     mean_shape: NDArray
@@ -62,6 +64,7 @@ class PaperResult(NamedTuple):
     rank_floor: float
     n_iter: int
     converged: bool
+    factors: Factorisation
 
 
 def run_paper_pipeline(
@@ -143,6 +146,7 @@ def run_paper_pipeline(
         float(energy[3 * n_components + 3 :].sum() / energy.sum()),
         n_iter,
         converged,
+        factors,
     )
 
 

@@ -19,13 +19,27 @@ from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
+from isa_nrsfm._joint_fit import STIFFNESS
+from isa_nrsfm._robust import robust_sizes
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.metrics import affine_shape_error
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
+ONLY_JOINT = (
+    "alpha_std_",
+    "noise_variance_",
+    "stiffness_",
+    "reliability_",
+    "objective_history_",
+    "gradient_norm_",
+)
 
+
+# What noise is left in the table at the true number of basis shapes.
+JOINT_INVERSE_SNR = 5e-5
 
 # The run of FastICA that is kept may be one that goes round in a cycle; it says so.
 may_not_converge = pytest.mark.filterwarnings(
@@ -70,6 +84,20 @@ def frame_weights(tracks, scale_frames):
     )
 
 
+def size_weights(model, table):
+    """Return one over the square of the sizes of frames, those of the loss."""
+    tracks = tracks_of(table, model.layout)
+    if model.loss == "linear":
+        weights = frame_weights(tracks, True)
+    else:
+        weights = robust_sizes(tracks) ** -2
+    return (
+        weights
+        if model.scale_frames
+        else np.full_like(weights, 1 / np.mean(1 / weights))
+    )
+
+
 @pytest.fixture(scope="module")
 def model():
     return estimator().fit(TABLE)
@@ -81,13 +109,18 @@ def model():
         {},
         {"scale_frames": False},
         {"layout": "planar"},
-        {"layout": "planar", "scale_frames": False, "refinement": None},
-        {"refinement": None},
-        {"isa": PooledFastICA(n_init=3)},
-        {"block_recovery": "eigen"},
-        {"block_recovery": "irls", "refinement": None},
+        {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
+        {"loss": "huber"},
+        {"loss": "cauchy", "independence": None},
+        {"stiffness": 10.0},
         {"n_components": 1},
         {"n_components": 6},
+        {"refinement": "alternating"},
+        {"refinement": "alternating", "scale_frames": False},
+        {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
+        {"refinement": None, "layout": "planar", "scale_frames": False},
+        {"refinement": None, "block_recovery": "irls"},
+        {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
     ],
     ids=str,
 )
@@ -105,10 +138,13 @@ def variant(request):
 # --- attributes ---------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("n_components", [1, 4])
-def test_attributes_have_the_documented_shapes_and_types(dtype, n_components):
-    model = estimator(n_components).fit(TABLE.astype(dtype))
+@pytest.mark.parametrize("n_components", [3, 4])
+def test_attributes_have_the_documented_shapes_and_types(
+    dtype, n_components, refinement
+):
+    model = estimator(n_components, refinement=refinement).fit(TABLE.astype(dtype))
     in_type_of_the_table = {
         "mean_shape_": (N_POINTS, 3),
         "basis_": (n_components, N_POINTS, 3),
@@ -118,11 +154,23 @@ def test_attributes_have_the_documented_shapes_and_types(dtype, n_components):
         "reference_motion_": (2, 3),
         "reference_translation_": (2,),
     }
+    if refinement == "joint":
+        in_type_of_the_table["alpha_std_"] = (N_FRAMES, n_components)
+        assert model.reliability_.shape == (n_components,)
+        for name in ("noise_variance_", "stiffness_", "gradient_norm_"):
+            assert isinstance(getattr(model, name), float), name
+        assert model.objective_history_.shape == (model.n_iter_ + 1,)
+        assert np.isfinite(model.objective_history_).all()
+    else:
+        for name in ONLY_JOINT:
+            assert not hasattr(model, name)
     for name, shape in in_type_of_the_table.items():
         assert getattr(model, name).shape == shape, name
         assert getattr(model, name).dtype == dtype, name
     assert model.mode_covariance_.shape == (3 * n_components, 3 * n_components)
     assert model.singular_values_.shape == (3 * n_components + 3,)
+    assert model.energy_share_.shape == (n_components,)
+    assert_allclose(model.energy_share_.sum(), 1)
     assert type(model.inverse_snr_) is float
     assert type(model.rank_floor_) is float
     assert type(model.n_iter_) is int
@@ -144,7 +192,10 @@ def test_every_attribute_is_documented(model):
 def test_defaults_are_the_documented_ones():
     model = AffineNRSfM(n_components=2, random_state=0).fit(TABLE)
     assert isinstance(model.isa_, PooledFastICA)
-    assert model.refinement == "alternating"
+    assert model.refinement == "joint"
+    assert model.independence == "shapes"
+    assert model.loss == "linear"
+    assert model.stiffness is None
     assert model.layout == "interleaved"
     assert model.scale_frames is True
 
@@ -157,13 +208,25 @@ def test_inputs_of_other_types_are_fitted_in_double_precision():
     assert_array_equal(model.alpha_, estimator().fit(table.tolist()).alpha_)
 
 
-def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(variant):
-    model, table, _ = variant
+def scaled_matrix(model, table):
+    """Return the centred tracks of a table, scaled as in the fit, (2I, J)."""
     tracks = tracks_of(table, model.layout)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     weights = frame_weights(tracks, model.scale_frames)
-    W = np.vstack(list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1)))
-    S = np.linalg.svd(W, compute_uv=False)
+    return np.vstack(
+        list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1))
+    )
+
+
+def is_joint(model):
+    return model.refinement == "joint"
+
+
+def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(variant):
+    model, table, _ = variant
+    if model.loss != "linear":
+        pytest.skip("outliers have been filled in")
+    S = np.linalg.svd(scaled_matrix(model, table), compute_uv=False)
     rank = 3 * model.n_components + 3
     assert_allclose(model.rank_floor_, np.sum(S[rank:] ** 2) / np.sum(S**2), rtol=1e-9)
     assert 0 < model.rank_floor_ < model.inverse_snr_ < 1
@@ -174,46 +237,101 @@ def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(vari
         assert_allclose(ratio, ratio[0], rtol=1e-9)
 
 
-def test_mode_covariance_is_that_of_the_subspaces_in_the_order_of_the_basis(variant):
-    # Block k has the trace ||W P_k||^2 / 2I with P_k the projector on the subspace that
-    # the three coordinates of basis shape k span, and all blocks have it together.
+def test_mode_covariance(variant):
     model, table, _ = variant
     C = model.mode_covariance_
     assert_allclose(C, C.T, atol=1e-12 * np.abs(C).max())
     assert np.linalg.eigvalsh(C)[0] > -1e-12 * np.trace(C)
-    tracks = tracks_of(table, model.layout)
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    weights = frame_weights(tracks, model.scale_frames)
-    W = np.vstack(list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1)))
-    for k, shape in enumerate(model.basis_):
+    blocks = [slice(3 * k, 3 * k + 3) for k in range(model.n_components)]
+    if is_joint(model):
+        # (1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i), by plain loops.
+        sizes = 1 / np.sqrt(size_weights(model, table))
+        for k, rows in enumerate(blocks):
+            for m, columns in enumerate(blocks):
+                expected = sum(
+                    a[k] * a[m] * M.T @ M
+                    for a, M in zip(
+                        model.alpha_, model.motion_ / sizes[:, None, None], strict=True
+                    )
+                ) / (2 * N_FRAMES)
+                if not model.scale_frames:  # in the units of the table
+                    expected = expected * sizes[0] ** 2
+                tolerance = 1e-10 * np.abs(C).max()
+                assert_allclose(C[rows, columns], expected, atol=tolerance)
+        return
+    # Block k has the trace ||W P_k||^2 / 2I with P_k the projector on the subspace that
+    # the three coordinates of basis shape k span.
+    W = scaled_matrix(model, table)
+    for rows, shape in zip(blocks, model.basis_, strict=True):
         Q = np.linalg.qr(shape)[0]
-        block = C[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
-        assert_allclose(np.trace(block), np.sum((W @ Q) ** 2) / len(W), rtol=1e-6)
+        trace = np.trace(C[rows, rows])
+        assert_allclose(trace, np.sum((W @ Q) ** 2) / len(W), rtol=1e-6)
 
 
-def test_basis_shapes_are_orthogonal_as_those_of_the_paper(variant):
-    # B_k B_l^T = 0 for k != l, the mean shape included.
+def test_shapes_are_centred_and_pure(variant):
+    # The joint refinement's basis shapes have no part along the mean shape, which is
+    # white: tr(B_k^T B_0) = 0, and the mean of the coefficients is zero. The paper's
+    # are orthogonal: B_k B_l^T = 0 for k != l, the mean shape included.
     model, *_ = variant
     shapes = np.concatenate([model.mean_shape_[None], model.basis_])
     assert_allclose(shapes.mean(axis=1), 0, atol=1e-12)
+    if is_joint(model):
+        assert_allclose(
+            np.sum(model.basis_ * model.mean_shape_, axis=(1, 2)), 0, atol=1e-9
+        )
+        assert_allclose(model.alpha_.mean(axis=0), 0, atol=1e-10)
+        return
     for k, one in enumerate(shapes):
         for other in shapes[:k]:
             size = np.linalg.norm(one) * np.linalg.norm(other)
             assert np.abs(one.T @ other).max() < 1e-10 * size
 
 
+def test_coefficients_have_unit_variance_and_energy_decreases(variant):
+    model, table, _ = variant
+    assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-9)
+    assert np.all(np.mean(model.alpha_**3, axis=0) > 0)
+    assert np.all(np.diff(model.energy_share_) < 0)
+    weights = size_weights(model, table)
+    energy = np.zeros(model.n_components)
+    for alpha, M, weight in zip(model.alpha_, model.motion_, weights, strict=True):
+        images = model.basis_ @ M.T
+        energy += weight * alpha**2 * np.sum(images**2, axis=(1, 2))
+    assert_allclose(model.energy_share_, energy / energy.sum(), rtol=1e-9)
+
+
+def test_objective_never_rises(variant):
+    model, *_ = variant
+    if not is_joint(model):
+        pytest.skip("only the joint refinement has one")
+    history = model.objective_history_
+    assert np.all(np.diff(history) <= 1e-9 * np.abs(history).max())
+    assert 0 <= model.gradient_norm_ < 0.1
+    chosen = (0.0, STIFFNESS) if model.stiffness is None else (model.stiffness,)
+    assert model.stiffness_ in chosen
+
+
+def test_deviations_are_positive_and_below_the_prior(variant):
+    model, *_ = variant
+    if not is_joint(model):
+        pytest.skip("only the joint refinement knows them")
+    assert np.all(model.alpha_std_ > 0)
+    # On average nothing is known less well than its spread over the frames, which is 1.
+    assert np.all(np.mean(model.alpha_std_**2, axis=0) < 1)
+
+
 # --- the formula --------------------------------------------------------------------
 
 
-def test_decompose_of_the_fitted_table_gives_the_attributes(variant):
+def test_decompose_of_the_fitted_table_gives_the_attributes_to_the_bit(variant):
     model, table, _ = variant
     frames = model.decompose(table)
     assert isinstance(frames, Decomposition)
     assert frames._fields == ("motion", "translation", "alpha")
-    assert_allclose(frames.motion, model.motion_, rtol=1e-12)
-    assert_allclose(frames.translation, model.translation_, rtol=1e-12)
-    assert_allclose(frames.alpha, model.alpha_, rtol=1e-10, atol=1e-10)
-    assert_allclose(model.transform(table), model.alpha_, rtol=1e-10, atol=1e-10)
+    assert_array_equal(frames.motion, model.motion_)
+    assert_array_equal(frames.translation, model.translation_)
+    assert_array_equal(frames.alpha, model.alpha_)
+    assert_array_equal(model.transform(table), model.alpha_)
 
 
 @pytest.mark.parametrize("which", ["fitted", "new"])
@@ -221,7 +339,7 @@ def test_methods_follow_the_formula(variant, which):
     model, table, new = variant
     table = table if which == "fitted" else new
     motion, translation, alpha = model.decompose(table)
-    assert_allclose(model.transform(table), alpha, rtol=1e-12)
+    assert_array_equal(model.transform(table), alpha)
 
     shapes = model.reconstruct(table)
     assert shapes.shape == (len(table), N_POINTS, 3)
@@ -239,21 +357,22 @@ def test_methods_follow_the_formula(variant, which):
             tracks_of(result, model.layout), expected, atol=1e-12 * scale, rtol=0
         )
 
-    tracks = tracks_of(table, model.layout)
-    weights = frame_weights(tracks, model.scale_frames)
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    noise = np.sum((tracks - expected) ** 2, axis=(1, 2)) @ weights
-    signal = np.sum(centred**2, axis=(1, 2)) @ weights
-    assert_allclose(-model.score(table), noise / signal, rtol=1e-8)
     if which == "fitted":
-        assert_allclose(model.score(table), -model.inverse_snr_, rtol=1e-12)
+        tracks = tracks_of(table, model.layout)
+        weights = size_weights(model, table)
+        centred = tracks - tracks.mean(axis=1, keepdims=True)
+        noise = np.sum((tracks - expected) ** 2, axis=(1, 2)) @ weights
+        signal = np.sum(centred**2, axis=(1, 2)) @ weights
+        assert_allclose(model.inverse_snr_, noise / signal, rtol=1e-8)
         assert noise / signal < 0.01
 
 
 @pytest.mark.parametrize("which", ["fitted", "new"])
-def test_frames_are_linear_least_squares_fits(variant, which):
+def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
     # Camera: the rigid fit to the mean shape. Coefficients: the fit that follows.
     model, table, new = variant
+    if is_joint(model):
+        pytest.skip("camera and coefficients are fitted together")
     table = table if which == "fitted" else new
     motion, translation, alpha = model.decompose(table)
     tracks = tracks_of(table, model.layout)
@@ -268,23 +387,52 @@ def test_frames_are_linear_least_squares_fits(variant, which):
         assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
 
 
-def test_frames_are_fitted_by_themselves(model):
-    new = make_face_tracks(12, n_components=5, random_state=1).data
+@pytest.mark.parametrize("which", ["fitted", "new"])
+def test_cameras_of_the_joint_refinement_are_best_for_the_coefficients(variant, which):
+    # They are the least squares fit to the shape of the frame, position included.
+    model, table, new = variant
+    if not is_joint(model) or model.loss != "linear":
+        pytest.skip("cameras are those of the rigid fit, or points have weights")
+    table = table if which == "fitted" else new
+    motion, translation, _ = model.decompose(table)
+    tracks, shapes = tracks_of(table, model.layout), model.reconstruct(table)
+    for points, shape, M, t in zip(tracks, shapes, motion, translation, strict=True):
+        design = np.column_stack([shape, np.ones(N_POINTS)])
+        best = np.linalg.lstsq(design, points)[0]
+        size = np.abs(M).max()
+        assert_allclose(M, best[:3].T, atol=1e-6 * size)
+        assert_allclose(t, best[3], atol=1e-6 * size)
+
+
+def test_frames_are_fitted_by_themselves(variant):
+    model, _, new = variant
     together = model.decompose(new)
-    for i in range(len(new)):
+    for i in range(0, len(new), 5):
         alone = model.decompose(new[i : i + 1])
         for one, all_ in zip(alone, together, strict=True):
-            assert_allclose(one[0], all_[i], rtol=1e-10, atol=1e-12)
+            assert_allclose(one[0], all_[i], rtol=1e-9, atol=1e-10)
 
 
-def test_reconstructed_fitted_table_is_the_table_at_the_rank_of_the_truth():
-    # Nothing but the model itself is in a table that the model has made.
-    made = estimator(2).fit(TABLE)
-    table = made.reproject(TABLE)
-    assert_allclose(made.score(table), 0, atol=1e-25)
-    assert_allclose(made.transform(table), made.alpha_, atol=1e-10)
-    again = estimator(2).fit(table)
+def test_table_that_the_model_has_made_is_taken_apart_again():
+    # Nothing but the model itself is in it. The joint refinement's prior draws the
+    # coefficients a little to zero.
+    paper, joint = (
+        estimator(refinement=refinement).fit(TABLE)
+        for refinement in ("alternating", "joint")
+    )
+    table = paper.reproject(TABLE)
+    assert_allclose(paper.transform(table), paper.alpha_, atol=1e-10)
+    table = joint.reproject(TABLE)
+    drawn = np.abs(joint.transform(table) - joint.alpha_) / joint.alpha_std_
+    assert drawn.max() < 1
+    assert -joint.score(table) < 1e-2 * -joint.score(TABLE)
+    again = estimator().fit(table)
     assert again.rank_floor_ < 1e-20
+    assert again.inverse_snr_ < 1e-8
+    cosine = np.sum(again.basis_ * joint.basis_, axis=(1, 2))
+    cosine /= np.linalg.norm(again.basis_, axis=(1, 2))
+    cosine /= np.linalg.norm(joint.basis_, axis=(1, 2))
+    assert np.all(np.abs(cosine) > 0.99)
 
 
 def test_inverse_transform_takes_the_mean_view_by_default(model):
@@ -311,7 +459,8 @@ def test_inverse_transform_takes_the_mean_view_by_default(model):
             model.inverse_transform(alpha, motion, translation), table, rtol=1e-12
         )
     # The same coefficients come out again: the table is made by the model.
-    assert_allclose(model.transform(table), alpha, atol=1e-10)
+    # The prior draws them a little to zero.
+    assert_allclose(model.transform(table), alpha, atol=model.alpha_std_.max())
 
 
 @pytest.mark.parametrize(
@@ -327,10 +476,10 @@ def test_single_precision_is_kept(method):
     assert model.fit_transform(table).dtype == np.float32
     # Cameras and coefficients are computed in double precision from shapes that were
     # rounded to single precision.
-    assert_allclose(model.transform(table), model.alpha_, atol=1e-5)
+    assert_array_equal(model.transform(table), model.alpha_)
     reference = estimator().fit(table.astype(float))
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-4)
-    assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-4)
+    assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-3)
 
 
 def test_fit_transform_returns_a_copy_of_alpha():
@@ -434,7 +583,6 @@ BAD_TABLES = {
         TABLE[:, :-1],
         "must have two columns per point .* even number; got n_features=135",
     ),
-    "missing values": (with_value(np.nan), r"missing \(NaN\)"),
     "infinite values": (with_value(np.inf), "X contains infinity"),
     "minus infinity": (with_value(-np.inf), "X contains infinity"),
     "equal points": (
@@ -471,9 +619,8 @@ def test_bad_tables_are_refused(name):
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        (with_value(np.nan), "X contains NaN"),
         (with_value(np.inf), "X contains infinity"),
-        (with_equal_points(0, 1, 2), r"all points are equal in 3 frame\(s\), .* row 0"),
+        (with_value(-np.inf), "X contains infinity"),
         (TABLE[:, :-2], "X has 134 features, but AffineNRSfM is expecting 136"),
         (TABLE[:0], r"0 sample\(s\)"),
     ],
@@ -591,8 +738,13 @@ def test_methods_need_a_fitted_model():
         {"isa": "fastisa"},
         {"isa": object()},
         {"block_recovery": "best"},
-        {"refinement": "joint"},
+        {"refinement": "alternate"},
         {"refinement": False},
+        {"independence": "points"},
+        {"loss": "squared"},
+        {"loss": None},
+        {"stiffness": -1.0},
+        {"stiffness": "auto"},
         {"layout": "xy"},
         {"scale_frames": "yes"},
         {"max_iter": 0},
@@ -609,11 +761,32 @@ def test_bad_parameters_are_refused(params):
         estimator(**params).fit(TABLE)
 
 
+# --- fewer basis shapes than the object has ------------------------------------------
+
+
+@may_not_converge
+@pytest.mark.parametrize("n_components", [1, 2, 3])
+def test_too_few_basis_shapes_are_better_than_none(n_components):
+    # K is not known: shapes must not be worse for it than the mean shape alone.
+    model = estimator(n_components, isa=None).fit(TABLE)
+    rigid = np.repeat(FACES.shapes.mean(axis=0)[None], N_FRAMES, axis=0)
+    error = affine_shape_error(FACES.shapes, model.reconstruct(TABLE))
+    assert error < 1.05 * affine_shape_error(FACES.shapes, rigid)
+
+
+@may_not_converge
+@pytest.mark.parametrize("n_components", [1, 2, 3])
+def test_too_few_basis_shapes_do_not_depend_on_rounding(n_components):
+    model = estimator(n_components, isa=None).fit(TABLE)
+    moved = estimator(n_components, isa=None).fit(TABLE + 300.0)
+    assert_allclose(moved.alpha_, model.alpha_, atol=1e-5)
+
+
 # --- parameters ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("block_recovery", ["generalized_eigen", "eigen", "irls"])
-@pytest.mark.parametrize("refinement", ["alternating", None])
+@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
 @pytest.mark.parametrize("isa", [FastISA(n_init=3), PooledFastICA(n_init=3)], ids=str)
 def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
     block_recovery, refinement, isa
@@ -634,6 +807,38 @@ def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
         assert refined.inverse_snr_ <= model.inverse_snr_ * (1 + 1e-9)
     else:
         assert model.inverse_snr_ < 0.5 * rigid
+    if refinement == "joint":  # all end at the noise
+        assert model.inverse_snr_ < 1.2 * JOINT_INVERSE_SNR
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("refinement", ["alternating", None])
+def test_robust_losses_need_the_joint_refinement(refinement, loss):
+    with pytest.raises(
+        ValueError, match=f"loss='{loss}' needs refinement='joint'; got"
+    ):
+        estimator(refinement=refinement, loss=loss).fit(TABLE)
+
+
+def test_stiffness_zero_is_not_raised():
+    assert estimator(stiffness=0).fit(TABLE).stiffness_ == 0
+    soft, stiff = (estimator(stiffness=s).fit(TABLE) for s in (0, 1e6))
+    assert np.linalg.norm(stiff.basis_) < np.linalg.norm(soft.basis_)
+    assert stiff.inverse_snr_ > soft.inverse_snr_
+
+
+def test_shapes_of_frames_do_not_depend_on_the_independence():
+    fits = [
+        estimator(independence=name).fit(TABLE)
+        for name in ("shapes", "coefficients", None)
+    ]
+    shapes = fits[0].reconstruct(TABLE)
+    for other in fits[1:]:
+        assert_allclose(other.mean_shape_, fits[0].mean_shape_, atol=1e-9)
+        assert_allclose(other.reconstruct(TABLE), shapes, atol=1e-8)
+        assert_allclose(other.inverse_snr_, fits[0].inverse_snr_, rtol=1e-9)
+        assert_allclose(other.score(TABLE), fits[0].score(TABLE), rtol=1e-7)
+        assert np.abs(other.alpha_ - fits[0].alpha_).max() > 0.1
 
 
 def test_refinement_that_is_cut_short_says_so():
@@ -796,10 +1001,10 @@ def test_grid_search_over_own_and_nested_parameters():
     search.fit(TABLE)
     scores = search.cv_results_["mean_test_score"]
     assert np.isfinite(scores).all()
-    assert search.best_params_["n_components"] == 3
+    assert search.best_params_["n_components"] == K
     assert search.best_estimator_.isa_.n_init == search.best_params_["isa__n_init"]
     assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
-    assert_allclose(search.score(TABLE), -search.best_estimator_.inverse_snr_)
+    assert search.score(TABLE) == search.best_estimator_.score(TABLE)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.FitFailedWarning")
@@ -823,10 +1028,18 @@ COPIES = {
 }
 
 
+@may_not_converge
 @pytest.mark.parametrize("way", COPIES)
-@pytest.mark.parametrize("isa", [PooledFastICA(n_init=2), FastISA(n_init=2)], ids=str)
-def test_copies_give_the_same_to_the_bit(way, isa, tmp_path):
-    model = estimator(2, isa=isa).fit(TABLE)
+@pytest.mark.parametrize(
+    "params",
+    [
+        {"isa": PooledFastICA(n_init=2)},
+        {"isa": FastISA(n_init=2), "refinement": "alternating"},
+    ],
+    ids=str,
+)
+def test_copies_give_the_same_to_the_bit(way, params, tmp_path):
+    model = estimator(**params).fit(TABLE)
     loaded = COPIES[way](model, tmp_path / "model")
     assert_array_equal(loaded.transform(TABLE), model.transform(TABLE))
     assert_array_equal(loaded.reproject(TABLE), model.reproject(TABLE))

@@ -3,30 +3,41 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 # The warning about the layout has tests of its own.
-pytestmark = pytest.mark.filterwarnings("ignore:layout=:UserWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:layout=:UserWarning"),
+    # The joint refinement only starts from what FastICA finds.
+    pytest.mark.filterwarnings("ignore:FastICA did not converge"),
+]
 
-STRATEGIES = {"pooled": PooledFastICA(n_init=8), "fast": FastISA(n_init=4)}
+VARIANTS = {
+    "paper, pooled": {"isa": PooledFastICA(n_init=8), "refinement": "alternating"},
+    "paper, fast": {"isa": FastISA(n_init=4), "refinement": "alternating"},
+    "joint": {},
+}
 
-# The fixed-point iterations of ICA and ISA stop at some distance from their limit and
-# amplify rounding errors on their way: the results agree to less than rounding level.
+# All iterations amplify rounding errors on their way, those of ICA and ISA most, which
+# stop at some distance from their limit: the results agree to less than rounding level.
+# The joint refinement alone reaches 1e-9 for alpha and 1e-10 for the shapes.
 ALPHA_TOLERANCE = 1e-5
 SHAPE_TOLERANCE = 1e-6
 
 
-def estimator(isa, scale_frames=True):
+def estimator(params, scale_frames=True):
     """Return an estimator."""
-    return AffineNRSfM(4, isa=isa, scale_frames=scale_frames, random_state=0)
+    params = {"scale_frames": scale_frames, "random_state": 0} | params
+    return AffineNRSfM(4, **params)
 
 
 def faces(load_data, name):
     """Return the tracks of complete frames, a subset of a real table or synthetic."""
     if name == "synthetic":
-        return make_face_tracks(200, random_state=0).tracks
+        return make_face_tracks(120, n_components=4, random_state=0).tracks
     tracks = load_data(name)["W2d"].astype(float)
     tracks = tracks[~np.isnan(tracks).any(axis=(1, 2))]
     return tracks[:: len(tracks) // 200]
@@ -83,24 +94,24 @@ SIZE_CHANGES = {
 }
 
 
-@pytest.fixture(scope="module", params=["ict_bu3dfe_like_68", "muct_68", "synthetic"])
+@pytest.fixture(scope="module", params=["ict_bu3dfe_like_68", "synthetic"])
 def tracks(request, load_data):
     return faces(load_data, request.param)
 
 
-@pytest.fixture(scope="module", params=STRATEGIES)
-def isa(request):
-    return STRATEGIES[request.param]
+@pytest.fixture(scope="module", params=VARIANTS)
+def variant(request):
+    return VARIANTS[request.param]
 
 
 @pytest.fixture(scope="module")
-def model(tracks, isa):
-    return estimator(isa).fit(table_of(tracks))
+def model(tracks, variant):
+    return estimator(variant).fit(table_of(tracks))
 
 
 @pytest.fixture(scope="module")
-def unscaled(tracks, isa):
-    return estimator(isa, scale_frames=False).fit(table_of(tracks))
+def unscaled(tracks, variant):
+    return estimator(variant, scale_frames=False).fit(table_of(tracks))
 
 
 def all_shapes(model):
@@ -125,64 +136,104 @@ def assert_models_agree(model, expected):
 
 
 @pytest.mark.parametrize("change", [*IMAGE_CHANGES, *SIZE_CHANGES])
-def test_coefficients_do_not_depend_on_the_images_placement(tracks, model, isa, change):
+def test_coefficients_do_not_depend_on_the_images_placement(
+    tracks, model, variant, change
+):
     changed = (IMAGE_CHANGES | SIZE_CHANGES)[change](tracks, np.random.default_rng(0))
-    assert_models_agree(estimator(isa).fit(table_of(changed)), model)
+    assert_models_agree(estimator(variant).fit(table_of(changed)), model)
     # The model of the first table gives the coefficients of the second one.
     assert_allclose(model.transform(table_of(changed)), model.alpha_, atol=1e-9)
 
 
 @pytest.mark.parametrize("change", ["frames moved", "one frame turned", "tiny unit"])
-def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, isa, change):
+def test_coefficients_of_frames_that_count_by_size(tracks, unscaled, variant, change):
     changed = IMAGE_CHANGES[change](tracks, np.random.default_rng(0))
-    fitted = estimator(isa, scale_frames=False).fit(table_of(changed))
+    fitted = estimator(variant, scale_frames=False).fit(table_of(changed))
     assert_models_agree(fitted, unscaled)
 
 
-def test_frames_may_change_places(tracks, model, isa):
+def test_frames_may_change_places(tracks, model, variant):
     order = np.random.default_rng(0).permutation(len(tracks))
-    permuted = estimator(isa).fit(table_of(tracks[order]))
+    permuted = estimator(variant).fit(table_of(tracks[order]))
     assert_allclose(permuted.alpha_, model.alpha_[order], atol=ALPHA_TOLERANCE)
     assert_shapes_agree(all_shapes(permuted), all_shapes(model))
 
 
-def test_points_may_change_places(tracks, model, isa):
+def test_points_may_change_places(tracks, model, variant):
     order = np.random.default_rng(0).permutation(tracks.shape[1])
-    permuted = estimator(isa).fit(table_of(tracks[:, order]))
+    permuted = estimator(variant).fit(table_of(tracks[:, order]))
     assert_allclose(permuted.alpha_, model.alpha_, atol=ALPHA_TOLERANCE)
     assert_shapes_agree(all_shapes(permuted), all_shapes(model)[:, order])
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize(
-    "change", ["image moved", "one frame turned", "other unit", "points change places"]
-)
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
 @pytest.mark.parametrize(
     ("name", "n_components"),
-    [("synthetic", 3), ("ict_bu3dfe_like_68", 9), ("akhter_drink", 3)],
+    [
+        ("synthetic", 4),
+        ("muct_68", 4),
+        ("ict_bu3dfe_like_68", 9),
+        ("akhter_drink", 3),
+        ("missing", 2),
+    ],
 )
-def test_default_estimator_is_invariant(load_data, name, n_components, change):
-    original = faces(load_data, name)
-    order = np.arange(original.shape[1])
-    if change == "points change places":
-        order = np.random.default_rng(0).permutation(order)
-        changed = original[:, order]
+def test_default_strategies_are_invariant(load_data, name, n_components, refinement):
+    # With stiffness (drink) and with missing points, too.
+    if name == "missing":
+        original = make_nonrigid_tracks(
+            100, 30, n_components=2, noise=0.02, missing=0.2, random_state=0
+        ).tracks
     else:
-        changed = IMAGE_CHANGES[change](original, np.random.default_rng(0))
+        original = faces(load_data, name)
+    rng = np.random.default_rng(0)
+    first, *others = (
+        AffineNRSfM(n_components, refinement=refinement, random_state=0).fit(
+            table_of(each)
+        )
+        for each in (
+            original,
+            IMAGE_CHANGES["frames moved"](original, rng),
+            IMAGE_CHANGES["frames turned"](original, rng),
+            SIZE_CHANGES["frames rescaled"](original, rng),
+        )
+    )
+    for other in others:
+        assert_allclose(other.alpha_, first.alpha_, atol=ALPHA_TOLERANCE, rtol=0)
+        assert_shapes_agree(all_shapes(other), all_shapes(first))
+    frames, points = (rng.permutation(n) for n in original.shape[:2])
+    other = clone(first).fit(table_of(original[frames][:, points]))
+    expected = first.alpha_[frames]
+    assert_allclose(other.alpha_, expected, atol=ALPHA_TOLERANCE, rtol=0)
+    assert_shapes_agree(all_shapes(other), all_shapes(first)[:, points])
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize(
+    "change", ["frames moved", "image turned", "frames turned", "frames rescaled"]
+)
+def test_robust_fits_are_invariant(change, loss):
+    # The weights stop changing at some distance from their limit.
+    original = make_nonrigid_tracks(
+        80, 25, n_components=2, noise=0.02, random_state=0
+    ).tracks
+    original[:, 3] += np.where(np.arange(80) % 9 == 0, 1.0, 0.0)[:, None]
+    changed = IMAGE_CHANGES | SIZE_CHANGES
+    changed = changed[change](original, np.random.default_rng(0))
     first, second = (
-        AffineNRSfM(n_components, random_state=0).fit(table_of(each))
+        AffineNRSfM(2, loss=loss, random_state=0).fit(table_of(each))
         for each in (original, changed)
     )
-    assert_allclose(second.alpha_, first.alpha_, atol=ALPHA_TOLERANCE, rtol=0)
-    assert_shapes_agree(all_shapes(second), all_shapes(first)[:, order])
+    assert_allclose(second.alpha_, first.alpha_, atol=1e-4, rtol=0)
+    alpha = first.transform(table_of(changed))
+    assert_allclose(alpha, first.alpha_, atol=1e-4, rtol=0)
 
 
-def test_moved_and_turned_images_move_and_turn_the_cameras(tracks, model, isa):
+def test_moved_and_turned_images_move_and_turn_the_cameras(tracks, model, variant):
     R, t = rotations(0.3), np.array([20.0, -30.0])
-    moved = estimator(isa).fit(table_of(2.0 * tracks @ R.T + t))
-    assert_allclose(
-        moved.translation_, 2 * model.translation_ @ R.T + t, rtol=1e-9, atol=1e-9
-    )
+    moved = estimator(variant).fit(table_of(2.0 * tracks @ R.T + t))
+    expected = 2 * model.translation_ @ R.T + t
+    assert_allclose(moved.translation_, expected, rtol=1e-7)
     # x and y of the shapes turn with the mean camera, and so their product does.
     cameras = moved.motion_ @ np.swapaxes(all_shapes(moved)[:, None], -1, -2)
     expected = 2 * R @ (model.motion_ @ np.swapaxes(all_shapes(model)[:, None], -1, -2))
@@ -216,6 +267,8 @@ def test_gauge(tracks, model, unscaled, scale_frames):
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
     motion = fitted.motion_ / (sizes if scale_frames else 1.0)
+    if fitted.refinement == "joint":
+        assert_allclose(fitted.alpha_.mean(axis=0), 0, atol=1e-9)
     images = fitted.basis_[:, None] @ np.swapaxes(motion, 1, 2)
     energy = np.sum(fitted.alpha_.T[:, :, None, None] ** 2 * images**2, axis=(1, 2, 3))
     assert np.all(np.diff(energy) < 0)

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
@@ -94,8 +94,11 @@ def assert_finite(model):
 
 
 def fitted(tracks, n_components, **params):
-    """Return the model of tracks; warnings of ISA's convergence do not count."""
-    params = {"isa": FAST, "random_state": 0} | params
+    """Return the model of tracks by the paper's pipeline, if nothing else is said.
+
+    Warnings of ISA's convergence do not count.
+    """
+    params = {"isa": FAST, "refinement": "alternating", "random_state": 0} | params
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = AffineNRSfM(n_components, **params).fit(table_of(tracks))
@@ -291,6 +294,177 @@ def test_two_places_only():
     assert fitted(diagonal, 1).inverse_snr_ < 1e-25
 
 
+# --- degenerate tables, joint refinement ---------------------------------------------
+
+
+def jointly(tracks, n_components, **params):
+    """Return the default model of tracks; it is finite, and the same when repeated.
+
+    The table may determine little, then the refinement may not converge and say so;
+    other warnings are errors.
+    """
+    params = {"refinement": "joint", "isa": None} | params
+    model = fitted(tracks, n_components, **params)
+    assert_array_equal(model.transform(table_of(tracks)), model.alpha_)
+    again = fitted(tracks, n_components, **params)
+    assert_array_equal(again.alpha_, model.alpha_)
+    assert_array_equal(again.basis_, model.basis_)
+    return model
+
+
+@pytest.mark.parametrize("n_components", range(1, 7))
+def test_joint_refinement_of_the_shark(load_data, n_components):
+    tracks = real_tracks(load_data, "shark_torresani")[::8]
+    model = jointly(tracks, n_components)
+    paper = fitted(tracks, n_components)
+    assert model.inverse_snr_ < paper.inverse_snr_
+
+
+@pytest.mark.parametrize("n_components", [1, 2])
+@pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
+@pytest.mark.parametrize("independence", ["shapes", "coefficients", None])
+def test_joint_refinement_of_rigid_objects(flat, n_components, independence):
+    rng = np.random.default_rng(0)
+    shape = rng.normal(size=(20, 3)) * flat
+    tracks = seen(shape, cameras(rng, 40), rng)
+    model = jointly(tracks, n_components, independence=independence)
+    assert model.inverse_snr_ < 1e-20
+    assert_zero_from(model, 0)
+
+
+def test_joint_refinement_of_a_rigid_object_with_noise():
+    # What is found is noise, and the deviations say so.
+    rng = np.random.default_rng(0)
+    tracks = seen(rng.normal(size=(20, 3)), cameras(rng, 40), rng)
+    model = jointly(tracks + 0.02 * rng.normal(size=tracks.shape), 1)
+    assert model.inverse_snr_ < 1e-3
+    assert np.linalg.norm(model.basis_) < 0.02 * np.linalg.norm(model.mean_shape_)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_robust_fit_of_a_rigid_object(loss):
+    rng = np.random.default_rng(0)
+    tracks = seen(rng.normal(size=(20, 3)), cameras(rng, 40), rng)
+    model = jointly(tracks, 1, loss=loss)
+    assert model.inverse_snr_ < 1e-10
+    assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+def test_robust_fit_of_the_shark(load_data, loss):
+    # Most of its points hardly move: those that do are no outliers.
+    tracks = real_tracks(load_data, "shark_torresani")[::8]
+    model = jointly(tracks, 2, loss=loss)
+    assert model.inverse_snr_ < fitted(tracks, 2).inverse_snr_
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("n_components", [1, 3])
+def test_joint_refinement_of_flat_objects(n_components, noise):
+    rng = np.random.default_rng(0)
+    shape, basis = rng.normal(size=(2, 20, 3)) * [1, 1, 0]
+    alpha = rng.normal(size=(40, 1, 1))
+    tracks = seen(shape + 0.2 * alpha * basis, cameras(rng, 40), rng)
+    tracks += noise * rng.normal(size=tracks.shape)
+    model = jointly(tracks, n_components)
+    assert model.inverse_snr_ < 1e-9 + 2 * noise**2
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 5])
+@pytest.mark.parametrize("n_different", [1, 2, 3])
+def test_joint_refinement_of_repeated_frames(n_different, n_components):
+    rng = np.random.default_rng(0)
+    tracks = rng.normal(size=(n_different, 20, 2))
+    model = jointly(np.repeat(tracks, 12, axis=0), n_components)
+    assert model.inverse_snr_ < 1e-4
+    for i in range(n_different):
+        same = model.alpha_[12 * i : 12 * i + 12]
+        assert_allclose(same, same[:1].repeat(12, axis=0), atol=1e-6)
+
+
+def test_joint_refinement_of_duplicated_points_and_frames():
+    tracks = make_face_tracks(60, n_components=3, random_state=0).tracks
+    once = jointly(tracks, 3)
+    # A point that is seen twice tells a little more of the noise, a frame counts twice.
+    points = jointly(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 3)
+    assert_allclose(points.inverse_snr_, once.inverse_snr_, rtol=1e-2)
+    assert_allclose(points.basis_[:, 68:], points.basis_[:, 67::-1], atol=1e-6)
+    frames = jointly(np.tile(tracks, (2, 1, 1)), 3)
+    assert_allclose(frames.alpha_[60:], frames.alpha_[:60], atol=1e-9)
+    assert_allclose(frames.inverse_snr_, once.inverse_snr_, rtol=1e-2)
+
+
+def test_joint_refinement_of_few_points_seen_many_times():
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    model = jointly(np.tile(tracks[:, ::10], (1, 5, 1)), 4)
+    assert model.inverse_snr_ < 1e-4
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("n_cameras", [1, 2])
+@pytest.mark.parametrize("n_components", [1, 2])
+def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, noise):
+    # All frames from one place, or from two: depth is seen in part or not at all.
+    rng = np.random.default_rng(0)
+    shape, basis = rng.normal(size=(2, 20, 3))
+    alpha = rng.normal(size=(40, 1, 1))
+    motion = np.repeat(cameras(rng, n_cameras), 40 // n_cameras, axis=0)
+    tracks = seen(shape + 0.2 * alpha * basis, motion, rng)
+    tracks += noise * rng.normal(size=tracks.shape)
+    model = jointly(tracks, n_components)
+    assert model.inverse_snr_ < 1e-9 + 2 * noise**2
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 3])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_joint_refinement_of_smallest_tables(n_components, dtype):
+    rng = np.random.default_rng(n_components)
+    n_frames = -(-8 * (n_components + 2) // 5)
+    tracks = rng.normal(size=(n_frames, 3 * n_components + 4, 2)).astype(dtype)
+    model = jointly(tracks, n_components)
+    if dtype == np.float64:
+        assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("n_frames", "n_components"), [(60, 7), (200, 4), (400, 4)])
+def test_joint_refinement_of_real_tables(load_data, n_frames, n_components):
+    tracks = real_tracks(load_data, "muct_68")
+    model = jointly(tracks[:: len(tracks) // n_frames], n_components)
+    assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+@pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+def test_joint_refinement_of_frames_that_are_lines_or_tiny(loss, scale_frames):
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    whole = jointly(tracks, 2)
+    tracks[3] *= [1, 0]
+    tracks[5] = tracks[5].mean(axis=0) + 1e-7 * tracks[5]
+    tracks[7] = tracks[7, :1]
+    tracks[7, 0] += 1.0
+    model = jointly(tracks, 2, loss=loss, scale_frames=scale_frames)
+    others = np.setdiff1d(np.arange(60), [3, 5, 7])
+    errors = [
+        each.reproject(table_of(tracks))[others] - table_of(tracks)[others]
+        for each in (model, whole)
+    ]
+    assert np.median(np.abs(errors[0])) < 2 * np.median(np.abs(errors[1]))
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
+def test_joint_refinement_of_any_unit(scale):
+    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    model, expected = jointly(tracks * scale, 2), jointly(tracks, 2)
+    assert_allclose(model.alpha_, expected.alpha_, atol=1e-6)
+    assert_allclose(model.inverse_snr_, expected.inverse_snr_, rtol=1e-6)
+
+
+def test_joint_refinement_of_points_in_two_places():
+    rng = np.random.default_rng(0)
+    tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
+    assert jointly(tracks, 1).inverse_snr_ < 1e-20
+
+
 # --- accuracy -----------------------------------------------------------------------
 
 
@@ -311,6 +485,7 @@ def test_inverse_snr_of_known_tables(
     load_data, name, n_components, params, percent, seed
 ):
     table = table_of(real_tracks(load_data, name))
+    params = {"refinement": "alternating"} | params
     model = AffineNRSfM(n_components, random_state=seed, **params).fit(table)
     assert round(100 * model.inverse_snr_, 3) <= percent
 
@@ -321,7 +496,9 @@ def test_one_basis_shape_needs_no_independence(load_data, name):
     # There is one subspace only: neither strategy nor seed have a say.
     table = table_of(real_tracks(load_data, name))
     values = [
-        AffineNRSfM(1, isa=isa, random_state=seed).fit(table).inverse_snr_
+        AffineNRSfM(1, isa=isa, refinement="alternating", random_state=seed)
+        .fit(table)
+        .inverse_snr_
         for isa in (PooledFastICA(n_init=2), FastISA(n_init=2))
         for seed in (0, 1)
     ]
@@ -331,7 +508,9 @@ def test_one_basis_shape_needs_no_independence(load_data, name):
 def test_strategies_explain_more_than_a_rigid_shape_does(load_data):
     table = table_of(real_tracks(load_data, "ict_bu3dfe_like_68")[::5])
     values = [
-        AffineNRSfM(9, isa=isa, random_state=0).fit(table).inverse_snr_
+        AffineNRSfM(9, isa=isa, refinement="alternating", random_state=0)
+        .fit(table)
+        .inverse_snr_
         for isa in (PooledFastICA(n_init=4), FastISA(n_init=4))
     ]
     rigid = make_rigid(table)

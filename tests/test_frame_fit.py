@@ -5,7 +5,17 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
-from isa_nrsfm._frame_fit import compose, fit_frames, project
+from isa_nrsfm._frame_fit import (
+    FrameFit,
+    PosteriorFrames,
+    RigidFrames,
+    compose,
+    distances,
+    project,
+)
+from isa_nrsfm._frame_posterior import fit_posterior
+from isa_nrsfm._independent_gauge import FrameMap
+from isa_nrsfm._robust import robust_weights
 from isa_nrsfm._tracks import centred_tracks, measurement_matrix
 
 
@@ -31,41 +41,73 @@ def random_fit(seed, noise=0.0, n_frames=12, n_components=2):
     return tracks, mean_shape, basis, (motion, translation, alpha)
 
 
-class TestFit:
+def rigid(tracks, mean_shape, basis):
+    """Return the fit of the paper's model of a frame."""
+    return RigidFrames(mean_shape, basis).fit(tracks, np.ones(len(tracks)))
+
+
+def least_squares(mean_shape, basis, points):
+    """Return camera, position and coefficients of one frame, the one after the other.
+
+    Camera and position together are a linear least squares fit to the mean shape;
+    position and coefficients one to the basis shapes in this camera.
+    """
+    seen = ~np.isnan(points[:, 0])
+    points, mean_shape, basis = points[seen], mean_shape[seen], basis[:, seen]
+    with_position = np.column_stack([mean_shape, np.ones(len(points))])
+    M = np.linalg.lstsq(with_position, points)[0][:3].T
+    design = np.zeros((2 * len(points), len(basis) + 2))
+    for k, B in enumerate(basis):
+        design[:, k] = (B @ M.T).ravel()
+    design[0::2, -2], design[1::2, -1] = 1, 1
+    found = np.linalg.lstsq(design, (points - mean_shape @ M.T).ravel())[0]
+    return M, found[-2:], found[:-2]
+
+
+def hide(tracks, share, seed=0):
+    """Return tracks of which some points are missing."""
+    hidden = np.random.default_rng(seed).random(tracks.shape[:2]) < share
+    return np.where(hidden[..., None], np.nan, tracks)
+
+
+class TestRigidFrames:
     def test_exact_tracks(self):
         tracks, mean_shape, basis, truth = random_fit(0)
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape, basis)
-        for got, true in zip(fitted, truth, strict=True):
+        fitted = rigid(tracks, mean_shape, basis)
+        for got, true in zip(fitted, truth, strict=False):
             assert_allclose(got, true, atol=1e-11)
 
-    def test_camera_is_the_rigid_fit(self):
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_camera_first_then_coefficients_by_least_squares(self, missing):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        centred, translation = centred_tracks(tracks)
-        fitted = fit_frames(centred, translation, mean_shape, basis)
-        for i, W in enumerate(centred):
-            M = np.linalg.lstsq(mean_shape, W)[0].T
+        tracks = hide(tracks, missing)
+        fitted = rigid(tracks, mean_shape, basis)
+        for i, points in enumerate(tracks):
+            M, t, alpha = least_squares(mean_shape, basis, points)
             assert_allclose(fitted.motion[i], M, atol=1e-12)
-        assert_array_equal(fitted.translation, translation)
-
-    def test_coefficients_are_the_least_squares(self):
-        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        centred, translation = centred_tracks(tracks)
-        fitted = fit_frames(centred, translation, mean_shape, basis)
-        for i, W in enumerate(centred):
-            M = fitted.motion[i]
-            images = np.stack([(B @ M.T).ravel() for B in basis], axis=1)
-            residual = (W - mean_shape @ M.T).ravel()
-            alpha = np.linalg.lstsq(images, residual)[0]
+            assert_allclose(fitted.translation[i], t, atol=1e-11)
             assert_allclose(fitted.alpha[i], alpha, atol=1e-11)
+
+    def test_some_missing_points_do_not_change_complete_frames(self):
+        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
+        holed = tracks.copy()
+        holed[3, 5] = np.nan
+        fitted, expected = (rigid(each, mean_shape, basis) for each in (holed, tracks))
+        others = np.arange(len(tracks)) != 3
+        for got, complete in zip(fitted, expected, strict=True):
+            assert_allclose(got[others], complete[others], rtol=1e-13)
+
+    def test_it_knows_no_noise(self):
+        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
+        assert np.isnan(rigid(tracks, mean_shape, basis).alpha_std).all()
 
     def test_cost_rises_in_every_direction(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        centred, translation = centred_tracks(tracks)
-        motion, _, alpha = fit_frames(centred, translation, mean_shape, basis)
+        motion, translation, alpha, _ = rigid(tracks, mean_shape, basis)
 
         def cost(alpha):
             shapes = compose(mean_shape, basis, alpha)
-            return np.sum((centred - project(shapes, motion, np.zeros(2))) ** 2)
+            return np.sum((tracks - project(shapes, motion, translation)) ** 2)
 
         least = cost(alpha)
         for k in range(2):
@@ -74,59 +116,54 @@ class TestFit:
                 moved[:, k] += step
                 assert cost(moved) > least
 
-    def test_frames_are_separate(self):
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_frames_are_separate(self, missing):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        centred, translation = centred_tracks(tracks)
-        together = fit_frames(centred, translation, mean_shape, basis)
+        tracks = hide(tracks, missing)
+        together = rigid(tracks, mean_shape, basis)
         for i in range(len(tracks)):
-            alone = fit_frames(
-                centred[i : i + 1], translation[i : i + 1], mean_shape, basis
-            )
+            alone = rigid(tracks[i : i + 1], mean_shape, basis)
             for got, expected in zip(alone, together, strict=True):
                 assert_allclose(got[0], expected[i], rtol=1e-12, atol=1e-14)
 
     def test_rotation_of_single_frames_leaves_the_coefficients(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        angle = np.random.default_rng(1).uniform(0, 6, len(tracks))
-        c, s = np.cos(angle), np.sin(angle)
-        R = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape, basis)
-        turned = fit_frames(
-            *centred_tracks(tracks @ R.transpose(0, 2, 1)), mean_shape, basis
-        )
+        R = turns(len(tracks))
+        fitted = rigid(tracks, mean_shape, basis)
+        turned = rigid(tracks @ R.transpose(0, 2, 1), mean_shape, basis)
         assert_allclose(turned.alpha, fitted.alpha, atol=1e-11)
         assert_allclose(turned.motion, R @ fitted.motion, atol=1e-12)
 
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units_of_single_frames(self, unit):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape, basis)
-        scaled = fit_frames(*centred_tracks(unit * tracks), mean_shape, basis)
+        fitted = rigid(tracks, mean_shape, basis)
+        scaled = rigid(unit * tracks, mean_shape, basis)
         assert_allclose(scaled.alpha, fitted.alpha, rtol=1e-9, atol=1e-10)
         assert_allclose(scaled.motion, unit * fitted.motion, rtol=1e-9)
 
     def test_affinity_of_space_leaves_the_coefficients(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
         A = np.random.default_rng(1).normal(size=(3, 3))
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape, basis)
-        other = fit_frames(*centred_tracks(tracks), mean_shape @ A.T, basis @ A.T)
+        fitted = rigid(tracks, mean_shape, basis)
+        other = rigid(tracks, mean_shape @ A.T, basis @ A.T)
         assert_allclose(other.alpha, fitted.alpha, atol=1e-10)
         assert_allclose(other.motion @ A, fitted.motion, atol=1e-11)
 
     def test_basis_shape_of_zeros(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
-        centred, translation = centred_tracks(tracks)
         padded = np.concatenate([basis, np.zeros_like(basis[:1])])
-        fitted = fit_frames(centred, translation, mean_shape, padded)
-        expected = fit_frames(centred, translation, mean_shape, basis)
-        assert_array_equal(fitted.alpha[:, 2], 0)
-        assert_allclose(fitted.alpha[:, :2], expected.alpha)
+        for each in (tracks, hide(tracks, 0.3)):
+            fitted = rigid(each, mean_shape, padded)
+            expected = rigid(each, mean_shape, basis)
+            assert_array_equal(fitted.alpha[:, 2], 0)
+            assert_allclose(fitted.alpha[:, :2], expected.alpha)
 
     def test_flat_mean_shape(self):
         tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
         mean_shape = mean_shape.copy()
         mean_shape[:, 2] = 0
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape, basis)
+        fitted = rigid(tracks, mean_shape, basis)
         assert_allclose(fitted.motion[:, :, 2], 0, atol=1e-12)
         assert np.isfinite(fitted.alpha).all()
 
@@ -137,8 +174,162 @@ class TestFit:
         mean_shape, basis = mean_shape * [1.0, 1.0, 0.0], basis.copy()
         basis[1] *= [0.0, 0.0, 1.0]
         R = random_rotation(seed)
-        fitted = fit_frames(*centred_tracks(tracks), mean_shape @ R, basis @ R)
+        fitted = rigid(tracks, mean_shape @ R, basis @ R)
         assert_array_equal(fitted.alpha[:, 1], 0)
+
+
+def turns(n):
+    """Return rotations of images, (n, 2, 2)."""
+    angle = np.random.default_rng(1).uniform(0, 6, n)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
+
+
+NOISE = 0.05
+
+
+def posterior_frames(seed, loss="linear", gauge=None):
+    """Return a model of frames, and tracks of frames of size about one."""
+    rng = np.random.default_rng(seed)
+    mean_shape, basis = orthogonal_shapes(seed)
+    mean_shape, basis = np.sqrt(20) * mean_shape, 0.3 * np.sqrt(20) * basis
+    motion = np.eye(2, 3) + 0.3 * rng.normal(size=(12, 2, 3))
+    shapes = compose(mean_shape, basis, rng.normal(size=(12, 2)))
+    tracks = project(shapes, motion, rng.normal(size=(12, 2)))
+    tracks = tracks + NOISE * rng.normal(size=tracks.shape)
+    shapes = np.concatenate([mean_shape[None], basis]).transpose(0, 2, 1)
+    gauge = FrameMap.identity(2) if gauge is None else gauge
+    # Frames with an outlier have several minima: as the estimator does, start from more
+    # places than zero.
+    starts = np.random.default_rng(0).normal(size=(8, 2))
+    return PosteriorFrames(shapes, NOISE**2, starts, loss, gauge), tracks
+
+
+def mixing_gauge():
+    """Return a map to other shapes: B_0 with B_k, B_k with B_0, and an affinity."""
+    rng = np.random.default_rng(5)
+    mixing = np.eye(3) + 0.1 * rng.normal(size=(3, 3))
+    return FrameMap(mixing, rng.normal(size=(3, 3)))
+
+
+class TestPosteriorFrames:
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_fit_is_that_of_frames_of_size_one(self, missing):
+        frames, tracks = posterior_frames(0)
+        tracks = hide(tracks, missing)
+        sizes = np.linspace(0.5, 200.0, len(tracks))
+        fitted = frames.fit(tracks * sizes[:, None, None], sizes)
+        expected = fit_posterior(tracks, frames.shapes, NOISE**2, starts=frames.starts)
+        deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
+        assert_allclose(fitted.alpha, expected.alpha, atol=1e-9)
+        assert_allclose(fitted.alpha_std, deviation, rtol=1e-9)
+        scale = sizes[:, None]
+        assert_allclose(fitted.translation, expected.translation * scale, rtol=1e-9)
+        motion = expected.motion * scale[..., None]
+        assert_allclose(fitted.motion, motion, atol=1e-9 * np.abs(motion).max())
+
+    def test_images_do_not_depend_on_the_gauge(self):
+        frames, tracks = posterior_frames(0)
+        gauge = mixing_gauge()
+        mean_shape, *basis = frames.shapes.transpose(0, 2, 1)
+        # (1, alpha) = G^-1 (1, alpha') up to a factor: the new shapes follow from it.
+        inverse = np.linalg.inv(gauge.mixing)
+        new = np.einsum("kl,kjc->ljc", inverse, np.stack([mean_shape, *basis]))
+        new = new @ gauge.space.T
+        one, other = (
+            frames._replace(gauge=each).fit(tracks, np.ones(len(tracks)))
+            for each in (frames.gauge, gauge)
+        )
+        images = project(
+            compose(mean_shape, np.stack(basis), one.alpha), one.motion, one.translation
+        )
+        mixed = project(
+            compose(new[0], new[1:], other.alpha), other.motion, other.translation
+        )
+        assert_allclose(mixed, images, atol=1e-10)
+
+    def test_deviations_follow_the_map_of_the_gauge(self):
+        # To first order: by a difference quotient of the map along random draws.
+        frames, tracks = posterior_frames(0)
+        gauge = mixing_gauge()
+        posterior = frames.posterior(tracks)
+        shown = frames._replace(gauge=gauge).shown(posterior, np.ones(len(tracks)))
+
+        def mapped(alpha):
+            one = np.column_stack([np.ones(len(alpha)), alpha]) @ gauge.mixing.T
+            return one[:, 1:] / one[:, :1]
+
+        assert_allclose(shown.alpha, mapped(posterior.alpha), rtol=1e-12)
+        step = 1e-6
+        slope = np.stack(
+            [
+                (mapped(posterior.alpha + e) - mapped(posterior.alpha - e)) / (2 * step)
+                for e in step * np.eye(2)
+            ],
+            axis=2,
+        )
+        covariance = slope @ posterior.covariance @ slope.transpose(0, 2, 1)
+        expected = np.sqrt(np.einsum("ikk->ik", covariance))
+        assert_allclose(shown.alpha_std, expected, rtol=1e-7)
+
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
+        frames, tracks = posterior_frames(0, loss)
+        tracks = hide(tracks, missing)
+        tracks[:, 7] += 2.0
+        fitted = frames.posterior(tracks)
+        apart = distances(tracks, frames.shapes, *fitted[:3])
+        weights = np.nan_to_num(robust_weights(loss, apart / NOISE))
+        again = fit_posterior(
+            tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
+        )
+        assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
+        assert_allclose(again.motion, fitted.motion, atol=1e-4)
+
+    @pytest.mark.parametrize("point", [0, 7, 12])
+    @pytest.mark.parametrize("size", [2.0, 20.0])
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
+        frames, tracks = posterior_frames(0)
+        expected = frames.posterior(tracks)
+        deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
+        tracks[:, point] += size
+        drawn = frames.posterior(tracks).alpha - expected.alpha
+        robust = frames._replace(loss=loss).posterior(tracks).alpha - expected.alpha
+        assert np.median(np.abs(drawn / deviation)) > 3
+        assert np.abs(robust / deviation).max() < 2
+
+    @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+    def test_frames_are_separate(self, loss):
+        frames, tracks = posterior_frames(0, loss)
+        tracks = hide(tracks, 0.2)
+        tracks[2, :3] += 2.0
+        sizes = np.linspace(1, 2, len(tracks))
+        together = frames.fit(tracks, sizes)
+        for i in range(len(tracks)):
+            alone = frames.fit(tracks[i : i + 1], sizes[i : i + 1])
+            for got, expected in zip(alone, together, strict=True):
+                assert_allclose(got[0], expected[i], rtol=1e-9, atol=1e-11)
+
+    @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+    def test_frames_that_show_too_little_are_nan(self, loss):
+        frames, tracks = posterior_frames(0, loss)
+        tracks[4, 1:] = np.nan
+        tracks[6, 3:] = np.nan
+        fitted = frames.fit(tracks, np.ones(len(tracks)))
+        few = np.isin(np.arange(len(tracks)), [4, 6])
+        for part in fitted:
+            flat = part.reshape(len(tracks), -1)
+            assert np.isnan(flat[few]).all()
+            assert np.isfinite(flat[~few]).all()
+
+    def test_unknown_is_nan(self):
+        for part, shape in zip(
+            FrameFit.unknown(5, 2), [(5, 2, 3), (5, 2), (5, 2), (5, 2)], strict=True
+        ):
+            assert part.shape == shape
+            assert np.isnan(part).all()
 
 
 class TestComposeAndProject:

@@ -6,11 +6,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import permute_frames, random_rotation, rotate_frames
 
 from isa_nrsfm._camera import mean_view
-from isa_nrsfm._frame_fit import compose, fit_frames, project
+from isa_nrsfm._frame_fit import RigidFrames, compose, project
 from isa_nrsfm._gauge import (
     canonical_gauge,
     canonical_space,
     image_energies,
+    mode_covariance,
     reorder_blocks,
 )
 
@@ -211,6 +212,16 @@ class TestBasis:
         energies = image_energies(scene.motion, scene.basis, scene.alpha)
         assert_allclose(energies, expected)
 
+    def test_mode_covariance_by_plain_loops(self):
+        scene = Scene(n_frames=7)
+        expected = np.zeros((9, 9))
+        for M, alpha in zip(scene.motion, scene.alpha, strict=True):
+            for k in range(3):
+                for m in range(3):
+                    block = alpha[k] * alpha[m] * M.T @ M / 14
+                    expected[3 * k : 3 * k + 3, 3 * m : 3 * m + 3] += block
+        assert_allclose(mode_covariance(scene.motion, scene.alpha), expected)
+
     def test_order_signs_and_scales_before_do_not_matter(self):
         scene = Scene()
         expected, _ = scene.canonical()
@@ -272,7 +283,8 @@ class TestBasis:
         scene = Scene()
         gauge, motion = scene.canonical()
         tracks = project(gauge.mean_shape, motion, np.zeros(2))
-        fitted = fit_frames(tracks, np.zeros((30, 2)), gauge.mean_shape, gauge.basis)
+        frames = RigidFrames(gauge.mean_shape, gauge.basis)
+        fitted = frames.fit(tracks, np.ones(len(tracks)))
         assert_allclose(fitted.motion, motion, atol=1e-12)
 
 

@@ -45,6 +45,8 @@ class Stranger(AffineNRSfM):
     "parameters",
     [
         {},
+        {"loss": "cauchy", "independence": "coefficients"},
+        {"refinement": "alternating"},
         {"isa": PooledFastICA(n_init=2), "refinement": None},
         {"isa": FastISA(n_init=2), "layout": "interleaved", "block_recovery": "eigen"},
         {"isa": FastISA(n_init=2, density=SqrtDensity(0.2)), "scale_frames": False},
@@ -66,6 +68,16 @@ def test_loaded_model_equals_the_saved_one(faces, path, parameters):
             np.testing.assert_array_equal(getattr(loaded, name), value)
     np.testing.assert_array_equal(loaded.transform(faces), fitted.transform(faces))
     np.testing.assert_array_equal(loaded.reproject(faces), fitted.reproject(faces))
+    assert loaded.score(faces) == fitted.score(faces)
+
+
+def test_loaded_model_takes_missing_points(model, faces, path):
+    save_model(model, path)
+    holed = faces.mask(np.random.default_rng(0).random(faces.shape) < 0.2)
+    holed.iloc[:, 1::2] = holed.iloc[:, 1::2].mask(holed.iloc[:, ::2].isna().to_numpy())
+    holed.iloc[:, ::2] = holed.iloc[:, ::2].mask(holed.iloc[:, 1::2].isna().to_numpy())
+    loaded = load_model(path)
+    np.testing.assert_array_equal(loaded.transform(holed), model.transform(holed))
 
 
 def test_trusted_types_are_needed_and_exist(model, path):

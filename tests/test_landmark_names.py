@@ -221,7 +221,7 @@ def test_point_names_fall_back_to_columns_where_they_would_collide():
         (["x0", "y0", "z0"], "other"),
         (["x0", "y0", "x1"], "other"),
         (["x0", "y0", "x0", "y0"], "other"),
-        (["x0", "Y0", "x1", "Y1"], "other"),
+        (["x0", "Y0", "x1", "Y1"], "interleaved"),
         (["x0", "y0", "age", "sex"], None),
         (["x0", "x1", "x2", "x3"], None),
         (["y0", "y1"], None),

@@ -167,7 +167,6 @@ def test_tables_that_the_model_makes_are_taken_apart_again(table, seed, scale_fr
     assert_allclose(found.translation, translation, atol=1e-8)
     assert_allclose(found.alpha, alpha, atol=1e-7)
     assert_allclose(model.reproject(made), made, atol=1e-7 * np.abs(made).max())
-    assert -1e-12 < model.score(made) <= 0
 
 
 @few_examples
@@ -178,7 +177,9 @@ def test_fitted_table(table, scale_frames):
     model = fit(tracks, n_components, scale_frames=scale_frames)
     assert_allclose(model.transform(X), model.alpha_, atol=1e-10)
     assert_allclose(model.transform(X[3:4]), model.alpha_[3:4], atol=1e-8)
-    assert_allclose(model.score(X), -model.inverse_snr_, rtol=1e-12)
+    # Points that were left out of the fit of their frame are not fitted better.
+    assert -model.score(X) > model.inverse_snr_
+    assert model.score(X) == model.score(X)
     assert 0 <= model.rank_floor_ <= model.inverse_snr_ < 1
     assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
     assert np.all(np.mean(model.alpha_**3, axis=0) > -1e-6)
@@ -262,19 +263,19 @@ def test_tables_are_refused_if_and_only_if_they_are_too_small(
 @few_examples
 @given(
     tables(),
-    st.sampled_from([np.nan, np.inf, -np.inf]),
+    st.sampled_from([np.inf, -np.inf]),
     st.integers(0, 11),
     st.integers(0, 8),
     st.integers(0, 1),
 )
-def test_values_that_are_no_numbers_are_refused(table, value, frame, point, axis):
+def test_infinite_values_are_refused(table, value, frame, point, axis):
     tracks, n_components = table
     broken = tracks.copy()
     broken[frame, point, axis] = value
-    with pytest.raises(ValueError, match=r"(missing \(NaN\)|X contains infinity)"):
+    with pytest.raises(ValueError, match="X contains infinity"):
         fit(broken, n_components)
     model = fit(tracks, n_components)
-    with pytest.raises(ValueError, match=r"X contains (NaN|infinity)"):
+    with pytest.raises(ValueError, match="X contains infinity"):
         model.transform(broken.reshape(len(broken), -1))
 
 
@@ -293,6 +294,9 @@ def test_frames_of_equal_points_are_refused(table, rows, value, dtype):
     message = rf"equal in {len(rows)} frame\(s\), the first is row {min(rows)}$"
     with pytest.raises(ValueError, match=message):
         fit(broken, n_components)
-    model = fit(tracks, n_components)
-    with pytest.raises(ValueError, match=message):
-        model.decompose(broken.reshape(len(broken), -1))
+    # New frames of this kind have no camera.
+    frames = fit(tracks, n_components).decompose(broken.reshape(len(broken), -1))
+    unknown = np.isin(np.arange(len(broken)), list(rows))
+    for part in frames:
+        finite = np.isfinite(part.reshape(len(broken), -1))
+        assert np.all(finite == ~unknown[:, None])

@@ -121,6 +121,11 @@ def test_extra_checks_on_landmark_tables(estimator, name, landmark_tables):
     getattr(estimator_checks, name)(type(estimator).__name__, estimator)
 
 
+def test_missing_points_are_allowed():
+    # The checks leave NaN alone for estimators that say so.
+    assert all(each.__sklearn_tags__().input_tags.allow_nan for each in estimators())
+
+
 def test_checks_fail_because_their_tables_are_refused():
     results = check_estimator(AffineNRSfM(n_components=1), on_fail=None, on_skip=None)
     failed = [result for result in results if result["status"] == "failed"]

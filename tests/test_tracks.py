@@ -8,19 +8,28 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
 from isa_nrsfm._tracks import (
+    FEWEST_POINTS,
     LAYOUT_SAMPLE,
+    LAYOUTS,
     centred_tracks,
+    check_frames,
     check_names,
+    check_points,
     check_size,
+    clean_tracks,
+    frames_in_one_place,
     largest_n_components,
     measurement_matrix,
+    relative_precision,
+    seen_points,
     smallest_n_frames,
     table_to_tracks,
     tracks_to_table,
+    usable_frames,
     warn_if_other_layout,
     weighting_sizes,
 )
-from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 UNITS = [1e-9, 1.0, 1e9]
 
@@ -108,6 +117,238 @@ class TestCentring:
         tracks[:, 4, 1] += 1e-3 * unit
         centred, _ = centred_tracks(tracks)
         assert_allclose(centred[:, 4, 1], 8e-3 / 9 * unit)
+
+
+def with_missing(tracks, missing, seed=0):
+    """Return tracks with points missing at random, and the mask of those seen."""
+    seen = np.random.default_rng(seed).random(tracks.shape[:2]) >= missing
+    return np.where(seen[..., None], tracks, tracks.dtype.type(np.nan)), seen
+
+
+class TestMissingPoints:
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    def test_tables_keep_what_is_missing(self, rng, layout):
+        tracks, seen = with_missing(rng.normal(size=(6, 9, 2)), 0.3)
+        again = table_to_tracks(tracks_to_table(tracks, layout), layout)
+        assert_array_equal(again, tracks)
+        assert_array_equal(seen_points(again), seen)
+
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    def test_each_frame_equals_that_of_its_seen_points(self, rng, dtype):
+        tracks, seen = with_missing(
+            (5 + rng.normal(size=(30, 9, 2))).astype(dtype), 0.4
+        )
+        centred, translation = centred_tracks(tracks)
+        sizes = weighting_sizes(centred, scale_frames=True)
+        assert_array_equal(seen_points(centred), seen)
+        assert centred.dtype == translation.dtype == np.float64
+        for i, mask in enumerate(seen):
+            part, place = centred_tracks(tracks[i : i + 1, mask])
+            size = weighting_sizes(part, scale_frames=True)
+            assert_allclose(centred[i, mask], part[0], atol=1e-14)
+            assert_allclose(translation[i], place[0], atol=1e-14)
+            assert_allclose(sizes[i], size[0])
+            alone = relative_precision(tracks[i : i + 1, mask], size)
+            assert_allclose(relative_precision(tracks[i : i + 1], size), alone)
+
+    def test_sizes_of_unscaled_frames_are_one_size(self, rng):
+        centred, _ = centred_tracks(with_missing(rng.normal(size=(30, 9, 2)), 0.4)[0])
+        own = weighting_sizes(centred, scale_frames=True)
+        common = weighting_sizes(centred, scale_frames=False)
+        assert_array_equal(common, common[0])
+        assert_allclose(common[0] ** 2, np.mean(own**2))
+
+    @pytest.mark.parametrize("order", ["C", "F"])
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    def test_complete_tables_have_the_plain_values_to_the_last_bit(
+        self, rng, dtype, layout, order
+    ):
+        X = np.asarray(7 + rng.normal(size=(50, 40)), dtype=dtype, order=order)
+        tracks = table_to_tracks(X, layout)
+        assert clean_tracks(tracks) is tracks
+        plain = np.ascontiguousarray(tracks, dtype=np.float64)
+        centroid = np.einsum("ijc->ic", plain) / 20
+        centred, translation = centred_tracks(tracks)
+        assert_array_equal(translation, centroid)
+        assert_array_equal(centred, plain - centroid[:, None])
+        square = np.einsum("ijc,ijc->i", centred, centred) / 40
+        assert_array_equal(weighting_sizes(centred, True), np.sqrt(square))
+        assert_array_equal(weighting_sizes(centred, False)[0], np.sqrt(square.mean()))
+
+    def test_frames_without_any_point(self, rng):
+        tracks = rng.normal(size=(4, 9, 2))
+        tracks[[1, 3]] = np.nan
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            centred, translation = centred_tracks(tracks)
+            assert_array_equal(usable_frames(tracks), [True, False, True, False])
+            assert not frames_in_one_place(tracks).any()
+        assert_array_equal(np.isnan(centred).all(axis=(1, 2)), [0, 1, 0, 1])
+        assert_array_equal(np.isnan(translation).all(axis=1), [0, 1, 0, 1])
+
+
+class TestHalfPoints:
+    def half(self, rng):
+        tracks = rng.normal(size=(6, 9, 2))
+        tracks[4, 2, 0] = tracks[1, 7, 1] = tracks[1, 8, 0] = np.nan
+        tracks[2, 3] = np.nan
+        return tracks
+
+    def test_the_other_coordinate_is_dropped_with_a_warning(self, rng):
+        tracks = self.half(rng)
+        before = tracks.copy()
+        with pytest.warns(
+            UserWarning,
+            match=r"3 point\(s\) in 2 row\(s\) have only one of their two coordinates "
+            r"and count as missing; the first is point 7 in row 1$",
+        ):
+            clean = clean_tracks(tracks)
+        assert_array_equal(tracks, before)
+        seen = ~np.isnan(tracks).any(axis=2)
+        assert_array_equal(clean[seen], tracks[seen])
+        assert np.isnan(clean[~seen]).all()
+        assert clean.dtype == tracks.dtype
+
+    def test_single_precision_stays(self, rng):
+        with pytest.warns(UserWarning, match="3 point"):
+            assert clean_tracks(self.half(rng).astype(np.float32)).dtype == np.float32
+
+    @pytest.mark.parametrize(
+        ("layout", "columns"), [("interleaved", "c14, c15"), ("planar", "c7, c16")]
+    )
+    def test_columns_are_named(self, rng, layout, columns):
+        names = np.array([f"c{i}" for i in range(18)], dtype=object)
+        with pytest.warns(UserWarning, match=rf"point 7 \({columns}\) in row 1"):
+            clean_tracks(self.half(rng), layout, names)
+
+    def test_pairs_of_missing_coordinates_are_no_matter(self, rng):
+        tracks, _ = with_missing(rng.normal(size=(6, 9, 2)), 0.5)
+        assert clean_tracks(tracks) is tracks
+
+
+class TestFrames:
+    def test_equal_seen_points(self, rng):
+        tracks, seen = with_missing(100 * rng.normal(size=(30, 9, 2)), 0.3)
+        tracks[[3, 8]] = np.where(seen[[3, 8], :, None], 0.1, np.nan)
+        assert_array_equal(np.flatnonzero(frames_in_one_place(tracks)), [3, 8])
+        assert not usable_frames(tracks)[[3, 8]].any()
+        check_frames(tracks[[3, 8]])
+        with pytest.raises(
+            ValueError,
+            match=r"all seen points are equal in 2 frame\(s\), the first is row 3",
+        ):
+            centred_tracks(tracks)
+
+    @pytest.mark.parametrize("unit", UNITS)
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    def test_one_place_is_a_matter_of_rounding(self, rng, unit, dtype):
+        place = unit * rng.normal(size=(50, 1, 2))
+        noise = rng.normal(size=(50, 9, 2)) * np.linalg.norm(place, axis=2)[..., None]
+        eps = np.finfo(dtype).eps
+        assert frames_in_one_place((place + 0.5 * eps * noise).astype(dtype)).all()
+        assert not frames_in_one_place((place + 40 * eps * noise).astype(dtype)).any()
+
+    def test_fewest_points(self, rng):
+        tracks = np.full((9, 8, 2), np.nan)
+        for n in range(9):
+            tracks[n, :n] = rng.normal(size=(n, 2))
+        assert_array_equal(usable_frames(tracks), np.arange(9) >= FEWEST_POINTS)
+        check_frames(tracks[FEWEST_POINTS:])
+        with pytest.raises(
+            ValueError,
+            match=r"each frame must show at least 4 points .*; 3 of 8 frame\(s\) show "
+            r"fewer .*, the first is row 0 with 1 point\(s\)",
+        ):
+            check_frames(tracks[1:])
+
+    def test_fewest_points_determine_an_affine_camera(self, rng):
+        # Four points of space and a one for the translation: 4 x 4, of full rank.
+        points = np.column_stack([rng.normal(size=(8, 3)), np.ones(8)])
+        assert np.linalg.matrix_rank(points[:FEWEST_POINTS]) == 4
+        assert np.linalg.matrix_rank(points[: FEWEST_POINTS - 1]) < 4
+
+    @pytest.mark.parametrize("unit", UNITS)
+    @pytest.mark.parametrize("dtype", [np.float32, np.float64])
+    def test_points_on_a_line(self, rng, unit, dtype):
+        along = rng.normal(size=(40, 9, 1))
+        angle = rng.uniform(0, 2 * np.pi, size=(40, 1, 1))
+        line = along * np.concatenate([np.cos(angle), np.sin(angle)], axis=2)
+        tracks = (unit * (line + 5 * rng.normal(size=(40, 1, 2)))).astype(dtype)
+        assert usable_frames(tracks).all()  # complete: a flat object seen edge on
+        check_frames(tracks)
+        tracks[::2, 3] = np.nan
+        assert_array_equal(usable_frames(tracks), np.arange(40) % 2 == 1)
+        with pytest.raises(
+            ValueError,
+            match=r"not all lie on one line where others are missing \(NaN\); they "
+            r"do in 20 of 40 frame\(s\), the first is row 0",
+        ):
+            check_frames(tracks)
+
+    def test_points_nearly_on_a_line(self, rng):
+        line = rng.normal(size=(40, 9, 1)) * rng.normal(size=(40, 1, 2))
+        tracks, _ = with_missing(line + 1e-12 * rng.normal(size=line.shape), 0.2)
+        assert usable_frames(tracks).all()
+
+    def test_complete_and_real_frames_are_usable(self, load_data):
+        tracks = load_data("muct_68")["W2d"].astype(float)
+        assert usable_frames(tracks).all()
+        check_frames(tracks)
+        check_points(tracks, 9)
+
+
+class TestPoints:
+    def test_point_seen_in_too_few_frames(self, rng):
+        tracks = rng.normal(size=(50, 16, 2))
+        tracks[5:, 4] = np.nan
+        tracks[4:, 9] = np.nan
+        check_points(tracks[:, :9], 2)
+        names = np.array([f"{axis}_{j}" for axis in "xy" for j in range(16)])
+        with pytest.raises(
+            ValueError,
+            match=r"n_components=3 needs every point in at least 6 frames; 2 of 16 "
+            r"point\(s\) are seen in fewer, the first is point 4 \(x_4, y_4\), seen in "
+            r"5",
+        ):
+            check_points(tracks, 3, "planar", names)
+
+    @pytest.mark.parametrize("K", range(1, 21))
+    def test_least_number_of_frames_of_a_point(self, K):
+        least = -(-3 * (K + 1) // 2)
+        assert 2 * least >= 3 * (K + 1) > 2 * (least - 1)
+        # Complete tables that are large enough have it.
+        assert least <= smallest_n_frames(K)
+
+    @pytest.mark.parametrize("K", range(1, 6))
+    def test_count_of_all_equations(self, K):
+        # The smallest complete table has hardly more equations than unknowns.
+        n_frames, n_points = smallest_n_frames(K), 3 * K + 4
+        surplus = n_equations_minus_unknowns(n_frames, n_points, K)
+        tracks = np.random.default_rng(0).normal(size=(n_frames, n_points, 2))
+        check_points(tracks, K)
+        n_hidden = surplus // 2 + 1
+        tracks[np.arange(n_hidden) % n_frames, np.arange(n_hidden) % n_points] = np.nan
+        assert np.isnan(tracks).any(axis=2).sum() == n_hidden
+        with pytest.raises(
+            ValueError,
+            match=rf"too few points are seen for n_components={K}: .* equations, but "
+            r"the shapes have \d+ unknowns",
+        ):
+            check_points(tracks, K)
+
+    def test_groups_of_points_that_are_never_seen_together(self, rng):
+        tracks = rng.normal(size=(100, 20, 2))
+        tracks[:50, 12:] = np.nan
+        tracks[50:, :12] = np.nan
+        with pytest.raises(
+            ValueError,
+            match=r"2 groups, and no frame shows points of two of them; point 12 is "
+            r"the first that is never seen with point 0 or others of its group",
+        ):
+            check_points(tracks, 1)
+        tracks[7] = 0.0
+        check_points(tracks, 1)
 
 
 class TestMeasurementMatrix:
@@ -302,3 +543,55 @@ class TestOtherLayout:
         warn_if_other_layout(X, "interleaved", True)
         with pytest.warns(UserWarning, match="layout='interleaved' explains"):
             warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize(("right", "wrong"), [LAYOUTS, LAYOUTS[::-1]])
+    @pytest.mark.parametrize("missing", [0.1, 0.3, 0.6])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "akhter_yoga",
+            "expressions_dlib_68",
+            "hands_kazuhito_21",
+            "ict_bu3dfe_like_68",
+            "muct_68",
+            "shark_torresani",
+        ],
+    )
+    def test_real_tables_with_missing_points(
+        self, load_data, name, missing, right, wrong, scale_frames
+    ):
+        tracks, _ = with_missing(load_data(name)["W2d"].astype(float), missing)
+        X = tracks_to_table(tracks, right)
+        warn_if_other_layout(X, right, scale_frames)
+        with pytest.warns(UserWarning, match=f"layout='{right}' explains the table"):
+            warn_if_other_layout(X, wrong, scale_frames)
+
+    def test_faces_that_hide_a_side(self, load_data):
+        X = tracks_to_table(load_data("muct_68")["W2d"])
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_generated_faces_with_missing_points(self, seed):
+        X = make_face_tracks(60, missing=0.3, random_state=seed).data
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    @pytest.mark.parametrize("missing", [0.3, 0.8, 0.99])
+    def test_tables_that_hardly_show_anything(self, rng, missing, layout):
+        # No warning of arithmetic, whatever is left.
+        for seed in range(5):
+            X = with_missing(rng.normal(size=(30, 20, 2)), missing, seed)[0]
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                warn_if_other_layout(tracks_to_table(X), layout, True)
+
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    def test_a_rigid_object_with_missing_points(self, rng, layout):
+        tracks = rng.normal(size=(30, 3)) @ rng.normal(size=(40, 3, 2))
+        X = tracks_to_table(with_missing(tracks, 0.3)[0], layout)
+        warn_if_other_layout(X, layout, True)

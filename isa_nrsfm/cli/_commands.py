@@ -12,12 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._landmark_names import find_landmark_columns, parse_coordinate
+from isa_nrsfm._frame_fit import FrameFit
+from isa_nrsfm._landmark_names import (
+    LandmarkColumns,
+    find_landmark_columns,
+    parse_coordinate,
+    point_names,
+)
 from isa_nrsfm._optional import import_optional
+from isa_nrsfm.cli._choice import choose_n_components
 from isa_nrsfm.cli._frames import Frames, choose_frames
 from isa_nrsfm.cli._outputs import (
+    alpha_table,
     beside_other_columns,
-    component_names,
     prepare_folder,
     refuse_overwriting,
     write_figures,
@@ -28,6 +35,8 @@ from isa_nrsfm.cli._report import (
     fit_text,
     lay_out,
     model_report,
+    quality_lines,
+    quality_report,
     table_lines,
     table_report,
     versions,
@@ -67,41 +76,53 @@ def fit_table(
     import_optional("skops.io", extra="share")
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
+    if args.std and args.refinement != "joint":
+        raise ValueError(
+            "--std: only --refinement joint knows the standard deviations of the "
+            f"coefficients; got --refinement {args.refinement}"
+        )
     folder = Path(args.output)
-    clock = [time.perf_counter()]
+    clock = {"": time.perf_counter()}
     frames = _read_frames(args)
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
     files = prepare_folder(folder, [args.table], figures=not args.no_figures)
-    clock.append(time.perf_counter())
+    clock["read"] = time.perf_counter()
 
     estimator = AffineNRSfM(
-        args.n_components,
+        args.n_components[0],
         isa=_strategy(args),
         block_recovery=args.block_recovery,
         refinement=None if args.refinement == "none" else args.refinement,
+        independence=None if args.independence == "none" else args.independence,
+        loss=args.loss,
         scale_frames=not args.no_scale_frames,
         random_state=args.random_state,
         n_jobs=args.n_jobs,
     )
+    choice = None
+    if len(args.n_components) > 1:
+        choice = choose_n_components(estimator, X, args.n_components)
+        clock["choose"] = time.perf_counter()
     with _progress(estimator):
         estimator.fit(X)
-    clock.append(time.perf_counter())
+    clock["fit"] = time.perf_counter()
 
-    other = frames.other[frames.usable]
-    write_results(folder, estimator, X, other, frames.columns.points)
+    write_results(folder, estimator, frames, std=args.std)
     if not args.no_figures:
         write_figures(folder, estimator, X, args.random_state)
-    clock.append(time.perf_counter())
+    model = model_report(estimator, X, frames)
+    clock["write"] = time.perf_counter()
     report = {
         "command": "fit",
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "table": table_report(args.table, frames),
-        "model": model_report(estimator, X),
+        **({} if choice is None else {"choice": choice}),
+        "model": model,
         **{name: compute(estimator, X) for name, compute in extra.items()},
         "seconds": dict(
-            zip(("read", "fit", "write"), np.diff(clock).round(3), strict=True)
+            zip([*clock][1:], np.diff([*clock.values()]).round(3), strict=True)
         ),
         "warnings": warned,
         "versions": versions(),
@@ -113,28 +134,35 @@ def fit_table(
 
 def run_transform(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
-    pd = import_optional("pandas", extra="io")
     output = Path(args.output)
     table_suffix(output)
     estimator = load_model(args.model)
+    if args.std and not hasattr(estimator, "alpha_std_"):
+        raise ValueError(
+            f"--std: {args.model} was fitted with refinement="
+            f"{estimator.refinement!r}, which does not know the standard deviations "
+            "of its coefficients"
+        )
     frames = _read_frames(args, estimator)
     for source in (args.table, args.model):
         refuse_overwriting(source, [output])
-    points = frames.points[frames.usable]
-    alpha = np.full((len(frames.points), len(estimator.basis_)), np.nan)
-    if not points.empty:
-        alpha[frames.usable] = estimator.transform(_as_fitted(estimator, points))
-    results = pd.DataFrame(
-        alpha, index=frames.points.index, columns=component_names(alpha.shape[1])
-    )
+    X = _as_fitted(estimator, frames.points[frames.usable])
+    n_frames, n_components = len(X), len(estimator.basis_)
+    fit = FrameFit.unknown(0, n_components)
+    quality = ["no frame was fitted"]
+    if n_frames:
+        fit = _fitted_frames(estimator, X)
+        quality = quality_lines(quality_report(estimator, X, fit))
+    results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
 
     table = table_report(args.table, frames)
-    title = f"{len(alpha.T)} coefficients of {table['n_frames']} frames"
+    title = f"{n_components} coefficients of {n_frames} frames"
     sections = {
         "Table": table_lines(table, unusable="without coefficients"),
         "Model": [args.model],
-        "Output": [str(output), f"{len(alpha)} rows"],
+        "Quality": quality,
+        "Output": [str(output), f"{len(results)} rows"],
     }
     return f"{title}\n\n{lay_out(sections)}"
 
@@ -142,12 +170,14 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
 def _read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
     table = read_table(args.table)
-    columns = args.columns
-    if estimator is not None:
-        columns = _columns_of_model(estimator, table, columns)
+    columns = (
+        find_landmark_columns(table.columns, args.columns)
+        if estimator is None
+        else _columns_of_model(estimator, table, args.columns)
+    )
     return choose_frames(
         table,
-        columns=columns,
+        columns,
         rules=args.skip_rows,
         zeros_missing=args.zeros_missing,
     )
@@ -155,7 +185,7 @@ def _read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frame
 
 def _columns_of_model(
     estimator: AffineNRSfM, table: "pd.DataFrame", columns: str | None
-) -> str | list[str] | None:
+) -> LandmarkColumns:
     """Return the columns of the points that a model was fitted to."""
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
@@ -166,17 +196,24 @@ def _columns_of_model(
                 f"the model has {n_points} points, the table has {len(found.points)} "
                 f"({found.pattern})"
             )
-        return columns
-    wanted = [str(name).strip() for name in fitted]
-    coordinates = (
+        return found
+    tracks = np.array([str(name).strip() for name in fitted]).reshape(
+        _SHAPES[estimator.layout]
+    )
+    x, y = tracks if estimator.layout == "planar" else tracks.T
+    wanted = {*x, *y}
+    in_table = {str(name).strip(): name for name in table.columns}
+    # Columns that are coordinates or, where they are named, the chosen ones.
+    candidates = (
         [name for name in table.columns if parse_coordinate(name) is not None]
         if columns is None
         else find_landmark_columns(table.columns, columns).interleaved
     )
-    present = {str(name).strip() for name in table.columns if columns is None}
-    present.update(name.strip() for name in coordinates)
-    absent = [name for name in wanted if name not in present]
-    surplus = [name.strip() for name in coordinates if name.strip() not in set(wanted)]
+    coordinates = {str(name).strip(): name for name in candidates}
+    present = in_table if columns is None else coordinates
+    absent = [name for point in zip(x, y, strict=True) for name in point]
+    absent = [name for name in absent if name not in present]
+    surplus = [name for name in coordinates if name not in wanted]
     if absent or (surplus and columns is not None):
         differences = [
             f"{len(names)} columns are only in the {where} ({_shortened(names)})"
@@ -187,8 +224,14 @@ def _columns_of_model(
             "the points of the table are not those of the model: "
             + "; ".join(differences)
         )
-    tracks = np.array(wanted).reshape(_SHAPES[estimator.layout])
-    return (tracks.T if estimator.layout == "planar" else tracks).ravel().tolist()
+    return LandmarkColumns(
+        pattern="those of the model",
+        points=point_names(x),
+        x=tuple(in_table[name] for name in x),
+        y=tuple(in_table[name] for name in y),
+        z=(),
+        gaps=(),
+    )
 
 
 def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
@@ -200,6 +243,11 @@ def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
         return x_then_y.reshape(points.shape) if planar else points.to_numpy()
     in_order = points[[str(name).strip() for name in fitted]]
     return in_order.set_axis(list(fitted), axis=1)
+
+
+def _fitted_frames(estimator: AffineNRSfM, X: Any) -> FrameFit:
+    """Return cameras, coefficients and their standard deviations for a table."""
+    return estimator._fit_frames(estimator._validated(X))[2]
 
 
 def _strategy(args: Namespace) -> Any:

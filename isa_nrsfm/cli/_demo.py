@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _N_FRAMES = 400
 _N_COMPONENTS = 3
+_TRIED = "1-5"
 _SEED = 0
 
 
@@ -37,7 +38,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
 
     options = [
         *("fit", str(path)),
-        *("--n-components", str(_N_COMPONENTS)),
+        *("--n-components", _TRIED),
         *("--output", str(folder)),
         *(["--no-figures"] if args.no_figures else []),
     ]
@@ -85,7 +86,7 @@ def _compare(faces: "Bunch", estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
                 "name": name,
                 "found_as": names[found],
                 "similarity": similarity[k],
-                "correlation": abs(correlation[k, len(names) + found]),
+                "correlation": abs(correlation[k, len(faces.basis) + found]),
             }
             for k, (name, found) in enumerate(
                 zip(faces.component_names, matching, strict=True)

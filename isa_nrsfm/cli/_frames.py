@@ -7,20 +7,24 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._landmark_names import (
-    LandmarkColumns,
-    find_landmark_columns,
-    landmark_sets,
+from isa_nrsfm._landmark_names import LandmarkColumns, landmark_sets
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm._tracks import (
+    FEWEST_POINTS,
+    clean_tracks,
+    frames_in_one_place,
+    seen_points,
+    usable_frames,
 )
 from isa_nrsfm.cli._parser import RowRule
-from isa_nrsfm.io import landmark_table
+from isa_nrsfm.io._tables import _numbers
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
 class LeftOut(NamedTuple):
-    """Rows of a table that are not used, why, and whether a rule skips them."""
+    """Rows of a table that are not fitted, why, and whether a rule skips them."""
 
     reason: str
     rows: NDArray[np.intp]
@@ -32,12 +36,14 @@ class Frames(NamedTuple):
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     no rule skips, with the number of each row in the table as index. ``usable`` tells
-    which of them have all their points, and ``left_out`` accounts for all other rows.
+    which of them show enough points to be fitted, and ``left_out`` accounts for all
+    other rows. ``seen`` tells which points each of the former shows.
     """
 
     points: "pd.DataFrame"
     other: "pd.DataFrame"
     usable: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
     columns: LandmarkColumns
     not_used: dict[str, int]
     n_rows: int
@@ -46,13 +52,13 @@ class Frames(NamedTuple):
 
 def choose_frames(
     table: "pd.DataFrame",
+    columns: LandmarkColumns,
     *,
-    columns: str | Sequence[str] | None,
     rules: Sequence[RowRule],
     zeros_missing: bool,
 ) -> Frames:
     """Apply the rules for rows, take the landmarks, and look for unusable frames."""
-    found = find_landmark_columns(table.columns, columns)
+    pd = import_optional("pandas", extra="io")
     kept = np.ones(len(table), dtype=bool)
     left_out = []
     for rule in rules:
@@ -65,28 +71,52 @@ def choose_frames(
             )
         )
         kept &= ~matches
-    points, other = landmark_table(
-        table[kept],
-        columns=columns,
-        missing="zeros" if zeros_missing else None,
-    )
-    tracks = points.to_numpy().reshape(len(points), len(found.points), 2)
     rows = np.flatnonzero(kept)
-    incomplete = np.isnan(tracks).any(axis=(1, 2))
-    collapsed = ~incomplete & _in_one_place(tracks)
-    left_out.append(LeftOut("missing points", rows[incomplete], False))
-    left_out.append(LeftOut("all points in one place", rows[collapsed], False))
-    if not zeros_missing:
-        _warn_of_zeros(tracks[~incomplete & ~collapsed])
-    return Frames(
-        points=points,
-        other=other,
-        usable=~(incomplete | collapsed),
-        columns=found,
-        not_used=_sets_not_used(table, found),
-        n_rows=len(table),
-        left_out=tuple(reason for reason in left_out if len(reason.rows)),
+    names = columns.interleaved
+    stripped = [name.strip() for name in names]
+    cells = table.loc[kept, names]
+    # Messages about a row name its number in the table, so all rows are there.
+    tracks = np.full((len(table), len(columns.points), 2), np.nan)
+    tracks[rows] = np.stack([_numbers(cells[name]) for name in names], axis=1).reshape(
+        -1, len(columns.points), 2
     )
+    if zeros_missing:
+        tracks[(tracks == 0).all(axis=2)] = np.nan
+    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    usable = usable_frames(tracks)
+    left_out += [
+        LeftOut(reason, rows[which], skipped=False)
+        for reason, which in _reasons(tracks, usable)
+    ]
+    if not zeros_missing:
+        _warn_of_zeros(tracks[usable])
+    return Frames(
+        points=pd.DataFrame(
+            tracks.reshape(len(rows), len(names)), index=rows, columns=stripped
+        ),
+        other=table.loc[kept].drop(columns=names),
+        usable=usable,
+        seen=seen_points(tracks)[usable],
+        columns=columns,
+        not_used=_sets_not_used(table, columns),
+        n_rows=len(table),
+        left_out=tuple(out for out in left_out if len(out.rows)),
+    )
+
+
+def _reasons(
+    tracks: NDArray[np.float64], usable: NDArray[np.bool_]
+) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Tell in which frames what is the matter, each with one reason."""
+    n_seen = seen_points(tracks).sum(axis=1)
+    few = n_seen < FEWEST_POINTS
+    in_one_place = frames_in_one_place(tracks) & ~few
+    return [
+        ("all points missing", n_seen == 0),
+        (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
+        ("all points in one place", in_one_place),
+        ("points on one line, others missing", ~usable & ~few & ~in_one_place),
+    ]
 
 
 def _matching_rows(table: "pd.DataFrame", rule: RowRule) -> NDArray[np.bool_]:
@@ -108,13 +138,6 @@ def _matching_rows(table: "pd.DataFrame", rule: RowRule) -> NDArray[np.bool_]:
         ],
         dtype=bool,
     )
-
-
-def _in_one_place(tracks: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell in which frames all points are equal up to rounding."""
-    extent = np.ptp(tracks, axis=1).max(axis=1)
-    largest = np.abs(tracks).max(axis=(1, 2))
-    return extent <= 8 * np.finfo(float).eps * largest
 
 
 def _warn_of_zeros(tracks: NDArray[np.float64]) -> None:

@@ -3,14 +3,16 @@
 import json
 import tempfile
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm._optional import import_optional
+from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.io import save_model, write_table
 from isa_nrsfm.metrics import frame_energies
 
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 REPORT = "report.json"
 FIGURES = {
     "basis_shapes.png": "mean shape and basis shapes",
-    "mode_covariance.png": "covariance of the independent signals in 3x3 blocks",
+    "mode_covariance.png": "covariance of the deformations over the images, 3x3 blocks",
     "reprojection.png": "some frames, as observed and as the model has them",
 }
 TABLES = {
@@ -97,42 +99,64 @@ def beside_other_columns(
 def write_results(
     folder: Path,
     estimator: AffineNRSfM,
-    points: "pd.DataFrame",
-    other: "pd.DataFrame",
-    point_names: Sequence[str],
+    frames: Frames,
+    *,
+    std: bool,
 ) -> None:
-    """Write model, coefficients, cameras and shapes; rows are the frames of the fit."""
-    pd = import_optional("pandas", extra="io")
-    names = component_names(len(estimator.basis_))
-    alpha = pd.DataFrame(estimator.alpha_, index=points.index, columns=names)
-    write_table(beside_other_columns(alpha, other), folder / "alpha.csv")
+    """Write model, coefficients, cameras and shapes.
 
+    The tables have a row for each frame, empty for those that could not be fitted.
+    """
+    pd = import_optional("pandas", extra="io")
+    fit = fitted_frames(estimator)
+    alpha = alpha_table(fit, frames, std=std)
+    write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
+
+    X = frames.points[frames.usable]
     cameras = pd.DataFrame(
-        np.hstack([estimator.motion_.reshape(-1, 6), estimator.translation_]),
+        np.hstack([fit.motion.reshape(-1, 6), fit.translation]),
+        index=X.index,
         columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
     )
-    cameras.insert(0, "row", points.index)
-    energy, error, _ = frame_energies(points, fitted_table(estimator), estimator.layout)
+    energy, error, _ = frame_energies(X, fitted_table(estimator, fit), estimator.layout)
     cameras["inverse_snr"] = error / energy
+    cameras = cameras.reindex(frames.points.index)
+    cameras.insert(0, "row", cameras.index)
     write_table(cameras, folder / "cameras.csv")
 
     np.savez(
         folder / "shapes.npz",
         mean_shape=estimator.mean_shape_,
         basis=estimator.basis_,
-        point_names=np.array(point_names, dtype=str),
-        component_names=np.array(names, dtype=str),
+        point_names=np.array(frames.columns.points, dtype=str),
+        component_names=np.array(component_names(len(estimator.basis_)), dtype=str),
         reference_motion=estimator.reference_motion_,
         reference_translation=estimator.reference_translation_,
     )
     save_model(estimator, folder / "model.skops")
 
 
-def fitted_table(estimator: AffineNRSfM) -> np.ndarray:
-    """Return the table that a model was fitted to, as the model has it."""
-    return estimator.inverse_transform(
-        estimator.alpha_, estimator.motion_, estimator.translation_
-    )
+def alpha_table(fit: FrameFit, frames: Frames, *, std: bool) -> "pd.DataFrame":
+    """Return the coefficients of all frames, empty for those that are not usable."""
+    pd = import_optional("pandas", extra="io")
+    names = component_names(fit.alpha.shape[1])
+    alpha = pd.DataFrame(fit.alpha, columns=names)
+    if std:
+        alpha[[f"{name}_std" for name in names]] = fit.alpha_std
+    alpha.index = frames.points.index[frames.usable]
+    return alpha.reindex(frames.points.index)
+
+
+def fitted_frames(estimator: AffineNRSfM) -> FrameFit:
+    """Return cameras and coefficients of the table that a model was fitted to."""
+    alpha = estimator.alpha_
+    std = getattr(estimator, "alpha_std_", np.full_like(alpha, np.nan))
+    return FrameFit(estimator.motion_, estimator.translation_, alpha, std)
+
+
+def fitted_table(estimator: AffineNRSfM, fit: FrameFit) -> np.ndarray:
+    """Return a table as the model has it."""
+    return estimator.inverse_transform(fit.alpha, fit.motion, fit.translation)
 
 
 def write_figures(

@@ -6,8 +6,12 @@ from typing import Any, NamedTuple
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._independent_gauge import INDEPENDENCE
+from isa_nrsfm._robust import LOSSES
 
 PROGRAM = "isa-nrsfm"
+# A range of more numbers of basis shapes is a mistake.
+_MOST_CHOICES = 100
 
 _OVERVIEW = """\
 Factorise a table of 2D landmarks (one row a frame) into a mean 3D shape, basis shapes
@@ -28,20 +32,22 @@ such as x0, y0 or nose_x, nose_y; all other columns are kept beside the results.
 _FIT_EXAMPLES = """\
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
+  isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
   isa-nrsfm fit openface.csv --columns 'x_#,y_#' --skip-rows 'success=^0' \\
       --n-components 5 --output results
 
-Rows with missing points are left out and counted. Files of an earlier run in the output
-folder are replaced."""
+Cells of missing points are empty. Rows that show too few points for a fit are counted
+and get empty coefficients. Files of an earlier run in the output folder are
+replaced."""
 
 _TRANSFORM_EXAMPLES = """\
 example:
   isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
 
 The table must have the landmark columns that the model was fitted to. Every row has its
-row in the output; where points are missing, the coefficients are empty."""
+row in the output; where too few points are seen, the coefficients are empty."""
 
 _DEMO_EXAMPLES = """\
 example:
@@ -73,7 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
         ),
     )
     _add_table_options(fit)
-    _add_folder_options(fit, required=True)
+    _add_std_option(_add_folder_options(fit, required=True))
     _add_method_options(fit)
 
     transform = commands.add_parser(
@@ -84,15 +90,19 @@ def build_parser() -> argparse.ArgumentParser:
             _TRANSFORM_EXAMPLES,
         ),
     )
-    transform.add_argument("model", metavar="MODEL", help="model.skops, written by fit")
+    transform.add_argument(
+        "model", metavar="MODEL", type=_path, help="model.skops, written by fit"
+    )
     _add_table_options(transform)
     transform.add_argument(
         "-o",
         "--output",
         metavar="FILE",
+        type=_path,
         required=True,
         help="the .csv, .tsv or .parquet file to write",
     )
+    _add_std_option(transform)
 
     demo = commands.add_parser(
         "demo",
@@ -119,7 +129,9 @@ def _manners(description: str, epilog: str) -> dict[str, Any]:
 def _add_table_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that say what a table's rows and columns mean."""
     group = parser.add_argument_group("table")
-    group.add_argument("table", metavar="TABLE", help="a .csv, .tsv or .parquet file")
+    group.add_argument(
+        "table", metavar="TABLE", type=_path, help="a .csv, .tsv or .parquet file"
+    )
     group.add_argument(
         "--columns",
         metavar="PATTERN",
@@ -151,9 +163,11 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
         "-k",
         "--n-components",
         metavar="K",
-        type=_positive,
-        default=defaults["n_components"],
-        help="number of basis shapes (default: %(default)s)",
+        type=_numbers_of_shapes,
+        default=str(defaults["n_components"]),
+        help="number of basis shapes (default: %(default)s). Of several, such as 1-8 "
+        "or 3,6,9, that is taken which best predicts held-out points of held-out "
+        "frames",
     )
     group.add_argument(
         "--isa",
@@ -177,9 +191,24 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--refinement",
-        choices=["alternating", "none"],
-        default="alternating",
-        help="refinement of basis shapes and coefficients (default: %(default)s)",
+        choices=["joint", "alternating", "none"],
+        default=str(defaults["refinement"]).lower(),
+        help="joint: cameras, coefficients and basis shapes together; alternating: the "
+        "paper's, with the cameras of the rigid part held (default: %(default)s)",
+    )
+    group.add_argument(
+        "--independence",
+        choices=[*INDEPENDENCE, "none"],
+        default=str(defaults["independence"]).lower(),
+        help="what is made independent in the joint refinement, the basis shapes over "
+        "the points or their coefficients over the frames (default: %(default)s)",
+    )
+    group.add_argument(
+        "--loss",
+        choices=list(LOSSES),
+        default=defaults["loss"],
+        help="how far-off points count in the joint refinement: huber and cauchy "
+        "bound the influence of outliers (default: %(default)s)",
     )
     group.add_argument(
         "--no-scale-frames",
@@ -201,13 +230,16 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_folder_options(parser: argparse.ArgumentParser, *, required: bool) -> None:
+def _add_folder_options(
+    parser: argparse.ArgumentParser, *, required: bool
+) -> argparse._ActionsContainer:
     """Add the options that say what is written where."""
     group = parser.add_argument_group("output")
     group.add_argument(
         "-o",
         "--output",
         metavar="DIR",
+        type=_path,
         required=required,
         default=f"{PROGRAM}-demo",
         help="folder for the results, created if absent"
@@ -216,6 +248,24 @@ def _add_folder_options(parser: argparse.ArgumentParser, *, required: bool) -> N
     group.add_argument(
         "--no-figures", action="store_true", help="write no figures (png)"
     )
+    return group
+
+
+def _add_std_option(group: argparse._ActionsContainer) -> None:
+    """Add the option for standard deviations."""
+    group.add_argument(
+        "--std",
+        action="store_true",
+        help="write the standard deviation of each coefficient, too, in columns such "
+        "as alpha_1_std",
+    )
+
+
+def _path(text: str) -> str:
+    """Read the path of a file or a folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("expected a path; got an empty text")
+    return text
 
 
 def _row_rule(text: str) -> RowRule:
@@ -236,6 +286,22 @@ def _row_rule(text: str) -> RowRule:
 def _positive(text: str) -> int:
     """Read a whole number of at least 1."""
     return _whole_number(text, 1, 2**31 - 1)
+
+
+def _numbers_of_shapes(text: str) -> tuple[int, ...]:
+    """Read numbers of basis shapes, such as 9, 1-8 or 3,6,9; ascending."""
+    numbers: set[int] = set()
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        low = _positive(first)
+        high = _positive(last) if dash else low
+        if high < low or high - low >= _MOST_CHOICES:
+            raise argparse.ArgumentTypeError(
+                f"expected a range of at most {_MOST_CHOICES} numbers, the smaller one "
+                f"first, such as 1-8; got {part!r}"
+            )
+        numbers.update(range(low, high + 1))
+    return tuple(sorted(numbers))
 
 
 def _seed(text: str) -> int:

@@ -1,5 +1,6 @@
 """What a run reports, as data for the JSON file and as text for people."""
 
+import math
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm.cli._frames import Frames
-from isa_nrsfm.cli._outputs import component_names, fitted_table
+from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
+from isa_nrsfm.metrics import inverse_snr
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
@@ -24,6 +27,8 @@ def table_report(path: str, frames: Frames) -> dict[str, Any]:
         "n_rows": frames.n_rows,
         "n_frames": int(np.count_nonzero(frames.usable)),
         "n_points": len(frames.columns.points),
+        "n_missing_points": int(np.count_nonzero(~frames.seen)),
+        "n_frames_with_missing_points": int(np.count_nonzero(~frames.seen.all(axis=1))),
         "columns": frames.columns.pattern,
         "first_columns": list(frames.points.columns[:4]),
         "last_columns": list(frames.points.columns[-2:]),
@@ -41,15 +46,43 @@ def table_report(path: str, frames: Frames) -> dict[str, Any]:
     }
 
 
-def model_report(estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
+def quality_report(estimator: AffineNRSfM, X: Any, fit: FrameFit) -> dict[str, Any]:
+    """Describe how well a model explains a table."""
+    off = fitted_table(estimator, fit) - np.asarray(X)
+    return {
+        "inverse_snr": inverse_snr(
+            X,
+            fitted_table(estimator, fit),
+            layout=estimator.layout,
+            scale_frames=estimator.scale_frames,
+        ),
+        "held_out_error": -estimator.score(X),
+        "rms_point_error": np.sqrt(2 * np.nanmean(off**2)),
+    }
+
+
+def quality_lines(quality: dict[str, Any], remark: str = "") -> list[str]:
+    """Say how well a model explains a table, with a remark on its inverse SNR."""
+    return [
+        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}",
+        f"held-out error {_percent(quality['held_out_error'])}, the same for points "
+        "predicted from the others of their frame",
+        f"reprojected points are off by {quality['rms_point_error']:.3g}, root mean "
+        "square, in the units of the table",
+    ]
+
+
+def model_report(estimator: AffineNRSfM, X: Any, frames: Frames) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
-    off = fitted_table(estimator) - np.asarray(X)
     names = component_names(len(estimator.basis_))
+    # Known only where the fit has seen the table as it is.
+    floor = frames.seen.all() and estimator.loss == "linear"
     return {
         "n_components": len(estimator.basis_),
+        **quality_report(estimator, X, fitted_frames(estimator)),
         "inverse_snr": estimator.inverse_snr_,
-        "rank_floor": estimator.rank_floor_,
-        "rms_point_error": np.sqrt(2 * np.mean(off**2)),
+        "rank_floor": estimator.rank_floor_ if floor else None,
+        "noise_variance": getattr(estimator, "noise_variance_", None),
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": [
@@ -84,16 +117,25 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
     table, model = report["table"], report["model"]
     n_components = model["n_components"]
     shapes = f"{n_components} basis shape{'s' * (n_components != 1)}"
-    fit = [
-        f"inverse SNR {_percent(model['inverse_snr'])} "
-        f"(no model with {shapes} is below {_percent(model['rank_floor'])})",
-        f"reprojected points are off by {model['rms_point_error']:.3g}, root mean "
-        "square, in the units of the table",
-        f"{report['seconds']['fit']:.1f} seconds",
-    ]
+    remark = ""
+    if model["parameters"]["loss"] != "linear":
+        remark = " (outliers count in full)"
+    elif model["rank_floor"] is not None:
+        floor = _percent(model["rank_floor"])
+        remark = f" (no model with {shapes} is below {floor})"
+    fit = quality_lines(model, remark)
+    if model["noise_variance"] is not None:
+        noise = math.sqrt(model["noise_variance"])
+        unit = (
+            f"{_percent(noise)} of the frame's size"
+            if model["parameters"]["scale_frames"]
+            else f"{noise:.3g} in the units of the table"
+        )
+        fit.append(f"noise {unit}, standard deviation of a coordinate")
+    fit.append(f"{report['seconds']['fit']:.1f} seconds")
     alpha = [f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"]
     alpha += [
-        f"{row['name']:10} {100 * row['energy_share']:6.1f} % {row['mean']:7.2f} "
+        f"{row['name']:10} {100 * row['energy_share']:6.1f} % {row['mean']:z7.2f} "
         f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f}"
         for row in model["alpha"]
     ]
@@ -108,6 +150,7 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
     )
     sections = {
         "Table": table_lines(table),
+        **({"Choice": _choice_lines(report["choice"])} if "choice" in report else {}),
         "Fit": fit,
         "Alpha": alpha,
         "Files": files,
@@ -143,7 +186,29 @@ def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
     ]
     counts.append((table["n_frames"], "used"))
     width = len(str(table["n_rows"]))
-    return lines + [f"{count:{width}} {what}" for count, what in counts]
+    lines += [f"{count:{width}} {what}" for count, what in counts]
+    n_missing = table["n_missing_points"]
+    if n_missing:
+        share = n_missing / (table["n_frames"] * table["n_points"])
+        lines.append(
+            f"{n_missing} points ({_percent(share)}) are missing in "
+            f"{table['n_frames_with_missing_points']} of these rows"
+        )
+    return lines
+
+
+def _choice_lines(choice: dict[str, Any]) -> list[str]:
+    """Show the held-out error of each number of basis shapes."""
+    lines = ["  K   held-out error of frames that were not fitted"]
+    lines += [
+        f"{k:3}   {100 * error:#.3g} %{', the least' * (k == choice['chosen'])}"
+        for k, error in zip(
+            choice["n_components"], choice["held_out_error"], strict=True
+        )
+    ]
+    if choice["chosen"] == choice["n_components"][-1]:
+        lines.append("larger K may be better: this is the largest that was tried")
+    return lines
 
 
 def lay_out(sections: Mapping[str, Sequence[str]]) -> str:

@@ -11,6 +11,9 @@ from isa_nrsfm._optional import import_optional
 #: The types beside those that skops trusts by itself that a model file may contain.
 TRUSTED_TYPES = (
     "isa_nrsfm._estimator.AffineNRSfM",
+    "isa_nrsfm._frame_fit.PosteriorFrames",
+    "isa_nrsfm._frame_fit.RigidFrames",
+    "isa_nrsfm._independent_gauge.FrameMap",
     "isa_nrsfm.isa._density.SqrtDensity",
     "isa_nrsfm.isa._fastisa.FastISA",
     "isa_nrsfm.isa._pooled_fastica.PooledFastICA",

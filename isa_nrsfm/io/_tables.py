@@ -54,7 +54,8 @@ def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
     Returns
     -------
     DataFrame of shape (n_rows, n_columns)
-        The table. Its rows are numbered from 0.
+        The table. Its rows are numbered from 0; a named index of a parquet file is
+        among the first columns.
 
     Raises
     ------
@@ -276,7 +277,12 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
         raise ValueError(f"{path} is not a parquet file: {first_line}") from error
     if frame.empty:
         raise ValueError(f"{path} has no rows")
-    return frame.reset_index(drop=True)
+    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
+    if len(unnamed) == frame.index.nlevels:
+        return frame.reset_index(drop=True)
+    index = frame.index.droplevel(unnamed)
+    _refuse_same_names([str(name) for name in (*index.names, *frame)], str(path))
+    return frame.set_axis(index).reset_index()
 
 
 def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:

@@ -1,0 +1,270 @@
+"""
+Print how well known shapes, bases and numbers of basis shapes are recovered.
+
+Run ``python -m benchmarks.recovery [section ...] [--seeds N]``. The tables are drawn by
+`make_nonrigid_tracks`. From seed to seed the camera model changes (weak perspective,
+affine), the number of frames (300, 400, 500) and the amplitude (15 to 20 %).
+"""
+
+import numpy as np
+from sklearn.model_selection import GridSearchCV, KFold
+
+from benchmarks._command import run
+from benchmarks._data import as_table
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.metrics import affine_shape_error, basis_similarity
+
+CAMERAS = ("weak_perspective", "affine")
+FRAMES = (300, 400, 500)
+AMPLITUDES = (0.15, 0.175, 0.2)
+# The error of an efficient estimator is proportional to the noise: at so little noise
+# the answer is linear in it. It is run closer to convergence, which the bound means.
+SMALL = 1e-3
+BOUND_TOL = 1e-4
+
+
+def instance(seed, n_points, n_components, noise, **options):
+    """Return the tracks of a seed: the same truth and noise pattern for each noise."""
+    settings = {
+        "camera": CAMERAS[seed % 2],
+        "n_frames": FRAMES[seed % 3],
+        "amplitude": AMPLITUDES[(seed // 2) % 3],
+        "random_state": seed,
+    }
+    settings.update(options)
+    return make_nonrigid_tracks(
+        n_points=n_points, n_components=n_components, noise=noise, **settings
+    )
+
+
+def fitted(tracks, n_components, **parameters):
+    """Return the default fit of tracks, and its error in 3D."""
+    model = AffineNRSfM(n_components, random_state=0, **parameters).fit(tracks.data)
+    shapes = model.reconstruct(tracks.data)
+    return model, affine_shape_error(tracks.shapes, shapes)
+
+
+def least_similarity(tracks, model):
+    """
+    Return the lowest similarity of a basis shape, as it is and modulo the mean shape.
+
+    Images do not tell ``B_k + v B_0`` from B_k: the first is below one by what the true
+    basis shapes have in common with the mean shape, for any method.
+    """
+    plain = basis_similarity(tracks.basis, model.basis_)
+    modulo = basis_similarity(
+        tracks.basis,
+        model.basis_,
+        mean_shape_true=tracks.mean_shape,
+        mean_shape=model.mean_shape_,
+        modulo_mean_shape=True,
+    )
+    return plain.min(), modulo.min()
+
+
+def exact(options):
+    """No noise: largest inverse SNR (below 1e-10) and 3D error (below 1e-5)."""
+    print("points  K   exact     inverse SNR    3D error")
+    for n_points in options.points:
+        for K in options.components:
+            results = []
+            for seed in range(options.seeds):
+                model, error = fitted(instance(seed, n_points, K, 0.0), K)
+                results.append((model.inverse_snr_, error))
+            results = np.array(results)
+            n_exact = np.sum((results[:, 0] < 1e-10) & (results[:, 1] < 1e-5))
+            worst = results.max(axis=0)
+            print(
+                f"{n_points:6}{K:3}{n_exact:5}/{len(results):<4}{worst[0]:12.1e}"
+                f"{worst[1]:12.1e}",
+                flush=True,
+            )
+
+
+def noisy(options):
+    """1 and 2 % noise: 3D error, its ratio to the Cramer-Rao bound, similarity.
+
+    The bound is the error at a thousandth of the same noise, times a thousand. The
+    similarity is the lowest of a basis shape; "modulo" leaves out the mean shape.
+    """
+    print(
+        "points  K noise   3D error: median     max    bound     ratio: median   max"
+        "   similarity: median     min  modulo"
+    )
+    for n_points in options.points:
+        for K in options.components:
+            for noise in (0.01, 0.02):
+                rows = []
+                for seed in range(options.seeds):
+                    tracks = instance(seed, n_points, K, noise)
+                    model, error = fitted(tracks, K)
+                    little = instance(seed, n_points, K, SMALL * noise)
+                    bound = fitted(little, K, tol=BOUND_TOL)[1] / SMALL
+                    similarity = least_similarity(tracks, model)
+                    rows.append((error, bound, error / bound, *similarity))
+                error, bound, ratio, plain, modulo = np.array(rows).T
+                print(
+                    f"{n_points:6}{K:3}{noise:6.2f}{np.median(error):19.5f}"
+                    f"{error.max():8.5f}{np.median(bound):9.5f}"
+                    f"{np.median(ratio):18.3f}{ratio.max():6.3f}"
+                    f"{np.median(plain):21.4f}{plain.min():8.4f}{modulo.min():8.4f}",
+                    flush=True,
+                )
+
+
+def grid(options):
+    """GridSearchCV over n_components 1 to 8 at 2 % noise: how often it finds K."""
+    search = GridSearchCV(
+        AffineNRSfM(random_state=0), {"n_components": range(1, 9)}, cv=KFold(3)
+    )
+    for K in (1, 2, 3, 4, 5):
+        found = []
+        for seed in range(options.seeds):
+            tracks = instance(seed, 68, K, 0.02)
+            found.append(search.fit(tracks.data).best_params_["n_components"])
+        right = sum(k == K for k in found)
+        print(f"K={K}: found {right} of {len(found)}, {found}", flush=True)
+
+
+def coefficient_kinds(rng, n_frames, n_components):
+    """Return coefficients of several distributions, by name."""
+    normal = rng.standard_normal((n_frames, n_components))
+    mixing = np.eye(n_components) + 0.5 * rng.standard_normal(2 * (n_components,)) / (
+        np.sqrt(n_components)
+    )
+    waves = np.arange(n_frames)[:, None] * np.linspace(0.05, 0.2, n_components)
+    return {
+        "normal": normal,
+        "Laplace": rng.laplace(size=normal.shape),
+        "Student (3)": rng.standard_t(3, size=normal.shape),
+        "uniform": rng.uniform(-1, 1, size=normal.shape),
+        "correlated": normal @ mixing,
+        "waves": np.sin(waves + rng.uniform(0, 6, n_components)),
+        "one sided": rng.exponential(size=normal.shape),
+    }
+
+
+def with_coefficients(tracks, alpha, noise, rng):
+    """Replace the coefficients of tracks, of unit variance, and observe them again."""
+    alpha = (alpha - alpha.mean(axis=0)) / alpha.std(axis=0)
+    shapes = tracks.mean_shape + np.tensordot(alpha, tracks.basis, 1)
+    images = shapes @ tracks.motion.transpose(0, 2, 1)
+    size = np.sqrt(np.mean(images**2))
+    images = images + noise * size * rng.standard_normal(images.shape)
+    images = images + tracks.translation[:, None]
+    return type(tracks)(
+        data=as_table(images),
+        shapes=shapes,
+        basis=tracks.basis,
+        mean_shape=tracks.mean_shape,
+        alpha=alpha,
+    )
+
+
+def independence(options):
+    """Lowest similarity of a basis shape, 1 % noise, 68 points, by independence."""
+    print("independent shapes, independence='shapes', 400 frames")
+    print("coefficients     K    lowest: median     min  modulo   3D error")
+    for K in (3, 5):
+        rows = {}
+        for seed in range(options.seeds):
+            tracks = instance(seed, 68, K, 0.01, n_frames=400)
+            rng = np.random.default_rng(seed)
+            for name, alpha in coefficient_kinds(rng, 400, K).items():
+                drawn = with_coefficients(tracks, alpha, 0.01, rng)
+                model, error = fitted(drawn, K)
+                similarity = least_similarity(drawn, model)
+                rows.setdefault(name, []).append((*similarity, error))
+        for name, values in rows.items():
+            plain, modulo, error = np.array(values).T
+            print(
+                f"{name:15}{K:3}{np.median(plain):18.4f}{plain.min():8.4f}"
+                f"{modulo.min():8.4f}{error.max():11.5f}",
+                flush=True,
+            )
+    print("Gaussian shapes, Laplace coefficients, independence='coefficients'")
+    print("frames    K    lowest: median     min  modulo")
+    for K in (3, 5):
+        for n_frames in (400, 1500):
+            values = []
+            for seed in range(options.seeds):
+                tracks = instance(
+                    seed,
+                    68,
+                    K,
+                    0.01,
+                    n_frames=n_frames,
+                    shapes="gaussian",
+                    coefficients="heavy_tailed",
+                )
+                model, _ = fitted(tracks, K, independence="coefficients")
+                values.append(least_similarity(tracks, model))
+            plain, modulo = np.array(values).T
+            print(
+                f"{n_frames:6}{K:5}{np.median(plain):18.4f}{plain.min():8.4f}"
+                f"{modulo.min():8.4f}",
+                flush=True,
+            )
+
+
+def in_the_basis_of(alpha, truth):
+    """
+    Return true coefficients in the basis of a fit.
+
+    Cameras absorb multiples of the mean shape, so that the bases differ by a projective
+    map, ``alpha_k (1 + v a) = (U a + u)_k``; the best one by least squares is taken.
+    """
+    n_frames, n_components = truth.shape
+    known = np.hstack([truth, np.ones((n_frames, 1))])
+    linear = np.einsum("kl,ij->iklj", np.eye(n_components), known)
+    scale = -alpha[:, :, None] * truth[:, None, :]
+    system = np.concatenate([linear.reshape(*alpha.shape, -1), scale], axis=2)
+    solution = np.linalg.lstsq(system.reshape(alpha.size, -1), alpha.ravel())[0]
+    U, v = solution[:-n_components].reshape(n_components, -1), solution[-n_components:]
+    return known @ U.T / (1 + truth @ v)[:, None]
+
+
+def calibration(options):
+    """Coverage of 95 % intervals of alpha, and the noise variance to the true one."""
+    print(
+        "points  K noise  coverage: mean     min     max   noise: mean     min     max"
+    )
+    for n_points in options.points:
+        for K in options.components:
+            rows = []
+            for seed in range(options.seeds):
+                tracks = instance(seed, n_points, K, 0.02)
+                model, _ = fitted(tracks, K, scale_frames=False)
+                truth = in_the_basis_of(model.alpha_, tracks.alpha)
+                inside = np.abs(model.alpha_ - truth) < 1.96 * model.alpha_std_
+                noise = model.noise_variance_ / tracks.noise_variance
+                rows.append((inside.mean(), noise))
+            coverage, noise = np.array(rows).T
+            print(
+                f"{n_points:6}{K:3}{0.02:6.2f}{coverage.mean():16.4f}"
+                f"{coverage.min():8.4f}{coverage.max():8.4f}{noise.mean():14.4f}"
+                f"{noise.min():8.4f}{noise.max():8.4f}",
+                flush=True,
+            )
+
+
+SECTIONS = {
+    "exact": exact,
+    "noisy": noisy,
+    "grid": grid,
+    "independence": independence,
+    "calibration": calibration,
+}
+
+if __name__ == "__main__":
+    numbers = {"type": int, "nargs": "+"}
+    run(
+        __doc__,
+        SECTIONS,
+        n_seeds=2,
+        options={
+            "points": {**numbers, "default": [68, 500]},
+            "components": {**numbers, "default": [2, 4, 6, 9]},
+        },
+    )

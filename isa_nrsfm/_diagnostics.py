@@ -1,0 +1,184 @@
+"""How far a table determines what was fitted to it."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+# Frames of which the information on the weak directions is computed.
+INFORMATIVE_FRAMES = 400
+# A direction of the coefficients of which less than this is signal is not supported.
+LEAST_RELIABILITY = 0.8
+# Standard deviation of a number of V_k, from which on it counts as not determined.
+LARGEST_DEVIATION = 0.1
+
+
+class Diagnostics(NamedTuple):
+    """
+    How far a table determines a fit.
+
+    Attributes
+    ----------
+    camera_singular_values : ndarray of shape (3,)
+        Singular values of the stacked cameras, of frames of size one, in the space in
+        which the mean shape is white, divided by the root of the number of their rows:
+        how much the images show of each direction of space.
+    deformation_amplitude : float
+        Root mean square of the deformation relative to that of the mean shape, in that
+        space.
+    reliability : ndarray of shape (n_components,)
+        Shares of the variance of the coefficients that are not uncertainty, along
+        uncorrelated directions, decreasing. Directions near zero are noise: the table
+        does not support as many basis shapes.
+    effective_frames : ndarray of shape (n_components,)
+        Effective number of frames that speak for each basis shape, ``(sum_i
+        alpha_ik^2)^2 / sum_i alpha_ik^4``.
+    weak_deviations : ndarray of shape (8 * n_components,)
+        Standard deviations of the weakly determined parts of the basis shapes,
+        increasing. Shapes ``B_k + V_k B_0`` can be told from B_k by terms of second
+        order in the deformation alone; of each V_k (3x3) all but the trace can be
+        known, and these are the deviations of their principal directions, from the
+        noise and with everything else known: an entry of 0.1 adds a tenth of the mean
+        shape, per standard deviation of a coefficient.
+    """
+
+    camera_singular_values: NDArray
+    deformation_amplitude: float
+    reliability: NDArray
+    effective_frames: NDArray
+    weak_deviations: NDArray
+
+
+def diagnose(
+    mean_shape: NDArray,
+    basis: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    noise_variance: float,
+    reliability: NDArray,
+) -> Diagnostics:
+    """
+    Return how far a table determines a fit, and warn where it does not.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape, white.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras of frames of size one.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    noise_variance : float
+        Variance of a coordinate of frames of size one.
+    reliability : ndarray of shape (n_components,)
+        As of `reliabilities`.
+
+    Returns
+    -------
+    Diagnostics
+        The figures.
+
+    Warns
+    -----
+    UserWarning
+        If the table does not support so many basis shapes, or not the weak directions.
+    """
+    rows = motion.reshape(-1, 3)
+    deformation = np.einsum(
+        "ik,il,kjc,ljc->", alpha, alpha, basis, basis, optimize=True
+    ) / len(alpha)
+    fourth = np.sum(alpha**4, axis=0)
+    square = np.sum(alpha**2, axis=0) ** 2
+    information = weak_information(mean_shape, basis, motion, alpha)
+    known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
+    known = np.maximum(known, np.finfo(float).tiny)
+    found = Diagnostics(
+        np.linalg.svd(rows, compute_uv=False) / np.sqrt(len(rows)),
+        float(np.sqrt(deformation / np.sum(mean_shape**2))),
+        reliability,
+        np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
+        np.sqrt(noise_variance / known),
+    )
+    unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
+    if unsupported:
+        warnings.warn(
+            f"the table does not support n_components={len(basis)}: {unsupported} "
+            "direction(s) of the coefficients may well be noise; take at most "
+            f"n_components={len(basis) - unsupported}",
+            stacklevel=3,
+        )
+    elif found.weak_deviations[-1] > LARGEST_DEVIATION:
+        warnings.warn(
+            "the table hardly determines the part of the basis shapes that cameras "
+            "absorb: its largest standard deviation is "
+            f"{found.weak_deviations[-1]:.2g} of the mean shape; take more frames or "
+            "fewer basis shapes",
+            stacklevel=3,
+        )
+    return found
+
+
+def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
+    """
+    Return the shares of the variance of coefficients that are not uncertainty.
+
+    Parameters
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    covariance : ndarray of shape (n_frames, n_components, n_components)
+        Their covariances.
+
+    Returns
+    -------
+    ndarray of shape (n_components,)
+        ``1 - lambda`` for the eigenvalues of the mean covariance relative to the whole
+        variance, decreasing.
+    """
+    uncertain = covariance.mean(axis=0)
+    whole = alpha.T @ alpha / len(alpha) + uncertain
+    return 1.0 - eigh(uncertain, whole, eigvals_only=True)
+
+
+def weak_information(
+    mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
+) -> NDArray:
+    """
+    Return what the images tell of V_k in the basis shapes ``B_k + V_k B_0``.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras of frames of size one.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (9 * n_components, 9 * n_components)
+        Information matrix of V_1, ..., V_K for unit noise, cameras and coefficients of
+        the frames being unknown and the rest of the shapes known.
+    """
+    n_frames, n_components = alpha.shape
+    chosen = np.unique(np.linspace(0, n_frames - 1, INFORMATIVE_FRAMES).astype(int))
+    total = np.zeros((9 * n_components, 9 * n_components))
+    for i in chosen:
+        shape = mean_shape + np.tensordot(alpha[i], basis, 1)
+        shape = shape - shape.mean(axis=0)
+        # Images (2 J) of changes of the camera and of the coefficients.
+        cameras = np.kron(np.eye(2), shape)
+        moved = (basis @ motion[i].T).transpose(2, 1, 0).reshape(-1, n_components)
+        tangent, _ = np.linalg.qr(np.hstack([cameras, moved]))
+        # Images of alpha_k V_k B_0, for the nine entries of V.
+        strain = np.einsum("ra,jb->rjab", motion[i], mean_shape).reshape(-1, 9)
+        strain = strain - tangent @ (tangent.T @ strain)
+        total += np.kron(np.outer(alpha[i], alpha[i]), strain.T @ strain)
+    return total * (n_frames / len(chosen))

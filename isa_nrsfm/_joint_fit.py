@@ -1,0 +1,399 @@
+"""Where the joint refinement starts, and how stiff the shapes have to be for it.
+
+With free affine cameras a basis shape ``B_k + V B_0`` can hardly be told from B_k: the
+cameras absorb the difference, but for terms of second order in the deformation. Where
+the shapes move much and the model is not exact, as in motion capture, these terms hold
+mostly what the model leaves out, and the most likely shapes are far from the true ones.
+The cameras betray it: true ones are close to turned and scaled orthographic ones, in
+some metric of space, which the fit does not know of. So two fits are compared, a free
+one and one that pays for what its basis shapes move in the images, and the stiff one is
+taken where its cameras are clearly the more orthographic ones.
+"""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._camera import rigid_cameras
+from isa_nrsfm._factorisation import Factorisation, orientations
+from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._frame_posterior import fit_posterior
+from isa_nrsfm._joint_refinement import JointResult, JointState, refine_joint
+from isa_nrsfm._marginal_likelihood import MarginalLikelihood
+from isa_nrsfm._metric import anisotropy
+from isa_nrsfm._robust import ROUNDING, median_noise, robust_weights
+from isa_nrsfm._tracks import seen_points
+
+# Price of the basis shapes, per unit of the energy that they move in an image whose
+# coordinates have mean square one, where the shapes have to be stiff.
+STIFFNESS = 300.0
+# Rigid cameras whose anisotropy is below this leave nothing to mend.
+ISOTROPIC = 0.15
+# The stiff fit is taken where it brings the anisotropy below this share of it, and
+# where the free fit brings it above this multiple, unless the noise of the stiff fit is
+# so many times that of the free one.
+CLEARLY_LESS = 0.95
+DRIFTED = 1.5
+TOO_STIFF = 4.0
+# A stiff fit that leaves more than this share of what a rigid one leaves does not move.
+STILL_MOVING = 0.5
+# With more frames than that the first steps are made on a part of them.
+SAMPLE_FRAMES = 600
+# In tables with fewer coordinates than this several starts are tried.
+SMALL_TABLE = 150_000
+N_RANDOM_STARTS = 6
+# Tables of few frames are refined to this share of the tolerance: it costs little, and
+# the noise of many points can be small enough to need it.
+POLISH = 0.01
+FEW_FRAMES = 2000
+# Leading directions of the lifted motion per basis shape that these starts mix.
+DIRECTIONS = 4
+# Added to the diagonal of the rigid cameras' Gram matrices, relative to the trace.
+LIFTING_RIDGE = 0.02
+# Rounds of reweighting for a robust loss, and the change of the weights that ends them.
+REWEIGHTINGS = 20
+SETTLED_WEIGHTS = 1e-2
+# Share of what the rigid fit leaves that counts as noise at the start.
+FIRST_NOISE = 0.3
+
+
+class JointFit(NamedTuple):
+    """
+    Result of the joint refinement of a table.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        B_0, ..., B_K, centred, in coordinates in which alpha is drawn from N(0, I).
+    alpha : ndarray of shape (n_frames, n_components)
+        Means of the coefficients in these coordinates.
+    noise_variance : float
+        Variance of the noise of a coordinate, for the degrees of freedom that cameras
+        and shapes leave.
+    stiffness : float
+        What was paid for the energy that the basis shapes move in the images.
+    history : ndarray of shape (n_iter + 1,)
+        The objective at the start and after each step.
+    gradient_norm : float
+        As in `JointResult`.
+    converged : bool
+        Whether the refinement has converged.
+    """
+
+    shapes: NDArray
+    alpha: NDArray
+    noise_variance: float
+    stiffness: float
+    history: NDArray
+    gradient_norm: float
+    converged: bool
+
+
+def fit_jointly(
+    tracks: NDArray,
+    outliers: NDArray,
+    W: NDArray,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    *,
+    loss: str,
+    stiffness: float | None,
+    random_state: np.random.RandomState,
+    max_iter: int,
+    tol: float,
+) -> JointFit:
+    """
+    Start and run the joint refinement.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Centred tracks, each divided by the size of its frame; NaN where missing.
+    outliers : ndarray of bool, shape (n_frames, n_points)
+        Points that are left out at first; a robust loss takes them in again.
+    W : ndarray of shape (2 * n_frames, n_points)
+        Measurement matrix, completed where points are missing or outliers.
+    factors : Factorisation
+        Of W.
+    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes of the paper's pipeline.
+    loss : {"linear", "huber", "cauchy"}
+        How points count that are far from the model.
+    stiffness : float or None
+        What to pay for the energy that the basis shapes move in the images; None to
+        choose between nothing and `STIFFNESS`.
+    random_state : RandomState
+        Draws the additional starts of small tables.
+    max_iter : int
+        The most steps.
+    tol : float
+        As in `refine_joint`.
+
+    Returns
+    -------
+    JointFit
+        The fit of lowest objective.
+    """
+    seen = seen_points(tracks)
+    used = seen & ~outliers
+    problem = _Problem(W, tracks, None if used.all() else used * 1.0, max_iter, tol)
+    small = W.size < SMALL_TABLE
+    sample = problem
+    if not small and len(tracks) > SAMPLE_FRAMES:
+        sample = problem.take(_spread_frames(W, factors, SAMPLE_FRAMES))
+    starts = _starts(sample, factors, paper_shapes, random_state if small else None)
+    best, price = _best(sample, starts, factors, stiffness)
+    best = problem.finished(best, sample, price)
+    if stiffness is None and price == 0 and _ratio(best, factors) > DRIFTED:
+        stiff = sample.best(starts, STIFFNESS)
+        stiff = problem.finished(stiff, sample, STIFFNESS)
+        if stiff.state.noise < TOO_STIFF * best.state.noise:
+            best, price = stiff, STIFFNESS
+    noise, n_fitted = best.state.noise, 0
+    if loss != "linear":
+        # The scale of the noise is that of the residual with the coefficients fitted.
+        best, noise = _reweighted(problem, best, loss, price)
+        noise, n_fitted = max(noise, ROUNDING**2), len(paper_shapes) - 1
+    shapes = best.state.shapes
+    return JointFit(
+        shapes - shapes.mean(axis=2, keepdims=True),
+        best.alpha,
+        noise * _freedom_lost(seen, len(shapes), n_fitted),
+        price,
+        best.history,
+        best.gradient_norm,
+        best.converged,
+    )
+
+
+def _best(
+    problem: "_Problem",
+    starts: list[NDArray],
+    factors: Factorisation,
+    stiffness: float | None,
+) -> tuple[JointResult, float]:
+    """Return the best refinement and its stiffness, chosen if none is given."""
+    if stiffness is not None:
+        return problem.best(starts, stiffness), stiffness
+    if anisotropy(factors.rigid_motion.reshape(-1, 2, 3)) > ISOTROPIC:
+        stiff = problem.best(starts, STIFFNESS)
+        rigid = np.mean((problem.W - _rigid_part(problem.W, factors)) ** 2)
+        if (
+            _ratio(stiff, factors) < CLEARLY_LESS
+            and stiff.state.noise < STILL_MOVING * rigid
+        ):
+            return stiff, STIFFNESS
+    return problem.best(starts, 0.0), 0.0
+
+
+def _rigid_part(W: NDArray, factors: Factorisation) -> NDArray:
+    """Return the projection of a measurement matrix to the rigid shape."""
+    return W @ np.linalg.pinv(factors.rigid_shape, rcond=1e-10) @ factors.rigid_shape
+
+
+def _ratio(result: JointResult, factors: Factorisation) -> float:
+    """Return the anisotropy of the cameras relative to that of the rigid fit."""
+    rigid = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
+    cameras = anisotropy(result.state.motion.transpose(2, 0, 1))
+    return cameras / rigid if rigid > 0 else 1.0
+
+
+def _starts(
+    problem: "_Problem",
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    random_state: np.random.RandomState | None,
+) -> list[NDArray]:
+    """Return shapes to start from, and some random ones with a generator."""
+    n_components = len(paper_shapes) - 1
+    n_mixed = DIRECTIONS * n_components
+    directions = lifted_directions(factors, n_mixed if random_state else n_components)
+    lifted = lifted_shapes(factors, directions[:, :n_components])
+    starts = [problem.likelier(paper_shapes, lifted)]
+    if random_state is not None:
+        for _ in range(N_RANDOM_STARTS):
+            random = random_state.normal(size=(directions.shape[1], n_components))
+            mixing = np.linalg.qr(random)[0]
+            starts.append(lifted_shapes(factors, directions @ mixing))
+    return starts
+
+
+def _reweighted(
+    problem: "_Problem", result: JointResult, loss: str, stiffness: float
+) -> tuple[JointResult, float]:
+    """Return the refinement with weights of a robust loss, and the noise variance."""
+    tracks = problem.tracks
+    seen = seen_points(tracks)
+    weights = np.zeros(seen.shape)
+    history = [result.history]
+    for _ in range(REWEIGHTINGS):
+        shapes, motion, _ = result.state
+        stacked = shapes.transpose(0, 2, 1)
+        model = project(
+            compose(stacked[0], stacked[1:], result.alpha),
+            motion.transpose(2, 0, 1),
+            np.zeros(2),
+        )
+        rest = np.where(seen[..., None], tracks - model, 0.0)
+        counted = problem.weights if problem.weights is not None else seen * 1.0
+        position = np.einsum("ij,ijc->ic", counted, rest)
+        rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
+        distance = np.linalg.norm(rest, axis=2)
+        deviation = median_noise(distance[seen])
+        previous, weights = weights, np.zeros(seen.shape)
+        weights[seen] = robust_weights(loss, distance[seen] / max(deviation, 1e-300))
+        if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
+            break
+        problem = _Problem(problem.W, tracks, weights, problem.max_iter, problem.tol)
+        result = problem.refined(result.state, stiffness)
+        history.append(result.history)
+    return result._replace(history=history[-1]), deviation**2
+
+
+def _freedom_lost(seen: NDArray, n_shapes: int, n_fitted: int) -> float:
+    """
+    Return numbers seen divided by the degrees of freedom of the residual.
+
+    Each frame has a camera and a position, eight unknowns; the shapes have three each a
+    point, but for the affinity and the mixing. Coefficients that have been integrated
+    out take none, those that are fitted to a frame take one each. At least a tenth of
+    the numbers counts as free.
+    """
+    n_frames, n_points = seen.shape
+    n_seen = 2.0 * seen.sum()
+    unknowns = (
+        (8 + n_fitted) * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    )
+    return float(n_seen / max(n_seen - unknowns, 0.1 * n_seen))
+
+
+def lifted_directions(factors: Factorisation, n_directions: int) -> NDArray:
+    """
+    Return the principal directions of the lifted non-rigid motion.
+
+    The motion of a frame, ``M'_i ~ M_0^i L_i``, is lifted to space by the rigid camera
+    (with a little ridge): L_i (3, n_signals) are numbers that do not depend on the
+    viewpoint, as far as the rigid camera tells it.
+
+    Parameters
+    ----------
+    factors : Factorisation
+        Rigid and non-rigid factors.
+    n_directions : int
+        The most directions that are wanted.
+
+    Returns
+    -------
+    ndarray of shape (3 * n_signals, n_directions)
+        Eigenvectors of ``sum_i vec L_i vec L_i^T`` as columns, by decreasing
+        eigenvalue, times the root mean square of their coefficients, which have a third
+        moment that is not negative; zeros where there are not as many.
+    """
+    rigid = factors.rigid_motion.reshape(-1, 2, 3)
+    motion = factors.motion.reshape(len(rigid), 2, -1)
+    gram = rigid @ rigid.transpose(0, 2, 1)
+    size = np.trace(gram, axis1=1, axis2=2)
+    size = np.where(size > 0, size, 1.0)
+    gram = gram + LIFTING_RIDGE * size[:, None, None] * np.eye(2)
+    lifted = (rigid.transpose(0, 2, 1) @ np.linalg.solve(gram, motion)).reshape(
+        len(rigid), -1
+    )
+    energy, directions = np.linalg.eigh(lifted.T @ lifted / len(lifted))
+    directions = directions[:, ::-1] * np.sqrt(np.maximum(energy[::-1], 0.0))
+    directions = directions[:, :n_directions]
+    directions = directions * orientations(directions.T @ lifted.T)
+    missing = max(n_directions - directions.shape[1], 0)
+    return np.pad(directions, [(0, 0), (0, missing)])
+
+
+def lifted_shapes(factors: Factorisation, directions: NDArray) -> NDArray:
+    """
+    Return the shapes that belong to directions of the lifted motion.
+
+    Parameters
+    ----------
+    factors : Factorisation
+        Rigid and non-rigid factors.
+    directions : ndarray of shape (3 * n_signals, n_components)
+        Scaled directions, as of `lifted_directions`.
+
+    Returns
+    -------
+    ndarray of shape (n_components + 1, 3, n_points)
+        The rigid shape and a basis shape for each direction, one standard deviation of
+        its coefficient.
+    """
+    basis = directions.T.reshape(directions.shape[1], 3, -1) @ factors.signals
+    return np.concatenate([factors.rigid_shape[None], basis])
+
+
+class _Problem:
+    """The joint refinement of some frames, from given shapes."""
+
+    def __init__(
+        self,
+        W: NDArray,
+        tracks: NDArray,
+        weights: NDArray | None,
+        max_iter: int,
+        tol: float,
+    ):
+        self.W, self.tracks, self.weights = W, tracks, weights
+        self.max_iter, self.tol = max_iter, tol
+
+    def take(self, frames: slice | NDArray) -> Self:
+        """Return the problem of some of the frames."""
+        W = self.W.reshape(len(self.tracks), 2, -1)[frames].reshape(-1, self.W.shape[1])
+        weights = None if self.weights is None else self.weights[frames]
+        return type(self)(W, self.tracks[frames], weights, self.max_iter, self.tol)
+
+    def start(self, shapes: NDArray) -> JointState:
+        """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
+        motion = rigid_cameras(self.W, shapes[0].T)
+        rest = self.W - motion.reshape(-1, 3) @ shapes[0]
+        noise = FIRST_NOISE * float(np.mean(rest**2))
+        return JointState(shapes, motion.transpose(1, 2, 0), noise)
+
+    def aligned(self, state: JointState) -> JointState:
+        """Return a state with the most probable cameras for its shapes and noise."""
+        shapes = state.shapes - state.shapes.mean(axis=2, keepdims=True)
+        fit = fit_posterior(self.tracks, shapes, state.noise, weights=self.weights)
+        return JointState(shapes, fit.motion.transpose(1, 2, 0), state.noise)
+
+    def likelier(self, *starts: NDArray) -> NDArray:
+        """Return the shapes that are more likely to start with."""
+        likelihood = MarginalLikelihood(self.tracks, self.weights, 0.0)
+        return min(starts, key=lambda shapes: likelihood(*self.start(shapes)).value)
+
+    def best(self, starts: list[NDArray], stiffness: float) -> JointResult:
+        """Return the best of the joint refinements from some shapes."""
+        results = [self.refined(self.start(shapes), stiffness) for shapes in starts]
+        return min(results, key=lambda result: result.history[-1])
+
+    def finished(
+        self, result: JointResult, sample: "_Problem", stiffness: float
+    ) -> JointResult:
+        """Return the refinement, of all frames and to the end, of one of a sample."""
+        state = result.state if sample is self else self.aligned(result.state)
+        share = POLISH if len(self.tracks) <= FEW_FRAMES else 1.0
+        return self.refined(state, stiffness, tol=share * self.tol)
+
+    def refined(
+        self, state: JointState, stiffness: float, tol: float | None = None
+    ) -> JointResult:
+        """Return the joint refinement of a state."""
+        return refine_joint(
+            MarginalLikelihood(self.tracks, self.weights, stiffness),
+            state,
+            max_iter=self.max_iter,
+            tol=self.tol if tol is None else tol,
+        )
+
+
+def _spread_frames(W: NDArray, factors: Factorisation, n: int) -> NDArray:
+    """Return n frames from the most to the least rigid, whatever their order."""
+    rest = W - _rigid_part(W, factors)
+    energy = np.sum(rest.reshape(len(W) // 2, -1) ** 2, axis=1)
+    order = np.argsort(energy, kind="stable")
+    return order[np.linspace(0, len(order) - 1, n).round().astype(int)]

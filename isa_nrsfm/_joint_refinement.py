@@ -1,0 +1,221 @@
+"""Joint refinement: cameras, shapes and noise of greatest marginal likelihood.
+
+Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a limited
+memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
+7.2). Its first metric is the curvature that expectation maximisation would use, so that
+a step without memory is a step of that, and it is brought up to date at each step.
+"""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._marginal_likelihood import MarginalLikelihood, Passed
+from isa_nrsfm._small_matrices import inverse3
+
+# Steps whose curvature is remembered.
+MEMORY = 20
+# The noise variance is at least this share of the mean square of the tracks: tables
+# without noise are fitted, too.
+NOISE_FLOOR = 1e-12
+# The logarithm of the noise variance changes by at most so much in a step.
+LARGEST_NOISE_STEP = 1.5
+# A step has to gain this share of what the slope promises.
+SUFFICIENT_DECREASE = 1e-4
+# A step shorter than this finds nothing but rounding errors.
+SHORTEST_STEP = 1e-8
+# Ridge, relative to the mean diagonal, for shapes that the table does not determine.
+RIDGE = 1e-12
+
+
+class JointState(NamedTuple):
+    """
+    Unknowns of the joint refinement.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        B_0, ..., B_K.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras, frames last.
+    noise : float
+        Variance of the noise of a coordinate.
+    """
+
+    shapes: NDArray
+    motion: NDArray
+    noise: float
+
+
+class JointResult(NamedTuple):
+    """
+    Result of the joint refinement.
+
+    Attributes
+    ----------
+    state : JointState
+        Where it ended.
+    history : ndarray of shape (n_iter + 1,)
+        The objective at the start and after each step; it never rises.
+    gradient_norm : float
+        Norm of the gradient at the end in the metric of the curvature, relative to the
+        number of coordinates: about the gain of the objective per coordinate that is
+        still possible, under the root.
+    converged : bool
+        Whether it stopped by itself.
+    alpha : ndarray of shape (n_frames, n_components)
+        Means of the coefficients at the end.
+    """
+
+    state: JointState
+    history: NDArray
+    gradient_norm: float
+    converged: bool
+    alpha: NDArray
+
+
+def refine_joint(
+    likelihood: MarginalLikelihood, start: JointState, *, max_iter: int, tol: float
+) -> JointResult:
+    """
+    Minimise the objective of `MarginalLikelihood`.
+
+    Parameters
+    ----------
+    likelihood : MarginalLikelihood
+        The objective.
+    start : JointState
+        Where to start.
+    max_iter : int
+        The most steps.
+    tol : float
+        It has converged when two steps one after the other each lower the objective,
+        minus twice the log likelihood, by less than tol for each frame.
+
+    Returns
+    -------
+    JointResult
+        The result.
+    """
+    floor = NOISE_FLOOR * likelihood.square / likelihood.n_seen
+    start = start._replace(noise=max(start.noise, floor))
+    point = _Point(likelihood, start, floor)
+    memory: deque[tuple[NDArray, NDArray, float]] = deque(maxlen=MEMORY)
+    history = [point.value]
+    small_steps = 0
+    while len(history) <= max_iter and small_steps < 2:
+        step = -_inverse_hessian_product(point, memory)
+        if not point.gradient @ step < 0:
+            memory.clear()
+            step = -point.precondition(point.gradient)
+        reached = _line_search(likelihood, point, step, floor)
+        if reached is None:
+            if not memory:  # not even downhill: rounding errors are left
+                small_steps = 2
+            memory.clear()
+            continue
+        moved = reached.vector - point.vector
+        change = reached.gradient - point.gradient
+        curvature = float(moved @ change)
+        if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
+            memory.append((moved, change, curvature))
+        gain = point.value - reached.value
+        small_steps = small_steps + 1 if gain < tol * likelihood.n_frames else 0
+        point = reached
+        history.append(point.value)
+    slope = point.gradient @ point.precondition(point.gradient)
+    return JointResult(
+        point.state,
+        np.array(history),
+        float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
+        small_steps >= 2 and bool(np.isfinite(point.value)),
+        point.passed.alpha.T,
+    )
+
+
+class _Point:
+    """A state with the objective, its gradient and its curvature there."""
+
+    def __init__(self, likelihood: MarginalLikelihood, state: JointState, floor: float):
+        self.state = state
+        self.n_seen = likelihood.n_seen
+        self.passed: Passed = likelihood(*state)
+        self.value = self.passed.value
+        self.gradient = _stacked(
+            self.passed.shape_gradient,
+            self.passed.motion_gradient,
+            # Noise that is least already does not fall.
+            min(self.passed.noise_gradient, 0.0 if state.noise <= floor else np.inf),
+        )
+        self.vector = _stacked(state.shapes, state.motion, np.log(state.noise))
+        curvature = self.passed.shape_curvature
+        size = curvature.shape[-1]
+        # Points that no frame shows have no curvature, and no gradient either.
+        ridge = RIDGE * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
+        self.shape_metric = np.linalg.inv(curvature + ridge * np.eye(size))
+        self.motion_metric = inverse3(self.passed.motion_curvature)
+
+    def precondition(self, vector: NDArray) -> NDArray:
+        """Return a vector times the inverse of the curvature."""
+        half = self.state.noise / 2
+        shapes, motion, noise = self.split(vector)
+        stacked = shapes.reshape(-1, shapes.shape[-1])
+        if len(self.shape_metric) == 1:
+            stacked = self.shape_metric[0] @ stacked
+        else:
+            stacked = (self.shape_metric @ stacked.T[:, :, None])[:, :, 0].T
+        motion = sum(motion[:, [b]] * self.motion_metric[b] for b in range(3))
+        return _stacked(half * stacked, half * motion, noise / self.n_seen)
+
+    def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
+        """Return the parts of a vector, shapes, cameras and noise."""
+        shapes, motion, _ = self.state
+        first = shapes.size
+        return (
+            vector[:first].reshape(shapes.shape),
+            vector[first:-1].reshape(motion.shape),
+            vector[-1],
+        )
+
+
+def _stacked(shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
+    """Return the three parts of the unknowns as one vector."""
+    return np.concatenate([shapes.ravel(), motion.ravel(), [noise]])
+
+
+def _inverse_hessian_product(
+    point: _Point, memory: deque[tuple[NDArray, NDArray, float]]
+) -> NDArray:
+    """Return the gradient times the inverse Hessian of the remembered steps."""
+    vector = point.gradient.copy()
+    weights = []
+    for moved, change, curvature in reversed(memory):
+        weight = moved @ vector / curvature
+        vector -= weight * change
+        weights.append(weight)
+    vector = point.precondition(vector)
+    for (moved, change, curvature), weight in zip(
+        memory, reversed(weights), strict=True
+    ):
+        vector += (weight - change @ vector / curvature) * moved
+    return vector
+
+
+def _line_search(
+    likelihood: MarginalLikelihood, point: _Point, step: NDArray, floor: float
+) -> _Point | None:
+    """Return the first point along a step that is low enough, None where none is."""
+    slope = point.gradient @ step
+    length = min(1.0, LARGEST_NOISE_STEP / max(abs(step[-1]), 1e-300))
+    while length > SHORTEST_STEP:
+        shapes, motion, noise = point.split(point.vector + length * step)
+        state = JointState(shapes, motion, max(np.exp(noise), floor))
+        reached = _Point(likelihood, state, floor)
+        if reached.value <= point.value + SUFFICIENT_DECREASE * length * slope:
+            return reached
+        # The minimum of the parabola through what is known, kept within bounds.
+        excess = reached.value - point.value - length * slope
+        length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
+    return None

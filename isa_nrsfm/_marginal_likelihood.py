@@ -1,0 +1,237 @@
+"""Marginal likelihood of cameras and shapes, with the coefficients integrated out.
+
+The coefficients of a frame are drawn from ``N(0, I)`` and every coordinate has noise of
+variance s2. With ``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1) minus two
+log likelihoods of all frames are, up to a constant ::
+
+    N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
+                       + log det(I + H_i / s2) ]
+
+with N the number of coordinates that were seen. `objective` adds ``stiffness * sum_i
+tr H_i``, what the basis shapes move the points in the images, times a constant. The
+gradient follows from the first two moments of the coefficients given the frame, as in
+expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
+1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
+
+Frames are the last index of all arrays here, and everything is a sum over blocks of
+frames: how they are split makes no difference.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frame_products import (
+    FrameTracks,
+    frame_products,
+    frame_tracks,
+    shape_pairs,
+)
+from isa_nrsfm._small_matrices import COLUMNS, ROWS, invert_positive, unpack3
+
+# Frames that are worked on at a time, so that their small matrices stay in the cache.
+BLOCK_FRAMES = 1024
+
+
+class Passed(NamedTuple):
+    """
+    What a pass over frames gives.
+
+    Attributes
+    ----------
+    value : float
+        The objective.
+    shape_gradient : ndarray of shape (n_shapes, 3, n_points)
+        Its derivative by the shapes.
+    motion_gradient : ndarray of shape (2, 3, n_frames)
+        Its derivative by the cameras.
+    noise_gradient : float
+        Its derivative by the logarithm of the noise variance.
+    shape_curvature : ndarray of shape (n_points or 1, 3 * n_shapes, 3 * n_shapes)
+        ``sum_i w_ij E_i (x) M_i^T M_i`` with the second moments E_i of (1, alpha): half
+        of s2 times the second derivative by point j of the shapes, the coefficients and
+        positions held. One matrix for all points where all weights are one.
+    motion_curvature : ndarray of shape (6, n_frames)
+        The same for the rows of the cameras, ``sum_kl E_kl B_k B_l^T``, packed.
+    alpha : ndarray of shape (n_components, n_frames)
+        Means of the coefficients.
+    residual : float
+        Energy of the tracks that the shapes with these coefficients leave.
+    """
+
+    value: float
+    shape_gradient: NDArray
+    motion_gradient: NDArray
+    noise_gradient: float
+    shape_curvature: NDArray
+    motion_curvature: NDArray
+    alpha: NDArray
+    residual: float
+
+
+class MarginalLikelihood:
+    """
+    The objective and its derivatives, as a sum over blocks of frames.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks; NaN where a point is missing.
+    weights : ndarray of shape (n_frames, n_points) or None
+        Weights of the points, zero for those that are missing; None for ones.
+    stiffness : float
+        Factor of ``sum_i tr H_i``.
+    block_frames : int, default=1024
+        Frames that are worked on at a time.
+
+    Attributes
+    ----------
+    n_frames : int
+        Number of frames.
+    n_seen : float
+        Number of coordinates that were seen, N.
+    square : float
+        Weighted energy of the centred tracks.
+    """
+
+    def __init__(
+        self,
+        tracks: NDArray,
+        weights: NDArray | None,
+        stiffness: float,
+        block_frames: int = BLOCK_FRAMES,
+    ):
+        self.n_frames = len(tracks)
+        self.stiffness = stiffness
+        self.blocks = [
+            frame_tracks(
+                tracks[start : start + block_frames],
+                None if weights is None else weights[start : start + block_frames],
+            )
+            for start in range(0, len(tracks), block_frames)
+        ]
+        n_seen = tracks[..., 0].size if weights is None else np.count_nonzero(weights)
+        self.n_seen = 2.0 * n_seen
+        self.square = float(sum(block.energy.sum() for block in self.blocks))
+
+    def __call__(self, shapes: NDArray, motion: NDArray, noise: float) -> Passed:
+        """
+        Return the objective, its gradient and an approximate curvature.
+
+        Parameters
+        ----------
+        shapes : ndarray of shape (n_shapes, 3, n_points)
+            B_0, ..., B_K.
+        motion : ndarray of shape (2, 3, n_frames)
+            M_i.
+        noise : float
+            s2.
+
+        Returns
+        -------
+        Passed
+            The sums over the frames.
+        """
+        parts, start = [], 0
+        for block in self.blocks:
+            frames = slice(start, start + len(block.weight))
+            parts.append(
+                _pass_over(block, shapes, motion[:, :, frames], noise, self.stiffness)
+            )
+            start = frames.stop
+        fields: Any = Passed(*zip(*parts, strict=True))
+        curvature = kronecker_matrices(
+            np.sum(fields.shape_curvature, axis=0), len(shapes)
+        )
+        rows = shapes.reshape(3 * len(shapes), -1).T[:, :, None]
+        pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
+        return Passed(
+            float(np.sum(fields.value) + self.n_seen * np.log(noise)),
+            np.sum(fields.shape_gradient, axis=0) + (2 / noise) * pulled,
+            np.concatenate(fields.motion_gradient, axis=-1),
+            float(np.sum(fields.noise_gradient) + self.n_seen),
+            curvature,
+            np.concatenate(fields.motion_curvature, axis=-1),
+            np.concatenate(fields.alpha, axis=-1),
+            float(np.sum(fields.residual)),
+        )
+
+
+def _pass_over(
+    block: FrameTracks,
+    shapes: NDArray,
+    motion: NDArray,
+    noise: float,
+    stiffness: float,
+) -> Passed:
+    """
+    Return the parts of `Passed` for one block, but for what is common to all.
+
+    Left out are ``N log s2`` and what the curvature adds to the gradient by the shapes;
+    the curvature is packed: (n_pairs, 6, n_points or 1).
+    """
+    n_shapes, _, n_points = shapes.shape
+    n_frames = len(block.weight)
+    products = frame_products(block, shapes)
+    flat_tracks = block.weighted.reshape(n_points, -1)
+    cameras = np.sum(motion[:, ROWS] * motion[:, COLUMNS], axis=0)  # M^T M
+    H = products.gram.energies(cameras)
+    seen = sum(products.cross[:, a, r] * motion[r, a] for a in range(3) for r in (0, 1))
+
+    # The posterior of the coefficients of each frame.
+    diagonal = np.arange(n_shapes - 1)
+    moving = H[1:, 1:][diagonal, diagonal].sum()
+    Q = H[1:, 1:].copy()
+    Q[diagonal, diagonal] += noise
+    Q, logdet, _ = invert_positive(Q)
+    along = seen[1:] - H[1:, 0]
+    alpha = np.einsum("kli,li->ki", Q, along)
+    explained = np.einsum("ki,ki->i", alpha, along)
+    rest = block.energy - 2 * seen[0] + H[0, 0] - explained  # with s2 |alpha|^2
+    value = np.sum(rest / noise + logdet - len(diagonal) * np.log(noise))
+    residual = rest.sum() - noise * np.sum(alpha**2)
+    spread = noise * (alpha.size - noise * Q[diagonal, diagonal].sum())
+
+    # Second moments of c, with what the stiffness adds to them.
+    c = np.concatenate([np.ones((1, n_frames)), alpha])
+    E = c[:, None] * c
+    E[1:, 1:] += noise * Q
+    E[1 + diagonal, 1 + diagonal] += noise * stiffness
+    packed = E[shape_pairs(n_shapes)]
+    motion_curvature = products.gram.moments(packed)
+    A = unpack3(motion_curvature)
+    Y = sum(c[k] * products.cross[k] for k in range(n_shapes))
+    motion_gradient = np.stack(
+        [sum(motion[r, b] * A[b] for b in range(3)) - Y[:, r] for r in (0, 1)]
+    )
+    X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
+    shape_gradient = -X @ flat_tracks.T
+    if block.weights is None:
+        shape_curvature = (packed @ cameras.T)[:, :, None]
+    else:
+        moments = (packed[:, None] * cameras).reshape(-1, n_frames)
+        shape_curvature = (moments @ block.weights.T).reshape(-1, 6, n_points)
+        # The position of a frame follows the weighted means of its points.
+        mixed = np.einsum("kli,lbi->kbi", E, products.shape_centroid)
+        means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
+        shape_gradient -= means.reshape(-1, n_frames) @ block.weights.T
+    return Passed(
+        float(value + stiffness * moving),
+        (2 / noise) * shape_gradient.reshape(shapes.shape),
+        (2 / noise) * motion_gradient,
+        -float(residual + spread) / noise,
+        shape_curvature,
+        motion_curvature,
+        alpha,
+        float(residual),
+    )
+
+
+def kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
+    """Return (n, 3 n_shapes, 3 n_shapes) of packed pairs of shapes and of axes."""
+    first, second = shape_pairs(n_shapes)
+    rows = np.empty((n_shapes, n_shapes, *packed.shape[1:]))
+    rows[first, second] = rows[second, first] = packed
+    size = 3 * n_shapes
+    return unpack3(rows).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)

@@ -1,0 +1,155 @@
+"""The metric of space that affine cameras show: where angles and lengths are true.
+
+A factorisation into affine cameras and shapes is known up to one 3x3 affinity of
+space. If the cameras are scaled orthographic (weak perspective) ones in some metric of
+space, as those of small objects and square pixels are, they tell which (Tomasi, Kanade
+1992; Poelman, Kanade, "A paraperspective factorization method for shape and motion
+recovery", 1997).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The smallest eigenvalue, relative to the largest, down to which a symmetric matrix is
+# taken for positive definite.
+SMALLEST_EIGENVALUE = 1e-10
+# Five unknowns are determined while the smallest singular value of their equations is
+# above this share of the largest one.
+SMALLEST_SINGULAR_VALUE = 1e-6
+# The upgrade is trusted while no axis of space is stretched, relative to another one,
+# by more than this: a depth that cameras hardly show is stretched without limit.
+LARGEST_STRETCH = 20.0
+
+# Unknowns of a symmetric 3x3 matrix: its diagonal, and sqrt(2) times the entries above
+# it, so that the norm of the six is the Frobenius norm of the matrix.
+_ROWS, _COLUMNS = [0, 0, 1], [1, 2, 2]
+
+
+def unit_cameras(motion: NDArray) -> NDArray:
+    """Return the usable cameras, each divided by its Frobenius norm."""
+    size = np.linalg.norm(motion, axis=(1, 2))
+    usable = np.isfinite(size) & (size > 0)
+    if not usable.any():
+        raise ValueError(
+            "the viewing frame needs at least one finite camera other than zero; "
+            f"got none among the {len(motion)} cameras"
+        )
+    return motion[usable] / size[usable, None, None]
+
+
+def mean_gram(cameras: NDArray) -> NDArray:
+    """Return the mean of M_i^T M_i over the cameras."""
+    rows = cameras.reshape(-1, 3)
+    return rows.T @ rows / len(cameras)
+
+
+def symmetric_power(matrix: NDArray, power: float) -> NDArray:
+    """Return a power of a symmetric positive semidefinite matrix."""
+    eigenvalues, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(eigenvalues, 0) ** power) @ vectors.T
+
+
+def _quadratic_terms(a: NDArray, b: NDArray) -> NDArray:
+    """Return the coefficients of a Q b^T in the six unknowns of Q, one row a pair."""
+    mixed = a[:, _ROWS] * b[:, _COLUMNS] + a[:, _COLUMNS] * b[:, _ROWS]
+    return np.hstack([a * b, mixed / np.sqrt(2)])
+
+
+def _symmetric_matrix(unknowns: NDArray) -> NDArray:
+    """Return the symmetric 3x3 matrix of six unknowns."""
+    matrix = np.diag(unknowns[:3])
+    matrix[_ROWS, _COLUMNS] = matrix[_COLUMNS, _ROWS] = unknowns[3:] / np.sqrt(2)
+    return matrix
+
+
+def metric_quadric(motion: NDArray) -> NDArray | None:
+    """
+    Find the symmetric Q under which the cameras are weak-perspective ones.
+
+    The rows m1 and m2 of each camera, divided by its norm, should satisfy
+    ``m1 Q m1^T = m2 Q m2^T`` and ``m1 Q m2^T = 0``: homogeneous linear equations in
+    six unknowns, solved by least squares. They are weighted such that turning a frame
+    in its image plane changes nothing. What is kept constant, to exclude Q = 0, is the
+    mean of ``m1 Q m1^T + m2 Q m2^T``, so that a depth which the cameras show little of
+    does not pass for a solution.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        The affine cameras.
+
+    Returns
+    -------
+    ndarray of shape (3, 3) or None
+        Q, positive definite, the mean of ``m1 Q m1^T + m2 Q m2^T`` being one. None
+        where the equations do not determine it, and where it is not safely positive
+        definite.
+    """
+    Q = _most_metric(motion)
+    if Q is None:
+        return None
+    eigenvalues = np.linalg.eigvalsh(Q)
+    # Q is stretched as the square of space.
+    return Q if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
+
+
+def _most_metric(motion: NDArray) -> NDArray | None:
+    """Return Q of `metric_quadric`, positive definite or not, if it is determined."""
+    cameras = unit_cameras(motion)
+    gram = mean_gram(cameras)
+    eigenvalues = np.linalg.eigvalsh(gram)
+    if eigenvalues[0] <= SMALLEST_EIGENVALUE * eigenvalues[-1]:
+        return None
+    # In coordinates in which the mean of M_i^T M_i is the identity the mean to be kept
+    # is the trace of Q: the identity over three plus five unknowns without trace.
+    whitening = symmetric_power(gram, -0.5)
+    m1, m2 = np.moveaxis(cameras @ whitening, 1, 0)
+    equations = np.vstack(
+        [
+            _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2),
+            2 * _quadratic_terms(m1, m2),
+        ]
+    )
+    trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    traceless = np.linalg.svd(trace[None])[2][1:].T
+    unknowns, _, _, singular_values = np.linalg.lstsq(
+        equations @ traceless, -equations @ trace / 3
+    )
+    if (
+        len(singular_values) < 5
+        or singular_values[-1] <= SMALLEST_SINGULAR_VALUE * singular_values[0]
+    ):
+        return None
+    return whitening @ _symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
+
+
+def anisotropy(motion: NDArray) -> float:
+    """
+    Return how far cameras are from weak-perspective ones, whatever the affinity.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        The affine cameras.
+
+    Returns
+    -------
+    float
+        Root mean square over the cameras of ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and
+        s2 the singular values of the camera in the metric of `metric_quadric`, from 0
+        for scaled orthographic cameras to 1. Axes that are stretched too much there are
+        shortened to what is allowed. Zero where the metric is not determined.
+    """
+    motion = motion[np.isfinite(motion).all(axis=(1, 2)) & motion.any(axis=(1, 2))]
+    if not len(motion):
+        return 0.0
+    # In the space in which all directions are seen alike.
+    motion = motion @ np.linalg.pinv(symmetric_power(mean_gram(motion), 0.5))
+    Q = _most_metric(motion)
+    if Q is None:
+        return 0.0
+    stretch, axes = np.linalg.eigh(Q)
+    Q = (axes * np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)) @ axes.T
+    gram = motion @ Q @ motion.transpose(0, 2, 1)
+    xx, xy, yy = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    return float(np.sqrt(np.mean(((xx - yy) ** 2 + 4 * xy**2) / (xx + yy) ** 2)))

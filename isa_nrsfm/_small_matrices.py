@@ -1,0 +1,177 @@
+"""Algebra of many small symmetric matrices, the index of the matrix last.
+
+With the index last each operation is one pass over long rows of numbers, which for
+matrices of one to fifteen rows is faster than a call of LAPACK for each. None of the
+functions divides by zero: a pivot that is not positive is left out, as said at each.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Symmetric 3x3 matrices are packed as xx, yy, zz, xy, xz, yz.
+ROWS = (0, 1, 2, 0, 0, 1)
+COLUMNS = (0, 1, 2, 1, 2, 2)
+UNPACKED = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+# What elimination leaves of a diagonal entry is rounding errors below this share.
+SMALLEST_PIVOT = 1e-13
+# For up to so many matrices LAPACK is faster than elimination by passes.
+FEW = 48
+
+
+def unpack3(packed: NDArray) -> NDArray:
+    """Return packed symmetric matrices (..., 6, n) as (..., 3, 3, n)."""
+    return packed[..., UNPACKED, :]
+
+
+def inverse_factor3(packed: NDArray) -> NDArray:
+    """
+    Return the inverse of the Cholesky factor of symmetric 3x3 matrices.
+
+    Parameters
+    ----------
+    packed : ndarray of shape (6, n)
+        Positive semidefinite matrices ``A = L L^T``, packed. Their scale does not
+        matter, nor do the scales of the coordinates.
+
+    Returns
+    -------
+    ndarray of shape (3, 3, n)
+        ``R = L^-1``, lower triangular: ``R^T R = A^-1``. Where A is singular, up to
+        rounding, ``R^T R`` is a generalised inverse (``A R^T R A = A``) with a row and
+        a column of zeros for each coordinate that the ones before it determine.
+    """
+    a, b, c, d, e, f = packed
+    R = np.zeros((3, 3, packed.shape[-1]))
+    R[0, 0] = x = _inverse_root(a, a)
+    xy, xz = d * x, e * x  # the first column of L
+    R[1, 1] = y = _inverse_root(b - xy * xy, b)
+    yz = (f - xz * xy) * y
+    R[2, 2] = z = _inverse_root(c - xz * xz - yz * yz, c)
+    R[1, 0] = -xy * x * y
+    R[2, 0] = -(xz * x + yz * R[1, 0]) * z
+    R[2, 1] = -yz * y * z
+    return R
+
+
+def _inverse_root(pivot: NDArray, diagonal: NDArray) -> NDArray:
+    """Return ``pivot^(-1/2)``, and zero where the pivot is rounding errors."""
+    kept = pivot > SMALLEST_PIVOT * diagonal
+    return kept / np.sqrt(np.where(kept, pivot, 1.0))
+
+
+def inverse3(packed: NDArray) -> NDArray:
+    """
+    Return the inverses of symmetric 3x3 matrices.
+
+    Parameters
+    ----------
+    packed : ndarray of shape (6, n)
+        Positive semidefinite matrices, packed.
+
+    Returns
+    -------
+    ndarray of shape (3, 3, n)
+        Their inverses, or the generalised inverses of `inverse_factor3`.
+    """
+    R = inverse_factor3(packed)
+    return np.einsum("can,cbn->abn", R, R)
+
+
+def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Solve symmetric positive definite systems of equations.
+
+    Parameters
+    ----------
+    A : ndarray of shape (k, k, n)
+        Symmetric matrices.
+    b : ndarray of shape (k, n)
+        Right sides.
+
+    Returns
+    -------
+    x : ndarray of shape (k, n)
+        ``A x = b``. An unknown whose pivot is not positive is zero and its equation
+        is left out, so that x is finite for any matrix.
+    positive : ndarray of bool, shape (n,)
+        Whether all pivots are positive, that is, A is positive definite.
+    """
+    k, _, n = A.shape
+    if n <= FEW:
+        x = _solve_by_lapack(A, b)
+        if x is not None:
+            return x, np.ones(n, dtype=bool)
+    # Rows of A below the diagonal are never read: by symmetry they are the columns.
+    work = np.empty((k, k + 1, n))
+    work[:, :k] = A
+    work[:, k] = b
+    positive = np.ones(n, dtype=bool)
+    for i in range(k):
+        inverse = _inverse_pivot(work[i, i], A[i, i], positive)
+        rest = work[i, i + 1 :]
+        scaled = rest * inverse
+        work[i + 1 :, i + 1 :] -= rest[:-1, None] * scaled
+        work[i, i + 1 :] = scaled
+    x = work[:, k]
+    for i in range(k - 2, -1, -1):
+        x[i] -= np.einsum("jn,jn->n", work[i, i + 1 : k], x[i + 1 :])
+    return np.ascontiguousarray(x), positive
+
+
+def _solve_by_lapack(A: NDArray, b: NDArray) -> NDArray | None:
+    """Return the solutions if all matrices are positive definite, otherwise None."""
+    matrices = A.transpose(2, 0, 1)
+    try:
+        factors = np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        return None
+    pivots = np.diagonal(factors, axis1=1, axis2=2) ** 2
+    if (pivots <= SMALLEST_PIVOT * np.diagonal(A)).any():
+        return None
+    x = np.linalg.solve(matrices, b.T[..., None])
+    return np.ascontiguousarray(x[..., 0].T)
+
+
+def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return the inverses of symmetric positive definite matrices.
+
+    Parameters
+    ----------
+    A : ndarray of shape (k, k, n)
+        Symmetric matrices.
+
+    Returns
+    -------
+    inverse : ndarray of shape (k, k, n)
+        Inverses, by Gauss-Jordan elimination. A coordinate whose pivot is not
+        positive has a row and a column of zeros, so that the result is finite for
+        any matrix.
+    log_determinant : ndarray of shape (n,)
+        Sum of the logarithms of the positive pivots.
+    positive : ndarray of bool, shape (n,)
+        Whether all pivots are positive, that is, A is positive definite.
+    """
+    k, _, n = A.shape
+    work = A.copy()
+    log_determinant = np.zeros(n)
+    positive = np.ones(n, dtype=bool)
+    for i in range(k):
+        inverse = _inverse_pivot(work[i, i], A[i, i], positive)
+        log_determinant -= np.log(inverse, where=inverse > 0, out=np.zeros(n))
+        row = work[i] * inverse
+        row[i] = inverse
+        column = work[:, i].copy()
+        column[i] = 0.0
+        work[:, i] = 0.0
+        work -= column[:, None] * row
+        work[i] = row
+    # Rounding errors differ on the two sides of the diagonal.
+    return 0.5 * (work + work.swapaxes(0, 1)), log_determinant, positive
+
+
+def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
+    """Return the inverse pivots, zero for those left out, and mark these."""
+    kept = pivot > SMALLEST_PIVOT * diagonal
+    positive &= kept
+    return kept / np.where(kept, pivot, 1.0)

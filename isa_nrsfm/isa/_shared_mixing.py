@@ -1,0 +1,400 @@
+"""Independent signals whose samples are vectors, all coordinates mixed alike.
+
+Independent subspace analysis lets each subspace have a basis of its own. Here the
+mixing of the signals is the same for all coordinates, K x K numbers instead of
+(dK) x (dK). Basis shapes that fit equally well are mixed so, with points of three
+coordinates as samples; with one coordinate it is plain ICA, as for coefficients.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, expm
+from scipy.special import gammaln
+from sklearn.utils.parallel import _threadpool_controller_decorator
+
+from isa_nrsfm._factorisation import orientations
+from isa_nrsfm.isa._fixed_point import orthogonalise
+
+# A direction whose singular value is below this share of the first is null.
+NULL_DIRECTION = 1e-10
+
+# Densities for each signal to choose from: Student's with these degrees of freedom, and
+# one with tails lighter than a Gaussian's.
+LIGHT = 0.0
+TAILS = (LIGHT, 16.0, 8.0, 4.0, 2.0)
+# All densities fall at least like a Gaussian of this inverse variance. Otherwise the
+# likelihood has no bound where a signal vanishes at a large share of the samples.
+TEMPER = 1e-3
+
+# The fixed point has few local optima with mild tails. A few steps lead to a basin.
+# More would go astray where signals are Gaussian, and magnify rounding errors.
+FIRST_TAIL = 8.0
+FIXED_POINT_STEPS = 8
+# Orthogonal matrices are in one basin if their rows agree in pairs to this cosine.
+SAME_BASIN = 0.97
+# Starts from which the likelihood is maximised, those likeliest at their basin.
+N_FINALISTS = 2
+TURNS = 10  # between mixing and densities
+SCALE_STEPS = 5
+NEWTON_STEPS = 100
+# Converged when no entry of the relative gradient is above this share of the size.
+GRADIENT_TOL = 1e-11
+# A longer step, in any entry of E, would turn past the next maximum.
+LONGEST_STEP = 1.0
+# What is taken off the Hessian, relative to the size, where a Newton step fails.
+SMALLEST_SHIFT, LARGEST_SHIFT, SHIFT_FACTOR = 1e-3, 1e8, 4.0
+# A step must gain this share of its slope, rounding errors of the likelihood apart.
+LEAST_GAIN, ROUNDING = 1e-3, 1e-13
+
+
+# Threads cost more than they give on matrices of this size.
+@_threadpool_controller_decorator(limits=1, user_api="blas")
+def shared_mixing(
+    signals: NDArray, *, n_starts: int = 8, random_state: int = 0
+) -> NDArray[np.float64]:
+    """
+    Return the mixing, the same for all coordinates, that makes signals independent.
+
+    The signals are whitened. From several starts, orthogonal mixings are improved by
+    the fixed point of FastICA for vectors. From the best of them the likelihood of
+    independent spherical signals, ``sum_k E log p_k(||y_k||) + size * log |det W|``
+    with y = W signals, is maximised by Newton steps over all matrices W, each signal
+    having the likeliest of a few densities, heavy and light tailed.
+
+    Parameters
+    ----------
+    signals : ndarray of shape (n_signals, n_samples, size)
+        Each sample of a signal is a vector of `size` coordinates: basis shapes with
+        three coordinates a point, or coefficients with one coordinate a frame. They
+        are taken as centred: means are not removed.
+    n_starts : int, default=8
+        Number of orthogonal starts: a canonical one, and rotations of it.
+    random_state : int, default=0
+        Draws the rotations.
+
+    Returns
+    -------
+    ndarray of shape (n_signals, n_signals)
+        W, invertible: ``tensordot(W, signals, 1)`` are the independent signals, each
+        with mean square 1 over its ``n_samples * size`` numbers. The least Gaussian
+        comes first (in terms of the likelihood), and each has a third moment, over all
+        its numbers, that is not negative. Where the signals have a rank r below their
+        number, the first r rows give the independent signals and the others signals of
+        zeros: linear dependencies are taken out, signals of zeros stay.
+
+    Notes
+    -----
+    The independent signals do not depend on the order of the samples, on the basis in
+    which the signals are given or on a rotation common to all samples, but for
+    rounding, order and sign. Where two or more signals are Gaussian, or there are too
+    few samples, a mixing is returned that has no further meaning.
+
+    One Newton step takes ``O(n_signals^3 n_samples size + n_signals^6)`` operations.
+
+    References
+    ----------
+    A. Hyvarinen, "Fast and robust fixed-point algorithms for independent component
+    analysis", IEEE Trans. Neural Networks 10(3), 1999.
+    P. Ablin, J.-F. Cardoso, A. Gramfort, "Faster independent component analysis by
+    preconditioning with Hessian approximations", IEEE Trans. Signal Processing 66(15),
+    2018: relative gradient and Hessian, here with vectors and without approximation.
+    """
+    signals = np.ascontiguousarray(signals, dtype=np.float64)
+    n_signals, _, size = signals.shape
+    whitening, null = _whitening(signals.reshape(n_signals, -1))
+    if not len(whitening):
+        return np.eye(n_signals)
+    Z = np.tensordot(whitening, signals, 1)
+
+    basins = _distinct(_fixed_point(_starts(Z, n_starts, random_state), Z))
+    if len(basins) > N_FINALISTS:
+        likeliest = np.argsort([-_fit_densities(W, Z).total for W in basins])
+        basins = [basins[b] for b in likeliest[:N_FINALISTS]]
+    optima = [_maximise(W, Z) for W in basins]
+    W, fit = max(optima, key=lambda optimum: optimum[1].total)
+
+    Y = np.tensordot(W, Z, 1).reshape(len(W), -1)
+    scale = np.sqrt(np.mean(Y**2, axis=1))
+    # Of all signals of unit mean square, Gaussian ones are the least likely.
+    order = np.argsort(-(fit.of_signals + size * np.log(scale)), kind="stable")
+    W = (W * (orientations(Y) / scale)[:, None])[order]
+    return np.vstack([W @ whitening, null])
+
+
+def independent_coefficients(
+    alpha: NDArray, *, n_starts: int = 8, random_state: int = 0
+) -> NDArray[np.float64]:
+    """
+    Return the mixing that makes coefficients independent over the frames.
+
+    Parameters
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients; their means do not matter.
+    n_starts : int, default=8
+        As for `shared_mixing`.
+    random_state : int, default=0
+        As for `shared_mixing`.
+
+    Returns
+    -------
+    ndarray of shape (n_components, n_components)
+        W, invertible: the columns of ``alpha @ W.T`` are independent, with unit
+        variance over the frames. Order, sign and linear dependencies as for
+        `shared_mixing`, with frames as samples of one coordinate.
+
+    Notes
+    -----
+    With the basis ``tensordot(inv(W).T, basis, 1)`` the new coefficients give the same
+    shapes.
+    """
+    centred = alpha - alpha.mean(axis=0)
+    signals = centred.T[:, :, None]
+    return shared_mixing(signals, n_starts=n_starts, random_state=random_state)
+
+
+def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return the mixings to uncorrelated rows of mean square 1 and to rows of zeros.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_rows, n)
+        Any rows.
+
+    Returns
+    -------
+    whitening : ndarray of shape (rank, n_rows)
+        ``whitening @ rows`` are uncorrelated.
+    null : ndarray of shape (n_rows - rank, n_rows)
+        ``null @ rows`` vanishes up to rounding; orthogonal to `whitening`.
+    """
+    # The triangular factor has the singular values, and not their squares.
+    R = np.linalg.qr(rows.T, mode="r") / np.sqrt(rows.shape[1])
+    U, S, _ = np.linalg.svd(R.T)
+    rank = int(np.sum(S > NULL_DIRECTION * S[0]))
+    if rank == 0:
+        return np.empty((0, len(rows))), np.eye(len(rows))
+    return (U[:, :rank] / S[:rank]).T, U[:, rank:].T / S[0]
+
+
+def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
+    """
+    Return orthogonal matrices that give the same signals in whatever basis Z came.
+
+    The first are the axes of a fourth-order moment (FOBI, Cardoso 1989) with bounded
+    weights, the others fixed rotations of these. Axes have no sign, so they are turned
+    to one side, whatever the rotation of the coordinates. Z are white signals
+    (n_signals, n_samples, size).
+    """
+    n_signals = len(Z)
+    energy = np.einsum("kjc,kjc->j", Z, Z)
+    weighted = (energy / (energy + energy.mean()))[:, None] * Z
+    moment = weighted.reshape(n_signals, -1) @ Z.reshape(n_signals, -1).T
+    axes = np.linalg.eigh(moment)[1].T
+    side = axes @ weighted.mean(axis=1)
+    axes[side @ np.linalg.svd(side)[2][0] < 0] *= -1.0
+
+    rng = np.random.default_rng(random_state)
+    turned = rng.standard_normal((n_starts - 1, n_signals, n_signals)) @ axes
+    return np.concatenate([axes[None], orthogonalise(turned)])
+
+
+def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
+    """
+    Repeat the fixed point of symmetric FastICA for vectors.
+
+    ``w+ = E[sum_c z_c y_c g(u)] - E[size g(u) + 2 u g'(u)] w`` with u = ||y||^2 and
+    g = F', then symmetric orthogonalisation, for orthogonal W (n_starts, n_signals,
+    n_signals) and white signals Z (n_signals, n_samples, size).
+    """
+    n_signals, n_samples, size = Z.shape
+    flat = Z.reshape(n_signals, -1)
+    for _ in range(FIXED_POINT_STEPS):
+        Y = (W @ flat).reshape(*W.shape[:2], n_samples, size)
+        u = np.einsum("skjc,skjc->skj", Y, Y)
+        g, dg = _slopes(u, np.array(FIRST_TAIL), size)
+        curvature = np.mean(size * g + 2.0 * u * dg, axis=-1)
+        step = (g[..., None] * Y).reshape(*W.shape[:2], -1) @ flat.T / n_samples
+        W = orthogonalise(step - curvature[..., None] * W)
+    return W
+
+
+def _distinct(W: NDArray) -> list[NDArray]:
+    """Return the first of the orthogonal matrices of each basin."""
+    kept: list[NDArray] = []
+    for candidate in W:
+        cosines = [np.abs(candidate @ other.T).max(axis=1).min() for other in kept]
+        if max(cosines, default=0.0) < SAME_BASIN:
+            kept.append(candidate)
+    return kept
+
+
+def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
+    """Return F(u), the logarithm of a density of `TAILS` up to a constant."""
+    light = tail == LIGHT
+    F = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
+    if light.any():
+        F = np.where(light, -0.5 / (size + 2) * u * u, F)
+    return F - 0.5 * TEMPER * u
+
+
+def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
+    """Return F'(u) and F''(u)."""
+    light = tail == LIGHT
+    nearness = 1.0 / (np.where(light, 1.0, tail) + u)
+    g = -0.5 * (tail + size) * nearness
+    dg = -g * nearness
+    if light.any():
+        g = np.where(light, -1.0 / (size + 2) * u, g)
+        dg = np.where(light, -1.0 / (size + 2), dg)
+    return g - 0.5 * TEMPER, dg
+
+
+def _log_integral(tail: float, size: int) -> float:
+    """Return the logarithm of the integral of ``exp F(||y||^2)`` over all vectors y."""
+    # Over the logarithm of the radius the trapezoidal rule is exact to rounding.
+    log_radius = np.linspace(-40.0, 8.0, 1001)
+    F = _log_density(np.exp(2.0 * log_radius), np.array(tail), size)
+    radial = np.exp(F + size * log_radius).sum() * (log_radius[1] - log_radius[0])
+    sphere = np.log(2.0) + size / 2 * np.log(np.pi) - gammaln(size / 2)
+    return float(sphere + np.log(radial))
+
+
+class DensityFit(NamedTuple):
+    """
+    The likeliest density of each signal.
+
+    Attributes
+    ----------
+    tails : ndarray of shape (n_signals,)
+        Which of `TAILS`.
+    variance : ndarray of shape (n_signals,)
+        Square of the signal's scale in the units of the density.
+    of_signals : ndarray of shape (n_signals,)
+        ``E log p_k(||y_k||)`` of the signals y = W z.
+    total : float
+        The likelihood: their sum plus ``size * log |det W|``.
+    """
+
+    tails: NDArray
+    variance: NDArray
+    of_signals: NDArray
+    total: float
+
+
+def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
+    """Return the likeliest density and scale of each of the signals ``W z``."""
+    size = Z.shape[2]
+    Y = np.tensordot(W, Z, 1)
+    u = np.einsum("kjc,kjc->kj", Y, Y)
+    log_variance = np.log(u.mean(axis=1) / size)
+    variances, values = [], []
+    for tail in TAILS:
+        for _ in range(SCALE_STEPS):
+            v = u * np.exp(-log_variance)[:, None]
+            g, dg = _slopes(v, np.array(tail), size)
+            # The likelihood is largest where E[-2 g(v) v] = size.
+            excess = -2.0 * np.mean(g * v, axis=1) - size
+            slope = 2.0 * np.mean((g + dg * v) * v, axis=1)
+            log_variance = log_variance - np.clip(excess / slope, -1.0, 1.0)
+        v = u * np.exp(-log_variance)[:, None]
+        F = _log_density(v, np.array(tail), size).mean(axis=1)
+        variances.append(np.exp(log_variance))
+        values.append(F - _log_integral(tail, size) - size / 2 * log_variance)
+    best = np.argmax(values, axis=0), np.arange(len(W))
+    of_signals = np.array(values)[best]
+    total = float(of_signals.sum() + size * np.linalg.slogdet(W)[1])
+    return DensityFit(
+        np.array(TAILS)[best[0]], np.array(variances)[best], of_signals, total
+    )
+
+
+def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, DensityFit]:
+    """Return a local maximum of the likelihood, over mixings and densities in turns."""
+    fit = _fit_densities(W, Z)
+    for _ in range(TURNS):
+        W = _newton(W / np.sqrt(fit.variance)[:, None], Z, fit.tails)
+        before, fit = fit, _fit_densities(W, Z)
+        if np.array_equal(fit.tails, before.tails):
+            break
+    return W, fit
+
+
+def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
+    """
+    Maximise the likelihood for fixed densities over all mixings.
+
+    The steps are relative, ``W <- exp(E) W``, so that a long one still rotates. Where
+    the Hessian is not negative definite, or a step is too long or does not raise the
+    likelihood, a multiple of the identity is taken off the Hessian.
+    """
+    size = Z.shape[2]
+    tail = tails[:, None]
+
+    def likelihood(W: NDArray) -> tuple[float, NDArray, NDArray]:
+        Y = np.tensordot(W, Z, 1)
+        u = np.einsum("kjc,kjc->kj", Y, Y)
+        F = _log_density(u, tail, size).mean(axis=1).sum()
+        return float(F + size * np.linalg.slogdet(W)[1]), Y, u
+
+    value, Y, u = likelihood(W)
+    shift = 0.0
+    for _ in range(NEWTON_STEPS):
+        gradient, hessian = _relative_derivatives(Y, *_slopes(u, tail, size))
+        if np.abs(gradient).max() < GRADIENT_TOL * size:
+            break
+        while shift < LARGEST_SHIFT:
+            E = _ascent(gradient, hessian, shift * size)
+            if E is not None:
+                trial = expm(E) @ W
+                raised, Y, u = likelihood(trial)
+                least = LEAST_GAIN * np.vdot(gradient, E) - ROUNDING * abs(value)
+                if raised - value > least:
+                    break
+            shift = max(SHIFT_FACTOR * shift, SMALLEST_SHIFT)
+        else:
+            break
+        W, value = trial, raised
+        shift = shift / SHIFT_FACTOR if shift > SMALLEST_SHIFT else 0.0
+    return W
+
+
+def _relative_derivatives(
+    Y: NDArray, g: NDArray, dg: NDArray
+) -> tuple[NDArray, NDArray]:
+    """
+    Return the derivatives G and H of the likelihood by a relative step E.
+
+    To second order ``W <- (I + E) W`` raises it by ``<G, E> + <E, H E> / 2``, with
+    ``G_ka = 2 E[g_k y_k.y_a] + size delta_ka`` and
+    ``H_ka,kb = 2 E[g_k y_a.y_b] + 4 E[g'_k (y_k.y_a) (y_k.y_b)]``, and ``-size`` added
+    to ``H_ka,ak`` (Ablin, Cardoso and Gramfort 2018, here for vectors).
+    """
+    n_signals, n_samples, size = Y.shape
+    flat = Y.reshape(n_signals, -1)
+    gradient = 2.0 / n_samples * (g[..., None] * Y).reshape(n_signals, -1) @ flat.T
+    gradient += size * np.eye(n_signals)
+    hessian = np.zeros((n_signals,) * 4)
+    for k in range(n_signals):
+        products = np.einsum("ajc,jc->aj", Y, Y[k])
+        weighted = (g[k, :, None] * Y).reshape(n_signals, -1)
+        hessian[k, :, k] = 2.0 * weighted @ flat.T
+        hessian[k, :, k] += 4.0 * (dg[k] * products) @ products.T
+    hessian /= n_samples
+    row, column = np.indices((n_signals, n_signals))
+    hessian[row, column, column, row] -= size
+    return gradient, hessian
+
+
+def _ascent(gradient: NDArray, hessian: NDArray, shift: float) -> NDArray | None:
+    """Return ``(shift I - H)^-1 G`` if that is an ascent, and not too long."""
+    matrix = shift * np.eye(gradient.size) - hessian.reshape(gradient.size, -1)
+    try:
+        factor = cho_factor(matrix)
+    except np.linalg.LinAlgError:
+        return None
+    E = cho_solve(factor, gradient.ravel()).reshape(gradient.shape)
+    return E if np.abs(E).max() < LONGEST_STEP else None

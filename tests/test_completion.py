@@ -1,0 +1,394 @@
+"""Completion of tracks by a low-rank model."""
+
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import random_rotation
+from scipy.spatial.transform import Rotation
+
+import isa_nrsfm._completion as completion
+from isa_nrsfm._completion import (
+    _by_pattern,
+    _em_step,
+    _fit,
+    _Model,
+    complete_tracks,
+    rigid_noise,
+)
+from isa_nrsfm._tracks import centred_tracks, weighting_sizes
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+
+
+def hide(tracks, seen):
+    """Return tracks with NaN where points are not seen."""
+    return np.where(seen[..., None], tracks, np.nan)
+
+
+def random_mask(shape, missing, seed, least=4):
+    """Return a mask of seen points, at least some in every frame."""
+    order = np.random.default_rng(seed).random(shape)
+    return (order >= missing) | (
+        order.argsort(axis=1).argsort(axis=1) >= shape[1] - least
+    )
+
+
+def half_mask(tracks, share, seed):
+    """Return a mask that hides the left or the right part of a share of the frames."""
+    rng = np.random.default_rng(seed)
+    x = np.mean(tracks[..., 0] - tracks[..., 0].mean(axis=1, keepdims=True), axis=0)
+    seen = np.ones(tracks.shape[:2], dtype=bool)
+    for i in np.flatnonzero(rng.random(len(tracks)) < share):
+        side = rng.choice([-1.0, 1.0]) * x
+        seen[i] = side <= np.quantile(side, rng.uniform(0.5, 0.8))
+    return seen
+
+
+def completed(tracks, n_components, **params):
+    """Return tracks in place of those with missing points."""
+    centred, translation = centred_tracks(tracks)
+    sizes = weighting_sizes(centred, scale_frames=True)
+    result = complete_tracks(centred, sizes, n_components, **params)
+    assert_allclose(result.centred.mean(axis=1), 0, atol=1e-12 * sizes.max())
+    return result.centred + (result.shift + translation)[:, None]
+
+
+def held_out_error(tracks, seen, n_components, usable=None):
+    """Return the inverse SNR of the hidden points, frames of unit size."""
+    filled = completed(hide(tracks, seen), n_components)
+    centred, translation = centred_tracks(hide(tracks, seen))
+    weights = weighting_sizes(centred, scale_frames=True) ** -2.0
+    hidden = ~seen if usable is None else ~seen & usable[:, None]
+    error = np.sum((filled - tracks) ** 2, axis=2)
+    energy = np.sum((tracks - translation[:, None]) ** 2, axis=2)
+    weights = np.where(hidden, weights[:, None], 0.0)
+    return np.sum(weights * error) / np.sum(weights * energy)
+
+
+# --- what it returns ----------------------------------------------------------------
+
+
+def test_seen_points_are_kept():
+    scene = make_face_tracks(50, missing=0.3, random_state=0)
+    filled = completed(scene.tracks, 3)
+    assert_allclose(filled[scene.visible], scene.tracks[scene.visible], rtol=1e-13)
+
+
+def test_complete_tracks_are_returned_as_they_are():
+    centred, _ = centred_tracks(make_face_tracks(20, random_state=0).tracks)
+    result = complete_tracks(centred, np.ones(20), 2)
+    assert result.centred is centred
+    assert_array_equal(result.shift, np.zeros((20, 2)))
+
+
+def test_the_input_is_not_changed():
+    scene = make_face_tracks(50, missing=0.3, random_state=0)
+    centred, _ = centred_tracks(scene.tracks)
+    before = centred.copy()
+    complete_tracks(centred, np.ones(50), 2)
+    assert_array_equal(centred, before)
+
+
+# --- the model ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Return frames of a small noisy table, with a complete and a repeated pattern."""
+    scene = make_nonrigid_tracks(24, 9, 1, noise=0.1, random_state=0)
+    seen = random_mask((24, 9), 0.3, 0)
+    seen[5:8] = True
+    seen[10:13] = seen[10]
+    centred, _ = centred_tracks(hide(scene.tracks, seen))
+    sizes = weighting_sizes(centred, scale_frames=True)
+    return centred, seen, sizes
+
+
+def log_likelihood(B, noise, centred, seen, sizes):
+    """Return that of all rows, as said by normal densities without translation."""
+    total = 0.0
+    for frame, mask, size in zip(centred, seen, sizes, strict=True):
+        n = mask.sum()
+        # Contrasts of the seen points: an orthonormal basis of what sums to zero.
+        contrasts = np.linalg.svd(np.ones((1, n)))[2][1:]
+        covariance = contrasts @ (B[:, mask].T @ B[:, mask]) @ contrasts.T
+        covariance += noise * np.eye(n - 1)
+        for row in (contrasts @ frame[mask] / size).T:
+            total -= 0.5 * row @ np.linalg.solve(covariance, row)
+            total -= 0.5 * np.linalg.slogdet(covariance)[1]
+    return total
+
+
+def test_missing_points_are_conditional_expectations(small):
+    centred, seen, sizes = small
+    frames, _ = _by_pattern(centred, seen, sizes)
+    filled = completed(centred, 1)  # rank 6 of 9 points
+    model = _fit(frames, 6, completion.TOL, 200)
+    far = 1e7  # variance of the translation, which may be anything
+    covariance = model.B.T @ model.B + model.noise * np.eye(9) + far
+    for frame, mask, result in zip(centred, seen, filled, strict=True):
+        gain = covariance[np.ix_(~mask, mask)] @ np.linalg.inv(
+            covariance[np.ix_(mask, mask)]
+        )
+        assert_allclose(result[~mask], gain @ frame[mask], atol=1e-5)
+
+
+def test_the_fit_is_a_stationary_point_of_the_likelihood(small):
+    centred, seen, sizes = small
+    frames, _ = _by_pattern(centred, seen, sizes)
+    model = _fit(frames, 3, 1e-13, 5000)
+    best = log_likelihood(*model, *small)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        step = 1e-4 * rng.normal(size=model.B.shape) * np.std(model.B)
+        up, down = (
+            log_likelihood(model.B + s * step, model.noise, *small) for s in (1, -1)
+        )
+        assert abs(up - down) < 1e-6
+        assert max(up, down) < best
+    up, down = (
+        log_likelihood(model.B, model.noise * f, *small) for f in (1.001, 1 / 1.001)
+    )
+    assert abs(up - down) < 1e-6
+    assert max(up, down) < best
+
+
+def test_a_step_with_fixed_noise_raises_the_likelihood(small):
+    centred, seen, sizes = small
+    frames, _ = _by_pattern(centred, seen, sizes)
+    B = np.random.default_rng(0).normal(size=(4, 9))
+    for _ in range(20):
+        before = log_likelihood(B, 0.01, *small)
+        B = _em_step(_Model(B, 0.01), frames)[0].B
+        assert log_likelihood(B, 0.01, *small) > before
+
+
+def test_the_residual_of_a_step_is_that_of_least_squares_with_a_ridge(small):
+    centred, seen, sizes = small
+    frames, order = _by_pattern(centred, seen, sizes)
+    B = np.random.default_rng(0).normal(size=(3, 9))
+    _, residual, mean_square = _em_step(_Model(B, 0.1), frames)
+    n_numbers = 2 * seen.sum()
+    assert_allclose(mean_square, np.sum(residual**2) / n_numbers)
+    for i, rows in zip(order, residual, strict=True):
+        mask = seen[i]
+        design = np.vstack([B[:, mask], np.ones(mask.sum())]).T
+        ridge = np.diag([0.1, 0.1, 0.1, 0.0])
+        target = centred[i, mask] / sizes[i]
+        fit = design @ np.linalg.solve(design.T @ design + ridge, design.T @ target)
+        assert_allclose(rows[:, mask], (target - fit).T, atol=1e-12)
+        assert_array_equal(rows[:, ~mask], 0)
+
+
+# --- exact tables -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("n_frames", "n_points", "n_components", "missing"),
+    [(60, 30, 2, 0.2), (60, 30, 3, 0.3), (300, 68, 5, 0.3), (300, 68, 9, 0.2)],
+)
+def test_tables_of_the_rank_without_noise(
+    n_frames, n_points, n_components, missing, seed
+):
+    scene = make_nonrigid_tracks(n_frames, n_points, n_components, random_state=seed)
+    seen = random_mask((n_frames, n_points), missing, seed)
+    determined = seen.sum(axis=1) >= 3 * n_components + 4
+    assert determined.mean() > 0.95
+    error = held_out_error(scene.tracks, seen, n_components, determined)
+    assert np.sqrt(error) < 1e-7
+
+
+def seen_from_outside(n_frames, n_points, least_cosine, seed):
+    """Return tracks of points on an opaque ball, and which of them the camera sees."""
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(n_points, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    cameras = Rotation.random(n_frames, rng).as_matrix()
+    image = points @ cameras.transpose(0, 2, 1)
+    return image[..., :2], image[..., 2] > least_cosine
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("least_cosine", [-0.3, 0.0])
+def test_a_ball_of_which_every_frame_sees_one_side(least_cosine, seed):
+    tracks, seen = seen_from_outside(100, 30, least_cosine, seed)
+    assert not seen.all(axis=1).any()
+    assert seen.mean() < 0.7
+    assert np.sqrt(held_out_error(tracks, seen, 0)) < 1e-6
+
+
+def test_points_that_are_never_seen_together():
+    tracks, seen = seen_from_outside(200, 40, 0.3, 0)
+    together = seen.T.astype(float) @ seen
+    assert np.mean(together == 0) > 0.1
+    assert np.sqrt(held_out_error(tracks, seen, 0)) < 1e-6
+
+
+# --- tables with noise --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02])
+def test_the_error_is_near_the_noise(noise):
+    scene = make_nonrigid_tracks(400, 68, 3, noise=noise, random_state=0)
+    seen = random_mask((400, 68), 0.3, 0)
+    # The hidden points have noise of their own; the prediction adds to it.
+    assert noise**2 < held_out_error(scene.tracks, seen, 3) < 2 * noise**2
+
+
+def test_sides_of_faces():
+    tracks = make_face_tracks(400, random_state=0).tracks
+    assert held_out_error(tracks, half_mask(tracks, 0.7, 0), 4) < 5e-4
+
+
+def test_more_steps_do_not_find_much_better_points():
+    scene = make_face_tracks(300, random_state=0)
+    seen = random_mask(scene.visible.shape, 0.3, 0)
+    stopped = completed(hide(scene.tracks, seen), 4)
+    carried_on = completed(hide(scene.tracks, seen), 4, tol=1e-6, max_iter=500)
+    errors = [
+        np.sum((filled - scene.tracks)[~seen] ** 2) for filled in (stopped, carried_on)
+    ]
+    assert errors[0] < 1.05 * errors[1]
+
+
+# Inverse SNR in percent of hidden points on every fifth frame, a little above what is
+# reached; filling in with the centroid has 100, the mean of the 5 nearest frames 0.7.
+@pytest.mark.parametrize(
+    ("name", "n_components", "largest"),
+    [
+        ("ict_bu3dfe_like_68", 9, 0.06),
+        ("faces_wild_68_combined", 9, 0.20),
+        ("akhter_drink", 3, 0.016),
+    ],
+)
+def test_random_points_of_real_tables(load_data, name, n_components, largest):
+    tracks = load_data(name)["W2d"].astype(float)[::5]
+    seen = random_mask(tracks.shape[:2], 0.3, 0)
+    assert 100 * held_out_error(tracks, seen, n_components) < largest
+
+
+def test_faces_that_hide_a_side(load_data):
+    tracks = load_data("muct_68")["W2d"].astype(float)
+    seen = ~np.isnan(tracks).any(axis=2)
+    complete = seen.all(axis=1)
+    # The sides that other frames hide, on frames of which they are known.
+    known, patterns = tracks[complete], seen[~complete]
+    mask = np.ones(known.shape[:2], dtype=bool)
+    mask[:: len(known) // len(patterns)][: len(patterns)] = patterns
+    assert 100 * held_out_error(known, mask, 9) < 0.4
+
+
+# --- invariances --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def faces():
+    return make_face_tracks(80, missing=0.25, random_state=0).tracks
+
+
+def test_order_of_frames(faces):
+    order = np.random.default_rng(0).permutation(len(faces))
+    assert_allclose(completed(faces[order], 3), completed(faces, 3)[order], atol=1e-6)
+
+
+def test_order_of_points(faces):
+    order = np.random.default_rng(0).permutation(faces.shape[1])
+    result = completed(faces[:, order], 3)
+    assert_allclose(result, completed(faces, 3)[:, order], atol=1e-6)
+
+
+def test_rotations_and_translations_of_single_images(faces):
+    R = np.stack([random_rotation(seed, 2) for seed in range(len(faces))])
+    t = np.random.default_rng(0).normal(size=(len(faces), 1, 2))
+    result = completed(faces @ R + t, 3)
+    assert_allclose(result, completed(faces, 3) @ R + t, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_units(faces, unit):
+    assert_allclose(completed(unit * faces, 3), unit * completed(faces, 3), rtol=1e-8)
+
+
+def test_memory_order(faces):
+    centred, _ = centred_tracks(faces)
+    sizes = weighting_sizes(centred, scale_frames=True)
+    results = [
+        complete_tracks(tracks, sizes, 3).centred
+        for tracks in (centred, np.asfortranarray(centred))
+    ]
+    assert_array_equal(*results)
+
+
+@pytest.mark.parametrize("numbers", [1, 12345])
+def test_split_of_the_frames_into_blocks(faces, monkeypatch, numbers):
+    expected = completed(faces, 3)
+    monkeypatch.setattr(completion, "BLOCK_NUMBERS", numbers)
+    assert_allclose(completed(faces, 3), expected, atol=1e-6)
+
+
+# --- degenerate tables --------------------------------------------------------------
+
+
+def assert_completes(tracks, seen, n_components):
+    """Complete without warnings and with finite numbers; return the relative error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isfinite(completed(hide(tracks, seen), n_components)).all()
+        return np.sqrt(held_out_error(tracks, seen, n_components))
+
+
+def test_shark_has_a_lower_rank(load_data):
+    tracks = load_data("shark_torresani")["W2d"].astype(float)
+    seen = random_mask(tracks.shape[:2], 0.3, 0)
+    for n_components in (1, 2, 6):
+        assert assert_completes(tracks, seen, n_components) < 1e-5
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rigid_objects_and_more_basis_shapes(dtype):
+    tracks = make_nonrigid_tracks(200, 40, 0, random_state=0).tracks.astype(dtype)
+    seen = random_mask((200, 40), 0.3, 0)
+    assert assert_completes(tracks, seen, 5) < 1e-5
+
+
+def test_flat_objects():
+    rng = np.random.default_rng(0)
+    tracks = rng.normal(size=(40, 2)) @ rng.normal(size=(200, 2, 2)) + 5
+    assert assert_completes(tracks, random_mask((200, 40), 0.3, 0), 1) < 1e-5
+
+
+@pytest.mark.parametrize(("n_frames", "n_points"), [(8, 13), (8, 68), (30, 100)])
+def test_the_smallest_tables(n_frames, n_points):
+    tracks = make_nonrigid_tracks(n_frames, n_points, 3, random_state=0).tracks
+    assert_completes(tracks, random_mask((n_frames, n_points), 0.1, 3), 3)
+
+
+def test_points_and_frames_that_are_rarely_seen():
+    tracks = make_nonrigid_tracks(100, 30, 3, random_state=0).tracks
+    seen = np.ones((100, 30), dtype=bool)
+    seen[6:, 3] = False
+    seen[50:, 4:] = False
+    assert_completes(tracks, seen, 3)
+    seen[90:, 1:] = False
+    assert np.isfinite(
+        complete_tracks(hide(tracks - tracks[:, :1], seen), np.ones(100), 3).centred
+    ).all()
+
+
+# --- noise of the rigid model -------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3, 0.6])
+def test_noise_of_a_rigid_object(missing):
+    scene = make_nonrigid_tracks(500, 30, 0, noise=0.05, random_state=0)
+    centred, _ = centred_tracks(hide(scene.tracks, random_mask((500, 30), missing, 0)))
+    variance = rigid_noise(centred, np.ones(500))
+    assert_allclose(variance, scene.noise_variance, rtol=0.05)
+
+
+def test_a_rigid_object_without_noise():
+    tracks = make_nonrigid_tracks(100, 30, 0, random_state=0).tracks
+    centred, _ = centred_tracks(hide(tracks, random_mask((100, 30), 0.3, 0)))
+    assert rigid_noise(centred, np.ones(100)) < 1e-18

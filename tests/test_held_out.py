@@ -1,0 +1,170 @@
+"""Error of points that were held out of the fit of their frame."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from sklearn.model_selection import GridSearchCV
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frame_fit import PosteriorFrames, RigidFrames, compose, project
+from isa_nrsfm._held_out import FOLD_SEED, N_FOLDS, held_out_error
+from isa_nrsfm._independent_gauge import FrameMap
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+# The joint refinement only starts from what FastICA finds.
+pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
+
+NOISE = 0.02
+
+
+def scene(seed=0, n_frames=12, n_points=23):
+    """Return the model of frames, its shapes, and tracks with noise."""
+    rng = np.random.default_rng(seed)
+    shapes = (
+        rng.normal(size=(3, n_points, 3)) * np.array([1.0, 0.3, 0.3])[:, None, None]
+    )
+    shapes -= shapes.mean(axis=1, keepdims=True)
+    motion = np.eye(2, 3) + 0.3 * rng.normal(size=(n_frames, 2, 3))
+    position = rng.normal(size=(n_frames, 2))
+    alpha = rng.normal(size=(n_frames, 2))
+    tracks = project(compose(shapes[0], shapes[1:], alpha), motion, position)
+    tracks += NOISE * rng.normal(size=tracks.shape)
+    frames = PosteriorFrames(
+        shapes.transpose(0, 2, 1),
+        NOISE**2,
+        np.zeros((0, 2)),
+        "linear",
+        FrameMap.identity(2),
+    )
+    return frames, shapes, tracks
+
+
+def by_plain_loops(frames, shapes, tracks, sizes):
+    """Return the documented error, frame by frame and point by point."""
+    n_points = tracks.shape[1]
+    folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
+    noise = signal = 0.0
+    for points, size in zip(tracks, sizes, strict=True):
+        centre = np.nanmean(points, axis=0)
+        for fold in range(N_FOLDS):
+            visible = np.where((folds == fold)[:, None], np.nan, points)
+            if np.sum(~np.isnan(visible[:, 0])) < 4:
+                continue
+            fit = frames.fit(visible[None], np.array([size]))
+            S = shapes[0] + np.tensordot(fit.alpha[0], shapes[1:], 1)
+            for j in np.flatnonzero(folds == fold):
+                if np.isnan(points[j, 0]):
+                    continue
+                model = fit.motion[0] @ S[j] + fit.translation[0]
+                noise += np.sum((points[j] - model) ** 2) / size**2
+                signal += np.sum((points[j] - centre) ** 2) / size**2
+    return noise / signal
+
+
+def hide(tracks, share):
+    hidden = np.random.default_rng(1).random(tracks.shape[:2]) < share
+    return np.where(hidden[..., None], np.nan, tracks)
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.3])
+@pytest.mark.parametrize("model", ["posterior", "rigid"])
+def test_by_plain_loops(model, missing):
+    frames, shapes, tracks = scene()
+    if model == "rigid":
+        frames = RigidFrames(shapes[0], shapes[1:])
+    tracks = hide(tracks, missing)
+    sizes = np.linspace(1, 3, len(tracks))
+    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    assert_allclose(error, by_plain_loops(frames, shapes, tracks, sizes), rtol=1e-8)
+
+
+def test_every_point_is_held_out_once_and_parts_are_of_equal_size():
+    folds = np.random.RandomState(FOLD_SEED).permutation(23) % N_FOLDS
+    assert sorted(np.bincount(folds)) == [4, 4, 5, 5, 5]
+
+
+def test_it_is_larger_than_the_error_of_fitted_points():
+    frames, shapes, tracks = scene()
+    sizes = np.ones(len(tracks))
+    fit = frames.fit(tracks, sizes)
+    images = project(
+        compose(shapes[0], shapes[1:], fit.alpha), fit.motion, fit.translation
+    )
+    signal = np.sum((tracks - tracks.mean(axis=1, keepdims=True)) ** 2)
+    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    assert error > 1.2 * np.sum((tracks - images) ** 2) / signal
+
+
+def test_frames_that_show_too_little_are_left_out():
+    frames, shapes, tracks = scene()
+    sizes = np.ones(len(tracks))
+    expected = held_out_error(frames, shapes[0], shapes[1:], tracks[:8], sizes[:8])
+    tracks[8:, 4:] = np.nan  # four points: with one held out too few are left
+    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    folds = np.random.RandomState(FOLD_SEED).permutation(23) % N_FOLDS
+    if all(
+        np.any(folds[:4] == fold) == (np.sum(folds[:4] == fold) > 0) for fold in folds
+    ):
+        assert_allclose(error, expected, rtol=1e-9)
+
+
+def test_nothing_that_can_be_held_out_is_nan():
+    frames, shapes, tracks = scene()
+    tracks[:, 3:] = np.nan
+    error = held_out_error(frames, shapes[0], shapes[1:], tracks, np.ones(len(tracks)))
+    assert np.isnan(error)
+
+
+# --- score --------------------------------------------------------------------------
+
+
+def table(n_components, seed, **params):
+    params = {"n_frames": 70, "n_points": 34, "noise": NOISE} | params
+    return make_nonrigid_tracks(
+        n_components=n_components, random_state=seed, **params
+    ).data
+
+
+@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+def test_score_is_minus_the_error_and_the_same_each_time(refinement):
+    X = table(2, 0, missing=0.1)
+    model = AffineNRSfM(2, refinement=refinement, random_state=0).fit(X)
+    score = model.score(X)
+    assert type(score) is float
+    assert score < 0
+    assert model.score(X) == score
+    assert model.score(X, y=np.zeros(len(X))) == score
+    assert (
+        AffineNRSfM(2, refinement=refinement, random_state=0).fit(X).score(X) == score
+    )
+
+
+def test_score_weights_frames_as_the_fit_does():
+    X = table(2, 0)
+    sizes = np.exp(np.random.default_rng(0).normal(size=(len(X), 1)))
+    model = AffineNRSfM(2, random_state=0).fit(X)
+    assert_allclose(model.score(sizes * X), model.score(X), rtol=1e-8)
+    model = AffineNRSfM(2, scale_frames=False, random_state=0).fit(X)
+    assert abs(model.score(sizes * X) / model.score(X) - 1) > 1e-3
+
+
+def test_score_leaves_frames_without_camera_out():
+    X = table(2, 0)
+    model = AffineNRSfM(2, random_state=0).fit(X)
+    expected = model.score(X[5:])
+    X[:5, 4:] = np.nan
+    assert_allclose(model.score(X), expected, rtol=1e-9)
+    X[:, 4:] = np.nan
+    assert np.isnan(model.score(X))
+
+
+@pytest.mark.parametrize(
+    ("n_components", "seed"), [(1, 0), (2, 1), (3, 2), (4, 3), (5, 4)]
+)
+def test_score_of_new_frames_is_best_at_the_true_number(n_components, seed):
+    X = table(n_components, seed)
+    search = GridSearchCV(
+        AffineNRSfM(random_state=0), {"n_components": range(1, 7)}, cv=2, refit=False
+    )
+    search.fit(X)
+    assert search.best_params_["n_components"] == n_components

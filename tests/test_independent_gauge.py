@@ -1,0 +1,375 @@
+"""The independent basis: one result for all fits that are equally good."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import random_rotation
+
+from isa_nrsfm._independent_gauge import (
+    INDEPENDENCE,
+    FrameMap,
+    independent_gauge,
+)
+from isa_nrsfm.metrics import affine_shape_error, basis_similarity
+
+ALL = [*INDEPENDENCE, None]
+EACH = pytest.mark.parametrize("independence", ALL)
+
+
+class Fit(NamedTuple):
+    shapes: NDArray  # (n_components + 1, 3, n_points), centred
+    motion: NDArray  # (n_frames, 2, 3)
+    alpha: NDArray  # (n_frames, n_components)
+
+    def images(self):
+        """Return the images of the shapes (n_frames, 2, n_points)."""
+        return self.motion @ self.frames()
+
+    def frames(self):
+        """Return the shapes of the frames (n_frames, 3, n_points)."""
+        return self.shapes[0] + np.tensordot(self.alpha, self.shapes[1:], 1)
+
+
+def random_fit(seed=0, n_frames=60, n_points=80, n_components=3):
+    """Return a fit with independent heavy-tailed basis shapes and coefficients."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes[1:] *= 0.3 * rng.normal(size=(n_components, 1, n_points))
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = rng.normal(size=(n_frames, 2, 3)) + 2 * np.eye(2, 3)
+    alpha = rng.laplace(size=(n_frames, n_components)) / np.sqrt(2)
+    return Fit(shapes, motion, alpha)
+
+
+def random_mixing(seed, n_shapes, shift=0.05):
+    """
+    Return a mixing of the mean shape and the basis shapes.
+
+    The basis is mixed and shifted a little along the mean shape, so that the scales of
+    all frames stay positive, and the mean shape is shifted along the basis.
+    """
+    mixing = np.random.default_rng(seed).normal(size=(n_shapes, n_shapes))
+    mixing[0] *= 0.3
+    mixing[0, 0] = 1.0
+    mixing[1:, 0] *= shift
+    return mixing
+
+
+def remixed(alpha, mixing):
+    """Return the coefficients (..., n_components) of mixed shapes, and the scales."""
+    c = np.insert(alpha, 0, 1.0, axis=-1) @ np.linalg.inv(mixing)
+    assert (c[..., 0] > 0).all()
+    return c[..., 1:] / c[..., :1], c[..., 0]
+
+
+def regauged(fit, seed=1, shift=0.05):
+    """Return another fit that is as good: mixed, in a space that is sheared."""
+    mixing = random_mixing(seed, len(fit.shapes), shift)
+    rng = np.random.default_rng(seed)
+    space = random_rotation(seed) + 0.3 * rng.normal(size=(3, 3))
+    alpha, scale = remixed(fit.alpha, mixing)
+    return Fit(
+        space @ np.tensordot(mixing, fit.shapes, 1),
+        scale[:, None, None] * fit.motion @ np.linalg.inv(space),
+        alpha,
+    )
+
+
+def canonical(fit, independence="shapes"):
+    """Return the canonical fit, and the standard deviations for unit covariances."""
+    gauge = independent_gauge(*fit, independence)
+    n_frames, n_components = fit.alpha.shape
+    covariance = np.broadcast_to(
+        np.eye(n_components), (n_frames,) + 2 * (n_components,)
+    )
+    motion, alpha, deviation = gauge.frames.apply(fit.motion, fit.alpha, covariance)
+    shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
+    return Fit(shapes.transpose(0, 2, 1), motion, alpha), deviation
+
+
+def assert_same(got, expected, atol=1e-7):
+    for name, one, other in zip(Fit._fields, got, expected, strict=True):
+        assert_allclose(one, other, atol=atol, err_msg=name)
+
+
+class TestSameFit:
+    """What a fit says of the table and of the shapes is not changed."""
+
+    @EACH
+    @pytest.mark.parametrize("n_components", [1, 3])
+    def test_images(self, independence, n_components):
+        fit = random_fit(n_components=n_components)
+        result, _ = canonical(fit, independence)
+        assert_allclose(result.images(), fit.images(), atol=1e-11)
+
+    @EACH
+    def test_shapes_but_for_one_affinity_and_the_scales_of_frames(self, independence):
+        fit = random_fit()
+        result, _ = canonical(fit, independence)
+        frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
+        assert affine_shape_error(*frames) < 1e-10
+        # The affinity is that of the map.
+        space = independent_gauge(*fit, independence).frames.space
+        scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
+        scales /= np.linalg.norm(result.frames(), axis=(1, 2))
+        assert_allclose(
+            space @ fit.frames(), scales[:, None, None] * result.frames(), atol=1e-11
+        )
+
+    def test_identity_changes_nothing(self):
+        fit = random_fit()
+        covariance = np.cov(np.random.default_rng(1).normal(size=(3, 9)))
+        covariance = np.broadcast_to(covariance, (len(fit.alpha), 3, 3))
+        motion, alpha, deviation = FrameMap.identity(3).apply(
+            fit.motion, fit.alpha, covariance
+        )
+        assert_array_equal(motion, fit.motion)
+        assert_array_equal(alpha, fit.alpha)
+        expected = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        assert_allclose(deviation, expected)
+
+    def test_input_is_not_changed(self):
+        fit = random_fit()
+        copy = Fit(*(each.copy() for each in fit))
+        independent_gauge(*fit, "shapes")
+        for got, expected in zip(fit, copy, strict=True):
+            assert_array_equal(got, expected)
+
+
+class TestConditions:
+    @EACH
+    @pytest.mark.parametrize("seed", range(3))
+    def test_hold(self, independence, seed):
+        result, _ = canonical(regauged(random_fit(seed)), independence)
+        mean_shape, basis = result.shapes[0], result.shapes[1:]
+        n_points = mean_shape.shape[1]
+        assert_allclose(result.shapes.mean(axis=2), 0, atol=1e-12)
+        assert_allclose(mean_shape @ mean_shape.T / n_points, np.eye(3), atol=1e-12)
+        along = np.einsum("kaj,aj->k", basis, mean_shape)
+        assert_allclose(along, 0, atol=1e-10 * n_points)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
+        assert (np.sum(result.alpha**3, axis=0) >= 0).all()
+        moved = result.motion[:, None] @ basis
+        energy = np.sum((result.alpha[..., None, None] * moved) ** 2, axis=(0, 2, 3))
+        assert (np.diff(energy) <= 0).all()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_shapes_recovers_independent_basis_shapes(self, seed):
+        fit = random_fit(seed, n_points=400)
+        result, _ = canonical(regauged(fit), "shapes")
+        truth = whitened(fit)
+        cosines = basis_similarity(truth, result.shapes[1:].transpose(0, 2, 1))
+        assert np.min(cosines) > 0.97
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_coefficients_recovers_independent_coefficients(self, seed):
+        fit = random_fit(seed, n_frames=3000, n_points=20)
+        result, _ = canonical(regauged(fit, shift=0.02), "coefficients")
+        # Up to the scales of the frames, which change a little with the basis.
+        correlation = np.corrcoef(fit.alpha.T, result.alpha.T)[:3, 3:]
+        assert_array_equal(np.sort(np.abs(correlation).argmax(axis=1)), range(3))
+        assert np.abs(correlation).max(axis=1).min() > 0.95
+
+    def test_none_takes_principal_axes(self):
+        # Uncorrelated coefficients, and basis shapes that are orthogonal in the space
+        # in which the mean shape is white, by decreasing energy there.
+        result, _ = canonical(regauged(random_fit()), None)
+        assert_allclose(result.alpha.T @ result.alpha / 60, np.eye(3), atol=1e-11)
+        flat = result.shapes[1:].reshape(3, -1)
+        gram = flat @ flat.T
+        assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-10 * np.trace(gram))
+
+    def test_bases_differ(self):
+        fit = random_fit()
+        bases = [canonical(fit, each)[0].shapes[1:] for each in ALL]
+        for one, other in ((0, 1), (0, 2), (1, 2)):
+            assert np.abs(bases[one] - bases[other]).max() > 0.1
+
+
+def whitened(fit):
+    """Return the basis shapes where the mean shape is white, without part along it."""
+    B = fit.shapes[0]
+    variance, axes = np.linalg.eigh(B @ B.T / B.shape[1])
+    white = (axes / np.sqrt(variance)).T @ fit.shapes
+    along = np.einsum("kaj,aj->k", white[1:], white[0]) / np.sum(white[0] ** 2)
+    return (white[1:] - along[:, None, None] * white[0]).transpose(0, 2, 1)
+
+
+class TestInvariance:
+    @EACH
+    @pytest.mark.parametrize("n_components", [1, 3, 5])
+    def test_gauge_of_the_fit(self, independence, n_components):
+        fit = random_fit(n_components=n_components, n_points=150)
+        expected, _ = canonical(fit, independence)
+        for seed in (1, 2, 3):
+            other = regauged(fit, seed, shift=0.01)
+            assert_allclose(other.images(), fit.images(), atol=1e-10)
+            got, _ = canonical(other, independence)
+            assert_same(got, expected)
+
+    @EACH
+    def test_canonical_fits_stay_as_they_are(self, independence):
+        expected, _ = canonical(random_fit(), independence)
+        assert_same(canonical(expected, independence)[0], expected, atol=1e-9)
+
+    @EACH
+    def test_order_of_frames_and_points(self, independence):
+        fit = random_fit()
+        rng = np.random.default_rng(2)
+        frames, points = rng.permutation(60), rng.permutation(80)
+        other = Fit(fit.shapes[:, :, points], fit.motion[frames], fit.alpha[frames])
+        expected, deviation = canonical(fit, independence)
+        got, got_deviation = canonical(other, independence)
+        expected = Fit(
+            expected.shapes[:, :, points],
+            expected.motion[frames],
+            expected.alpha[frames],
+        )
+        assert_same(got, expected)
+        assert_allclose(got_deviation, deviation[frames], rtol=1e-6)
+
+    @EACH
+    def test_rotation_of_single_images(self, independence):
+        fit = random_fit()
+        angle = np.random.default_rng(2).uniform(-0.3, 0.3, 60)
+        c, s = np.cos(angle), np.sin(angle)
+        R = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+        expected, _ = canonical(fit, independence)
+        got, _ = canonical(fit._replace(motion=R @ fit.motion), independence)
+        # The front view turns a little, about the axis of depth at most a lot.
+        turn = np.linalg.lstsq(got.shapes[0].T, expected.shapes[0].T)[0].T
+        assert_allclose(turn @ turn.T, np.eye(3), atol=1e-10)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-7)
+        assert_allclose(turn @ got.shapes, expected.shapes, atol=1e-7)
+
+
+class TestStandardDeviations:
+    @EACH
+    def test_are_those_of_random_coefficients(self, independence):
+        fit = random_fit()
+        frames = independent_gauge(*fit, independence).frames
+        rng = np.random.default_rng(3)
+        root = 0.03 * rng.normal(size=(60, 3, 3))
+        covariance = root @ root.swapaxes(1, 2)
+        _, _, got = frames.apply(fit.motion, fit.alpha, covariance)
+        n_draws = 2000
+        drawn = fit.alpha + np.einsum(
+            "ikl,nil->nik", root, rng.normal(size=(n_draws, 60, 3))
+        )
+        alpha = np.array(
+            [frames.apply(fit.motion, each, covariance)[1] for each in drawn]
+        )
+        assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
+
+    def test_do_not_depend_on_the_gauge_of_the_fit(self):
+        # The covariance of the coefficients of a fit that is as good, to first order.
+        fit = random_fit()
+        mixing = random_mixing(1, 4)
+        rng = np.random.default_rng(3)
+        root = rng.normal(size=(60, 3, 3))
+        step = 1e-6
+        slopes = [
+            remixed(fit.alpha + step * e, mixing)[0]
+            - remixed(fit.alpha - step * e, mixing)[0]
+            for e in np.eye(3)
+        ]
+        moved = np.stack(slopes, axis=2) / (2 * step) @ root
+        other = regauged(fit)
+        deviations = [
+            independent_gauge(*one, "shapes").frames.apply(
+                one.motion, one.alpha, each @ each.swapaxes(1, 2)
+            )[2]
+            for one, each in ((fit, root), (other, moved))
+        ]
+        assert_allclose(deviations[1], deviations[0], rtol=1e-5)
+
+
+class TestDegenerate:
+    @EACH
+    @pytest.mark.parametrize("n_zero", [1, 3])
+    def test_basis_shapes_of_zero(self, independence, n_zero):
+        fit = random_fit()
+        fit.shapes[4 - n_zero :] = 0.0
+        fit.alpha[:, 3 - n_zero :] = 0.0
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-10)
+        norms = np.linalg.norm(result.shapes[1:], axis=(1, 2))
+        assert (norms[: 3 - n_zero] > 0.1).all()
+        assert_allclose(norms[3 - n_zero :], 0, atol=1e-9)
+
+    @EACH
+    def test_basis_shapes_that_are_dependent(self, independence):
+        fit = random_fit()
+        fit.shapes[3] = fit.shapes[1] - 2 * fit.shapes[2]
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+
+    @EACH
+    def test_flat_objects(self, independence):
+        fit = random_fit()
+        fit.shapes[:, 2] = 0.0
+        other = regauged(fit)
+        result, deviation = canonical(other, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), other.images(), atol=1e-10)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+        assert_allclose(along, 0, atol=1e-9)
+
+    @EACH
+    @pytest.mark.parametrize("depth", [0.0, 0.02])
+    def test_thin_objects_that_bend(self, independence, depth):
+        fit = random_fit()
+        fit.shapes[0, 2] *= depth
+        self.check_extreme(fit, independence)
+
+    @EACH
+    @pytest.mark.parametrize("value", [0.0, 0.3])
+    def test_coefficients_that_do_not_vary(self, independence, value):
+        fit = random_fit()
+        fit.alpha[:, 1] = value
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        for each in result:
+            assert np.isfinite(each).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+
+    @EACH
+    def test_no_coefficients_vary(self, independence):
+        fit = random_fit()
+        fit.alpha[:] = 0.0
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        for each in result:
+            assert np.isfinite(each).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+
+    @EACH
+    def test_frames_whose_scale_would_be_negative(self, independence):
+        # Basis shapes with a part along the mean shape, and a frame far out on them.
+        fit = random_fit()
+        shapes = fit.shapes.copy()
+        shapes[1] -= 0.3 * shapes[0]
+        fit.alpha[7, 0] = 4.5
+        self.check_extreme(fit._replace(shapes=shapes), independence)
+
+    @staticmethod
+    def check_extreme(fit, independence):
+        """Without pure basis shapes, which they do not have, but as good and sound."""
+        result, deviation = canonical(fit, independence)
+        assert np.isfinite(deviation).all()
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1)
+        # No frame is turned inside out, or grows or shrinks beyond measure.
+        space = independent_gauge(*fit, independence).frames.space
+        scales = np.sum((space @ fit.frames()) * result.frames(), axis=(1, 2))
+        scales /= np.sum(result.frames() ** 2, axis=(1, 2))
+        assert scales.min() > 0.1
+        assert scales.max() < 10

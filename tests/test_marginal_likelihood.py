@@ -1,0 +1,459 @@
+"""The marginal likelihood of cameras, shapes and noise, and its derivatives."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+from scenes import random_rotation
+
+from isa_nrsfm._marginal_likelihood import MarginalLikelihood
+
+NOISE = 0.05
+STIFFNESS = 7.0
+
+
+class Scene(NamedTuple):
+    tracks: NDArray  # (n_frames, n_points, 2)
+    weights: NDArray | None  # (n_frames, n_points)
+    shapes: NDArray  # (n_components + 1, 3, n_points)
+    motion: NDArray  # (2, 3, n_frames)
+
+    def at(self, stiffness=0.0, noise=NOISE, **options):
+        """Return the objective and its derivatives."""
+        likelihood = MarginalLikelihood(self.tracks, self.weights, stiffness, **options)
+        return likelihood(self.shapes, self.motion, noise)
+
+
+def random_scene(kind, seed=0, n_frames=11, n_points=9, n_components=3):
+    """
+    Return a table and shapes and cameras that are near it, but not at the optimum.
+
+    The points are "complete", "weighted", or "missing": weighted and NaN at some.
+    """
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes[1:] *= 0.3
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = rng.normal(size=(2, 3, n_frames))
+    c = np.vstack([np.ones(n_frames), rng.normal(size=(n_components, n_frames))])
+    tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
+    tracks += 0.2 * rng.normal(size=tracks.shape)
+    weights = None
+    if kind != "complete":
+        weights = rng.uniform(0.2, 2.0, size=tracks.shape[:2])
+    if kind == "missing":
+        weights[rng.random(weights.shape) < 0.2] = 0.0
+        tracks[weights == 0] = np.nan
+    return Scene(tracks, weights, shapes, motion)
+
+
+def frame_by_frame(scene):
+    """
+    Yield for each frame its points and shapes, centred, missing points left out.
+
+    That is: the points (n, 2), the shapes (n_shapes, 3, n), the roots of the weights
+    (n,), the camera (2, 3), and which points are seen.
+    """
+    for i, frame in enumerate(scene.tracks):
+        w = np.ones(len(frame)) if scene.weights is None else scene.weights[i]
+        seen = w > 0
+        w = w[seen]
+        points = frame[seen] - np.average(frame[seen], axis=0, weights=w)
+        shapes = scene.shapes[:, :, seen]
+        middle = np.average(shapes, axis=2, weights=w)
+        yield points, shapes - middle[..., None], np.sqrt(w), scene.motion[..., i], seen
+
+
+def coefficients(points, shapes, root, M, noise):
+    """Return mean and covariance of alpha, given a frame, by dense linear algebra."""
+    images = [(root * (M @ B)).ravel() for B in shapes]
+    y, X = (root * points.T).ravel() - images[0], np.array(images[1:]).T
+    precision = X.T @ X / noise + np.eye(X.shape[1])
+    return np.linalg.solve(precision, X.T @ y / noise), np.linalg.inv(precision)
+
+
+def second_moments(scene, noise, stiffness):
+    """Yield E of each frame with what the stiffness adds to it, and the mean of c."""
+    for points, shapes, root, M, _ in frame_by_frame(scene):
+        alpha, covariance = coefficients(points, shapes, root, M, noise)
+        c = np.concatenate([[1.0], alpha])
+        E = np.outer(c, c)
+        E[1:, 1:] += covariance + noise * stiffness * np.eye(len(alpha))
+        yield E, c
+
+
+KINDS = pytest.mark.parametrize("kind", ["complete", "weighted", "missing"])
+STIFF = pytest.mark.parametrize("stiffness", [0.0, STIFFNESS])
+
+
+class TestValue:
+    @KINDS
+    def test_is_minus_two_log_of_the_normal_density_of_the_frames(self, kind):
+        # All coordinates of a frame at once: N(M B_0, s2 + sum_k M B_k (M B_k)^T).
+        scene = random_scene(kind)
+        expected = 0.0
+        for points, shapes, root, M, _ in frame_by_frame(scene):
+            images = np.array([(root * (M @ B)).ravel() for B in shapes])
+            y = (root * points.T).ravel() - images[0]
+            covariance = NOISE * np.eye(len(y)) + images[1:].T @ images[1:]
+            expected += np.linalg.slogdet(covariance)[1]
+            expected += y @ np.linalg.solve(covariance, y)
+        assert scene.at().value == pytest.approx(expected, rel=1e-12)
+
+    @KINDS
+    def test_stiffness_adds_the_energy_of_the_images_of_the_basis_shapes(self, kind):
+        scene = random_scene(kind)
+        energy = sum(
+            np.sum((root * (M @ shapes[1:])) ** 2)
+            for _, shapes, root, M, _ in frame_by_frame(scene)
+        )
+        added = scene.at(STIFFNESS).value - scene.at().value
+        assert added == pytest.approx(STIFFNESS * energy, rel=1e-12)
+
+    @KINDS
+    def test_coefficients_and_residual(self, kind):
+        scene = random_scene(kind)
+        passed = scene.at(STIFFNESS)
+        residual = 0.0
+        for i, (points, shapes, root, M, _) in enumerate(frame_by_frame(scene)):
+            alpha, _ = coefficients(points, shapes, root, M, NOISE)
+            assert_allclose(passed.alpha[:, i], alpha, rtol=1e-10, atol=1e-12)
+            model = M @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
+            residual += np.sum((root * (points.T - model)) ** 2)
+        assert passed.residual == pytest.approx(residual, rel=1e-11)
+
+    def test_counts_of_the_table(self):
+        scene = random_scene("missing")
+        likelihood = MarginalLikelihood(scene.tracks, scene.weights, 0.0)
+        assert likelihood.n_frames == len(scene.tracks)
+        assert likelihood.n_seen == np.isfinite(scene.tracks).sum()
+        energy = sum(
+            np.sum((root * points.T) ** 2)
+            for points, _, root, _, _ in frame_by_frame(scene)
+        )
+        assert likelihood.square == pytest.approx(energy, rel=1e-13)
+
+    def test_without_basis_shapes_it_is_the_likelihood_of_rigid_frames(self):
+        scene = random_scene("complete")
+        rigid = scene._replace(shapes=scene.shapes[:1])
+        energy = sum(
+            np.sum((points.T - M @ shapes[0]) ** 2)
+            for points, shapes, _, M, _ in frame_by_frame(scene)
+        )
+        expected = scene.tracks.size * np.log(NOISE) + energy / NOISE
+        assert rigid.at(STIFFNESS).value == pytest.approx(expected, rel=1e-12)
+
+
+class TestGradient:
+    @KINDS
+    @STIFF
+    @pytest.mark.parametrize("name", ["shapes", "motion"])
+    def test_against_differences(self, kind, stiffness, name):
+        scene = random_scene(kind)
+        gradient = getattr(
+            scene.at(stiffness),
+            {"shapes": "shape", "motion": "motion"}[name] + "_gradient",
+        )
+        rng = np.random.default_rng(1)
+        for _ in range(5):
+            change = rng.normal(size=gradient.shape)
+            step = 1e-5
+            above, below = (
+                scene._replace(**{name: getattr(scene, name) + sign * step * change})
+                for sign in (1, -1)
+            )
+            slope = (above.at(stiffness).value - below.at(stiffness).value) / (2 * step)
+            assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
+
+    @KINDS
+    @STIFF
+    def test_by_the_logarithm_of_the_noise_against_differences(self, kind, stiffness):
+        scene, step = random_scene(kind), 1e-5
+        above, below = (
+            scene.at(stiffness, NOISE * np.exp(sign * step)).value for sign in (1, -1)
+        )
+        gradient = scene.at(stiffness).noise_gradient
+        assert gradient == pytest.approx((above - below) / (2 * step), rel=1e-6)
+
+    @KINDS
+    def test_leaves_shapes_centred(self, kind):
+        # A shift of a shape moves all points of a frame by the same: nothing changes.
+        gradient = random_scene(kind).at(STIFFNESS).shape_gradient
+        assert_allclose(gradient.sum(axis=2), 0, atol=1e-10 * np.abs(gradient).max())
+
+
+class TestCurvature:
+    @KINDS
+    @STIFF
+    def test_of_the_shapes_at_each_point(self, kind, stiffness):
+        scene = random_scene(kind)
+        got = scene.at(stiffness).shape_curvature
+        n_shapes, _, n_points = scene.shapes.shape
+        expected = np.zeros((n_points, 3 * n_shapes, 3 * n_shapes))
+        weights = 1.0 if scene.weights is None else scene.weights
+        weights = np.broadcast_to(weights, scene.tracks.shape[:2])
+        moments = second_moments(scene, NOISE, stiffness)
+        for i, (E, _) in enumerate(moments):
+            M = scene.motion[..., i]
+            expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
+        assert got.shape[0] == (1 if kind == "complete" else n_points)
+        assert_allclose(np.broadcast_to(got, expected.shape), expected, rtol=1e-10)
+
+    @KINDS
+    @STIFF
+    def test_of_the_cameras(self, kind, stiffness):
+        scene = random_scene(kind)
+        got = scene.at(stiffness).motion_curvature
+        moments = second_moments(scene, NOISE, stiffness)
+        frames = frame_by_frame(scene)
+        for i, ((E, _), (_, shapes, root, _, _)) in enumerate(
+            zip(moments, frames, strict=True)
+        ):
+            weighted = root * shapes
+            A = np.einsum("kl,kaj,lbj->ab", E, weighted, weighted)
+            packed = [A[0, 0], A[1, 1], A[2, 2], A[0, 1], A[0, 2], A[1, 2]]
+            assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
+
+    @STIFF
+    def test_newton_steps_with_them_are_those_of_expectation_maximisation(
+        self, stiffness
+    ):
+        # M_i = (sum_k c_ik W_i B_k^T) A_i^-1 for the shapes held, and
+        # B = N^-1 sum_i (c_i (x) M_i^T) W_i for the cameras held.
+        scene = random_scene("complete")
+        passed = scene.at(stiffness)
+        n_shapes = len(scene.shapes)
+        N = np.zeros((3 * n_shapes, 3 * n_shapes))
+        R = np.zeros((3 * n_shapes, scene.tracks.shape[1]))
+        moments = second_moments(scene, NOISE, stiffness)
+        for i, (E, c) in enumerate(moments):
+            W = scene.tracks[i].T - scene.tracks[i].mean(axis=0)[:, None]
+            A = np.einsum("kl,kaj,lbj->ab", E, scene.shapes, scene.shapes)
+            Y = np.einsum("k,rj,kaj->ra", c, W, scene.shapes)
+            step = NOISE / 2 * passed.motion_gradient[..., i] @ np.linalg.inv(A)
+            assert_allclose(scene.motion[..., i] - step, Y @ np.linalg.inv(A))
+            M = scene.motion[..., i]
+            N += np.kron(E, M.T @ M)
+            R += np.kron(c[:, None], M.T) @ W
+        step = np.linalg.solve(
+            passed.shape_curvature[0],
+            NOISE / 2 * passed.shape_gradient.reshape(len(N), -1),
+        )
+        moved = scene.shapes.reshape(len(N), -1) - step
+        assert_allclose(moved, np.linalg.solve(N, R), atol=1e-10)
+
+    @STIFF
+    def test_noise_of_expectation_maximisation(self, stiffness):
+        # The noise gradient vanishes where s2 is the mean of the expected residual.
+        scene = random_scene("missing")
+        passed = scene.at(stiffness)
+        expected = passed.residual
+        for points, shapes, root, M, _ in frame_by_frame(scene):
+            images = np.array([(root * (M @ B)).ravel() for B in shapes[1:]])
+            covariance = coefficients(points, shapes, root, M, NOISE)[1]
+            expected += np.trace(images.T @ covariance @ images)
+        n_seen = np.isfinite(scene.tracks).sum()
+        assert passed.noise_gradient == pytest.approx(n_seen - expected / NOISE)
+
+
+def assert_same(got, expected, but=()):
+    """Assert that two passes agree up to rounding, in all fields but those named."""
+    for name, one, other in zip(got._fields, got, expected, strict=True):
+        if name not in but:
+            scale = np.abs(other).max()
+            assert_allclose(one, other, rtol=1e-9, atol=1e-11 * scale, err_msg=name)
+
+
+class TestBlocks:
+    @KINDS
+    @pytest.mark.parametrize("size", [1, 4, 11, 50])
+    def test_size_makes_no_difference(self, kind, size):
+        scene = random_scene(kind)
+        whole = scene.at(STIFFNESS, block_frames=len(scene.tracks))
+        assert_same(scene.at(STIFFNESS, block_frames=size), whole)
+
+    def test_default_size_is_passed(self):
+        # More frames than a block has: the cameras are dealt out in the right order.
+        scene = random_scene("complete", n_frames=2100, n_points=4, n_components=1)
+        whole = scene.at(STIFFNESS, block_frames=2100)
+        assert len(MarginalLikelihood(scene.tracks, None, 0.0).blocks) == 3
+        assert_same(scene.at(STIFFNESS), whole)
+
+    @KINDS
+    def test_memory_order_makes_no_difference(self, kind):
+        scene = random_scene(kind)
+        other = scene._replace(
+            tracks=np.asfortranarray(scene.tracks),
+            shapes=np.asfortranarray(scene.shapes),
+            motion=np.ascontiguousarray(scene.motion.transpose(2, 0, 1)).transpose(
+                1, 2, 0
+            ),
+        )
+        assert_same(other.at(STIFFNESS), scene.at(STIFFNESS))
+
+
+class TestWeights:
+    def test_of_one_are_none(self):
+        scene = random_scene("complete")
+        ones = scene._replace(weights=np.ones(scene.tracks.shape[:2]))
+        got, expected = ones.at(STIFFNESS), scene.at(STIFFNESS)
+        n_points = scene.tracks.shape[1]
+        same = np.repeat(expected.shape_curvature, n_points, axis=0)
+        assert_same(got, expected._replace(shape_curvature=same))
+
+    @pytest.mark.parametrize("hidden", [np.nan, 1e6])
+    def test_of_zero_leave_a_point_out(self, hidden):
+        # Whatever the table holds there.
+        scene = random_scene("weighted")
+        weights, tracks = scene.weights.copy(), scene.tracks.copy()
+        weights[:, 2], tracks[:, 2] = 0.0, hidden
+        kept = np.arange(weights.shape[1]) != 2
+        got = scene._replace(weights=weights, tracks=tracks).at(STIFFNESS)
+        expected = Scene(
+            scene.tracks[:, kept],
+            scene.weights[:, kept],
+            scene.shapes[:, :, kept],
+            scene.motion,
+        ).at(STIFFNESS)
+        assert_allclose(got.shape_gradient[:, :, 2], 0, atol=1e-12)
+        assert_allclose(got.shape_curvature[2], 0, atol=1e-12)
+        got = got._replace(
+            shape_gradient=got.shape_gradient[:, :, kept],
+            shape_curvature=got.shape_curvature[kept],
+        )
+        assert_same(got, expected)
+
+    def test_are_inverse_variances(self):
+        # All of them times w is noise divided by w, but for the count of log s2; the
+        # price of the stiffness is per weighted energy.
+        scene = random_scene("missing")
+        n_seen = np.isfinite(scene.tracks).sum()
+        doubled = scene._replace(weights=2 * scene.weights)
+        got, expected = doubled.at(0.0, 2 * NOISE), scene.at(0.0, NOISE)
+        assert got.value == pytest.approx(expected.value + n_seen * np.log(2))
+        for name in ("alpha", "shape_gradient", "motion_gradient", "noise_gradient"):
+            assert_allclose(
+                getattr(got, name), getattr(expected, name), rtol=1e-9, atol=1e-9
+            )
+
+
+class TestInvariances:
+    """Of the model, with the stiffness, which shares them."""
+
+    @KINDS
+    def test_affinity_of_space(self, kind):
+        scene = random_scene(kind)
+        A = np.random.default_rng(1).normal(size=(3, 3))
+        other = scene._replace(
+            shapes=np.einsum("ab,kbj->kaj", A, scene.shapes),
+            motion=np.einsum("rbi,ba->rai", scene.motion, np.linalg.inv(A)),
+        )
+        got, expected = other.at(STIFFNESS), scene.at(STIFFNESS)
+        for name in ("value", "alpha", "residual", "noise_gradient"):
+            assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-8)
+
+    @KINDS
+    def test_rotation_of_the_coefficients(self, kind):
+        scene = random_scene(kind)
+        Q = random_rotation(1)
+        shapes = scene.shapes.copy()
+        shapes[1:] = np.tensordot(Q, shapes[1:], 1)
+        got = scene._replace(shapes=shapes).at(STIFFNESS)
+        expected = scene.at(STIFFNESS)
+        assert_allclose(got.value, expected.value, rtol=1e-12)
+        assert_allclose(got.alpha, Q @ expected.alpha, atol=1e-10)
+        assert_allclose(got.motion_gradient, expected.motion_gradient, atol=1e-8)
+
+    def test_other_mixings_of_the_coefficients_do_matter(self):
+        # The prior fixes their scale.
+        scene = random_scene("complete")
+        shapes = scene.shapes.copy()
+        shapes[1] *= 1.1
+        assert abs(scene._replace(shapes=shapes).at().value - scene.at().value) > 1e-2
+
+    @KINDS
+    def test_rotation_of_single_frames(self, kind):
+        scene = random_scene(kind)
+        angle = np.random.default_rng(1).uniform(0, 2 * np.pi, len(scene.tracks))
+        c, s = np.cos(angle), np.sin(angle)
+        R = np.array([[c, -s], [s, c]])
+        other = scene._replace(
+            tracks=np.einsum("rci,ijc->ijr", R, scene.tracks),
+            motion=np.einsum("rci,cai->rai", R, scene.motion),
+        )
+        turned = scene.at(STIFFNESS)
+        turned = turned._replace(
+            motion_gradient=np.einsum("rci,cai->rai", R, turned.motion_gradient)
+        )
+        assert_same(other.at(STIFFNESS), turned)
+
+    @KINDS
+    def test_place_of_single_frames(self, kind):
+        scene = random_scene(kind)
+        shift = np.random.default_rng(1).normal(size=(len(scene.tracks), 1, 2))
+        moved = scene._replace(tracks=scene.tracks + 3 * shift)
+        assert_same(moved.at(STIFFNESS), scene.at(STIFFNESS))
+
+    @KINDS
+    def test_order_of_frames_and_points(self, kind):
+        scene = random_scene(kind)
+        rng = np.random.default_rng(1)
+        frames = rng.permutation(len(scene.tracks))
+        points = rng.permutation(scene.tracks.shape[1])
+        weights = scene.weights
+        other = Scene(
+            scene.tracks[frames][:, points],
+            None if weights is None else weights[frames][:, points],
+            scene.shapes[..., points],
+            scene.motion[..., frames],
+        )
+        expected = scene.at(STIFFNESS)
+        curvature = expected.shape_curvature
+        expected = expected._replace(
+            shape_gradient=expected.shape_gradient[..., points],
+            motion_gradient=expected.motion_gradient[..., frames],
+            shape_curvature=curvature if weights is None else curvature[points],
+            motion_curvature=expected.motion_curvature[:, frames],
+            alpha=expected.alpha[:, frames],
+        )
+        assert_same(other.at(STIFFNESS), expected)
+
+    @KINDS
+    def test_unit_of_the_table(self, kind):
+        scene = random_scene(kind)
+        n_seen = np.isfinite(scene.tracks).sum()
+        got = scene._replace(tracks=10 * scene.tracks, motion=10 * scene.motion).at(
+            noise=100 * NOISE
+        )
+        expected = scene.at()
+        assert got.value == pytest.approx(expected.value + n_seen * np.log(100))
+        assert_allclose(got.alpha, expected.alpha, rtol=1e-9)
+        assert_allclose(got.shape_gradient, expected.shape_gradient, atol=1e-7)
+
+
+class TestDegenerate:
+    @KINDS
+    @pytest.mark.parametrize("part", ["basis", "cameras", "shapes", "equal"])
+    def test_values_are_finite(self, kind, part):
+        scene = random_scene(kind)
+        shapes, motion = scene.shapes.copy(), scene.motion.copy()
+        if part == "basis":
+            shapes[1:] = 0.0
+        elif part == "cameras":
+            motion[..., 3] = 0.0
+        elif part == "shapes":
+            shapes[:, 2] = 0.0
+        else:
+            shapes[2] = shapes[1]
+        for each in scene._replace(shapes=shapes, motion=motion).at(STIFFNESS):
+            assert np.isfinite(each).all()
+
+    def test_basis_shapes_of_zero_have_coefficients_of_zero(self):
+        scene = random_scene("missing")
+        shapes = scene.shapes * np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]
+        passed = scene._replace(shapes=shapes).at()
+        rigid = scene._replace(shapes=scene.shapes[:1]).at()
+        assert_allclose(passed.alpha, 0, atol=1e-12)
+        assert passed.value == pytest.approx(rigid.value)

@@ -1,0 +1,240 @@
+"""The metric of space that affine cameras show, and how far they are from one."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._metric import (
+    LARGEST_STRETCH,
+    anisotropy,
+    mean_gram,
+    metric_quadric,
+    symmetric_power,
+    unit_cameras,
+)
+
+
+def rotations(rng, n_frames, spread=0.6):
+    return Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3))).as_matrix()
+
+
+def affinity(rng):
+    """A stretch between 1/2 and 2 with any axes and handedness."""
+    left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in "ab")
+    return left @ np.diag([0.5, 1.0, 2.0]) @ right
+
+
+def weak_perspective(rng, n_frames=30, scales=None):
+    scales = rng.uniform(1, 5, n_frames) if scales is None else scales
+    return np.asarray(scales)[:, None, None] * rotations(rng, n_frames)[:, :2]
+
+
+def lorentz_cameras(rng, n_frames=30):
+    """Rows that are orthonormal in the metric diag(1, 1, -1), which is indefinite."""
+    angle = rng.uniform(0, 2 * np.pi, n_frames)
+    boost = 0.5 * rng.standard_normal(n_frames)
+    turn = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    squeeze = np.zeros((n_frames, 3, 3))
+    squeeze[:, 0, 0] = squeeze[:, 2, 2] = np.cosh(boost)
+    squeeze[:, 0, 2] = squeeze[:, 2, 0] = np.sinh(boost)
+    squeeze[:, 1, 1] = 1
+    return (squeeze @ turn)[:, :2]
+
+
+def rolled_and_scaled(rng, motion, scales=None):
+    """Turn each image and change its unit."""
+    angle = rng.uniform(0, 2 * np.pi, len(motion))
+    roll = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    if scales is None:
+        scales = rng.uniform(0.1, 10, (len(motion), 1, 1))
+    return scales * (roll.transpose(2, 0, 1) @ motion)
+
+
+def noisy_cameras(rng, n_frames=30):
+    return weak_perspective(rng, n_frames) + 0.3 * rng.standard_normal((n_frames, 2, 3))
+
+
+def residuals(Q, motion):
+    unit = motion / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
+    B = unit @ Q @ unit.transpose(0, 2, 1)
+    return np.stack([B[:, 0, 0] - B[:, 1, 1], 2 * B[:, 0, 1]])
+
+
+def least_squares_metric(motion):
+    """Return Q of least residuals and mean scale one, by its Lagrange equations."""
+    basis = [np.zeros((3, 3)) for _ in range(6)]
+    for Q, (a, b) in zip(basis, zip(*np.triu_indices(3), strict=True), strict=True):
+        Q[a, b] = Q[b, a] = 1.0
+    A = np.array([residuals(Q, motion).ravel() for Q in basis]).T
+    t = np.array([mean_scale(Q, motion) for Q in basis])
+    equations = np.block([[A.T @ A, t[:, None]], [t, 0.0]])
+    unknowns = np.linalg.solve(equations, np.eye(7)[6])[:6]
+    return np.tensordot(unknowns, basis, 1)
+
+
+def mean_scale(Q, motion):
+    unit = motion / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
+    return np.trace(np.mean(unit @ Q @ unit.transpose(0, 2, 1), axis=0))
+
+
+class TestMetricQuadric:
+    @pytest.mark.parametrize("n_frames", [3, 30])
+    def test_of_weak_perspective_cameras_is_the_metric(self, n_frames):
+        rng = np.random.default_rng(0)
+        A = affinity(rng)
+        Q = metric_quadric(weak_perspective(rng, n_frames) @ np.linalg.inv(A))
+        expected = A @ A.T
+        assert_allclose(Q / np.trace(Q), expected / np.trace(expected), atol=1e-9)
+
+    def test_is_the_least_squares_solution(self):
+        rng = np.random.default_rng(3)
+        motion = noisy_cameras(rng)
+        Q = metric_quadric(motion)
+        assert_allclose(Q, least_squares_metric(motion), atol=1e-9)
+        assert mean_scale(Q, motion) == pytest.approx(1)
+        least = np.sum(residuals(Q, motion) ** 2)
+        assert least > 1e-3
+        for _ in range(50):
+            step = rng.standard_normal((3, 3))
+            other = Q + 1e-2 * np.linalg.norm(Q) * (step + step.T)
+            other /= mean_scale(other, motion)
+            assert np.sum(residuals(other, motion) ** 2) > least
+
+    def test_does_not_depend_on_roll_and_scale_of_the_frames(self):
+        rng = np.random.default_rng(4)
+        motion = noisy_cameras(rng)
+        other = rolled_and_scaled(rng, motion)
+        assert_allclose(metric_quadric(other), metric_quadric(motion), rtol=1e-9)
+
+    def test_little_depth_is_not_taken_for_none(self):
+        # Faces that hardly turn: a solution that keeps the norm of Q constant, not the
+        # size of the cameras, would let depth vanish.
+        rng = np.random.default_rng(5)
+        cameras = rotations(rng, 2000, spread=0.1)[:, :2]
+        noise = 0.02 * rng.standard_normal(cameras.shape) * [1, 1, 0.1]
+        eigenvalues = np.linalg.eigvalsh(metric_quadric(cameras + noise))
+        assert_allclose(eigenvalues, eigenvalues.mean(), rtol=0.3)
+
+    def test_cameras_that_say_nothing_about_depth_have_none(self):
+        rng = np.random.default_rng(6)
+        same = np.repeat(rng.standard_normal((1, 2, 3)), 10, axis=0)
+        assert metric_quadric(same) is None
+        assert metric_quadric(weak_perspective(rng, 2)) is None
+
+    def test_indefinite_solutions_are_refused(self):
+        assert metric_quadric(lorentz_cameras(np.random.default_rng(7))) is None
+
+    def test_extreme_stretches_are_refused(self):
+        motion = weak_perspective(np.random.default_rng(8))
+        for stretch, found in (
+            (0.9 * LARGEST_STRETCH, True),
+            (2 * LARGEST_STRETCH, False),
+        ):
+            Q = metric_quadric(motion @ np.diag([1, 1, stretch]))
+            assert (Q is not None) == found
+
+    def test_leaves_out_frames_without_camera(self):
+        rng = np.random.default_rng(9)
+        motion = noisy_cameras(rng)
+        nothing = [np.full((1, 2, 3), value) for value in (np.nan, 0.0)]
+        assert_allclose(
+            metric_quadric(np.concatenate([motion, *nothing])), metric_quadric(motion)
+        )
+
+
+class TestAnisotropy:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_of_weak_perspective_cameras_is_zero_in_any_coordinates(self, seed):
+        rng = np.random.default_rng(seed)
+        motion = weak_perspective(rng)
+        assert anisotropy(motion) < 1e-7
+        assert anisotropy(motion @ affinity(rng)) < 1e-7
+
+    @pytest.mark.parametrize("cameras", ["noisy", "lorentz"])
+    def test_by_the_singular_values_in_the_metric(self, cameras):
+        # Of least squares in the space in which the cameras see all directions alike;
+        # that of the Lorentz cameras is indefinite.
+        rng = np.random.default_rng(0)
+        motion = noisy_cameras(rng) if cameras == "noisy" else lorentz_cameras(rng)
+        white = motion @ np.linalg.inv(symmetric_power(mean_gram(motion), 0.5))
+        stretch, axes = np.linalg.eigh(least_squares_metric(white))
+        assert (stretch[0] > 0) == (cameras == "noisy")
+        stretch = np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)
+        s1, s2 = np.linalg.svd(white @ axes * np.sqrt(stretch), compute_uv=False).T
+        expected = np.sqrt(np.mean(((s1**2 - s2**2) / (s1**2 + s2**2)) ** 2))
+        assert 0.1 < expected < 0.9
+        assert anisotropy(motion) == pytest.approx(expected, rel=1e-9)
+
+    @pytest.mark.parametrize("squeeze", [0.9, 0.5])
+    def test_of_images_that_are_squeezed_along_any_axis(self, squeeze):
+        # The axis is different in each image, so that no metric of space explains it.
+        rng = np.random.default_rng(1)
+        cameras = Rotation.random(5000, random_state=2).as_matrix()[:, :2]
+        squeezed = np.array([[1.0], [squeeze]]) * cameras
+        expected = (1 - squeeze**2) / (1 + squeeze**2)
+        motion = rolled_and_scaled(rng, squeezed)
+        assert anisotropy(motion) == pytest.approx(expected, rel=0.02)
+
+    def test_does_not_depend_on_roll_and_unit_of_the_frames(self):
+        rng = np.random.default_rng(4)
+        motion = noisy_cameras(rng)
+        other = 10 * rolled_and_scaled(rng, motion, 1.0)
+        assert anisotropy(other) == pytest.approx(anisotropy(motion), rel=1e-9)
+
+    @pytest.mark.parametrize("stretch", [1.0, 30.0])
+    def test_does_not_depend_on_the_affinity(self, stretch):
+        rng = np.random.default_rng(4)
+        motion = noisy_cameras(rng) @ np.diag([1.0, 1.0, stretch])
+        other = anisotropy(motion @ affinity(rng))
+        assert other == pytest.approx(anisotropy(motion), rel=1e-6)
+
+    def test_is_zero_where_the_metric_is_not_determined(self):
+        rng = np.random.default_rng(6)
+        same = np.repeat(rng.standard_normal((1, 2, 3)), 10, axis=0)
+        assert anisotropy(same) == 0.0
+        assert anisotropy(weak_perspective(rng, 2)) == 0.0
+
+    def test_without_cameras_the_metric_is_not_determined(self):
+        assert anisotropy(np.zeros((5, 2, 3))) == 0.0
+
+    def test_of_cameras_that_see_a_line_is_one(self):
+        rng = np.random.default_rng(8)
+        axes = rng.standard_normal((30, 1, 3))
+        motion = rng.standard_normal((30, 2, 1)) * axes
+        assert anisotropy(motion) == pytest.approx(1.0)
+
+    @pytest.mark.parametrize("value", [np.nan, 0.0])
+    def test_leaves_out_frames_without_camera(self, value):
+        motion = noisy_cameras(np.random.default_rng(9))
+        more = np.concatenate([motion, np.full((3, 2, 3), value)])
+        assert anisotropy(more) == pytest.approx(anisotropy(motion))
+
+
+class TestParts:
+    def test_unit_cameras(self):
+        rng = np.random.default_rng(0)
+        motion = rng.standard_normal((5, 2, 3))
+        motion[1], motion[3, 0, 2] = 0.0, np.nan
+        unit = unit_cameras(motion)
+        assert_allclose(np.linalg.norm(unit, axis=(1, 2)), 1)
+        for got, given in zip(unit, motion[[0, 2, 4]], strict=True):
+            assert_allclose(got * np.linalg.norm(given), given)
+        with pytest.raises(ValueError, match="none among the 2 cameras"):
+            unit_cameras(motion[[1, 3]])
+
+    def test_mean_gram(self):
+        motion = np.random.default_rng(0).standard_normal((5, 2, 3))
+        expected = np.mean([M.T @ M for M in motion], axis=0)
+        assert_allclose(mean_gram(motion), expected)
+
+    @pytest.mark.parametrize("power", [0.5, -0.5, -1.0])
+    def test_symmetric_power(self, power):
+        root = np.random.default_rng(0).standard_normal((3, 3))
+        matrix = root @ root.T
+        got = symmetric_power(matrix, power)
+        assert_allclose(got, got.T)
+        assert_allclose(
+            np.linalg.matrix_power(got, 2 if abs(power) == 0.5 else 1),
+            matrix if power > 0 else np.linalg.inv(matrix),
+        )

@@ -1,0 +1,390 @@
+"""Independent signals with the same mixing of all coordinates."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import random_rotation
+from scipy.integrate import quad
+from scipy.linalg import expm
+from scipy.optimize import linear_sum_assignment
+
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.isa import _shared_mixing
+from isa_nrsfm.isa._shared_mixing import (
+    LIGHT,
+    TAILS,
+    independent_coefficients,
+    shared_mixing,
+)
+
+
+def sources(kinds, seed, n_samples, size):
+    """Return centred sources of mean square 1, one of each kind."""
+    rng = np.random.default_rng(seed)
+    drawn = []
+    for kind in kinds:
+        y = rng.normal(size=(n_samples, size))
+        if kind == "product":
+            y *= rng.normal(size=(n_samples, 1))
+        elif kind == "student":
+            y /= np.sqrt(rng.chisquare(3, size=(n_samples, 1)))
+        elif kind == "laplace":
+            y *= np.sqrt(rng.exponential(size=(n_samples, 1)))
+        elif kind == "uniform":
+            y = rng.uniform(-1.0, 1.0, size=(n_samples, size))
+        else:
+            assert kind == "gaussian"
+        drawn.append(y)
+    return standardise(np.stack(drawn))
+
+
+def standardise(signals):
+    """Return signals centred over the samples, of mean square 1."""
+    centred = signals - signals.mean(axis=1, keepdims=True)
+    return centred / np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
+
+
+def random_mixing(seed, n, condition=30.0):
+    """Return a matrix of given condition number."""
+    scale = np.geomspace(1.0, condition, n)
+    return random_rotation(seed, n) * scale @ random_rotation(seed + 1, n)
+
+
+def unmix(signals):
+    """Return the independent signals."""
+    return np.tensordot(shared_mixing(signals), signals, 1)
+
+
+def matched(truth, recovered):
+    """Return the recovered signals in the order and with the signs of the truth."""
+    a, b = truth.reshape(len(truth), -1), recovered.reshape(len(truth), -1)
+    products = a @ b.T
+    row, column = linear_sum_assignment(-np.abs(products))
+    sign = np.where(products[row, column] < 0, -1.0, 1.0)
+    return sign[:, None, None] * recovered[column]
+
+
+def cosines(truth, recovered):
+    """Return the cosine of each true signal with the recovered one."""
+    found = matched(truth, recovered)
+    product = np.sum(truth * found, axis=(1, 2))
+    size = np.sum(truth**2, axis=(1, 2)) * np.sum(found**2, axis=(1, 2))
+    return product / np.sqrt(size)
+
+
+def white(signals):
+    """Return white signals."""
+    whitening, _ = _shared_mixing._whitening(signals.reshape(len(signals), -1))
+    return np.tensordot(whitening, signals, 1)
+
+
+class TestRecovery:
+    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize(
+        ("n_components", "n_points", "least"),
+        [(2, 68, 0.97), (5, 68, 0.95), (9, 500, 0.99)],
+    )
+    def test_basis_shapes(self, n_components, n_points, least, seed):
+        truth = make_nonrigid_tracks(
+            n_frames=10, n_points=n_points, n_components=n_components, random_state=seed
+        ).basis
+        mixed = np.tensordot(random_mixing(seed, n_components), truth, 1)
+        assert cosines(truth, unmix(mixed)).min() > least
+
+    @pytest.mark.parametrize("n_components", [3, 5])
+    @pytest.mark.parametrize(("n_frames", "least"), [(400, 0.96), (1500, 0.99)])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_coefficients(self, n_components, n_frames, least, seed):
+        truth = make_nonrigid_tracks(
+            n_frames=n_frames,
+            n_components=n_components,
+            coefficients="heavy_tailed",
+            random_state=seed,
+        ).alpha
+        mixed = truth @ random_mixing(seed, n_components).T
+        found = mixed @ independent_coefficients(mixed).T
+        assert cosines(truth.T[..., None], found.T[..., None]).min() > least
+
+    @pytest.mark.parametrize("size", [1, 2, 3])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_heavy_light_and_gaussian_tails_together(self, size, seed):
+        kinds = ["product", "gaussian", "uniform", "student", "laplace", "uniform"]
+        truth = sources(kinds, seed, 1500, size)
+        mixed = np.tensordot(random_mixing(seed, len(kinds)), truth, 1)
+        assert cosines(truth, unmix(mixed)).min() > 0.97
+
+    def test_mirrored_halves(self):
+        # The left and the right side move on their own. Their sums and differences are
+        # uncorrelated too, and a stationary point of the likelihood.
+        flip = np.array([-1.0, 1.0, 1.0])
+        side = sources(["product"] * 3, 0, 34, 3)
+        left = np.concatenate([side, 0.02 * side * flip], axis=1)
+        right = np.roll(left, 34, axis=1) * flip
+        truth = standardise(np.concatenate([left, right]))
+        mixed = np.concatenate([truth[:3] + truth[3:], truth[:3] - truth[3:]])
+        assert cosines(truth, unmix(mixed)).min() > 0.99
+
+    def test_coefficients_with_labels(self, load_data):
+        data = load_data("ict_bu3dfe_like_68")
+        shapes = data["S3d"].reshape(len(data["S3d"]), -1)
+        U, S, _ = np.linalg.svd(shapes - shapes.mean(axis=0), full_matrices=False)
+        alpha = U[:, :9] * S[:9]
+        found = alpha @ independent_coefficients(alpha).T
+        label = data["labels"][:, None] == np.unique(data["labels"])
+        means = label.T @ found / label.sum(axis=0)[:, None]
+        share = label.sum(axis=0) @ means**2 / len(found)  # the variance is 1
+        assert np.sum(share > 0.5) >= 3
+        assert np.sum(share < 0.05) >= 4
+
+
+class TestReturned:
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_mean_square_and_third_moment(self, size):
+        Y = unmix(sources(["product", "student", "uniform"], 0, 200, size))
+        assert_allclose(np.mean(Y**2, axis=(1, 2)), 1.0, rtol=1e-12)
+        assert np.all(np.sum(Y**3, axis=(1, 2)) >= 0.0)
+
+    def test_least_gaussian_first(self):
+        truth = sources(["gaussian", "product", "laplace"], 0, 5000, 3)
+        found = unmix(truth)
+        for k, true in enumerate([1, 2, 0]):
+            assert abs(np.mean(found[k] * truth[true])) > 0.99
+
+    def test_variance_and_shift_of_coefficients(self):
+        alpha = np.random.default_rng(0).laplace(size=(300, 3))
+        W = independent_coefficients(alpha)
+        assert_allclose(np.std(alpha @ W.T, axis=0), 1.0, rtol=1e-12)
+        shift = np.array([5.0, 0.0, -3.0])
+        assert_allclose(independent_coefficients(alpha + shift), W)
+
+    def test_coefficients_and_basis_give_the_same_shapes(self):
+        rng = np.random.default_rng(0)
+        alpha, basis = rng.laplace(size=(300, 3)), rng.normal(size=(3, 20, 3))
+        W = independent_coefficients(alpha)
+        new = np.tensordot(alpha @ W.T, np.tensordot(np.linalg.inv(W).T, basis, 1), 1)
+        assert_allclose(new, np.tensordot(alpha, basis, 1), atol=1e-10)
+
+    def test_number_of_starts_and_seed_do_not_matter_for_a_clear_optimum(self):
+        signals = sources(["product"] * 4, 0, 200, 3)
+        for arguments in ({"n_starts": 1}, {"n_starts": 3}, {"random_state": 5}):
+            W = shared_mixing(signals, **arguments)
+            assert_allclose(W, shared_mixing(signals), atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        ["product"] * 4,
+        ["student", "product", "gaussian", "uniform"],
+        ["gaussian"] * 4,
+    ],
+    ids=["heavy", "mixed", "gaussian"],
+)
+class TestInvariance:
+    def signals(self, kinds, size, seed):
+        return sources(kinds, seed, 200 if size == 1 else 68, size)
+
+    def test_to_the_basis(self, kinds, size, seed):
+        signals = self.signals(kinds, size, seed)
+        mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
+        found = unmix(signals)
+        assert_allclose(matched(found, unmix(1e-6 * mixed)), found, atol=1e-7)
+
+    def test_to_the_order_of_samples(self, kinds, size, seed):
+        signals = self.signals(kinds, size, seed)
+        order = np.random.default_rng(seed).permutation(signals.shape[1])
+        found = unmix(signals)[:, order]
+        assert_allclose(matched(found, unmix(signals[:, order])), found, atol=1e-7)
+
+    def test_to_a_common_rotation_or_reflection(self, kinds, size, seed):
+        signals = self.signals(kinds, size, seed)
+        R = -random_rotation(seed, size)
+        found = unmix(signals) @ R
+        assert_allclose(matched(found, unmix(signals @ R)), found, atol=1e-7)
+
+    def test_to_the_memory_order(self, kinds, size, seed):
+        signals = self.signals(kinds, size, seed)
+        expected = shared_mixing(signals)
+        assert_array_equal(shared_mixing(np.asfortranarray(signals)), expected)
+        assert_array_equal(shared_mixing(signals.copy()), expected)
+
+
+class TestOptimality:
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_no_mixing_near_by_is_likelier(self, size):
+        Z = white(sources(["product", "uniform", "student", "laplace"], 0, 200, size))
+        W = shared_mixing(Z)
+        most = _shared_mixing._fit_densities(W, Z).total
+        rng = np.random.default_rng(0)
+        for _ in range(50):
+            E = 1e-3 * rng.normal(size=W.shape)
+            assert _shared_mixing._fit_densities(W + E @ W, Z).total < most
+
+    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_likelier_than_the_truth(self, size, seed):
+        truth = sources(["product", "student", "uniform", "laplace"], seed, 200, size)
+        W = shared_mixing(truth)
+        found = _shared_mixing._fit_densities(W, truth).total
+        assert found > _shared_mixing._fit_densities(np.eye(4), truth).total
+
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_newton_steps_end_at_a_maximum(self, size):
+        Z = white(sources(["product", "uniform", "student"], 0, 200, size))
+        tails = np.array([2.0, LIGHT, 4.0])
+        for seed in range(5):
+            W = _shared_mixing._newton(random_rotation(seed, 3), Z, tails)
+            Y = np.tensordot(W, Z, 1)
+            slopes = _shared_mixing._slopes(np.sum(Y**2, axis=2), tails[:, None], size)
+            gradient, hessian = _shared_mixing._relative_derivatives(Y, *slopes)
+            assert_allclose(gradient, 0.0, atol=1e-9)
+            assert np.linalg.eigvalsh(hessian.reshape(9, 9)).max() < 0.0
+
+    def test_derivatives_by_differences(self):
+        rng = np.random.default_rng(0)
+        Y, tail = rng.normal(size=(3, 40, 3)), np.array([[2.0], [LIGHT], [8.0]])
+
+        def likelihood(E):
+            W = np.eye(3) + E
+            u = np.sum(np.tensordot(W, Y, 1) ** 2, axis=2)
+            F = _shared_mixing._log_density(u, tail, 3).mean(axis=1).sum()
+            return F + 3 * np.linalg.slogdet(W)[1]
+
+        slopes = _shared_mixing._slopes(np.sum(Y**2, axis=2), tail, 3)
+        gradient, hessian = _shared_mixing._relative_derivatives(Y, *slopes)
+        h = 1e-4
+        for _ in range(5):
+            E = rng.normal(size=(3, 3))
+            up, here, down = (likelihood(s * h * E) for s in (1, 0, -1))
+            first, second = (up - down) / (2 * h), (up - 2 * here + down) / h**2
+            assert_allclose(np.sum(gradient * E), first, rtol=1e-6, atol=1e-6)
+            curvature = np.einsum("ka,kalb,lb->", E, hessian, E)
+            assert_allclose(curvature, second, rtol=1e-4)
+
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_fixed_point_converges_fast(self, size, monkeypatch):
+        Z = white(sources(["laplace"] * 3, 0, 20_000, size))
+        monkeypatch.setattr(_shared_mixing, "FIXED_POINT_STEPS", 30)
+        end = _shared_mixing._fixed_point(shared_mixing(Z)[None], Z)
+        turned = expm(0.1 * (np.eye(3, k=1) - np.eye(3, k=-1))) @ end
+        monkeypatch.setattr(_shared_mixing, "FIXED_POINT_STEPS", 1)
+        after = _shared_mixing._fixed_point(turned, Z)
+        error = [np.abs(W @ end[0].T - np.eye(3)).max() for W in (turned, after)]
+        assert error[1] < 0.1 * error[0]
+
+    def test_more_starts_find_likelier_signals(self):
+        gains = []
+        for seed in range(4):
+            Z = white(sources(["gaussian"] * 5, seed, 68, 3))
+            few, many = (
+                _shared_mixing._fit_densities(shared_mixing(Z, n_starts=n), Z).total
+                for n in (1, 8)
+            )
+            gains.append(many - few)
+        assert np.max(gains) > 1e-3
+        assert np.mean(gains) > 0.0
+
+
+class TestDensities:
+    @pytest.mark.parametrize("tail", TAILS)
+    def test_slopes_by_differences(self, tail):
+        u, tail, h = np.linspace(0.1, 20.0, 50), np.array(tail), 1e-5
+        g, dg = _shared_mixing._slopes(u, tail, 3)
+        F = [_shared_mixing._log_density(u + s, tail, 3) for s in (h, -h)]
+        assert_allclose(g, (F[0] - F[1]) / (2 * h), rtol=1e-6)
+        G = [_shared_mixing._slopes(u + s, tail, 3)[0] for s in (h, -h)]
+        assert_allclose(dg, (G[0] - G[1]) / (2 * h), rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("size", "sphere"), [(1, 2.0), (2, 2 * np.pi), (3, 4 * np.pi)]
+    )
+    @pytest.mark.parametrize("tail", TAILS)
+    def test_integral_by_quadrature(self, tail, size, sphere):
+        def radial(r):
+            return r ** (size - 1) * np.exp(
+                _shared_mixing._log_density(np.array(r * r), np.array(tail), size)
+            )
+
+        integral = sum(quad(radial, *ends)[0] for ends in ((0, 5), (5, 50), (50, 400)))
+        value = _shared_mixing._log_integral(tail, size)
+        assert_allclose(value, np.log(sphere * integral), atol=1e-8)
+
+    @pytest.mark.parametrize("size", [1, 3])
+    @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
+    def test_tail_and_scale_are_found(self, size, scale):
+        rng = np.random.default_rng(0)
+        shape = (1, 20_000, size)
+        student = rng.normal(size=shape) / np.sqrt(
+            rng.chisquare(8, size=(1, 20_000, 1)) / 8
+        )
+        uniform = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size=shape)
+        Z = scale * np.concatenate([student, uniform])
+        fit = _shared_mixing._fit_densities(np.eye(2), Z)
+        assert_array_equal(fit.tails, [8.0, LIGHT])
+        assert_allclose(fit.variance[0], scale**2, rtol=0.05)
+
+
+class TestDegenerate:
+    def test_one_signal(self):
+        signals = 5.0 * sources(["product"], 0, 30, 3)
+        assert_allclose(np.abs(shared_mixing(signals)), [[0.2]], rtol=1e-12)
+
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_signal_of_zeros(self, size):
+        truth = sources(["product"] * 4, 0, 200, size)
+        padded = np.insert(truth, 2, 0.0, axis=0)
+        W = shared_mixing(padded)
+        assert np.linalg.cond(W) < 1e3
+        Y = np.tensordot(W, padded, 1)
+        assert_allclose(Y[4], 0.0, atol=1e-12)
+        assert_allclose(matched(unmix(truth), Y[:4]), unmix(truth), atol=1e-9)
+        assert_allclose(W[:4, 2], 0.0, atol=1e-12)
+
+    @pytest.mark.parametrize("size", [1, 3])
+    def test_dependent_signals(self, size):
+        truth = sources(["product"] * 3, 0, 300, size)
+        signals = np.tensordot(np.random.default_rng(0).normal(size=(5, 3)), truth, 1)
+        W = shared_mixing(signals)
+        assert np.linalg.cond(W) < 1e3
+        assert np.linalg.cond(shared_mixing(1e-9 * signals)) < 1e3
+        Y = np.tensordot(W, signals, 1)
+        assert_allclose(Y[3:], 0.0, atol=1e-12)
+        assert_allclose(matched(unmix(truth), Y[:3]), unmix(truth), atol=1e-9)
+
+    def test_all_zero(self):
+        assert_array_equal(shared_mixing(np.zeros((3, 10, 3))), np.eye(3))
+        assert_array_equal(independent_coefficients(np.ones((10, 2))), np.eye(2))
+
+    @pytest.mark.parametrize("size", [1, 3])
+    @pytest.mark.parametrize("n_samples", [1, 2, 3, 5, 8])
+    def test_few_samples(self, n_samples, size):
+        signals = np.random.default_rng(0).normal(size=(6, n_samples, size))
+        rank = min(6, n_samples * size)
+        W = shared_mixing(signals)
+        assert np.linalg.cond(W) < 1e4
+        Y = np.tensordot(W, signals, 1)
+        assert_allclose(np.mean(Y**2, axis=(1, 2)), np.arange(6) < rank, atol=1e-9)
+
+    @pytest.mark.parametrize("n_moving", [1, 8, 20])
+    @pytest.mark.parametrize("shift", [0.0, 1.0])
+    def test_most_points_rest(self, n_moving, shift):
+        # Signals that vanish at most samples: the likelihood must have a bound.
+        rng = np.random.default_rng(0)
+        signals = np.zeros((5, 68, 3)) + shift * rng.normal(size=(5, 1, 3))
+        signals[:, :n_moving] += sources(["product"] * 5, 0, 68, 3)[:, :n_moving]
+        signals -= signals.mean(axis=1, keepdims=True)
+        rank = min(5, 3 * n_moving)
+        W = shared_mixing(signals)
+        assert np.linalg.cond(W) < 1e4
+        found = np.tensordot(W, signals, 1)
+        mixed = np.tensordot(random_mixing(3, 5), signals, 1)
+        again = matched(found[:rank], unmix(mixed)[:rank])
+        if n_moving > 1:
+            assert_allclose(again, found[:rank], atol=1e-7)
+
+    def test_signals_of_few_values(self):
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(3, 200, 1))
+        Y = unmix(np.tensordot(random_mixing(0, 3), signs, 1))
+        assert cosines(signs, Y).min() > 0.99

@@ -1,0 +1,164 @@
+"""Algebra of many small symmetric matrices."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from isa_nrsfm._small_matrices import (
+    COLUMNS,
+    FEW,
+    ROWS,
+    inverse3,
+    inverse_factor3,
+    invert_positive,
+    solve_positive,
+    unpack3,
+)
+
+# One number of matrices for each of the two ways to solve, by LAPACK and by passes.
+NUMBERS = [3, FEW + 50]
+
+
+def positive_matrices(seed, k, n, condition=1e3):
+    """Return symmetric positive definite matrices (k, k, n) of a given condition."""
+    rng = np.random.default_rng(seed)
+    Q = np.linalg.qr(rng.normal(size=(n, k, k)))[0]
+    values = condition ** -np.linspace(0, 1, k) * rng.uniform(0.5, 2, (n, 1))
+    A = np.moveaxis((Q * values[:, None]) @ Q.swapaxes(1, 2), 0, -1)
+    return 0.5 * (A + A.swapaxes(0, 1))
+
+
+def last_to_first(matrices):
+    return np.moveaxis(matrices, -1, 0)
+
+
+class TestThreeByThree:
+    def test_packing(self):
+        A = positive_matrices(0, 3, 5)
+        assert_array_equal(unpack3(A[ROWS, COLUMNS]), A)
+
+    def test_inverse(self):
+        A = positive_matrices(0, 3, 50)
+        expected = np.linalg.inv(last_to_first(A))
+        assert_allclose(last_to_first(inverse3(A[ROWS, COLUMNS])), expected, rtol=1e-9)
+
+    def test_factor(self):
+        A = positive_matrices(0, 3, 50)
+        R = last_to_first(inverse_factor3(A[ROWS, COLUMNS]))
+        assert_array_equal(R, np.tril(R))
+        L = np.linalg.cholesky(last_to_first(A))
+        assert_allclose(R @ L, np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
+
+    def test_scales_of_coordinates_cost_no_precision(self):
+        A = positive_matrices(0, 3, 50, condition=10)
+        scale = np.array([1e-70, 1.0, 1e80])
+        scaled = A * scale[:, None, None] * scale[:, None]
+        inverse = inverse3(scaled[ROWS, COLUMNS])
+        unscaled = inverse * scale[:, None, None] * scale[:, None]
+        assert_allclose(unscaled, inverse3(A[ROWS, COLUMNS]), rtol=1e-13)
+
+    @pytest.mark.parametrize("rank", [0, 1, 2])
+    @pytest.mark.parametrize("unit", [1e-100, 1.0, 1e100])
+    def test_singular_matrices_have_a_generalised_inverse(self, rank, unit):
+        rng = np.random.default_rng(rank)
+        X = rng.normal(size=(40, 3, rank))
+        X[:10, 0] = 0  # flat along an axis
+        A = unit * last_to_first((X @ X.swapaxes(1, 2)).T)
+        inverse = last_to_first(inverse3(np.moveaxis(A, 0, -1)[ROWS, COLUMNS]))
+        assert np.isfinite(inverse).all()
+        assert_allclose(A @ inverse @ A, A, atol=1e-12 * unit)
+
+    def test_matrices_are_left_alone(self):
+        packed = positive_matrices(0, 3, 5)[ROWS, COLUMNS]
+        before = packed.copy()
+        inverse3(packed)
+        assert_array_equal(packed, before)
+
+
+@pytest.mark.parametrize("n", NUMBERS)
+class TestPositiveDefinite:
+    @pytest.mark.parametrize("k", range(1, 16))
+    def test_solution(self, k, n):
+        A = positive_matrices(k, k, n)
+        b = np.random.default_rng(0).normal(size=(k, n))
+        x, positive = solve_positive(A, b)
+        expected = np.linalg.solve(last_to_first(A), b.T[..., None])[..., 0].T
+        assert_allclose(x, expected, rtol=1e-10, atol=1e-11 * np.abs(x).max())
+        assert positive.all()
+
+    @pytest.mark.parametrize("k", range(1, 16))
+    def test_inverse_and_determinant(self, k, n):
+        A = positive_matrices(k, k, n)
+        inverse, log_determinant, positive = invert_positive(A)
+        expected = np.linalg.inv(last_to_first(A))
+        assert_allclose(last_to_first(inverse), expected, atol=1e-9)
+        assert_array_equal(inverse, inverse.swapaxes(0, 1))
+        assert_allclose(log_determinant, np.linalg.slogdet(last_to_first(A))[1])
+        assert positive.all()
+
+    @pytest.mark.parametrize("k", [2, 5, 9])
+    def test_indefinite_matrices_are_told(self, k, n):
+        rng = np.random.default_rng(k)
+        A = positive_matrices(k, k, n) - 0.05 * rng.random(n) * np.eye(k)[..., None]
+        b = rng.normal(size=(k, n))
+        expected = np.linalg.eigvalsh(last_to_first(A))[:, 0] > 0
+        x, positive = solve_positive(A, b)
+        assert not expected.all()
+        assert_array_equal(positive, expected)
+        assert_array_equal(invert_positive(A)[2], expected)
+        assert np.isfinite(x).all()
+        assert np.isfinite(invert_positive(A)[0]).all()
+        # The others are solved all the same.
+        right = np.einsum("kln,ln->kn", A, x)
+        assert_allclose(right[:, positive], b[:, positive], atol=1e-6)
+
+    def test_a_zero_coordinate_is_left_out(self, n):
+        A, b = positive_matrices(0, 4, n), np.ones((4, n))
+        A[2] = A[:, 2] = 0.0
+        kept = [0, 1, 3]
+        x, positive = solve_positive(A, b)
+        inverse, log_determinant, _ = invert_positive(A)
+        expected = invert_positive(A[kept][:, kept])
+        assert not positive.any()
+        assert_array_equal(x[2], 0)
+        assert_array_equal(inverse[2], 0)
+        assert_allclose(inverse[kept][:, kept], expected[0], rtol=1e-10)
+        assert_allclose(x[kept], expected[0].sum(axis=1), rtol=1e-8)
+        assert_allclose(log_determinant, expected[1])
+
+    def test_equal_coordinates(self, n):
+        # The matrix is singular; whatever rounding makes of it the result is finite.
+        A = positive_matrices(0, 4, n)[[0, 1, 2, 3, 1]][:, [0, 1, 2, 3, 1]]
+        b = np.ones((5, n))
+        x, positive = solve_positive(A, b)
+        assert not positive.any()
+        assert np.abs(x).max() < 1e5
+        assert np.abs(invert_positive(A)[0]).max() < 1e5
+
+    def test_arguments_are_left_alone(self, n):
+        A, b = positive_matrices(0, 4, n), np.ones((4, n))
+        before = A.copy()
+        solve_positive(A, b)
+        invert_positive(A)
+        assert_array_equal(A, before)
+        assert_array_equal(b, 1)
+
+
+def test_both_ways_agree():
+    A = positive_matrices(0, 6, FEW + 50)
+    b = np.random.default_rng(0).normal(size=(6, FEW + 50))
+    many = solve_positive(A, b)[0]
+    for i in range(0, FEW + 50, 10):
+        alone = solve_positive(A[..., i : i + 1], b[:, i : i + 1])[0]
+        assert_allclose(alone[:, 0], many[:, i], rtol=1e-10)
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 4), (0, 200), (3, 0)])
+def test_nothing_to_solve(k, n):
+    A = np.ones((k, k, n))
+    x, positive = solve_positive(A, np.ones((k, n)))
+    inverse, log_determinant, _ = invert_positive(A)
+    assert x.shape == (k, n)
+    assert positive.all()
+    assert inverse.shape == (k, k, n)
+    assert_array_equal(log_determinant, np.zeros(n))
