@@ -18,9 +18,9 @@ from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 INDEPENDENCE = ("shapes", "coefficients")
 # The alternation of the two shifts ends when they are below this, or after so many.
-SHIFTED = 1e-14
+SHIFTED = 1e-12
 MAX_SHIFTS = 200
-# The scale of a frame does not get below this share of what it was.
+# The scale of a frame does not get below this share of the mean.
 SMALLEST_SCALE = 0.1
 
 
@@ -162,15 +162,17 @@ def _centred(
         along = np.eye(len(shapes))
         along[1:, 0] = -np.einsum("kcj,jc->k", current[1:], inverse) / rank
         factor = 1 - moved @ along[1:, 0]
-        scale = scale * factor
-        if not (scale > SMALLEST_SCALE).all():
+        if not (factor > 0).all():
             break
+        scale = scale * factor
         moved = moved / factor[:, None]
         mean = _mean_shift(moved)
         moved = moved - mean[0, 1:]
         total = mean @ along @ total
         change = np.abs(mean[0, 1:]) + np.abs(along[1:, 0])
         if np.max(change, initial=0.0) <= SHIFTED * max(1.0, np.abs(moved).max()):
+            if scale.min() < SMALLEST_SCALE * scale.mean():
+                break
             return total, motion * scale[:, None, None], moved
     return first, motion, alpha - first[0, 1:]
 

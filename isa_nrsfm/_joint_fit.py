@@ -5,19 +5,21 @@ cameras absorb the difference, but for terms of second order in the deformation.
 the shapes move much and the model is not exact, as in motion capture, these terms hold
 mostly what the model leaves out, and the most likely shapes are far from the true ones.
 The cameras betray it: true ones are close to turned and scaled orthographic ones, in
-some metric of space, which the fit does not know of. So two fits are compared, a free
-one and one that pays for what its basis shapes move in the images, and the stiff one is
-taken where its cameras are clearly the more orthographic ones.
+some metric of space, which the fit does not know of. Where the cameras of the rigid fit
+are far from that, a fit that pays for what its basis shapes move in the images is tried
+first, and taken if it brings them nearer. Otherwise the free fit is taken, unless its
+cameras are much farther from orthographic ones than those of the rigid fit.
 """
 
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.utils.parallel import _threadpool_controller_decorator
 
 from isa_nrsfm._camera import rigid_cameras
 from isa_nrsfm._factorisation import Factorisation, orientations
-from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._frame_fit import RigidFrames, compose, project
 from isa_nrsfm._frame_posterior import fit_posterior
 from isa_nrsfm._joint_refinement import JointResult, JointState, refine_joint
 from isa_nrsfm._marginal_likelihood import MarginalLikelihood
@@ -30,6 +32,8 @@ from isa_nrsfm._tracks import seen_points
 STIFFNESS = 300.0
 # Rigid cameras whose anisotropy is below this leave nothing to mend.
 ISOTROPIC = 0.15
+# So many starts are enough for them: the fits have one optimum in practice.
+ISOTROPIC_STARTS = 2
 # The stiff fit is taken where it brings the anisotropy below this share of it, and
 # where the free fit brings it above this multiple, unless the noise of the stiff fit is
 # so many times that of the free one.
@@ -90,6 +94,8 @@ class JointFit(NamedTuple):
     converged: bool
 
 
+# The products are of small blocks: more threads would wait for each other.
+@_threadpool_controller_decorator(limits=1, user_api="blas")
 def fit_jointly(
     tracks: NDArray,
     outliers: NDArray,
@@ -133,7 +139,7 @@ def fit_jointly(
     Returns
     -------
     JointFit
-        The fit of lowest objective.
+        The fit of lowest objective for the stiffness that is given or chosen.
     """
     seen = seen_points(tracks)
     used = seen & ~outliers
@@ -146,7 +152,7 @@ def fit_jointly(
     best, price = _best(sample, starts, factors, stiffness)
     best = problem.finished(best, sample, price)
     if stiffness is None and price == 0 and _ratio(best, factors) > DRIFTED:
-        stiff = sample.best(starts, STIFFNESS)
+        stiff = sample.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
         stiff = problem.finished(stiff, sample, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
@@ -154,12 +160,13 @@ def fit_jointly(
     if loss != "linear":
         # The scale of the noise is that of the residual with the coefficients fitted.
         best, noise = _reweighted(problem, best, loss, price)
-        noise, n_fitted = max(noise, ROUNDING**2), len(paper_shapes) - 1
+        n_fitted = len(paper_shapes) - 1
     shapes = best.state.shapes
+    noise *= _freedom_correction(seen, len(shapes), n_fitted)
     return JointFit(
         shapes - shapes.mean(axis=2, keepdims=True),
         best.alpha,
-        noise * _freedom_lost(seen, len(shapes), n_fitted),
+        max(noise, ROUNDING**2),
         price,
         best.history,
         best.gradient_norm,
@@ -184,7 +191,8 @@ def _best(
             and stiff.state.noise < STILL_MOVING * rigid
         ):
             return stiff, STIFFNESS
-    return problem.best(starts, 0.0), 0.0
+        return problem.best(starts, 0.0), 0.0
+    return problem.best(starts[:ISOTROPIC_STARTS], 0.0), 0.0
 
 
 def _rigid_part(W: NDArray, factors: Factorisation) -> NDArray:
@@ -208,9 +216,11 @@ def _starts(
     """Return shapes to start from, and some random ones with a generator."""
     n_components = len(paper_shapes) - 1
     n_mixed = DIRECTIONS * n_components
-    directions = lifted_directions(factors, n_mixed if random_state else n_components)
+    directions = lifted_directions(
+        factors, n_components if random_state is None else n_mixed
+    )
     lifted = lifted_shapes(factors, directions[:, :n_components])
-    starts = [problem.likelier(paper_shapes, lifted)]
+    starts = [problem.likelier(problem.scaled(paper_shapes), lifted)]
     if random_state is not None:
         for _ in range(N_RANDOM_STARTS):
             random = random_state.normal(size=(directions.shape[1], n_components))
@@ -226,7 +236,6 @@ def _reweighted(
     tracks = problem.tracks
     seen = seen_points(tracks)
     weights = np.zeros(seen.shape)
-    history = [result.history]
     for _ in range(REWEIGHTINGS):
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
@@ -240,18 +249,17 @@ def _reweighted(
         position = np.einsum("ij,ijc->ic", counted, rest)
         rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
         distance = np.linalg.norm(rest, axis=2)
-        deviation = median_noise(distance[seen])
+        deviation = max(median_noise(distance[seen]), ROUNDING)
         previous, weights = weights, np.zeros(seen.shape)
-        weights[seen] = robust_weights(loss, distance[seen] / max(deviation, 1e-300))
+        weights[seen] = robust_weights(loss, distance[seen] / deviation)
         if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
             break
         problem = _Problem(problem.W, tracks, weights, problem.max_iter, problem.tol)
         result = problem.refined(result.state, stiffness)
-        history.append(result.history)
-    return result._replace(history=history[-1]), deviation**2
+    return result, deviation**2
 
 
-def _freedom_lost(seen: NDArray, n_shapes: int, n_fitted: int) -> float:
+def _freedom_correction(seen: NDArray, n_shapes: int, n_fitted: int) -> float:
     """
     Return numbers seen divided by the degrees of freedom of the residual.
 
@@ -342,7 +350,7 @@ class _Problem:
         self.W, self.tracks, self.weights = W, tracks, weights
         self.max_iter, self.tol = max_iter, tol
 
-    def take(self, frames: slice | NDArray) -> Self:
+    def take(self, frames: NDArray) -> Self:
         """Return the problem of some of the frames."""
         W = self.W.reshape(len(self.tracks), 2, -1)[frames].reshape(-1, self.W.shape[1])
         weights = None if self.weights is None else self.weights[frames]
@@ -354,6 +362,13 @@ class _Problem:
         rest = self.W - motion.reshape(-1, 3) @ shapes[0]
         noise = FIRST_NOISE * float(np.mean(rest**2))
         return JointState(shapes, motion.transpose(1, 2, 0), noise)
+
+    def scaled(self, shapes: NDArray) -> NDArray:
+        """Return shapes whose coefficients, with rigid cameras, have unit variance."""
+        frames = RigidFrames(shapes[0].T, shapes[1:].transpose(0, 2, 1))
+        tracks = self.W.reshape(len(self.tracks), 2, -1).transpose(0, 2, 1)
+        size = frames.fit(tracks, np.ones(len(tracks))).alpha.std(axis=0)
+        return np.concatenate([shapes[:1], size[:, None, None] * shapes[1:]])
 
     def aligned(self, state: JointState) -> JointState:
         """Return a state with the most probable cameras for its shapes and noise."""

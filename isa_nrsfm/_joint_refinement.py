@@ -19,7 +19,7 @@ from isa_nrsfm._small_matrices import inverse3
 MEMORY = 20
 # The noise variance is at least this share of the mean square of the tracks: tables
 # without noise are fitted, too.
-NOISE_FLOOR = 1e-12
+NOISE_FLOOR = 1e-11
 # The logarithm of the noise variance changes by at most so much in a step.
 LARGEST_NOISE_STEP = 1.5
 # A step has to gain this share of what the slope promises.
@@ -143,11 +143,12 @@ class _Point:
         self.n_seen = likelihood.n_seen
         self.passed: Passed = likelihood(*state)
         self.value = self.passed.value
+        at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             self.passed.shape_gradient,
             self.passed.motion_gradient,
             # Noise that is least already does not fall.
-            min(self.passed.noise_gradient, 0.0 if state.noise <= floor else np.inf),
+            min(self.passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
         self.vector = _stacked(state.shapes, state.motion, np.log(state.noise))
         curvature = self.passed.shape_curvature

@@ -7,11 +7,13 @@ log likelihoods of all frames are, up to a constant ::
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
                        + log det(I + H_i / s2) ]
 
-with N the number of coordinates that were seen. `objective` adds ``stiffness * sum_i
-tr H_i``, what the basis shapes move the points in the images, times a constant. The
-gradient follows from the first two moments of the coefficients given the frame, as in
-expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
-1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
+with N the number of coordinates that were seen. The objective is that plus ``stiffness
+* sum_i tr H_i``, a price for what the basis shapes move the points in the images.
+Positions are those of least squares: tracks and shapes are centred over the points of a
+frame (shapes have to be centred where no weights are given). The gradient follows from
+the first two moments of the coefficients given the frame, as in expectation
+maximisation (Tipping, Bishop, "Probabilistic principal component analysis", 1999;
+Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
 
 Frames are the last index of all arrays here, and everything is a sum over blocks of
 frames: how they are split makes no difference.

@@ -14,8 +14,6 @@ LOSSES = ("linear", "huber", "cauchy")
 # the plane is estimated from normal noise with 95 percent of the least squares'
 # efficiency.
 TUNING = {"huber": 1.5011, "cauchy": 2.5486}
-# Mean of weight times squared distance for normal noise, relative to least squares.
-CONSISTENCY = {"linear": 1.0, "huber": 0.8013, "cauchy": 0.6575}
 # Median distance of normal noise in the plane, in standard deviations of a coordinate.
 MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
 # A point so many sizes of its frame from the median point does not belong to it.
@@ -120,11 +118,13 @@ def robust_sizes(centred: NDArray) -> NDArray:
     -------
     ndarray of shape (n_frames,)
         Root of half the median squared distance of the seen points from their
-        `spatial_median`, or the root mean square where that is zero.
+        `spatial_median`, or the root mean square where half of them are in one place.
     """
     square = np.sum((centred - spatial_median(centred)[:, None]) ** 2, axis=2)
-    median = np.nanmedian(square, axis=1)
-    return np.sqrt(np.where(median > 0, median, np.nanmean(square, axis=1)) / 2)
+    median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
+    # Where half of the points are in one place, the median is rounding errors.
+    mean = np.nanmean(square, axis=1)
+    return np.sqrt(np.where(median > ROUNDING * upper, median, mean) / 2)
 
 
 def gross_outliers(tracks: NDArray) -> NDArray:

@@ -54,6 +54,7 @@ class Stranger(AffineNRSfM):
         {"n_components": np.int64(1), "random_state": None},
     ],
 )
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_loaded_model_equals_the_saved_one(faces, path, parameters):
     fitted = AffineNRSfM(**({"n_components": 2, "random_state": 0} | parameters))
     fitted.fit(faces)

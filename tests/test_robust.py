@@ -155,7 +155,6 @@ class TestSizes:
         spoilt[:, 5] = 1e6
         assert_allclose(robust_sizes(spoilt), robust_sizes(tracks), rtol=0.25)
 
-    @pytest.mark.xfail(reason="the median is not quite in that place")
     def test_where_most_points_are_in_one_place(self):
         tracks = self.random_tracks()
         tracks[2, :20] = 1.0
