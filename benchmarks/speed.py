@@ -15,8 +15,7 @@ from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._factorisation import factorise
-from isa_nrsfm._frame_posterior import _descend, _frame_blocks, _problem
-from isa_nrsfm._frame_products import whitened
+from isa_nrsfm._frame_posterior import fit_posterior
 from isa_nrsfm._tracks import (
     centred_tracks,
     measurement_matrix,
@@ -146,21 +145,16 @@ def found_by_search(model, tracks, seed):
     Both are in units of the noise variance: minus twice the log posterior.
     """
     frames = model._frames
-    posterior = frames.posterior(tracks)
+    fit = frames.posterior(tracks).objective
     found = np.full(len(tracks), np.inf)
     rng = np.random.default_rng(seed)
-    missing = np.isnan(tracks).any(axis=2)
-    white, _ = whitened(frames.shapes)
-    blocks = _frame_blocks(tracks, np.where(missing, 0.0, 1.0), white)
-    variance = np.full(len(tracks), frames.noise_variance)
-    for block, products in blocks:
-        problem = _problem(products, variance[block], np.zeros((3, 3)), tracks.shape[1])
-        for start in range(N_STARTS):
-            alpha = SPREAD * rng.normal(size=(model.n_components, len(block)))
-            minima = _descend(problem, alpha, np.full(len(block), start))
-            objective = products.energy - minima.explained
-            found[block] = np.minimum(found[block], objective)
-    return posterior.objective / frames.noise_variance, found / frames.noise_variance
+    for _ in range(N_STARTS):
+        alpha = SPREAD * rng.normal(size=(len(tracks), model.n_components))
+        search = fit_posterior(
+            tracks, frames.shapes, frames.noise_variance, initial=alpha
+        )
+        found = np.minimum(found, search.objective)
+    return fit / frames.noise_variance, found / frames.noise_variance
 
 
 def optima(options):
