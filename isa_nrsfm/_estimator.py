@@ -464,7 +464,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             alpha (n_frames, n_components).
         """
         X = self._validated(X)
-        return Decomposition(*as_type(self._fit_frames(X)[2], X.dtype)[:3])
+        return Decomposition(*as_type(self._fit_frames(X), X.dtype)[:3])
 
     def reconstruct(self, X: Any) -> NDArray:
         """
@@ -564,13 +564,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             scaled as in the fit; larger is better. Points whose frame the others do not
             determine are left out.
         """
-        tracks, sizes, usable = self._prepared(self._validated(X))
+        tracks, usable = self._usable(self._validated(X))
+        tracks = tracks[usable]
+        sizes = self._sizes_like_fit(centred_tracks(tracks)[0])
         error = held_out_error(
-            self._frames,
-            self.mean_shape_,
-            self.basis_,
-            tracks[usable],
-            sizes[usable],
+            self._frames, self.mean_shape_, self.basis_, tracks, sizes
         )
         return -error
 
@@ -746,27 +744,29 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             else np.full_like(sizes, np.sqrt(np.mean(sizes**2)))
         )
 
-    def _prepared(self, X: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return tracks of a valid table, sizes of its frames, and which are usable."""
+    def _usable(self, X: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the tracks of a valid table, and which of its frames are usable."""
         names = getattr(self, "feature_names_in_", None)
         tracks = clean_tracks(table_to_tracks(X, self.layout), self.layout, names)
-        usable = usable_frames(tracks)
-        sizes = np.full(len(tracks), self._unit)
-        if self.scale_frames and usable.any():
-            sizes[usable] = self._sizes(centred_tracks(tracks[usable])[0])
-        return tracks, sizes, usable
+        return tracks, usable_frames(tracks)
 
-    def _fit_frames(self, X: NDArray) -> tuple[NDArray, NDArray, FrameFit]:
-        """Return tracks of a valid table, sizes of its frames and their fit."""
-        tracks, sizes, usable = self._prepared(X)
+    def _sizes_like_fit(self, centred: NDArray) -> NDArray:
+        """Return the sizes of frames, or the one size of the fit for all."""
+        if self.scale_frames and len(centred):
+            return self._sizes(centred)
+        return np.full(len(centred), self._unit)
+
+    def _fit_frames(self, X: NDArray) -> FrameFit:
+        """Return the fit of the frames of a valid table."""
+        tracks, usable = self._usable(X)
         frames = FrameFit.unknown(len(tracks), self.n_components)
         if usable.any():
             centred, translation = centred_tracks(tracks[usable])
-            fit = self._frames.fit(centred, sizes[usable])
+            fit = self._frames.fit(centred, self._sizes_like_fit(centred))
             fit = fit._replace(translation=fit.translation + translation)
             for whole, part in zip(frames, fit, strict=True):
                 whole[usable] = part
-        return tracks, sizes, frames
+        return frames
 
     def _inverse_snr(self, tracks: NDArray, sizes: NDArray, frames: FrameFit) -> float:
         """Return the inverse SNR of fitted frames, weighted as in the fit."""

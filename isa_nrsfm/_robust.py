@@ -9,6 +9,8 @@ reweighted least-squares", 1977).
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._tracks import seen_points
+
 LOSSES = ("linear", "huber", "cauchy")
 # Standard deviations from which a loss leaves the parabola: with these a location in
 # the plane is estimated from normal noise with 95 percent of the least squares'
@@ -75,8 +77,21 @@ def distant_points(tracks: NDArray) -> NDArray:
         Points whose distance from the median of their frame is more than six times the
         frame's size (`robust_sizes`).
     """
-    distance = np.linalg.norm(tracks - spatial_median(tracks)[:, None], axis=2)
-    return distance > DISTANT * robust_sizes(tracks)[:, None]
+    square = _squares(tracks)
+    return np.sqrt(square) > DISTANT * _sizes(square)[:, None]
+
+
+def _squares(tracks: NDArray) -> NDArray:
+    """Return the squared distances of points from the median of their frame."""
+    return np.sum((tracks - spatial_median(tracks)[:, None]) ** 2, axis=2)
+
+
+def _sizes(square: NDArray) -> NDArray:
+    """Return the sizes of frames that belong to squared distances."""
+    median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
+    # Where half of the points are in one place, the median is rounding errors.
+    mean = np.nanmean(square, axis=1)
+    return np.sqrt(np.where(median > ROUNDING * upper, median, mean) / 2)
 
 
 def spatial_median(tracks: NDArray) -> NDArray:
@@ -93,7 +108,7 @@ def spatial_median(tracks: NDArray) -> NDArray:
     ndarray of shape (n_frames, 2)
         Reweighted means, from the mean on (Weiszfeld 1937): it turns with the image.
     """
-    seen = ~np.isnan(tracks[..., 0])
+    seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
     weights = seen * 1.0
     for _ in range(MEDIAN_STEPS):
@@ -120,11 +135,7 @@ def robust_sizes(centred: NDArray) -> NDArray:
         Root of half the median squared distance of the seen points from their
         `spatial_median`, or the root mean square where half of them are in one place.
     """
-    square = np.sum((centred - spatial_median(centred)[:, None]) ** 2, axis=2)
-    median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
-    # Where half of the points are in one place, the median is rounding errors.
-    mean = np.nanmean(square, axis=1)
-    return np.sqrt(np.where(median > ROUNDING * upper, median, mean) / 2)
+    return _sizes(_squares(centred))
 
 
 def gross_outliers(tracks: NDArray) -> NDArray:
@@ -143,7 +154,7 @@ def gross_outliers(tracks: NDArray) -> NDArray:
         times what is typical of the table and of this point; none in frames with many
         of them.
     """
-    seen = ~np.isnan(tracks).any(axis=2)
+    seen = seen_points(tracks)
     hidden = ~seen | distant_points(tracks)
     target = tracks - spatial_median(tracks)[:, None]
     filled = np.where(hidden[..., None], 0.0, target)

@@ -281,16 +281,6 @@ def smallest_n_frames(n_components: int) -> int:
     return -(-8 * (n_components + 2) // 5)
 
 
-def check_complete(X: NDArray) -> None:
-    """Refuse a table with missing values."""
-    rows = np.flatnonzero(np.isnan(X).any(axis=1))
-    if len(rows):
-        raise ValueError(
-            "complete rows are needed; points are missing (NaN) in "
-            f"{len(rows)} of {len(X)} row(s), the first is row {rows[0]}"
-        )
-
-
 def check_size(n_frames: int, n_points: int, n_components: int) -> None:
     """Refuse a table that is too small for the number of basis shapes."""
     largest = largest_n_components(n_points)
