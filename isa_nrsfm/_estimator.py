@@ -68,8 +68,9 @@ from isa_nrsfm.isa import PooledFastICA
 # Tolerances where none is given: for each frame, of minus twice the log likelihood, and
 # for the paper's refinement, of the energy that it explains.
 JOINT_TOL, PAPER_TOL = 0.05, 1e-10
-# Steps of the paper's refinement where its result is only a start.
-PAPER_STEPS = 200
+# Runs of FastICA, and steps and tolerance of the paper's refinement, where the result
+# is only a start.
+START_RUNS, START_STEPS, START_TOL = 4, 200, 1e-5
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
 
@@ -111,9 +112,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ``ceil(8 (K + 2) / 5)`` frames.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or
-        `PooledFastICA`, with subspaces of size three; None is ``PooledFastICA()``. A
-        clone is fitted; where its `random_state`, `n_jobs` or `verbose` is None or 0
-        it gets that of this estimator (a seed drawn from it).
+        `PooledFastICA`, with subspaces of size three; None is ``PooledFastICA()``, with
+        four runs where the joint refinement only starts from it. A clone is fitted;
+        where its `random_state`, `n_jobs` or `verbose` is None or 0 it gets that of
+        this estimator (a seed drawn from it).
     block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\
 "generalized_eigen"
         How the 3x3 matrix of each subspace is found that brings its motion to the
@@ -384,8 +386,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             precision=relative_precision(tracks, sizes),
             block_recovery=self.block_recovery,
             refinement="alternating" if joint else self.refinement,
-            max_iter=PAPER_STEPS if joint else self.max_iter,
-            tol=PAPER_TOL if joint or self.tol is None else self.tol,
+            max_iter=START_STEPS if joint else self.max_iter,
+            tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
             report=report,
         )
         self.singular_values_ = self._unit * result.singular_values
@@ -617,7 +619,12 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with what it leaves open filled in."""
-        isa = PooledFastICA() if self.isa is None else clone(self.isa)
+        if self.isa is not None:
+            isa = clone(self.isa)
+        elif self.refinement == "joint":
+            isa = PooledFastICA(n_init=START_RUNS)
+        else:
+            isa = PooledFastICA()
         params = isa.get_params(deep=False)
         if params.get("subspace_size", 3) != 3:
             raise ValueError(

@@ -40,6 +40,7 @@ from isa_nrsfm._frame_products import (
 from isa_nrsfm._small_matrices import (
     COLUMNS,
     ROWS,
+    SMALLEST_PIVOT,
     inverse_factor3,
     invert_positive,
     solve_positive,
@@ -117,6 +118,7 @@ def fit_posterior(
     initial: NDArray | None = None,
     starts: NDArray | None = None,
     camera_precision: NDArray | None = None,
+    max_steps: int = MAX_STEPS,
 ) -> FramePosterior:
     """
     Return the most probable camera, position and coefficients of each frame.
@@ -139,6 +141,8 @@ def fit_posterior(
         frames whose first fit is much worse than the noise explains.
     camera_precision : ndarray of shape (3, 3), optional
         C, symmetric and positive semidefinite, in squared units of the shapes.
+    max_steps : int, default=60
+        The most steps of a search.
 
     Returns
     -------
@@ -166,14 +170,16 @@ def fit_posterior(
         given = tracks[frames], seen[frames], variance[frames], initial
         return _fit(*given, white, prior, max_steps)
 
-    fits = fit(np.arange(n_frames), first, FIRST_STEPS)
-    # The few frames that take longer are brought together: short rows are slow.
-    slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
-    _put(fits, slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+    fits = fit(np.arange(n_frames), first, min(FIRST_STEPS, max_steps))
+    if max_steps > FIRST_STEPS:
+        # The few frames that take longer are brought together: short rows are slow.
+        slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
+        if len(slow):
+            _put(fits, slow, fit(slow, fits.alpha[slow], max_steps))
     poor = np.flatnonzero(_poorly_explained(fits, seen, variance))
     if len(extra) and len(poor):
         number = np.repeat(np.arange(len(extra)), len(poor))
-        others = fit(np.tile(poor, len(extra)), extra[number], MAX_STEPS)
+        others = fit(np.tile(poor, len(extra)), extra[number], max_steps)
         others = others._replace(start=number)
         # Of equal minima the first one is kept.
         objective = others.objective.reshape(len(extra), -1)
@@ -440,13 +446,30 @@ def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
         matrix = matrix + damping * state.known
     step, positive = solve_positive(matrix, state.slope)
     failing = np.flatnonzero(~positive)
-    while len(failing):
-        damping[failing] = np.maximum(10.0 * damping[failing], 1.0)
-        part = state.take(failing)
-        matrix = part.schur + damping[failing] * part.known
-        step[:, failing], positive = solve_positive(matrix, part.slope)
-        failing = failing[~positive & (damping[failing] < LARGEST_DAMPING)]
+    if len(failing):
+        damping[failing] = np.maximum(damping[failing], SMALLEST_DAMPING)
+        step[:, failing] = _step_off_saddle(state.take(failing), damping[failing])
     return step, damping
+
+
+def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
+    """
+    Return steps for frames whose Hessian is not positive definite.
+
+    In coordinates where ``H + s2 I`` is the identity the gradient is divided by the
+    magnitudes of the curvatures, and the damping: downhill along each axis (the
+    saddle-free Newton method of Dauphin et al., "Identifying and attacking the saddle
+    point problem in high-dimensional non-convex optimization", 2014).
+    """
+    size, axes = np.linalg.eigh(state.known.transpose(2, 0, 1))
+    size = np.maximum(size, SMALLEST_PIVOT * size[:, -1:])
+    whitening = axes / np.sqrt(size)[:, None]
+    schur = whitening.swapaxes(1, 2) @ state.schur.transpose(2, 0, 1) @ whitening
+    curvature, modes = np.linalg.eigh(schur)
+    axes = whitening @ modes
+    along = np.einsum("nab,an->nb", axes, state.slope)
+    along /= np.abs(curvature) + damping[:, None]
+    return np.einsum("nab,nb->an", axes, along)
 
 
 def _inverse_schur(state: _State) -> NDArray:

@@ -246,7 +246,18 @@ def _share(weight: NDArray) -> NDArray:
     return np.divide(1.0, weight, where=weight > 0, out=np.zeros_like(weight))
 
 
-def frame_products(tracks: FrameTracks, shapes: NDArray) -> FrameProducts:
+def shared_gram(shapes: NDArray) -> SharedGram:
+    """Return the Gram matrix of shapes (n_shapes, 3, n_points) with centred rows."""
+    n_shapes, _, n_points = shapes.shape
+    rows = shapes.reshape(-1, n_points)
+    blocks = (rows @ rows.T).reshape(n_shapes, 3, n_shapes, 3).transpose(0, 2, 1, 3)
+    pairs = blocks[shape_pairs(n_shapes)]
+    return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
+
+
+def frame_products(
+    tracks: FrameTracks, shapes: NDArray, gram: SharedGram | None = None
+) -> FrameProducts:
     """
     Return the sums over the points of frames.
 
@@ -256,6 +267,8 @@ def frame_products(tracks: FrameTracks, shapes: NDArray) -> FrameProducts:
         The frames.
     shapes : ndarray of shape (n_shapes, 3, n_points)
         Mean shape and basis shapes, rows centred.
+    gram : SharedGram, optional
+        That of the shapes, where it is at hand already.
 
     Returns
     -------
@@ -266,18 +279,16 @@ def frame_products(tracks: FrameTracks, shapes: NDArray) -> FrameProducts:
     n_shapes, _, n_points = shapes.shape
     rows = np.ascontiguousarray(shapes, dtype=np.float64).reshape(-1, n_points)
     cross = (rows @ weighted.reshape(n_points, -1)).reshape(n_shapes, 3, 2, -1)
-    gram: SharedGram | FrameGram
     if W is None:
         means = np.zeros((n_shapes, 3, len(weight)))
-        gram = SharedGram(_gram_pairs(rows))
-    else:
-        means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
-        products = _pair_products(rows.reshape(shapes.shape))
-        pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
-        # The rows are centred over all points, so that little is subtracted.
-        pairs -= _pair_products(means * np.sqrt(weight))
-        gram = FrameGram(pairs)
-    return FrameProducts(cross, gram, means, centroid, weight, energy)
+        shared = shared_gram(shapes) if gram is None else gram
+        return FrameProducts(cross, shared, means, centroid, weight, energy)
+    means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
+    products = _pair_products(rows.reshape(shapes.shape))
+    pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
+    # The rows are centred over all points, so that little is subtracted.
+    pairs -= _pair_products(means * np.sqrt(weight))
+    return FrameProducts(cross, FrameGram(pairs), means, centroid, weight, energy)
 
 
 def _pair_products(rows: NDArray) -> NDArray:
@@ -287,14 +298,6 @@ def _pair_products(rows: NDArray) -> NDArray:
     products += first[:, COLUMNS] * second[:, ROWS]
     products *= 0.5
     return products
-
-
-def _gram_pairs(rows: NDArray) -> NDArray:
-    """Return the symmetric parts of ``B_k B_l^T`` of rows (3 n, J) as (n_pairs, 6)."""
-    n_shapes = len(rows) // 3
-    blocks = (rows @ rows.T).reshape(n_shapes, 3, n_shapes, 3).transpose(0, 2, 1, 3)
-    pairs = blocks[shape_pairs(n_shapes)]
-    return 0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS])
 
 
 def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:

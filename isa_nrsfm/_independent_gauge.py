@@ -72,7 +72,7 @@ class FrameMap(NamedTuple):
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
-        variance = np.einsum("ikl,ilm,ikm->ik", slope, covariance, slope, optimize=True)
+        variance = np.vecdot(slope @ covariance, slope)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
         return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
 

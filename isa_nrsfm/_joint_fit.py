@@ -42,8 +42,12 @@ DRIFTED = 1.5
 TOO_STIFF = 4.0
 # A stiff fit that leaves more than this share of what a rigid one leaves does not move.
 STILL_MOVING = 0.5
-# With more frames than that the first steps are made on a part of them.
+# With more frames than that the first steps are made on so many of them, the next ones
+# on so many times more, and the last ones on all.
 SAMPLE_FRAMES = 600
+GROWTH = 4
+# Steps of the fit of frames that then brings the cameras of all frames close.
+ALIGNING_STEPS = 2
 # In tables with fewer coordinates than this several starts are tried.
 SMALL_TABLE = 150_000
 N_RANDOM_STARTS = 6
@@ -145,15 +149,16 @@ def fit_jointly(
     used = seen & ~outliers
     problem = _Problem(W, tracks, None if used.all() else used * 1.0, max_iter, tol)
     small = W.size < SMALL_TABLE
-    sample = problem
-    if not small and len(tracks) > SAMPLE_FRAMES:
-        sample = problem.take(_spread_frames(W, factors, SAMPLE_FRAMES))
+    problems = [problem] if small else _growing(problem, factors)
+    sample = problems[0]
     starts = _starts(sample, factors, paper_shapes, random_state if small else None)
-    best, price = _best(sample, starts, factors, stiffness)
-    best = problem.finished(best, sample, price)
-    if stiffness is None and price == 0 and _ratio(best, factors) > DRIFTED:
+    rigid = _Rigid.of(sample.W, factors)
+    best, price = _best(sample, starts, rigid, stiffness)
+    best = _finished(best, problems, price)
+    drifted = _anisotropy(best) > DRIFTED * rigid.anisotropy
+    if stiffness is None and price == 0 and drifted:
         stiff = sample.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
-        stiff = problem.finished(stiff, sample, STIFFNESS)
+        stiff = _finished(stiff, problems, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
     noise, n_fitted = best.state.noise, 0
@@ -174,37 +179,85 @@ def fit_jointly(
     )
 
 
+class _Rigid(NamedTuple):
+    """What the rigid fit says about the stiffness of shapes."""
+
+    anisotropy: float  # of its cameras
+    noise: float  # what it leaves, a coordinate
+
+    @classmethod
+    def of(cls, W: NDArray, factors: Factorisation) -> Self:
+        """Return the cameras' anisotropy, and what the rigid shape leaves of W."""
+        cameras = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
+        return cls(cameras, float(np.mean(_rigid_rest(W, factors) ** 2)))
+
+
+def _rigid_rest(W: NDArray, factors: Factorisation) -> NDArray:
+    """Return what a measurement matrix has beside its projection to the rigid shape."""
+    shape = factors.rigid_shape
+    return W - W @ np.linalg.pinv(shape, rcond=1e-10) @ shape
+
+
+def _anisotropy(result: JointResult) -> float:
+    """Return the anisotropy of the cameras of a refinement."""
+    return anisotropy(result.state.motion.transpose(2, 0, 1))
+
+
 def _best(
     problem: "_Problem",
     starts: list[NDArray],
-    factors: Factorisation,
+    rigid: _Rigid,
     stiffness: float | None,
 ) -> tuple[JointResult, float]:
     """Return the best refinement and its stiffness, chosen if none is given."""
     if stiffness is not None:
         return problem.best(starts, stiffness), stiffness
-    if anisotropy(factors.rigid_motion.reshape(-1, 2, 3)) > ISOTROPIC:
+    if rigid.anisotropy > ISOTROPIC:
         stiff = problem.best(starts, STIFFNESS)
-        rigid = np.mean((problem.W - _rigid_part(problem.W, factors)) ** 2)
         if (
-            _ratio(stiff, factors) < CLEARLY_LESS
-            and stiff.state.noise < STILL_MOVING * rigid
+            _anisotropy(stiff) < CLEARLY_LESS * rigid.anisotropy
+            and stiff.state.noise < STILL_MOVING * rigid.noise
         ):
             return stiff, STIFFNESS
         return problem.best(starts, 0.0), 0.0
     return problem.best(starts[:ISOTROPIC_STARTS], 0.0), 0.0
 
 
-def _rigid_part(W: NDArray, factors: Factorisation) -> NDArray:
-    """Return the projection of a measurement matrix to the rigid shape."""
-    return W @ np.linalg.pinv(factors.rigid_shape, rcond=1e-10) @ factors.rigid_shape
+def _finished(
+    result: JointResult, problems: list["_Problem"], stiffness: float
+) -> JointResult:
+    """Return the refinement, of all frames and to the end, of one of the first part."""
+    for problem in problems[1:] or problems:
+        state = result.state
+        if problem is not problems[0]:
+            state = problem.aligned(state)
+        few = problem is problems[-1] and len(problem.tracks) <= FEW_FRAMES
+        share = POLISH if few else 1.0
+        result = problem.refined(state, stiffness, tol=share * problem.tol)
+    return result
 
 
-def _ratio(result: JointResult, factors: Factorisation) -> float:
-    """Return the anisotropy of the cameras relative to that of the rigid fit."""
-    rigid = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
-    cameras = anisotropy(result.state.motion.transpose(2, 0, 1))
-    return cameras / rigid if rigid > 0 else 1.0
+def _growing(problem: "_Problem", factors: Factorisation) -> list["_Problem"]:
+    """Return problems of more and more of the frames, the last of all."""
+    n_frames = len(problem.tracks)
+    order = _by_rigidity(problem.W, factors)
+    problems: list[_Problem] = []
+    n = SAMPLE_FRAMES
+    while n < (n_frames if not problems else n_frames / 2):
+        problems.append(problem.take(_spread(order, n)))
+        n *= GROWTH
+    return [*problems, problem]
+
+
+def _by_rigidity(W: NDArray, factors: Factorisation) -> NDArray:
+    """Return the frames from the most to the least rigid one."""
+    rest = _rigid_rest(W, factors).reshape(len(W) // 2, -1)
+    return np.argsort(np.sum(rest**2, axis=1), kind="stable")
+
+
+def _spread(order: NDArray, n: int) -> NDArray:
+    """Return n of the frames at equal distances in an order."""
+    return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
 
 
 def _starts(
@@ -371,9 +424,15 @@ class _Problem:
         return np.concatenate([shapes[:1], size[:, None, None] * shapes[1:]])
 
     def aligned(self, state: JointState) -> JointState:
-        """Return a state with the most probable cameras for its shapes and noise."""
+        """Return a state with cameras close to the best for its shapes and noise."""
         shapes = state.shapes - state.shapes.mean(axis=2, keepdims=True)
-        fit = fit_posterior(self.tracks, shapes, state.noise, weights=self.weights)
+        fit = fit_posterior(
+            self.tracks,
+            shapes,
+            state.noise,
+            weights=self.weights,
+            max_steps=ALIGNING_STEPS,
+        )
         return JointState(shapes, fit.motion.transpose(1, 2, 0), state.noise)
 
     def likelier(self, *starts: NDArray) -> NDArray:
@@ -386,14 +445,6 @@ class _Problem:
         results = [self.refined(self.start(shapes), stiffness) for shapes in starts]
         return min(results, key=lambda result: result.history[-1])
 
-    def finished(
-        self, result: JointResult, sample: "_Problem", stiffness: float
-    ) -> JointResult:
-        """Return the refinement, of all frames and to the end, of one of a sample."""
-        state = result.state if sample is self else self.aligned(result.state)
-        share = POLISH if len(self.tracks) <= FEW_FRAMES else 1.0
-        return self.refined(state, stiffness, tol=share * self.tol)
-
     def refined(
         self, state: JointState, stiffness: float, tol: float | None = None
     ) -> JointResult:
@@ -404,11 +455,3 @@ class _Problem:
             max_iter=self.max_iter,
             tol=self.tol if tol is None else tol,
         )
-
-
-def _spread_frames(W: NDArray, factors: Factorisation, n: int) -> NDArray:
-    """Return n frames from the most to the least rigid, whatever their order."""
-    rest = W - _rigid_part(W, factors)
-    energy = np.sum(rest.reshape(len(W) // 2, -1) ** 2, axis=1)
-    order = np.argsort(energy, kind="stable")
-    return order[np.linspace(0, len(order) - 1, n).round().astype(int)]

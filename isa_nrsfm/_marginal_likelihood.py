@@ -26,9 +26,11 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frame_products import (
     FrameTracks,
+    SharedGram,
     frame_products,
     frame_tracks,
     shape_pairs,
+    shared_gram,
 )
 from isa_nrsfm._small_matrices import COLUMNS, ROWS, invert_positive, unpack3
 
@@ -135,11 +137,14 @@ class MarginalLikelihood:
         Passed
             The sums over the frames.
         """
+        gram = shared_gram(shapes)
         parts, start = [], 0
         for block in self.blocks:
             frames = slice(start, start + len(block.weight))
             parts.append(
-                _pass_over(block, shapes, motion[:, :, frames], noise, self.stiffness)
+                _pass_over(
+                    block, shapes, gram, motion[:, :, frames], noise, self.stiffness
+                )
             )
             start = frames.stop
         fields: Any = Passed(*zip(*parts, strict=True))
@@ -163,6 +168,7 @@ class MarginalLikelihood:
 def _pass_over(
     block: FrameTracks,
     shapes: NDArray,
+    gram: SharedGram,
     motion: NDArray,
     noise: float,
     stiffness: float,
@@ -175,7 +181,7 @@ def _pass_over(
     """
     n_shapes, _, n_points = shapes.shape
     n_frames = len(block.weight)
-    products = frame_products(block, shapes)
+    products = frame_products(block, shapes, gram)
     flat_tracks = block.weighted.reshape(n_points, -1)
     cameras = np.sum(motion[:, ROWS] * motion[:, COLUMNS], axis=0)  # M^T M
     H = products.gram.energies(cameras)

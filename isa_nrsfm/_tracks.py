@@ -499,15 +499,18 @@ def _collinear(
     centred: NDArray, translation: NDArray, seen: NDArray, dtype: np.dtype
 ) -> NDArray:
     """Tell which frames miss points and show the others on a line, up to rounding."""
+    on_line = np.asarray(~seen.all(axis=1))
+    centred, translation = centred[on_line], translation[on_line]
+    n_seen = seen[on_line].sum(axis=1)
     x, y = centred[..., 0], centred[..., 1]
     # The angle of the principal axis; what is left across it is not squared before.
     angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
     across = np.cos(angle)[:, None] * y - np.sin(angle)[:, None] * x
     extent = np.linalg.norm(translation, axis=1) + np.abs(centred).max(axis=(1, 2))
     rounding = EQUAL * np.finfo(dtype).eps * extent
-    n_seen = seen.sum(axis=1)
-    on_line = np.vecdot(across, across) <= n_seen * rounding**2
-    return on_line & (0 < n_seen) & (n_seen < seen.shape[1])
+    thin = np.vecdot(across, across) <= n_seen * rounding**2
+    on_line[on_line] = thin & (n_seen > 0)
+    return on_line
 
 
 def _describe_point(point: int, layout: Layout, names: NDArray | None) -> str:

@@ -403,23 +403,32 @@ class TestLargeTables:
         fitted(tracks)
         assert sizes == [40, 200]
 
+    def test_parts_grow_to_half_of_the_frames_and_all(self, small_limits):
+        tracks, _ = random_table(n_frames=700)
+        W = measurements(tracks, scale_frames=False)
+        problem = module._Problem(W, tracks, None, 10, 0.1)
+        parts = module._growing(problem, factorise(W, 2))
+        assert [len(part.tracks) for part in parts] == [40, 160, 700]
+        assert parts[-1] is problem
+
     def test_sample_is_spread_from_the_most_to_the_least_rigid_frame(self):
         W = measurements(random_table(n_frames=100)[0], scale_frames=False)
         factors = factorise(W, 2)
         rest = W - factors.rigid_motion @ factors.rigid_shape
         energy = np.sum(rest.reshape(100, -1) ** 2, axis=1)
-        chosen = module._spread_frames(W, factors, 21)
+        chosen = module._spread(module._by_rigidity(W, factors), 21)
         assert len(set(chosen)) == 21
         assert (np.diff(energy[chosen]) > 0).all()
         assert energy[chosen[0]] == energy.min()
         assert energy[chosen[-1]] == energy.max()
         # The same frames in any order.
         permuted, order = permute_frames(W, 1)
-        other = module._spread_frames(permuted, factorise(permuted, 2), 21)
+        order_there = module._by_rigidity(permuted, factorise(permuted, 2))
+        other = module._spread(order_there, 21)
         assert_array_equal(np.sort(order[other]), np.sort(chosen))
 
     def test_points_that_the_sample_does_not_show(self, small_limits, monkeypatch):
-        monkeypatch.setattr(module, "_spread_frames", lambda W, factors, n: range(n))
+        monkeypatch.setattr(module, "_spread", lambda order, n: np.arange(n))
         tracks, _ = random_table(n_frames=200)
         tracks[:150, 5] = np.nan
         tracks -= np.nanmean(tracks, axis=1, keepdims=True)
