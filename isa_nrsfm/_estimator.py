@@ -70,7 +70,7 @@ from isa_nrsfm.isa import PooledFastICA
 JOINT_TOL, PAPER_TOL = 0.05, 1e-10
 # Runs of FastICA, and steps and tolerance of the paper's refinement, where the result
 # is only a start.
-START_RUNS, START_STEPS, START_TOL = 4, 200, 1e-5
+START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
 
@@ -113,7 +113,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or
         `PooledFastICA`, with subspaces of size three; None is ``PooledFastICA()``, with
-        four runs where the joint refinement only starts from it. A clone is fitted;
+        two runs where the joint refinement only starts from it. A clone is fitted;
         where its `random_state`, `n_jobs` or `verbose` is None or 0 it gets that of
         this estimator (a seed drawn from it).
     block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\

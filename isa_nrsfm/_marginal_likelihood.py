@@ -137,13 +137,19 @@ class MarginalLikelihood:
         Passed
             The sums over the frames.
         """
-        gram = shared_gram(shapes)
+        gram, pairs = shared_gram(shapes), shape_pairs(len(shapes))
         parts, start = [], 0
         for block in self.blocks:
             frames = slice(start, start + len(block.weight))
             parts.append(
                 _pass_over(
-                    block, shapes, gram, motion[:, :, frames], noise, self.stiffness
+                    block,
+                    shapes,
+                    gram,
+                    pairs,
+                    motion[:, :, frames],
+                    noise,
+                    self.stiffness,
                 )
             )
             start = frames.stop
@@ -169,6 +175,7 @@ def _pass_over(
     block: FrameTracks,
     shapes: NDArray,
     gram: SharedGram,
+    pairs: tuple[NDArray, NDArray],
     motion: NDArray,
     noise: float,
     stiffness: float,
@@ -183,9 +190,9 @@ def _pass_over(
     n_frames = len(block.weight)
     products = frame_products(block, shapes, gram)
     flat_tracks = block.weighted.reshape(n_points, -1)
-    cameras = np.sum(motion[:, ROWS] * motion[:, COLUMNS], axis=0)  # M^T M
+    cameras = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])  # M^T M
     H = products.gram.energies(cameras)
-    seen = sum(products.cross[:, a, r] * motion[r, a] for a in range(3) for r in (0, 1))
+    seen = np.einsum("kari,rai->ki", products.cross, motion)
 
     # The posterior of the coefficients of each frame.
     diagonal = np.arange(n_shapes - 1)
@@ -203,16 +210,14 @@ def _pass_over(
 
     # Second moments of c, with what the stiffness adds to them.
     c = np.concatenate([np.ones((1, n_frames)), alpha])
-    E = c[:, None] * c
-    E[1:, 1:] += noise * Q
-    E[1 + diagonal, 1 + diagonal] += noise * stiffness
-    packed = E[shape_pairs(n_shapes)]
+    first, second = pairs
+    packed = c[first] * c[second]
+    Q[diagonal, diagonal] += stiffness
+    packed[first > 0] += noise * Q[first[first > 0] - 1, second[first > 0] - 1]
     motion_curvature = products.gram.moments(packed)
     A = unpack3(motion_curvature)
-    Y = sum(c[k] * products.cross[k] for k in range(n_shapes))
-    motion_gradient = np.stack(
-        [sum(motion[r, b] * A[b] for b in range(3)) - Y[:, r] for r in (0, 1)]
-    )
+    motion_gradient = np.einsum("rbi,bai->rai", motion, A)
+    motion_gradient -= np.einsum("ki,kari->rai", c, products.cross)
     X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
     shape_gradient = -X @ flat_tracks.T
     if block.weights is None:
@@ -221,6 +226,8 @@ def _pass_over(
         moments = (packed[:, None] * cameras).reshape(-1, n_frames)
         shape_curvature = (moments @ block.weights.T).reshape(-1, 6, n_points)
         # The position of a frame follows the weighted means of its points.
+        E = np.empty((n_shapes, n_shapes, n_frames))
+        E[first, second] = E[second, first] = packed
         mixed = np.einsum("kli,lbi->kbi", E, products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient -= means.reshape(-1, n_frames) @ block.weights.T
