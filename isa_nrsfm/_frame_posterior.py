@@ -161,7 +161,7 @@ def fit_posterior(
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
     first = np.zeros((n_frames, n_components)) if initial is None else initial
     extra = np.zeros((0, n_components)) if starts is None else np.asarray(starts)
-    white, space = whitened(shapes)
+    white, space = whitened(np.ascontiguousarray(shapes))
     prior = np.zeros((3, 3))
     if camera_precision is not None:
         prior = space @ camera_precision @ space.T
@@ -214,7 +214,8 @@ def _fit(
     )
     for frames, products in _frame_blocks(tracks, seen, shapes):
         problem = _problem(products, variance[frames], prior, tracks.shape[1])
-        alpha, converged = _descend(problem, initial[frames].T, max_steps)
+        first = np.ascontiguousarray(initial[frames].T)
+        alpha, converged = _descend(problem, first, max_steps)
         _write(fits, frames, products, problem, alpha, converged, prior)
     return fits
 
