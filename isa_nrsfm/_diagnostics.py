@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 # Frames of which the information on the weak directions is computed.
 INFORMATIVE_FRAMES = 400
 # A direction of the coefficients of which less than this is signal is not supported.
 LEAST_RELIABILITY = 0.8
+# Variance of a direction relative to the largest that is rounding errors.
+NO_VARIANCE = 1e-14
 # Standard deviation of a number of V_k, from which on it counts as not determined.
 LARGEST_DEVIATION = 0.1
 
@@ -136,12 +137,18 @@ def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_components,)
-        ``1 - lambda`` for the eigenvalues of the mean covariance relative to the whole
-        variance, decreasing.
+        Eigenvalues of the second moment of the coefficients relative to the whole
+        variance, that and the mean covariance, decreasing. Zero for directions in
+        which there is no variance at all.
     """
-    uncertain = covariance.mean(axis=0)
-    whole = alpha.T @ alpha / len(alpha) + uncertain
-    return 1.0 - eigh(uncertain, whole, eigvals_only=True)
+    known = alpha / np.sqrt(len(alpha))
+    variance, axes = np.linalg.eigh(known.T @ known + covariance.mean(axis=0))
+    kept = variance > NO_VARIANCE * variance[-1]
+    white = axes[:, kept] / np.sqrt(variance[kept])
+    shares = np.zeros(len(kept))
+    deviations = np.linalg.svd(known @ white, compute_uv=False)
+    shares[: len(deviations)] = deviations**2
+    return shares
 
 
 def weak_information(

@@ -204,6 +204,7 @@ def _pass_over(
     alpha = np.einsum("kli,li->ki", Q, along)
     explained = np.einsum("ki,ki->i", alpha, along)
     rest = block.energy - 2 * seen[0] + H[0, 0] - explained  # with s2 |alpha|^2
+    rest = np.maximum(rest, 0.0)  # less is rounding errors
     value = np.sum(rest / noise + logdet - len(diagonal) * np.log(noise))
     residual = rest.sum() - noise * np.sum(alpha**2)
     spread = noise * (alpha.size - noise * Q[diagonal, diagonal].sum())
