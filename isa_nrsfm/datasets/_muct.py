@@ -1,0 +1,227 @@
+"""MUCT: public landmarks of real faces, some of them hidden."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils import Bunch
+from sklearn.utils._param_validation import validate_params
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm._tracks import table_to_tracks
+from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
+
+MUCT = RemoteFile(
+    name="muct76-opencv.csv",
+    url=(
+        "https://raw.githubusercontent.com/aviralgoyal1997/"
+        "Gender-Classification-On-Muct-database/"
+        "0c0e908dadec1d89533b522ac37e5227455fc6a1/muct76-opencv.csv"
+    ),
+    sha256="e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb",
+)
+
+# The bit of a tag that is set where glasses are worn.
+GLASSES = 0x2
+
+DESCR = f"""\
+MUCT landmarks
+
+68 landmarks that were marked by hand in 3755 photos, 480 x 640 pixels, of the faces of
+276 people: two or three lightings (q to z), each seen by five cameras (a to e) at once.
+Camera a is in front of the face. Points that the face itself hides are missing: 2544
+points in 840 photos, all of them from the cameras b and c. Subjects 247 and 248 are
+identical twins.
+
+The landmarks are in the order of XM2VTS. The database has 76 a face; of these the
+file, whose name keeps the number, has 68.
+
+A photo is named like i000qa-fn: the subject, the lighting, the camera, the sex, and
+whether glasses are worn (g) or not (n). Three names have a number in the last place, so
+that the glasses are taken from the tag. Names of mirror images begin with ir; their
+points are renumbered such that those on the left of a face are on its left again.
+
+Source: free for academic use, {MUCT.url}
+
+S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
+Recognition Association of South Africa, 2010. http://www.milbo.org/muct
+"""
+
+
+@validate_params(
+    {
+        "data_home": [str, os.PathLike, None],
+        "download_if_missing": ["boolean"],
+        "mirrored": ["boolean"],
+        "return_X_y": ["boolean"],
+        "as_frame": ["boolean"],
+    },
+    prefer_skip_nested_validation=True,
+)
+def fetch_muct(
+    *,
+    data_home: DataHome = None,
+    download_if_missing: bool = True,
+    mirrored: bool = False,
+    return_X_y: bool = False,
+    as_frame: bool = False,
+) -> Bunch | tuple[Any, Any]:
+    """
+    Load the landmarks of the faces of MUCT; download them if necessary.
+
+    68 landmarks in each of 3755 photos of 276 people from five cameras; NaN for those
+    that the face itself hides. The data are free for academic use.
+
+    Parameters
+    ----------
+    data_home : str or path-like, default=None
+        The folder that has the file ``muct76-opencv.csv``, or into which it is
+        downloaded. By default it is ``isa_nrsfm`` in the data home of scikit-learn,
+        that is ``~/scikit_learn_data/isa_nrsfm``.
+    download_if_missing : bool, default=True
+        Whether to download the file (4.2 MB) if it is not there. This needs pooch:
+        ``pip install "isa-nrsfm[datasets]"``.
+    mirrored : bool, default=False
+        Whether to keep the mirror images of the photos, too: 7510 frames instead of
+        3755. Their points are renumbered such that those on the left of a face are on
+        its left again.
+    return_X_y : bool, default=False
+        Whether to return ``(data, target)`` instead of a Bunch.
+    as_frame : bool, default=False
+        Whether `data` is a pandas DataFrame and `target` a Series.
+
+    Returns
+    -------
+    sklearn.utils.Bunch or tuple of (data, target)
+        Dictionary-like object with the attributes
+
+        data : ndarray or DataFrame of shape (n_frames, 136)
+            The table x00, y00, x01, ..., in pixels, x to the right and y down. Points
+            that are not seen are NaN.
+        target : ndarray or Series of shape (n_frames,)
+            The same as `subjects`.
+        tracks : ndarray of shape (n_frames, 68, 2)
+            The same numbers as in `data`, one (x, y) pair a point.
+        visible : ndarray of shape (n_frames, 68), dtype=bool
+            False where a point is missing.
+        subjects : ndarray of shape (n_frames,), dtype=int
+            The number of the person, from 0 to 624, of which 276 occur.
+        lighting : ndarray of shape (n_frames,), dtype=str
+            The lighting, from q to z.
+        camera : ndarray of shape (n_frames,), dtype=str
+            The camera, from a (in front of the face) to e.
+        sex : ndarray of shape (n_frames,), dtype=str
+            The sex of the person, f or m.
+        glasses : ndarray of shape (n_frames,), dtype=bool
+            Whether glasses are worn.
+        mirrored : ndarray of shape (n_frames,), dtype=bool
+            Which rows are mirror images.
+        names : ndarray of shape (n_frames,), dtype=str
+            The names of the photos.
+        tags : ndarray of shape (n_frames,), dtype=str
+            Attributes of the photos as they are in the file: bits, hexadecimal.
+        feature_names : list of str
+            The names of the columns of `data`.
+        frame : DataFrame of shape (n_frames, 144)
+            Only with `as_frame`: the columns name, tag, subject, lighting, camera, sex,
+            glasses, mirrored, and those of `data`.
+        filename : str
+            The path of the file.
+        DESCR : str
+            What the data are, where they come from and the paper to cite.
+
+    Raises
+    ------
+    OSError
+        If the file is not there and cannot be downloaded, or not with
+        `download_if_missing=False`; or if the file that is there is another one.
+    ImportError
+        If the file has to be downloaded and pooch is not installed, or if pandas is not
+        installed with `as_frame`.
+
+    See Also
+    --------
+    fetch_shark : A sequence with its truth.
+    make_face_tracks : Artificial faces with known truth.
+
+    References
+    ----------
+    .. [1] Milborrow, Morkel, Nicolls, "The MUCT Landmarked Face Database", Pattern
+       Recognition Association of South Africa, 2010.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.datasets import fetch_muct
+    >>> faces = fetch_muct()  # doctest: +SKIP
+    >>> faces.data.shape  # doctest: +SKIP
+    (3755, 136)
+    """
+    path = fetch_file(MUCT, data_home, download_if_missing)
+    faces = _read(path)
+    if not mirrored:
+        faces = {name: column[~faces["mirrored"]] for name, column in faces.items()}
+    bunch = Bunch(
+        **faces,
+        target=faces["subjects"],
+        tracks=table_to_tracks(faces["data"]),
+        feature_names=_header(path)[2:],
+        filename=str(path),
+        DESCR=DESCR,
+    )
+    if as_frame:
+        _put_in_frames(bunch)
+    return (bunch.data, bunch.target) if return_X_y else bunch
+
+
+def _header(path: Path) -> list[str]:
+    """Return the names of the columns: name, tag, x00, y00, x01, ...."""
+    with path.open(encoding="ascii") as file:
+        return file.readline().rstrip().split(",")
+
+
+def _read(path: Path) -> dict[str, NDArray]:
+    """Return all rows of the file, NaN where a point is at (0, 0), and their labels."""
+    names, tags = np.loadtxt(
+        path, dtype=np.str_, delimiter=",", skiprows=1, usecols=(0, 1), unpack=True
+    )
+    columns = range(2, len(_header(path)))
+    data = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns)
+    visible = table_to_tracks(data).any(axis=2)
+    table_to_tracks(data)[~visible] = np.nan
+
+    mirrored = np.strings.startswith(names, "ir")
+    # One column a letter: i000qa-fn.
+    photos = np.where(mirrored, np.strings.replace(names, "ir", "i", 1), names)
+    letters = photos.astype("U9").view("U1").reshape(-1, 9)
+    return {
+        "data": data,
+        "visible": visible,
+        "subjects": letters[:, 1:4].astype(int) @ [100, 10, 1],
+        "lighting": letters[:, 4],
+        "camera": letters[:, 5],
+        "sex": letters[:, 7],
+        "glasses": np.array([int(tag, 16) & GLASSES > 0 for tag in tags]),
+        "mirrored": mirrored,
+        "names": names,
+        "tags": tags,
+    }
+
+
+def _put_in_frames(faces: Bunch) -> None:
+    """Make the table and the target of pandas, and add a frame of all columns."""
+    pd = import_optional("pandas", extra="io")
+    faces.data = pd.DataFrame(faces.data, columns=faces.feature_names)
+    faces.target = pd.Series(faces.subjects, name="subject")
+    labels = {
+        "name": faces.names,
+        "tag": faces.tags,
+        "subject": faces.subjects,
+        "lighting": faces.lighting,
+        "camera": faces.camera,
+        "sex": faces.sex,
+        "glasses": faces.glasses,
+        "mirrored": faces.mirrored,
+    }
+    faces.frame = pd.concat([pd.DataFrame(labels), faces.data], axis=1)
