@@ -22,6 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._camera import reference_camera
 from isa_nrsfm._completion import complete_tracks
+from isa_nrsfm._deformation_metric import deformation_metric, euclidean_frames
 from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
 from isa_nrsfm._frame_fit import (
     FrameFit,
@@ -44,6 +45,7 @@ from isa_nrsfm._independent_gauge import (
     independent_gauge,
 )
 from isa_nrsfm._joint_fit import fit_jointly
+from isa_nrsfm._metric_refinement import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._robust import LOSSES, gross_outliers, robust_sizes
 from isa_nrsfm._tracks import (
@@ -468,7 +470,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         X = self._validated(X)
         return Decomposition(*as_type(self._fit_frames(X), X.dtype)[:3])
 
-    def reconstruct(self, X: Any) -> NDArray:
+    def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """
         Return the 3D shape of each frame of a table.
 
@@ -476,14 +478,54 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        camera : {"orthographic", "weak_perspective"} or None, default=None
+            What is known of the cameras. None returns the affine shapes, in the space
+            of `mean_shape_`: angles and proportions in depth are not those of the
+            object. Otherwise shapes are Euclidean, up to rotation and mirror image,
+            which are the same for all frames. "weak_perspective" lets each camera have
+            a scale of its own, so that the sizes of the shapes mean nothing;
+            "orthographic" has one scale for all, so that shapes are in the units of the
+            table.
 
         Returns
         -------
         ndarray of shape (n_frames, n_points, 3)
-            Shapes in the space of `mean_shape_`, without camera.
+            Shapes, without camera; NaN for rows of which too little is seen. Euclidean
+            ones are turned to be as near as possible to the mean shape.
+
+        Raises
+        ------
+        ValueError
+            If `camera` is something else, or if the cameras of the fitted table see
+            less than three directions of space.
+
+        Warns
+        -----
+        UserWarning
+            If the cameras of the fitted table turn too little to tell its metric.
+
+        See Also
+        --------
+        isa_nrsfm.calibration.euclidean_frames : Rotations and scales, too.
+
+        Notes
+        -----
+        The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
+        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is.
         """
-        alpha = self.decompose(X).alpha
-        return compose(self.mean_shape_, self.basis_, alpha)
+        if camera is not None and camera not in CAMERA_MODELS:
+            raise ValueError(
+                f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
+            )
+        motion, _, alpha = self.decompose(X)
+        if camera is None:
+            return compose(self.mean_shape_, self.basis_, alpha)
+        metric = deformation_metric(self.motion_, self.alpha_)
+        frames = euclidean_frames(metric, motion, alpha, self.mean_shape_, self.basis_)
+        shapes = frames.shapes
+        if camera == "orthographic":
+            shapes = frames.scales[:, None, None] * shapes
+        return shapes.astype(motion.dtype, copy=False)
 
     def reproject(self, X: Any) -> NDArray:
         """

@@ -14,7 +14,7 @@ from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.io import save_model, write_table
-from isa_nrsfm.metrics import frame_energies
+from isa_nrsfm.metrics._reprojection import frame_energies
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -1,0 +1,227 @@
+"""Turn a shape upright and frontal."""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+
+from isa_nrsfm.datasets._face_model import mirror_points, neutral_shape
+
+SCHEMES = ("ibug-68",)
+# Two directions are parallel whose sine is below this.
+PARALLEL = 1e-6
+
+
+class CanonicalPose(NamedTuple):
+    """
+    A shape that stands upright and faces the viewer.
+
+    Attributes
+    ----------
+    shape : ndarray of shape (n_points, 3)
+        ``given shape @ rotation.T``: x points to the right of the viewer, y down and z
+        away from the viewer, who looks along z.
+    rotation : ndarray of shape (3, 3)
+        An orthogonal matrix, with determinant -1 if the shape is mirrored and +1
+        otherwise. Everything else that lives in the space of the shape follows by it:
+        basis shapes as the shape does, and cameras M become ``M @ rotation.T``.
+    mirrored : bool
+        Whether the shape is the mirror image of the given one.
+    """
+
+    shape: NDArray
+    rotation: NDArray
+    mirrored: bool
+
+
+def canonical_pose(
+    shape: ArrayLike,
+    *,
+    left_right: ArrayLike | None = None,
+    up: ArrayLike | None = None,
+    front: ArrayLike | None = None,
+    scheme: Literal["ibug-68"] | None = None,
+) -> CanonicalPose:
+    """
+    Turn a shape upright and frontal, as the image of a passport shows it.
+
+    Directions that are given in terms of points of the object make this independent of
+    the cameras. Angles have to be true: in the coordinates of `AffineNRSfM` they are
+    not, `euclidean_shapes` has to come first.
+
+    Parameters
+    ----------
+    shape : array-like of shape (n_points, 3)
+        The shape, such as a mean shape in Euclidean coordinates.
+    left_right : array-like of int, shape (n_pairs, 2), default=None
+        Pairs of points, the first of which the viewer sees on the left and the second
+        on the right: the right eye of a person comes before the left one. The x axis is
+        the principal axis of their differences.
+    up : array-like, default=None
+        A direction (3,) in the coordinates of the shape, or pairs of points (n_pairs,
+        2), a lower one and one above it, whose mean difference is the direction. An
+        upright shape has it opposite to the y axis, as far as x allows.
+    front : array-like, default=None
+        Which way the object faces the viewer: a direction (3,), or pairs of points
+        (n_pairs, 2), one behind and one in front of it, as for `up`. With both
+        `left_right` and `up` it decides on the mirror image: where it would point away
+        from the viewer, the sign of the depth is changed.
+    scheme : {"ibug-68"}, default=None
+        Fills in what is not given: for the 68 points of faces in the order of iBUG all
+        symmetric points as `left_right`, from the chin to the root of the nose as
+        `up`, and from the ends of the jaw to the tip of the nose as `front`.
+
+    Returns
+    -------
+    CanonicalPose
+        Named tuple of the shape, the rotation and whether it is a mirror image.
+
+    Raises
+    ------
+    ValueError
+        If only one of the three directions is given, if two of them are parallel or
+        one is zero, if points do not exist, or if the shape is not of the shape above
+        or not finite.
+
+    Notes
+    -----
+    Two of the three directions determine the rotation, with x before y before z where
+    they are not orthogonal. Without any, the axes become the principal axes of the
+    points, each the one that is nearest to it already: what is upright up to some
+    tens of degrees stays so.
+
+    Affine cameras do not tell a shape from its mirror image in depth. Nothing is
+    mirrored here unless all three directions are given and contradict each other. Note
+    that pairs of points with left and right confused do so as well.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.calibration import canonical_pose
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> face = make_face_tracks(n_frames=2, random_state=0).neutral_shape
+    >>> quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    >>> pose = canonical_pose(face @ quarter.T, scheme="ibug-68")
+    >>> bool(np.abs(pose.shape - face).max() < 2.5), pose.mirrored  # of 168 mm
+    (True, False)
+    """
+    points = np.asarray(shape, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(
+            "shape must be of the shape (n_points, 3) and finite; got the shape "
+            f"{points.shape} with {np.sum(~np.isfinite(points))} entries that are not"
+        )
+    if scheme is not None:
+        pairs = _scheme_pairs(scheme, len(points))
+        left_right = pairs["left_right"] if left_right is None else left_right
+        up = pairs["up"] if up is None else up
+        front = pairs["front"] if front is None else front
+    right = None if left_right is None else _principal_direction(points, left_right)
+    down = None if up is None else -_direction("up", points, up)
+    away = None if front is None else -_direction("front", points, front)
+    axes = [right, down, away]
+    n_given = sum(axis is not None for axis in axes)
+    if n_given == 0:
+        rotation = _principal_axes(points)
+    elif n_given == 1:
+        raise ValueError(
+            "two of left_right, up and front determine the pose; only one is given"
+        )
+    else:
+        rotation = _frame(axes)
+    mirrored = False
+    if away is not None and n_given == 3 and rotation[2] @ away < 0:
+        rotation[2] *= -1
+        mirrored = True
+    return CanonicalPose(points @ rotation.T, rotation, mirrored)
+
+
+def _frame(axes: list[NDArray | None]) -> NDArray:
+    """Return the rotation whose rows are the first two axes that are known."""
+    first, second, *_ = (i for i, axis in enumerate(axes) if axis is not None)
+    rotation = np.zeros((3, 3))
+    rotation[first] = axes[first]
+    rest = axes[second] - (axes[second] @ rotation[first]) * rotation[first]
+    size = np.linalg.norm(rest)
+    if size < PARALLEL:
+        names = ("left_right", "up", "front")
+        raise ValueError(
+            f"{names[first]} and {names[second]} must not be parallel; the sine of "
+            f"their angle is {size:.1e}"
+        )
+    rotation[second] = rest / size
+    third = 3 - first - second
+    sign = 1 if (second - first) % 3 == 1 else -1
+    rotation[third] = sign * np.cross(rotation[first], rotation[second])
+    return rotation
+
+
+def _principal_axes(points: NDArray) -> NDArray:
+    """Return the principal axes as a rotation, each near to where it is now."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1].T
+    chosen, places = linear_sum_assignment(np.abs(axes), maximize=True)
+    rotation = np.zeros((3, 3))
+    rotation[places] = axes[chosen]
+    rotation[rotation.diagonal() < 0] *= -1
+    if np.linalg.det(rotation) < 0:
+        rotation[np.argmin(rotation.diagonal())] *= -1
+    return rotation
+
+
+def _principal_direction(points: NDArray, pairs: ArrayLike) -> NDArray:
+    """Return the unit vector from left to right points."""
+    difference = _differences("left_right", points, pairs)
+    axis = np.linalg.svd(difference, full_matrices=False)[2][0]
+    along = axis @ difference.sum(axis=0)
+    if not along:
+        raise ValueError("the pairs of left_right have no direction in common")
+    return axis * np.sign(along)
+
+
+def _direction(name: str, points: NDArray, given: ArrayLike) -> NDArray:
+    """Return the unit vector that is given as it is or by pairs of points."""
+    vector = np.asarray(given)
+    if vector.shape == (3,):
+        vector = vector.astype(np.float64)
+    elif vector.ndim == 2:
+        vector = _differences(name, points, given).mean(axis=0)
+    else:
+        raise ValueError(
+            f"{name} must be a direction of shape (3,) or pairs of points of shape "
+            f"(n_pairs, 2); got the shape {vector.shape}"
+        )
+    size = np.linalg.norm(vector)
+    if not 0 < size < np.inf:
+        raise ValueError(f"{name} must be a direction other than zero; got {vector}")
+    return vector / size
+
+
+def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:
+    """Return the differences (n_pairs, 3) of the points of pairs."""
+    index = np.asarray(pairs)
+    if index.ndim != 2 or index.shape[1] != 2 or index.dtype.kind not in "iu":
+        raise ValueError(
+            f"{name} must be integers of shape (n_pairs, 2), two points a pair; got "
+            f"shape {index.shape} and dtype {index.dtype}"
+        )
+    if not index.size or index.min() < 0 or index.max() >= len(points):
+        found = f"{index.min()} to {index.max()}" if index.size else "none"
+        raise ValueError(f"{name} must name points 0 to {len(points) - 1}; got {found}")
+    return points[index[:, 1]] - points[index[:, 0]]
+
+
+def _scheme_pairs(scheme: str, n_points: int) -> dict[str, Any]:
+    """Return the pairs of points of a named scheme."""
+    if scheme not in SCHEMES:
+        raise ValueError(f"scheme must be one of {SCHEMES}; got {scheme!r}")
+    if n_points != 68:
+        raise ValueError(f"scheme={scheme!r} needs 68 points; got {n_points}")
+    mirror, x = mirror_points(), neutral_shape()[:, 0]
+    left = np.flatnonzero(x < x[mirror])
+    return {
+        "left_right": np.stack([left, mirror[left]], axis=1),
+        "up": [[8, 27]],
+        "front": [[0, 30], [16, 30]],
+    }

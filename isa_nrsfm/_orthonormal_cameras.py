@@ -1,0 +1,255 @@
+"""Orthographic cameras in the motion factor of a table: rows that are orthonormal."""
+
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import OptimizeResult, minimize
+from sklearn.utils import check_array
+
+# Columns that are added at a time: as many as a basis shape has.
+STEP = 3
+# A column that the ones before it determine up to this share of it is left out.
+DEPENDENT = 1e-10
+# Slopes at which the minimisation ends: where starts can be compared, and where what is
+# left is rounding errors.
+ROUGH, FLAT = 1e-3, 1e-13
+# Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
+# by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2): by 4 tr C, on average over all
+# cameras. C is the noise variance times Q^T Q.
+NOISE_PRICE = 4.0
+
+
+class OrthonormalCameras(NamedTuple):
+    """
+    Cameras whose rows are as nearly orthonormal as a motion factor allows.
+
+    Attributes
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        ``P Q``, nearly orthonormal rows.
+    mixing : ndarray of shape (n_columns, 3)
+        Q, with zeros for columns of P that are not used.
+    cost : float
+        Mean over the frames of ``||R_i R_i^T - I||_F^2``, which is ``(|r1|^2 - 1)^2 +
+        (|r2|^2 - 1)^2 + 2 (r1 . r2)^2`` with r1 and r2 the rows of a camera.
+    """
+
+    cameras: NDArray
+    mixing: NDArray
+    cost: float
+
+
+def orthonormal_cameras(
+    motion: ArrayLike, noise_variance: float = 0.0, max_iter: int = 2000
+) -> OrthonormalCameras:
+    """
+    Find orthographic cameras that are mixtures of the columns of a motion factor.
+
+    A factorisation ``W ~ P B`` of a measurement matrix is known up to a mixing of the
+    columns of P. If an object deforms as a mixture of few shapes, some mixtures ``P Q``
+    of three columns are, in each frame, two orthonormal rows: the orthographic cameras.
+
+    Parameters
+    ----------
+    motion : array-like of shape (2 * n_frames, n_columns)
+        P, for each frame the row of x, then of y. At least three columns, those of most
+        energy first, such as left singular vectors of W. Without noise their scales do
+        not matter.
+    noise_variance : float, default=0.0
+        Variance of the errors of the entries of P. It is that of the entries of W if P
+        is its left singular vectors times its singular values.
+    max_iter : int, default=2000
+        The most quasi-Newton steps for each number of columns.
+
+    Returns
+    -------
+    OrthonormalCameras
+        Named tuple of cameras, mixing and cost. The cameras are known up to a rotation
+        or reflection of space.
+
+    Raises
+    ------
+    ValueError
+        If P is not of the shape above, has entries that are not finite or fewer than
+        three linearly independent columns, or if the variance is negative.
+
+    Notes
+    -----
+    The cost is minimised for mixtures of the first three columns, then of the first
+    six, nine and so on, each time from the last mixture, while it falls. There are
+    local minima: where columns are added for the first time, each three of the columns
+    make a start, too. With noise the expected cost is minimised: to first order errors
+    of P add ``4 noise_variance ||Q||_F^2`` to it, for cameras that see all directions
+    alike. The result does not change when frames are turned in their image planes.
+
+    Cameras of an object that deforms a lot are hard to tell from those of one that
+    turns and deforms otherwise: a low cost does not mean that they are right.
+
+    References
+    ----------
+    J. Xiao, J. Chai, T. Kanade, "A closed-form solution to non-rigid shape and motion
+    recovery", International Journal of Computer Vision 67, 2006.
+
+    I. Akhter, Y. Sheikh, S. Khan, "In defense of orthonormality constraints for
+    nonrigid structure from motion", IEEE Conference on Computer Vision and Pattern
+    Recognition, 2009.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> from isa_nrsfm.calibration import orthonormal_cameras
+    >>> cameras = Rotation.random(20, rng=0).as_matrix()[:, :2]
+    >>> shape = np.random.default_rng(0).normal(size=(3, 9))
+    >>> U, S, _ = np.linalg.svd(cameras.reshape(-1, 3) @ shape, full_matrices=False)
+    >>> found = orthonormal_cameras(U[:, :3])
+    >>> np.allclose(found.cameras @ found.cameras.transpose(0, 2, 1), np.eye(2))
+    True
+    """
+    P = check_array(motion, dtype=np.float64, input_name="motion", ensure_min_samples=2)
+    if len(P) % 2:
+        raise ValueError(
+            f"motion must have two rows a frame, an even number; got {len(P)} rows"
+        )
+    if not noise_variance >= 0:
+        raise ValueError(f"noise_variance must not be negative; got {noise_variance}")
+    kept, basis, inverse = _orthonormal_columns(P)
+    price = NOISE_PRICE * noise_variance
+    n_columns = basis.shape[1]
+    mixing, least = np.eye(3), np.inf
+    for n in range(3, n_columns + STEP, STEP):
+        n = min(n, n_columns)
+        starts = [np.vstack([mixing, np.zeros((n - len(mixing), 3))])]
+        if 3 < n <= 3 + STEP:
+            triples = combinations(np.eye(n), 3)
+            starts += [np.column_stack(triple) for triple in triples]
+        arguments = basis[:, :n], inverse[:n, :n], price
+        if len(starts) > 1:
+            found = [_minimised(start, arguments, ROUGH, max_iter) for start in starts]
+            starts = [min(found, key=lambda result: result.fun).x]
+        best = _minimised(starts[0], arguments, FLAT, max_iter)
+        if not best.fun < least:
+            break
+        least, mixing = best.fun, best.x.reshape(n, 3)
+    n = len(mixing)
+    cameras = (basis[:, :n] @ mixing).reshape(-1, 2, 3)
+    Q = np.zeros((P.shape[1], 3))
+    Q[kept[:n]] = inverse[:n, :n] @ mixing
+    cost = np.sum(orthonormality_residuals(cameras) ** 2) / len(cameras)
+    return OrthonormalCameras(cameras, Q, float(cost))
+
+
+def nearest_orthonormal(cameras: NDArray) -> NDArray:
+    """
+    Return the cameras with orthonormal rows that are nearest to given ones.
+
+    Parameters
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2, 3)
+        Their polar factors.
+    """
+    U, _, Vt = np.linalg.svd(cameras, full_matrices=False)
+    return U @ Vt
+
+
+def orthonormality_residuals(cameras: NDArray) -> NDArray:
+    """
+    Return how far the rows of cameras are from orthonormal ones.
+
+    Parameters
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    ndarray of shape (3, n_frames)
+        ``|r1|^2 - 1``, ``|r2|^2 - 1`` and ``sqrt(2) r1 . r2``: the sum of their squares
+        is ``||R_i R_i^T - I||_F^2``.
+    """
+    r1, r2 = cameras[:, 0], cameras[:, 1]
+    across = np.sqrt(2.0) * np.vecdot(r1, r2)
+    return np.stack([np.vecdot(r1, r1) - 1.0, np.vecdot(r2, r2) - 1.0, across])
+
+
+def expected_cost(
+    mixing: NDArray, basis: NDArray, inverse: NDArray, price: float
+) -> tuple[float, NDArray]:
+    """
+    Return what `orthonormal_cameras` minimises, and its gradient.
+
+    Parameters
+    ----------
+    mixing : ndarray of shape (3 * n_columns,)
+        Mixing of the columns of the basis, row by row.
+    basis : ndarray of shape (2 * n_frames, n_columns)
+        Basis of the columns of P.
+    inverse : ndarray of shape (n_columns, n_columns)
+        Takes a mixing of the basis to Q.
+    price : float
+        Price of ``||Q||_F^2``.
+
+    Returns
+    -------
+    cost : float
+        Mean over the frames of the squares of `orthonormality_residuals`, plus the
+        price.
+    gradient : ndarray of shape (3 * n_columns,)
+        Its derivatives by the entries of the mixing.
+    """
+    mixing = mixing.reshape(-1, 3)
+    cameras = (basis @ mixing).reshape(-1, 2, 3)
+    Q = inverse @ mixing
+    xx, yy, xy = residuals = orthonormality_residuals(cameras)
+    slope = np.stack([xx, yy], axis=1)[..., None] * cameras
+    slope += xy[:, None, None] / np.sqrt(2.0) * cameras[:, ::-1]
+    n_frames = len(cameras)
+    cost = np.sum(residuals**2) / n_frames + price * np.sum(Q**2)
+    gradient = 4.0 / n_frames * basis.T @ slope.reshape(-1, 3)
+    gradient += 2.0 * price * inverse.T @ Q
+    return float(cost), gradient.ravel()
+
+
+def _minimised(
+    start: NDArray, arguments: tuple, slope: float, max_iter: int
+) -> OptimizeResult:
+    """Return the minimum of the expected cost next to a mixture."""
+    return minimize(
+        expected_cost,
+        start.ravel(),
+        args=arguments,
+        jac=True,
+        method="BFGS",
+        options={"gtol": slope, "maxiter": max_iter},
+    )
+
+
+def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return which columns are independent, and a basis of what the first n of them span.
+
+    Columns of the basis are triangular mixtures of the columns that are kept, the third
+    result. They are orthogonal and as long as columns of cameras are on average, so
+    that the cost is well scaled.
+    """
+    lengths = np.linalg.norm(motion, axis=0)
+    kept = np.flatnonzero(lengths > 0)
+    scaled = np.linalg.qr(motion[:, kept] / lengths[kept], mode="r")
+    kept = kept[np.abs(np.diagonal(scaled)) > DEPENDENT]
+    if len(kept) < 3:
+        raise ValueError(
+            "motion must have at least three linearly independent columns; "
+            f"{len(kept)} of {motion.shape[1]} are"
+        )
+    basis, triangle = np.linalg.qr(motion[:, kept])
+    root = np.sqrt(len(motion) / 3)
+    inverse = solve_triangular(triangle, root * np.eye(len(kept)))
+    return kept, root * basis, inverse

@@ -1,0 +1,14 @@
+"""Measures of a factorisation, blind to what the images cannot determine."""
+
+from isa_nrsfm.metrics._affine_shapes import affine_shape_error, basis_similarity
+from isa_nrsfm.metrics._euclidean_shapes import mean_shape_error_3d
+from isa_nrsfm.metrics._reprojection import inverse_snr
+from isa_nrsfm.metrics._subspaces import subspace_distance
+
+__all__ = [
+    "affine_shape_error",
+    "basis_similarity",
+    "inverse_snr",
+    "mean_shape_error_3d",
+    "subspace_distance",
+]

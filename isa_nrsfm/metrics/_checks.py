@@ -1,0 +1,57 @@
+"""Check the arrays that the measures take."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isa_nrsfm._affine_alignment import unit_shapes
+
+
+def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
+    """Return an array of floats; refuse NaN and infinity."""
+    values = np.asarray(array, dtype=np.float64)
+    if not np.isfinite(values).all():
+        n_bad = int(np.sum(~np.isfinite(values)))
+        raise ValueError(f"{name} must be finite; {n_bad} entries are NaN or infinite")
+    return values
+
+
+def as_shapes(name: str, array: ArrayLike) -> NDArray[np.float64]:
+    """Return shapes (n, n_points, 3); refuse anything else."""
+    shapes = as_finite(name, array)
+    if shapes.ndim != 3 or shapes.shape[2] != 3 or not shapes.size:
+        raise ValueError(
+            f"{name} must be of the shape (n, n_points, 3); got {shapes.shape}"
+        )
+    return shapes
+
+
+def as_mean_shape(name: str, array: ArrayLike, basis: NDArray) -> NDArray[np.float64]:
+    """Return a centred mean shape with the points of the basis."""
+    shape = as_finite(name, array)
+    if shape.shape != basis.shape[1:]:
+        raise ValueError(
+            f"{name} must be of the shape {basis.shape[1:]} of the basis shapes; got "
+            f"{shape.shape}"
+        )
+    shape = unit_shapes(shape[None])[0]
+    if not shape.any():
+        raise ValueError(f"all points of {name} are equal")
+    return shape
+
+
+def check_same_shape(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
+    """Refuse arrays of different shapes."""
+    if a.shape != b.shape:
+        raise ValueError(
+            f"{name_a} and {name_b} must be of the same shape; got {a.shape} and "
+            f"{b.shape}"
+        )
+
+
+def check_same_points(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
+    """Refuse shapes with different numbers of points."""
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"{name_a} and {name_b} must have the same points; got {a.shape[1]} and "
+            f"{b.shape[1]}"
+        )

@@ -1,0 +1,158 @@
+"""Measures of shapes up to rotations, in the conventions of the literature."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isa_nrsfm._affine_alignment import ROUNDING
+from isa_nrsfm.metrics._checks import as_shapes, check_same_shape
+
+CONVENTIONS = ("sequence", "frame")
+
+
+def mean_shape_error_3d(
+    S: ArrayLike,
+    X: ArrayLike,
+    *,
+    convention: Literal["sequence", "frame"] = "sequence",
+    scale: bool | None = None,
+) -> float:
+    r"""
+    Compare 3D shapes up to rotations, as papers on non-rigid structure from motion do.
+
+    All shapes are centred over their points. With :math:`s_{ij}` and :math:`x_{ij}` for
+    point j of the true and the estimated shape of frame i, I frames and J points, the
+    two conventions are
+
+    - "sequence": one orthogonal matrix O aligns all frames,
+
+      .. math:: e_{3D} = \frac{1}{\sigma I J} \sum_{ij} \|s_{ij} - O x_{ij}\|,
+                \quad \sigma = \frac{1}{3 I} \sum_i (\sigma_{ix} + \sigma_{iy} +
+                \sigma_{iz}),
+
+      with the standard deviations :math:`\sigma_{ix}, \sigma_{iy}, \sigma_{iz}` of the
+      coordinates of the true shape over its points: a mean distance, in units of the
+      extent of the object along an axis (Akhter et al. 2008; Dai et al. 2014);
+
+    - "frame": an orthogonal matrix :math:`O_i` and a scale :math:`c_i` of its own align
+      each frame,
+
+      .. math:: \frac{1}{I} \sum_i \frac{\|S_i - c_i X_i O_i\|_F}{\|S_i\|_F},
+
+      relative to the size of the whole object (Garg et al. 2013; Kong, Lucey 2019).
+
+    Parameters
+    ----------
+    S : array-like of shape (n_frames, n_points, 3)
+        The true shapes.
+    X : array-like of shape (n_frames, n_points, 3)
+        The shapes to be judged, as ``AffineNRSfM.reconstruct(X, camera=...)`` returns
+        them: lengths and angles should be true.
+    convention : {"sequence", "frame"}, default="sequence"
+        Which error to compute. That of the sequence also counts rotations of the
+        estimated shapes against each other; the other one does not.
+    scale : bool, default=None
+        Whether to fit a scale, too: a common one for "sequence", one for each frame for
+        "frame". By default that is False for "sequence", where shapes have to have the
+        true size, and True for "frame".
+
+    Returns
+    -------
+    float
+        The error, 0 for shapes that are right up to what is fitted. A shape whose
+        points are all equal has the errors 1 ("frame") and about 1.6 ("sequence").
+
+    Raises
+    ------
+    ValueError
+        If the arrays differ in shape, are not of the shape above, have entries that
+        are not finite (there is no convention for missing points), if `convention` is
+        none of the two, or if all points of a true shape are equal.
+
+    See Also
+    --------
+    affine_shape_error : The error up to an affinity of space, which is all that affine
+        images determine.
+
+    Notes
+    -----
+    The matrices and scales minimise the sum of squared distances (orthogonal
+    Procrustes analysis). They may be reflections: orthographic images do not tell a
+    shape from its mirror image. With "frame" that is granted to each frame, which
+    forgives frames that are mirror images of each other.
+
+    The program of Akhter et al. takes the orthogonal matrix that is nearest to the best
+    affinity, which is not quite the best orthogonal matrix: for reconstructions of
+    motion capture its errors differ by up to 5 percent. That of Kong and Lucey takes
+    the ratio of the norms for the scale of a frame.
+
+    References
+    ----------
+    I. Akhter, Y. Sheikh, S. Khan, T. Kanade, "Nonrigid structure from motion in
+    trajectory space", Advances in Neural Information Processing Systems 21, 2008.
+
+    Y. Dai, H. Li, M. He, "A simple prior-free method for non-rigid
+    structure-from-motion factorization", International Journal of Computer Vision 107,
+    2014.
+
+    R. Garg, A. Roussos, L. Agapito, "Dense variational reconstruction of non-rigid
+    surfaces from monocular video", IEEE Conference on Computer Vision and Pattern
+    Recognition, 2013.
+
+    C. Kong, S. Lucey, "Deep non-rigid structure from motion", IEEE International
+    Conference on Computer Vision, 2019.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.datasets import make_nonrigid_tracks
+    >>> from isa_nrsfm.metrics import mean_shape_error_3d
+    >>> S = make_nonrigid_tracks(random_state=0).shapes
+    >>> mirrored = S @ np.diag([1.0, 1.0, -1.0])
+    >>> mean_shape_error_3d(S, mirrored) < 1e-12
+    True
+
+    Shapes of twice the size have the wrong size for the one convention only:
+
+    >>> round(mean_shape_error_3d(S, 2 * S), 2)
+    1.65
+    >>> mean_shape_error_3d(S, 2 * S, convention="frame") < 1e-12
+    True
+    """
+    if convention not in CONVENTIONS:
+        raise ValueError(f"convention must be one of {CONVENTIONS}; got {convention!r}")
+    truth, shapes = as_shapes("S", S), as_shapes("X", X)
+    check_same_shape("S", truth, "X", shapes)
+    truth, shapes = _centred(truth), _centred(shapes)
+    flat = np.flatnonzero(~truth.any(axis=(1, 2)))
+    if len(flat):
+        raise ValueError(
+            "each true shape must have at least two different points; all points are "
+            f"equal in {len(flat)} frame(s) of S, the first is {flat[0]}"
+        )
+    if convention == "frame":
+        rest = _rest(truth, shapes, scale is None or scale)
+        size = np.linalg.norm(truth, axis=(1, 2))
+        return float(np.mean(np.linalg.norm(rest, axis=(1, 2)) / size))
+    rest = _rest(truth.reshape(1, -1, 3), shapes.reshape(1, -1, 3), bool(scale))
+    return float(np.linalg.norm(rest, axis=2).mean() / truth.std(axis=1).mean())
+
+
+def _centred(shapes: NDArray) -> NDArray:
+    """Return shapes centred over their points; zero if all points are equal."""
+    centred = shapes - shapes.mean(axis=1, keepdims=True)
+    size = np.abs(shapes).max(axis=(1, 2), keepdims=True)
+    largest = np.abs(centred).max(axis=(1, 2), keepdims=True)
+    return np.where(largest > ROUNDING * size, centred, 0.0)
+
+
+def _rest(truth: NDArray, shapes: NDArray, scale: bool) -> NDArray:
+    """Return what orthogonal matrices, and scales, leave of each pair of shapes."""
+    left, shared, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ truth)
+    aligned = shapes @ (left @ right)
+    if scale:
+        energy = np.sum(shapes**2, axis=(1, 2))
+        factor = shared.sum(axis=1) / np.where(energy > 0, energy, 1.0)
+        aligned = factor[:, None, None] * aligned
+    return truth - aligned

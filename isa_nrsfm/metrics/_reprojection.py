@@ -1,0 +1,116 @@
+"""Measures of the reprojection of a table."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import check_array
+
+from isa_nrsfm._tracks import LAYOUTS, Layout, table_to_tracks
+from isa_nrsfm.metrics._checks import check_same_shape
+
+
+def inverse_snr(
+    X: ArrayLike,
+    X_hat: ArrayLike,
+    *,
+    layout: Layout = "interleaved",
+    scale_frames: bool = False,
+) -> float:
+    r"""
+    Compute the energy of the reprojection error relative to that of the table.
+
+    This is :math:`\|W - \hat W\|_F^2 / \|W\|_F^2`, where W and :math:`\hat W` are the
+    two tables with every frame centred over its points.
+
+    Parameters
+    ----------
+    X : array-like of shape (n_frames, 2 * n_points)
+        The table. Points of which a coordinate is NaN were not seen: they are left
+        out, in both tables, of the centroids and of the sums.
+    X_hat : array-like of shape (n_frames, 2 * n_points)
+        The reprojection. It must be finite at the points seen in `X`.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    scale_frames : bool, default=False
+        Whether to divide the frames of both tables by the root mean square of the
+        centred coordinates seen in the frame of `X`, so that small and large images
+        count alike. This is the weighting of ``AffineNRSfM(scale_frames=True)``.
+
+    Returns
+    -------
+    float
+        The inverse signal-to-noise ratio, a fraction (not percent): 0 for a perfect
+        reprojection, 1 if nothing but the centroids is reprojected.
+
+    Raises
+    ------
+    ValueError
+        If the tables differ in shape, have an odd number of columns or infinite
+        entries, if a seen point has no reprojection, or if there is no energy to
+        compare with: all seen points equal in every frame (with `scale_frames`, in any
+        frame where points are seen).
+
+    Examples
+    --------
+    >>> from isa_nrsfm.metrics import inverse_snr
+    >>> X = [[0.0, 0.0, 2.0, 0.0], [5.0, 5.0, 5.0, 7.0]]
+    >>> X_hat = [[0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    >>> inverse_snr(X, X_hat)
+    0.125
+    """
+    if layout not in LAYOUTS:
+        raise ValueError(f"layout must be one of {LAYOUTS}; got {layout!r}")
+    energy, error, seen = frame_energies(X, X_hat, layout)
+    if scale_frames:
+        used = seen.any(axis=1)
+        flat = np.flatnonzero(used & (energy == 0))
+        if len(flat):
+            raise ValueError(
+                "scale_frames=True needs two different seen points in each frame; all "
+                f"are equal in {len(flat)} frame(s), the first is row {flat[0]}"
+            )
+        weights = seen.sum(axis=1)[used] / energy[used]
+        energy, error = energy[used] * weights, error[used] * weights
+    if not energy.sum() > 0:
+        raise ValueError("X has no energy: all seen points are equal in every frame")
+    return float(error.sum() / energy.sum())
+
+
+def frame_energies(
+    X: ArrayLike, X_hat: ArrayLike, layout: Layout
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return each frame's energy, that of its error, and the mask of seen points."""
+    truth, seen, fitted = _paired_tracks(X, X_hat, layout)
+    truth, fitted = _centre_seen(truth, seen), _centre_seen(fitted, seen)
+    energy = np.sum(truth**2, axis=(1, 2))
+    return energy, np.sum((truth - fitted) ** 2, axis=(1, 2)), seen
+
+
+def _paired_tracks(
+    X: ArrayLike, X_hat: ArrayLike, layout: Layout
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the tracks of both tables, zero where not seen, and the mask of seen."""
+    tables = [
+        check_array(
+            table, dtype=np.float64, ensure_all_finite="allow-nan", input_name=name
+        )
+        for table, name in ((X, "X"), (X_hat, "X_hat"))
+    ]
+    check_same_shape("X", tables[0], "X_hat", tables[1])
+    truth, fitted = (table_to_tracks(table, layout) for table in tables)
+    seen = ~np.isnan(truth).any(axis=2)
+    lost = seen & np.isnan(fitted).any(axis=2)
+    if lost.any():
+        row = np.flatnonzero(lost.any(axis=1))[0]
+        raise ValueError(
+            f"X_hat is NaN at {lost.sum()} point(s) that are seen in X, the first in "
+            f"row {row}"
+        )
+    mask = seen[..., None]
+    return np.where(mask, truth, 0.0), seen, np.where(mask, fitted, 0.0)
+
+
+def _centre_seen(tracks: NDArray, seen: NDArray) -> NDArray:
+    """Centre each frame over its seen points; the others stay zero."""
+    n_seen = np.maximum(seen.sum(axis=1), 1)
+    centroids = tracks.sum(axis=1) / n_seen[:, None]
+    return (tracks - centroids[:, None]) * seen[..., None]

@@ -1,0 +1,219 @@
+"""The metric in which cameras are most nearly scaled rotations, by Gauss-Newton."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import expm
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._metric import metric_quadric
+from isa_nrsfm._metric_refinement import (
+    CAMERA_MODELS,
+    STRETCH_OF_START,
+    _linearised,
+    exponential,
+    orthonormality,
+    refine_metric,
+    safe_start,
+    strain_basis,
+)
+
+both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)
+
+
+def axes_and_stretch(rng, *stretch):
+    left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in "ab")
+    return left @ np.diag(stretch) @ right
+
+
+def exact_cameras(seed, camera, n_frames=20, spread=None):
+    """Return Euclidean cameras in affine coordinates, and these coordinates."""
+    rng = np.random.default_rng(seed)
+    turns = (
+        Rotation.random(n_frames, random_state=seed)
+        if spread is None
+        else Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3)))
+    )
+    scales = np.ones(n_frames)
+    if camera == "weak_perspective":
+        scales = rng.uniform(0.2, 5, n_frames)
+    affinity = axes_and_stretch(rng, 0.2, 1, 3)
+    return scales[:, None, None] * turns.as_matrix()[:, :2] @ affinity, affinity
+
+
+def noisy_cameras(seed, camera, n_frames=30):
+    rng = np.random.default_rng(seed)
+    motion, _ = exact_cameras(seed, camera, n_frames, spread=0.7)
+    return motion + 0.3 * rng.standard_normal(motion.shape)
+
+
+def bad_start(seed):
+    """A metric that stretches some direction a thousand times more than another."""
+    root = axes_and_stretch(np.random.default_rng(seed), 1e-3, 0.03, 1.0)
+    return root @ root.T
+
+
+def objective(motion, Q, camera, alpha, strain, ridge):
+    turned = [Q @ expm(np.tensordot(a, strain, 1)) @ Q.T for a in alpha]
+    gram = motion @ np.array(turned) @ motion.transpose(0, 2, 1)
+    rest = orthonormality(gram, camera)
+    return np.sum(rest**2) + ridge * np.sum(strain**2)
+
+
+class TestParts:
+    @both_cameras
+    def test_basis_of_strains_is_orthonormal(self, camera):
+        basis = strain_basis(camera)
+        flat = basis.reshape(len(basis), 9)
+        assert_allclose(flat @ flat.T, np.eye(len(basis)), atol=1e-15)
+        assert_allclose(basis, basis.transpose(0, 2, 1))
+        assert len(basis) == (6 if camera == "orthographic" else 5)
+        assert_allclose(np.trace(basis[:5], axis1=1, axis2=2), 0, atol=1e-15)
+
+    def test_norms_of_the_residuals(self):
+        cameras = np.random.default_rng(0).standard_normal((6, 2, 3))
+        gram = cameras @ cameras.transpose(0, 2, 1)
+        s1, s2 = np.linalg.svd(cameras, compute_uv=False).T
+        weak = np.linalg.norm(orthonormality(gram, "weak_perspective"), axis=1)
+        assert_allclose(weak, (s1**2 - s2**2) / (s1**2 + s2**2))
+        ortho = np.linalg.norm(orthonormality(gram, "orthographic"), axis=1)
+        assert_allclose(ortho, np.linalg.norm(gram - np.eye(2), axis=(1, 2)))
+
+    @both_cameras
+    def test_derivatives_by_central_differences(self, camera):
+        rng = np.random.default_rng(0)
+        motion, alpha = rng.standard_normal((4, 2, 3)), rng.standard_normal((4, 2))
+        basis = strain_basis(camera)
+        numbers = 0.3 * rng.standard_normal((2, len(basis)))
+        numbers[1, 3:] = 0.0
+
+        def at(step):
+            first, rest = step[: len(basis)], step[len(basis) :].reshape(numbers.shape)
+            moved = motion @ expm(np.tensordot(first, basis, 1) / 2)
+            strain = np.tensordot(numbers + rest, basis, 1)
+            return _linearised(moved, strain, alpha, camera)
+
+        slopes = at(np.zeros(3 * len(basis)))[1]
+        for k, unit in enumerate(1e-6 * np.eye(3 * len(basis))):
+            change = (at(unit)[0] - at(-unit)[0]) / 2e-6
+            assert_allclose(slopes[:, :, k], change, atol=1e-7)
+
+    def test_derivative_where_there_is_no_strain(self):
+        # Equal eigenvalues, whose divided difference is a derivative.
+        motion = np.random.default_rng(0).standard_normal((4, 2, 3))
+        slopes = _linearised(
+            motion, np.zeros((1, 3, 3)), np.ones((4, 1)), "weak_perspective"
+        )[1]
+        assert_allclose(slopes[:, :, :5], slopes[:, :, 5:])
+
+    def test_exponential(self):
+        roots = np.random.default_rng(0).standard_normal((4, 3, 3))
+        symmetric = roots + roots.transpose(0, 2, 1)
+        expected = [expm(matrix) for matrix in symmetric]
+        assert_allclose(exponential(symmetric), expected, rtol=1e-9)
+
+    @both_cameras
+    def test_start_is_not_nearly_singular(self, camera):
+        motion, _ = exact_cameras(0, camera)
+        counted = motion / np.linalg.norm(motion, axis=(1, 2), keepdims=True)
+        if camera == "orthographic":
+            counted = motion
+        Q = safe_start(motion, np.diag([1.0, -1.0, 1e-5]), camera)
+        gram = counted @ Q @ Q.T @ counted.transpose(0, 2, 1)
+        assert_allclose(np.mean(np.trace(gram, axis1=1, axis2=2)), 2)
+        rows = (counted @ Q).reshape(-1, 3)
+        stretch = np.linalg.svd(rows, compute_uv=False)
+        assert stretch[0] / stretch[-1] <= STRETCH_OF_START * (1 + 1e-9)
+
+
+class TestRefineMetric:
+    @both_cameras
+    @pytest.mark.parametrize("seed", range(10))
+    @pytest.mark.parametrize("spread", [None, 0.3, 0.05])
+    def test_exact_cameras_from_a_bad_start(self, seed, camera, spread):
+        motion, affinity = exact_cameras(seed, camera, spread=spread)
+        fit = refine_metric(motion, safe_start(motion, bad_start(seed), camera), camera)
+        metric = affinity @ fit.Q @ fit.Q.T @ affinity.T
+        assert_allclose(metric * 3 / np.trace(metric), np.eye(3), atol=1e-8)
+        assert fit.cost < 1e-20
+
+    @both_cameras
+    def test_result_does_not_depend_on_the_start(self, camera):
+        motion = noisy_cameras(0, camera)
+        costs = [
+            refine_metric(motion, safe_start(motion, bad_start(s), camera), camera).cost
+            for s in range(10)
+        ]
+        assert costs[0] > 0.1
+        assert_allclose(costs, costs[0], rtol=1e-10)
+
+    @both_cameras
+    @pytest.mark.parametrize("ridge", [0.0, 0.5])
+    def test_is_a_minimum(self, camera, ridge):
+        rng = np.random.default_rng(1)
+        motion, alpha = noisy_cameras(1, camera), rng.standard_normal((30, 2))
+        start = safe_start(motion, np.eye(3), camera)
+        fit = refine_metric(motion, start, camera, alpha, ridge=ridge)
+        here = fit.cost + ridge * np.sum(fit.strain**2)
+        args = (camera, alpha, fit.strain, ridge)
+        assert objective(motion, fit.Q, *args) == pytest.approx(here, rel=1e-9)
+        basis = strain_basis(camera)
+        flat = fit.slopes.reshape(-1, 3 * len(basis))
+        gradient = flat.T @ fit.residuals.ravel()
+        own = ridge * np.einsum("kab,nab->kn", fit.strain, basis).ravel()
+        gradient[len(basis) :] += own
+        assert_allclose(gradient, 0, atol=1e-6)
+        # In any direction the objective rises.
+        for step in rng.standard_normal((10, 3, len(basis))):
+            change = 1e-3 * np.tensordot(step, basis, 1)
+            moved = fit.Q @ expm(change[0] / 2)
+            moved_args = (camera, alpha, fit.strain + change[1:], ridge)
+            assert objective(motion, moved, *moved_args) > here
+
+    def test_orthographic_minimum_is_that_of_the_linear_equations(self):
+        # Where their solution is positive definite, as it is here.
+        motion, affinity = exact_cameras(2, "orthographic")
+        motion += 0.1 * np.random.default_rng(2).standard_normal(motion.shape)
+        m1, m2 = np.moveaxis(motion, 1, 0)
+        pairs = [(m1, m1), (m2, m2), (m1, m2), (m2, m1)]
+        equations = [np.einsum("ia,ib->iab", a, b).reshape(-1, 9) for a, b in pairs]
+        linear = np.linalg.lstsq(np.vstack(equations), np.repeat([1.0, 0.0], 40))[0]
+        start = np.linalg.inv(affinity)
+        fit = refine_metric(motion, start, "orthographic")
+        assert fit.cost > 0.1
+        assert_allclose((fit.Q @ fit.Q.T).ravel(), linear, rtol=1e-7)
+
+    @pytest.mark.parametrize(("n", "noise", "seed"), [(6, 0.5, 47), (8, 0.3, 52)])
+    def test_indefinite_linear_solution(self, n, noise, seed):
+        rng = np.random.default_rng(seed)
+        spread = 0.4 if n == 6 else 0.3
+        turns = Rotation.from_rotvec(spread * rng.standard_normal((n, 3))).as_matrix()
+        motion = turns[:, :2] + noise * rng.standard_normal((n, 2, 3))
+        assert metric_quadric(motion) is None
+        camera = "weak_perspective"
+        fit = refine_metric(motion, safe_start(motion, np.eye(3), camera), camera)
+
+        def cost(entries):
+            root = entries.reshape(3, 3)
+            gram = motion @ root @ root.T @ motion.transpose(0, 2, 1)
+            return np.sum(orthonormality(gram, camera) ** 2)
+
+        found = [minimize(cost, rng.standard_normal(9)).fun for _ in range(20)]
+        assert fit.cost <= min(found) * (1 + 1e-6)
+
+    def test_never_worse_than_the_linear_solution(self):
+        motion = noisy_cameras(3, "weak_perspective")
+        linear = metric_quadric(motion)
+        fit = refine_metric(motion, safe_start(motion, linear, "weak_perspective"),
+                            "weak_perspective")  # fmt: skip
+        gram = motion @ linear @ motion.transpose(0, 2, 1)
+        before = np.sum(orthonormality(gram, "weak_perspective") ** 2)
+        assert fit.cost < 0.999 * before
+
+    def test_condition_number(self):
+        camera = "weak_perspective"
+        turns = Rotation.random(3000, random_state=0).as_matrix()[:, :2]
+        fit = refine_metric(turns, np.eye(3), camera)
+        assert fit.condition_number == pytest.approx(1, abs=0.1)
+        assert refine_metric(turns[:2], np.eye(3), camera).condition_number == np.inf

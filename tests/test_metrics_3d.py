@@ -1,0 +1,224 @@
+"""Errors of 3D shapes up to rotations, in the conventions of the literature."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
+
+CONVENTIONS = ["sequence", "frame"]
+both = pytest.mark.parametrize("convention", CONVENTIONS)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def pair(rng):
+    """True shapes, and others that resemble them."""
+    truth = rng.standard_normal((6, 15, 3)) + 4.0
+    return truth, truth + 0.3 * rng.standard_normal(truth.shape)
+
+
+def centred(shapes):
+    return shapes - shapes.mean(axis=1, keepdims=True)
+
+
+class TestDefinitions:
+    def test_sequence_by_hand(self):
+        # A square in the plane, of standard deviations 1, 1, 0, and one of its corners
+        # moved: the centroid follows by a quarter.
+        S = np.array([[[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]])
+        assert mean_shape_error_3d(S, S) < 1e-15
+        # Moved along z, which no rotation of this symmetric kind undoes; all corners
+        # are a quarter too high or too low after the best one, of angle zero.
+        X = S + 0.1 * np.array([[[0.0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1]]])
+        assert mean_shape_error_3d(S, X) == pytest.approx(0.1 / (2 / 3))
+
+    def test_frame_by_hand(self):
+        S = np.array([[[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]])
+        X = S + 0.1 * np.array([[[0.0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1]]])
+        found = mean_shape_error_3d(S, X, convention="frame", scale=False)
+        assert found == pytest.approx(0.2 / np.sqrt(8))
+        # The best scale c = |S|^2 / |X|^2 leaves the sine of the angle to the truth.
+        found = mean_shape_error_3d(S, X, convention="frame")
+        assert found == pytest.approx(np.sqrt(1 - 8 / 8.04))
+
+    def test_as_written_in_the_docstring(self, pair):
+        truth, shapes = map(centred, pair)
+        turn, _ = self.procrustes(truth.reshape(-1, 3), shapes.reshape(-1, 3))
+        distance = [
+            np.linalg.norm(s - turn @ x)
+            for S, X in zip(truth, shapes, strict=True)
+            for s, x in zip(S, X, strict=True)
+        ]
+        sigma = np.mean([S.std(axis=0) for S in truth])
+        expected = np.mean(distance) / sigma
+        assert mean_shape_error_3d(*pair) == pytest.approx(expected, rel=1e-9)
+
+        expected = []
+        for S, X in zip(truth, shapes, strict=True):
+            turn, c = self.procrustes(S, X)
+            expected.append(np.linalg.norm(S - c * X @ turn.T) / np.linalg.norm(S))
+        found = mean_shape_error_3d(*pair, convention="frame")
+        assert found == pytest.approx(np.mean(expected), rel=1e-9)
+
+    @staticmethod
+    def procrustes(S, X):
+        """Return the best rotation and scale, by numerical minimisation."""
+
+        def cost(x):
+            R = Rotation.from_rotvec(x[:3]).as_matrix()
+            return np.sum((S - x[3] * X @ R.T) ** 2)
+
+        with_scale = minimize(cost, [0, 0, 0, 1.0], tol=1e-14).x
+        without = minimize(lambda x: cost([*x, 1.0]), np.zeros(3), tol=1e-14).x
+        assert_allclose(with_scale[:3], without, atol=1e-5)
+        return Rotation.from_rotvec(without).as_matrix(), with_scale[3]
+
+    def test_equal_sizes_make_the_conventions_comparable(self, rng):
+        # Many points, noise of standard deviation 0.1 on unit Gaussian shapes: a mean
+        # distance of 0.1 * sqrt(8 / pi), relative norms of 0.1.
+        S = rng.standard_normal((20, 2000, 3))
+        X = S + 0.1 * rng.standard_normal(S.shape)
+        expected = 0.1 * np.sqrt(8 / np.pi)
+        assert mean_shape_error_3d(S, X) == pytest.approx(expected, rel=0.01)
+        found = mean_shape_error_3d(S, X, convention="frame", scale=False)
+        assert found == pytest.approx(0.1, rel=0.01)
+
+
+class TestInvariances:
+    @both
+    def test_nothing_but_positions_is_free_within_a_frame(self, pair, rng, convention):
+        truth, shapes = pair
+        moved = shapes + rng.standard_normal((6, 1, 3))
+        one = mean_shape_error_3d(truth, shapes, convention=convention)
+        two = mean_shape_error_3d(truth, moved, convention=convention)
+        assert two == pytest.approx(one, rel=1e-10)
+
+    @both
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    def test_common_rotations_and_mirror_images(self, pair, convention, sign):
+        truth, shapes = pair
+        turn = Rotation.random(random_state=1).as_matrix() @ np.diag([1, 1, sign])
+        one = mean_shape_error_3d(truth, shapes, convention=convention)
+        two = mean_shape_error_3d(truth, shapes @ turn, convention=convention)
+        assert two == pytest.approx(one, rel=1e-10)
+
+    def test_rotations_of_single_frames(self, pair):
+        truth, _ = pair
+        turns = Rotation.random(6, random_state=1).as_matrix()
+        turned = truth @ turns
+        assert mean_shape_error_3d(truth, turned, convention="frame") < 1e-12
+        assert mean_shape_error_3d(truth, turned) > 0.5
+        # And mirror images of single frames.
+        turned[2] *= [1, 1, -1]
+        assert mean_shape_error_3d(truth, turned, convention="frame") < 1e-12
+
+    @both
+    @pytest.mark.parametrize("scale", [None, False, True])
+    def test_scales(self, pair, convention, scale):
+        truth, shapes = pair
+        kind = {"convention": convention, "scale": scale}
+        fitted = scale if scale is not None else convention == "frame"
+        one = mean_shape_error_3d(truth, shapes, **kind)
+        two = mean_shape_error_3d(truth, 3 * shapes, **kind)
+        assert (two == pytest.approx(one, rel=1e-10)) == fitted
+        own = mean_shape_error_3d(truth, np.arange(1, 7)[:, None, None] * truth, **kind)
+        assert (own < 1e-12) == (fitted and convention == "frame")
+
+    @both
+    @pytest.mark.parametrize("unit", [1e-80, 1e-12, 1e3, 1e75])
+    def test_unit_of_length(self, pair, convention, unit):
+        truth, shapes = pair
+        for scale in (False, True):
+            kind = {"convention": convention, "scale": scale}
+            one = mean_shape_error_3d(truth, shapes, **kind)
+            two = mean_shape_error_3d(unit * truth, unit * shapes, **kind)
+            assert two == pytest.approx(one, rel=1e-10)
+
+    def test_order_of_frames_and_points(self, pair, rng):
+        truth, shapes = pair
+        frames, points = rng.permutation(6), rng.permutation(15)
+        for convention in CONVENTIONS:
+            one = mean_shape_error_3d(truth, shapes, convention=convention)
+            two = mean_shape_error_3d(
+                truth[frames][:, points],
+                shapes[frames][:, points],
+                convention=convention,
+            )
+            assert two == pytest.approx(one, rel=1e-12)
+
+    def test_never_below_what_an_affinity_and_scales_leave(self, rng):
+        # Per frame, with one rotation for all.
+        truth = rng.standard_normal((1, 15, 3))
+        shapes = truth + 0.3 * rng.standard_normal(truth.shape)
+        error = mean_shape_error_3d(truth, shapes, convention="frame")
+        assert error >= affine_shape_error(truth, shapes)
+
+
+class TestDegenerateInput:
+    @pytest.mark.parametrize("nothing", [0.0, 0.1])
+    def test_shapes_of_one_point(self, pair, nothing):
+        truth, _ = pair
+        shapes = np.full_like(truth, nothing)
+        assert mean_shape_error_3d(truth, shapes, convention="frame") == pytest.approx(
+            1
+        )
+        distance = np.linalg.norm(centred(truth), axis=2).mean()
+        expected = distance / truth.std(axis=1).mean()
+        assert mean_shape_error_3d(truth, shapes) == pytest.approx(expected)
+        assert 1.3 < expected < 1.8
+
+    @both
+    def test_flat_shapes(self, rng, convention):
+        truth = rng.standard_normal((4, 9, 3)) * [1, 1, 0]
+        assert mean_shape_error_3d(truth, truth, convention=convention) < 1e-12
+
+    @pytest.mark.parametrize(
+        ("S", "X", "message"),
+        [
+            (
+                np.ones((2, 4, 2)),
+                np.ones((2, 4, 2)),
+                r"S must be of the shape \(n, n_p",
+            ),
+            (
+                np.ones((4, 3)),
+                np.ones((4, 3)),
+                r"S must be of the shape .* got \(4, 3\)",
+            ),
+            (np.eye(3)[None], np.ones((1, 4, 3)), r"S and X .* \(1, 3, 3\) and \(1, 4"),
+            (
+                np.eye(3)[None],
+                np.full((1, 3, 3), np.nan),
+                "X must be finite; 9 entries",
+            ),
+            (
+                np.full((1, 3, 3), np.inf),
+                np.eye(3)[None],
+                "S must be finite; 9 entries",
+            ),
+            (np.full((2, 3, 3), 0.1), np.ones((2, 3, 3)), r"2 frame\(s\) of S, the f"),
+        ],
+    )
+    def test_refuses(self, S, X, message):
+        with pytest.raises(ValueError, match=message):
+            mean_shape_error_3d(S, X)
+
+    def test_refuses_other_conventions(self, pair):
+        with pytest.raises(
+            ValueError, match=r"convention must be one of .* got 'mpjpe'"
+        ):
+            mean_shape_error_3d(*pair, convention="mpjpe")
+
+
+def test_of_a_published_estimate(load_data):
+    # The trajectory-space estimate of Akhter et al. that comes with their data.
+    data = load_data("akhter_drink")
+    error = mean_shape_error_3d(data["S3d"], data["S3d_akhter_estimate"])
+    assert error == pytest.approx(0.0249, abs=1e-4)

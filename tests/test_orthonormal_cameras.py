@@ -1,0 +1,214 @@
+"""Orthographic cameras in the motion factor of a table."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import permute_frames, random_rotation, rotate_frames
+from scipy.optimize import approx_fprime
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._orthonormal_cameras import (
+    NOISE_PRICE,
+    expected_cost,
+    nearest_orthonormal,
+    orthonormal_cameras,
+    orthonormality_residuals,
+)
+from isa_nrsfm._tracks import centred_tracks, measurement_matrix
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+N_COMPONENTS = 2
+
+
+def scene(seed, noise=0.0, n_frames=60):
+    """Return the left singular vectors times singular values, and true cameras."""
+    truth = make_nonrigid_tracks(
+        n_frames,
+        40,
+        N_COMPONENTS,
+        camera="orthographic",
+        noise=noise,
+        random_state=seed,
+    )
+    W = measurement_matrix(centred_tracks(truth.tracks)[0])
+    U, S, _ = np.linalg.svd(W, full_matrices=False)
+    n = 3 * N_COMPONENTS + 3
+    return U[:, :n] * S[:n], truth.motion
+
+
+def gram(cameras):
+    """Return what does not depend on the orientation of space."""
+    rows = cameras.reshape(-1, 3)
+    return rows @ rows.T
+
+
+def cost_of(cameras):
+    return np.mean([np.sum((R @ R.T - np.eye(2)) ** 2) for R in cameras])
+
+
+class TestExactCameras:
+    @pytest.mark.parametrize("seed", range(4))
+    def test_are_found(self, seed):
+        P, cameras = scene(seed)
+        found = orthonormal_cameras(P)
+        assert found.cost < 1e-17
+        rows = found.cameras @ found.cameras.transpose(0, 2, 1)
+        assert_allclose(rows, np.broadcast_to(np.eye(2), rows.shape), atol=1e-8)
+        # The cost is of fourth order in some directions.
+        assert_allclose(gram(found.cameras), gram(cameras), atol=2e-4)
+
+    def test_of_a_rigid_object_are_in_three_columns(self):
+        cameras = Rotation.random(20, rng=0).as_matrix()[:, :2]
+        mixing = np.random.default_rng(0).normal(size=(3, 3))
+        found = orthonormal_cameras(cameras.reshape(-1, 3) @ mixing)
+        assert_allclose(gram(found.cameras), gram(cameras), atol=1e-8)
+
+
+class TestResult:
+    def test_identities(self):
+        P, _ = scene(0, noise=0.02)
+        found = orthonormal_cameras(P)
+        assert_allclose(found.cameras.reshape(-1, 3), P @ found.mixing, atol=1e-10)
+        assert found.cost == pytest.approx(cost_of(found.cameras))
+
+    @pytest.mark.parametrize("noise_variance", [0.0, 1e-2])
+    def test_is_a_minimum(self, noise_variance):
+        P, _ = scene(0, noise=0.02)
+        found = orthonormal_cameras(P, noise_variance)
+
+        def cost(Q):
+            return cost_of((P @ Q.reshape(-1, 3)).reshape(-1, 2, 3)) + (
+                4 * noise_variance * np.sum(Q**2)
+            )
+
+        Q = found.mixing.ravel()
+        least = cost(Q)
+        assert np.abs(approx_fprime(Q, cost, 1e-7)).max() < 1e-5 * np.abs(P).max()
+        rng = np.random.default_rng(0)
+        assert all(
+            cost(Q + size * np.abs(Q).max() * rng.normal(size=Q.shape)) > least
+            for size in (1e-3, 1e-2, 1e-1)
+            for _ in range(20)
+        )
+
+    def test_more_columns_never_cost_more(self):
+        P, _ = scene(0, noise=0.05)
+        costs = [orthonormal_cameras(P[:, :n]).cost for n in range(3, P.shape[1] + 1)]
+        assert (np.diff(costs) <= 1e-12).all()
+        assert costs[-1] < 0.1 * costs[0]
+
+    def test_scales_and_triangular_mixtures_of_columns_do_not_matter(self):
+        P, _ = scene(1, noise=0.01)
+        expected = orthonormal_cameras(P)
+        rng = np.random.default_rng(0)
+        upper = np.triu(rng.normal(size=(P.shape[1],) * 2), 1) + np.eye(P.shape[1])
+        for mixing in (upper, np.diag(10.0 ** rng.integers(-9, 9, P.shape[1]))):
+            found = orthonormal_cameras(P @ mixing)
+            assert_allclose(gram(found.cameras), gram(expected.cameras), atol=1e-6)
+
+    def test_turning_images_turns_cameras(self):
+        P, _ = scene(1, noise=0.01)
+        expected = orthonormal_cameras(P).cameras.reshape(-1, 3)
+        found = orthonormal_cameras(rotate_frames(P, 0)).cameras.reshape(-1, 3)
+        turned = rotate_frames(expected, 0)
+        assert_allclose(found @ found.T, turned @ turned.T, atol=1e-6)
+
+    def test_order_of_frames_does_not_matter(self):
+        P, _ = scene(1, noise=0.01)
+        expected = orthonormal_cameras(P).cameras.reshape(-1, 3)
+        permuted, _ = permute_frames(P, 0)
+        found = orthonormal_cameras(permuted).cameras
+        expected, _ = permute_frames(expected, 0)
+        assert_allclose(gram(found), expected @ expected.T, atol=1e-6)
+
+    def test_local_minimum_is_left(self, load_data):
+        # From the first three columns alone the cost ends at 2e-4 and above.
+        tracks = load_data("akhter_yoga")["W2d"]
+        W = measurement_matrix(centred_tracks(tracks)[0])
+        U = np.linalg.svd(W, full_matrices=False)[0]
+        assert orthonormal_cameras(U[:, :6]).cost < 0.005
+        assert orthonormal_cameras(U[:, :30]).cost < 3e-6
+
+
+class TestNoise:
+    def test_price_is_what_noise_costs(self):
+        rng = np.random.default_rng(0)
+        cameras = Rotation.random(3000, rng=0).as_matrix()[:, :2]
+        Q = rng.normal(size=(5, 3))
+        P = cameras.reshape(-1, 3) @ np.linalg.pinv(Q)
+        deviation = 1e-3
+        costs = [
+            cost_of(
+                ((P + deviation * rng.normal(size=P.shape)) @ Q).reshape(cameras.shape)
+            )
+            for _ in range(20)
+        ]
+        expected = NOISE_PRICE * deviation**2 * np.sum(Q**2)
+        assert np.mean(costs) == pytest.approx(expected, rel=0.03)
+
+    def test_more_of_it_means_smaller_mixtures(self):
+        P, _ = scene(0, noise=0.02)
+        found = [orthonormal_cameras(P, v) for v in (0.0, 1e-3, 1e-1, 10.0)]
+        assert (np.diff([np.linalg.norm(f.mixing) for f in found]) < 0).all()
+        assert (np.diff([f.cost for f in found]) > 0).all()
+
+
+@pytest.mark.parametrize("price", [0.0, 0.3])
+def test_gradient(price):
+    rng = np.random.default_rng(0)
+    P, mixing = rng.normal(size=(14, 5)), rng.normal(size=15)
+    inverse = np.triu(rng.normal(size=(5, 5)))
+    numerical = approx_fprime(
+        mixing, lambda m: expected_cost(m, P, inverse, price)[0], 1e-7
+    )
+    value, gradient = expected_cost(mixing, P, inverse, price)
+    assert_allclose(gradient, numerical, rtol=1e-4)
+    Q = mixing.reshape(5, 3)
+    expected = cost_of((P @ Q).reshape(-1, 2, 3)) + price * np.sum((inverse @ Q) ** 2)
+    assert value == pytest.approx(expected)
+
+
+def test_residuals_of_orthonormal_rows_are_zero():
+    cameras = Rotation.random(5, rng=0).as_matrix()[:, :2]
+    assert_allclose(orthonormality_residuals(cameras), np.zeros((3, 5)), atol=1e-14)
+
+
+def test_nearest_orthonormal():
+    rng = np.random.default_rng(0)
+    cameras = rng.normal(size=(6, 2, 3))
+    nearest = nearest_orthonormal(cameras)
+    assert_allclose(orthonormality_residuals(nearest), np.zeros((3, 6)), atol=1e-14)
+    # What is left is a symmetric positive semidefinite matrix times the result.
+    rest = cameras @ nearest.transpose(0, 2, 1)
+    assert_allclose(rest, rest.transpose(0, 2, 1), atol=1e-14)
+    assert (np.linalg.eigvalsh(rest) > 0).all()
+    assert_allclose(nearest_orthonormal(nearest), nearest, atol=1e-14)
+    turn = random_rotation(0)
+    assert_allclose(nearest_orthonormal(cameras @ turn), nearest @ turn, atol=1e-13)
+
+
+class TestColumns:
+    def test_dependent_ones_are_left_out(self):
+        P, _ = scene(0, noise=0.02)
+        expected = orthonormal_cameras(P)
+        more = np.insert(P, [2, 5], np.stack([P[:, 0], 0 * P[:, 0]], axis=1), axis=1)
+        found = orthonormal_cameras(more)
+        assert_array_equal(found.mixing[[2, 6]], 0)
+        assert_allclose(found.cameras, expected.cameras, atol=1e-6)
+
+    def test_two_are_too_few(self):
+        P = np.random.default_rng(0).normal(size=(10, 2))
+        with pytest.raises(ValueError, match="three linearly independent columns; 2"):
+            orthonormal_cameras(np.column_stack([P, P]))
+
+    def test_rows_of_frames_come_in_pairs(self):
+        with pytest.raises(ValueError, match="two rows a frame, an even number; got 5"):
+            orthonormal_cameras(np.ones((5, 3)))
+
+    def test_entries_are_finite(self):
+        with pytest.raises(ValueError, match="motion contains NaN"):
+            orthonormal_cameras(np.full((6, 3), np.nan))
+
+    def test_variance_is_not_negative(self):
+        with pytest.raises(ValueError, match="must not be negative; got -1"):
+            orthonormal_cameras(scene(0)[0], -1.0)
