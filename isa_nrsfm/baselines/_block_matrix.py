@@ -1,0 +1,310 @@
+"""The block matrix method: shapes of least nuclear norm, then of low rank."""
+
+import warnings
+from numbers import Integral, Real
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils._param_validation import Interval
+
+from isa_nrsfm._tracks import Layout
+from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.baselines._pseudo_inverse import (
+    least_norm_shapes,
+    orthographic_cameras,
+    truncate_rank,
+)
+from isa_nrsfm.baselines._shape_sequence import ShapeSequence
+
+# Prices of the nuclear norm, one after the other.
+PRICES = tuple(4.0**-k for k in range(18))
+# Step of the published iteration; accelerated ones take the longest that is safe, the
+# inverse of the curvature of the images, whose cameras have orthonormal rows.
+PUBLISHED_STEP = 0.2
+# Tolerances where none is given. Steps with momentum are some hundred times as long as
+# the published ones, which end where these do.
+ACCELERATED_TOL, PUBLISHED_TOL = 1e-4, 1e-6
+
+
+class NuclearNormShapes(NamedTuple):
+    """
+    Shapes of all frames by the price of their nuclear norm.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_frames, n_points, 3)
+        The shapes.
+    n_iter : int
+        Steps taken.
+    converged : bool
+        Whether the last one changed the shapes by no more than the tolerance.
+    """
+
+    shapes: NDArray
+    n_iter: int
+    converged: bool
+
+
+def nuclear_norm_shapes(
+    W: NDArray,
+    cameras: NDArray,
+    price: float,
+    start: NDArray,
+    *,
+    accelerated: bool = True,
+    max_iter: int,
+    tol: float,
+) -> NuclearNormShapes:
+    """
+    Return shapes that show a measurement matrix and have a small nuclear norm.
+
+    Parameters
+    ----------
+    W : ndarray of shape (2 * n_frames, n_points)
+        Measurement matrix.
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Cameras R_i with orthonormal rows.
+    price : float
+        Price mu of the nuclear norm.
+    start : ndarray of shape (n_frames, n_points, 3)
+        Shapes to start from.
+    accelerated : bool, default=True
+        Whether steps of length one have the momentum of Nesterov, which is dropped when
+        it leads up (Beck, Teboulle 2009; O'Donoghue, Candes 2015), or they have length
+        0.2 without momentum, as published. The solution is the same.
+    max_iter : int
+        The most steps.
+    tol : float
+        Change of the shapes by a step, relative to their norm, that ends the steps.
+
+    Returns
+    -------
+    NuclearNormShapes
+        Shapes that minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2``, where S
+        has one row a frame, by proximal gradient steps.
+    """
+    images = W.reshape(len(cameras), 2, -1).transpose(0, 2, 1)
+    step = 1.0 if accelerated else PUBLISHED_STEP
+    shapes = ahead = start
+    momentum = 1.0
+    for n_iter in range(1, max_iter + 1):
+        error = ahead @ cameras.transpose(0, 2, 1) - images
+        moved = shrink(ahead - step * (error @ cameras), step * price)
+        change = moved - shapes
+        size = np.linalg.norm(shapes)
+        if not accelerated:
+            ahead = moved
+        elif np.vdot(ahead - moved, change) > 0:
+            ahead, momentum = moved, 1.0
+        else:
+            larger = 0.5 + np.sqrt(0.25 + momentum**2)
+            ahead = moved + (momentum - 1.0) / larger * change
+            momentum = larger
+        shapes = moved
+        if np.linalg.norm(change) <= tol * size:
+            return NuclearNormShapes(shapes, n_iter, True)
+    return NuclearNormShapes(shapes, max_iter, False)
+
+
+def shrink(shapes: NDArray, amount: float) -> NDArray:
+    """
+    Return shapes with smaller singular values.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_frames, n_points, 3)
+        Shapes; their matrix has one row a frame.
+    amount : float
+        What is taken off the singular values, down to zero.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_points, 3)
+        The shapes. Singular values come from the eigenvalues of the smaller Gram
+        matrix: those below 1e-8 of the largest are not exact.
+    """
+    rows = shapes.reshape(len(shapes), -1)
+    tall = len(rows) > rows.shape[1]
+    eigenvalues, vectors = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)
+    kept = eigenvalues > amount**2
+    vectors, values = vectors[:, kept], np.sqrt(eigenvalues[kept])
+    shrunk = vectors * (1.0 - amount / values)
+    rows = (rows @ shrunk) @ vectors.T if tall else shrunk @ (vectors.T @ rows)
+    return rows.reshape(shapes.shape)
+
+
+class BlockMatrixNRSfM(ShapeSequenceNRSfM):
+    """
+    Block matrix method of non-rigid structure from motion.
+
+    Finds orthographic cameras R_i, then shapes S_i that are mixtures of few: those of
+    least nuclear norm ``||S||_*``, of the matrix S with one row a frame, that show what
+    the images do. Row i, reshaped to (n_points, 2), is modelled as::
+
+        shapes_[i] @ motion_[i].T + translation_[i]
+
+    Parameters
+    ----------
+    n_components : int, default=3
+        K, the number of basis shapes besides the mean shape: in the literature, which
+        counts the mean shape, K is one more. K needs at least 3K + 4 points and
+        ``ceil(8 (K + 2) / 5)`` frames.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    scale_frames : bool, default=False
+        Whether each centred frame is divided by the root mean square of its coordinates
+        before the fit; the scale is given back to `motion_`. False is for orthographic
+        cameras, as published; photos of any resolution need True.
+    ordered : bool, default=False
+        Whether the rows are successive frames of a camera that turns little from one to
+        the next. Images do not tell the sign of a frame's camera and shape: with True
+        it is the sign with which the camera turns by the lesser angle from the one
+        before, with False the one with which the shapes resemble each other.
+    accelerated : bool, default=True
+        Whether the steps have length one and the momentum of Nesterov, or length 0.2
+        without momentum, as published. The minimum is the same, and the first reach it
+        in far fewer steps.
+    max_iter : int, default=10000
+        The most steps for each price of the nuclear norm.
+    tol : float or None, default=None
+        For each price the steps end when one changes the shapes by no more than this
+        share of their norm. None is 1e-4 with acceleration and 1e-6, as published,
+        without, which end in nearly the same place. Less takes more steps and explains
+        the images better; the 3D shapes do not get better.
+
+    Attributes
+    ----------
+    mean_shape_ : ndarray of shape (n_points, 3)
+        Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
+        for image coordinates), z is depth; the mirror image fits as well.
+    basis_ : ndarray of shape (n_components, n_points, 3)
+        Principal components of `shapes_`, by decreasing variance; one standard
+        deviation each.
+    alpha_ : ndarray of shape (n_frames, n_components)
+        Coefficients of the fitted table, as `transform` returns them: of the model of
+        mean and principal components, with cameras as of `decompose`.
+    motion_ : ndarray of shape (n_frames, 2, 3)
+        Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
+    translation_ : ndarray of shape (n_frames, 2)
+        Centroids of the frames, in the units of the table.
+    shapes_ : ndarray of shape (n_frames, n_points, 3)
+        Shapes of the frames, centred, of rank ``n_components + 1`` as a matrix with
+        one row a frame. In the units of the table or, with `scale_frames`, of frames
+        of size one.
+    inverse_snr_ : float
+        ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
+        as in the fit, and What the image of `shapes_` in `motion_`.
+    noise_variance_ : float
+        Mean square error of a coordinate when each shape is replaced by its projection
+        on the model; of frames of size one where frames are scaled.
+    n_iter_ : int
+        Steps for all prices together.
+    n_features_in_ : int
+        Number of columns.
+    feature_names_in_ : ndarray of shape (n_features_in_,)
+        Names of the columns, where the table is a dataframe with string names.
+
+    Warns
+    -----
+    ConvergenceWarning
+        If `max_iter` steps were not enough for one of the prices.
+
+    See Also
+    --------
+    PseudoInverseNRSfM : Shapes of least norm, where this method starts.
+    isa_nrsfm.AffineNRSfM : Affine cameras, missing points, independent basis shapes.
+
+    Notes
+    -----
+    ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` is minimised by proximal gradient
+    steps for prices mu from 1 to 6e-11, each a quarter of the last and started from its
+    shapes, where W has unit mean square (fixed-point continuation; with acceleration,
+    Beck and Teboulle 2009, O'Donoghue and Candes 2015). The shapes that are returned
+    are the nearest mixtures of ``n_components + 1`` shapes.
+
+    The method factorises the table it is given and knows no other frames; what
+    `transform` and the methods beside it do, and what signs of frames mean, is said at
+    `PseudoInverseNRSfM`.
+
+    Cameras are found by `isa_nrsfm.calibration.orthonormal_cameras` among the mixtures
+    of the first ``3 (n_components + 1)`` left singular vectors of W, and made exactly
+    orthonormal. A flat object that does not deform does not determine them: `fit`
+    raises a ValueError, as it does for points that are missing.
+
+    References
+    ----------
+    Y. Dai, H. Li, M. He, "A simple prior-free method for non-rigid
+    structure-from-motion factorization", International Journal of Computer Vision 107,
+    2014.
+
+    A. Beck, M. Teboulle, "A fast iterative shrinkage-thresholding algorithm for linear
+    inverse problems", SIAM Journal on Imaging Sciences 2, 2009.
+
+    B. O'Donoghue, E. Candes, "Adaptive restart for accelerated gradient schemes",
+    Foundations of Computational Mathematics 15, 2015.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.baselines import BlockMatrixNRSfM
+    >>> from isa_nrsfm.datasets import make_nonrigid_tracks
+    >>> tracks = make_nonrigid_tracks(100, camera="orthographic", random_state=0)
+    >>> model = BlockMatrixNRSfM(n_components=3).fit(tracks.data)
+    >>> model.shapes_.shape, model.alpha_.shape
+    ((100, 68, 3), (100, 3))
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **ShapeSequenceNRSfM._parameter_constraints,
+        "accelerated": ["boolean"],
+        "max_iter": [Interval(Integral, 1, None, closed="left")],
+        "tol": [None, Interval(Real, 0, None, closed="left")],
+    }
+
+    def __init__(
+        self,
+        n_components: int = 3,
+        *,
+        layout: Layout = "interleaved",
+        scale_frames: bool = False,
+        ordered: bool = False,
+        accelerated: bool = True,
+        max_iter: int = 10_000,
+        tol: float | None = None,
+    ):
+        super().__init__(
+            n_components, layout=layout, scale_frames=scale_frames, ordered=ordered
+        )
+        self.accelerated = accelerated
+        self.max_iter = max_iter
+        self.tol = tol
+
+    def _factorise(self, W: NDArray) -> ShapeSequence:
+        """Return cameras and the shapes of least nuclear norm, of rank K + 1."""
+        rank = self.n_components + 1
+        cameras = orthographic_cameras(W, rank)
+        shapes = least_norm_shapes(W, cameras)
+        tol = ACCELERATED_TOL if self.accelerated else PUBLISHED_TOL
+        self.n_iter_, converged = 0, True
+        for price in PRICES:
+            found = nuclear_norm_shapes(
+                W,
+                cameras,
+                price,
+                shapes,
+                accelerated=self.accelerated,
+                max_iter=self.max_iter,
+                tol=tol if self.tol is None else self.tol,
+            )
+            shapes = found.shapes
+            self.n_iter_ += found.n_iter
+            converged &= found.converged
+        if not converged:
+            warnings.warn(
+                f"the shapes did not converge in max_iter={self.max_iter} steps; "
+                "increase max_iter or tol",
+                ConvergenceWarning,
+                stacklevel=4,
+            )
+        return ShapeSequence(cameras, truncate_rank(shapes, rank))

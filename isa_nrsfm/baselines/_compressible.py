@@ -1,0 +1,394 @@
+"""Compressible structure from motion: each shape is a sum of a few of many atoms.
+
+Kong, Lucey, "Prior-less compressible structure from motion" (2016). A frame is
+``W_i = R_i sum_l c_il X_l``, its blocks ``P_il = c_il R_i`` over a block-sparse
+dictionary are known up to one 3x3 matrix for each atom.
+"""
+
+from numbers import Integral, Real
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils import check_random_state
+from sklearn.utils._param_validation import Interval
+
+from isa_nrsfm._factorisation import NULL_DIRECTION
+from isa_nrsfm._metric import LARGEST_STRETCH, _quadratic_terms, _symmetric_matrix
+from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._tracks import Layout
+from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.baselines._block_dictionary import (
+    BlockCode,
+    BlockDictionary,
+    block_ksvd,
+    group_sparse_factors,
+)
+from isa_nrsfm.baselines._shape_sequence import ShapeSequence
+
+# The relaxed problem, whose atoms are a start, is solved for at most so many frames.
+RELAXED_FRAMES = 1000
+# An atom is aligned by the cameras of frames that it shares with the atoms before it,
+# if there are so many. Where few share, their second blocks are small, and the result
+# is often mirrored or wrong.
+FEWEST_SHARED = 10
+# Rounds of `align_blocks`, and the change of an entry below which they end.
+MAX_ROUNDS = 100
+ALIGNED = 1e-12
+
+
+class ChainedAtoms(NamedTuple):
+    """
+    Cameras and shapes of frames over a dictionary.
+
+    Attributes
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        R_i, with orthonormal rows.
+    coefficients : ndarray of shape (n_frames, n_atoms)
+        c_il, zero where an atom is not active.
+    atoms : ndarray of shape (n_atoms, 3, n_points)
+        X_l, zero for atoms that no frame uses.
+    """
+
+    cameras: NDArray
+    coefficients: NDArray
+    atoms: NDArray
+
+
+def metric_correction(blocks: NDArray) -> NDArray:
+    """
+    Return the matrix that makes the blocks of an atom scaled orthographic cameras.
+
+    Parameters
+    ----------
+    blocks : ndarray of shape (n_frames, 2, 3)
+        Blocks P_i.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        G, up to a scale, such that the rows of ``P_i G`` are orthogonal and of equal
+        length: ``Q = G G^T`` is the symmetric matrix of unit norm that has the least
+        sum of squares of ``p1 Q p1^T - p2 Q p2^T`` and ``2 p1 Q p2^T``, an eigenvector.
+        Of several solutions, as of fewer than three frames, it is the one next to the
+        identity. Where Q is not positive definite its axes are kept, and none is
+        stretched more than 20 times as much as another.
+    """
+    p1, p2 = blocks[:, 0], blocks[:, 1]
+    equations = np.vstack(
+        [
+            _quadratic_terms(p1, p1) - _quadratic_terms(p2, p2),
+            2 * _quadratic_terms(p1, p2),
+        ]
+    )
+    _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
+    n_determined = min(int(np.sum(values > NULL_DIRECTION * values[0])), 5)
+    solutions = vectors[n_determined:]
+    traces = solutions[:, :3].sum(axis=1)
+    eigenvalues, axes = np.linalg.eigh(_symmetric_matrix(traces @ solutions))
+    eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / LARGEST_STRETCH**2)
+    return axes * np.sqrt(eigenvalues)
+
+
+def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
+    """
+    Return the rotation or reflection of space that brings blocks to cameras.
+
+    Parameters
+    ----------
+    blocks : ndarray of shape (n_frames, 2, 3)
+        Scaled cameras ``c_i R_i O^T``, the signs of c_i unknown.
+    cameras : ndarray of shape (n_frames, 2, 3)
+        R_i, with orthonormal rows.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        Orthogonal O that, with the best c_i, minimises ``sum_i ||P_i O - c_i R_i||^2``:
+        in turns the coefficients and an orthogonal Procrustes problem, from the
+        matrix of any shape that has the largest ``sum_i <P_i O, R_i>^2``.
+    """
+    products = np.einsum("irc,ird->icd", blocks, cameras).reshape(-1, 9)
+    start = np.linalg.eigh(products.T @ products)[1][:, -1]
+    O = nearest_orthonormal(start.reshape(3, 3))  # noqa: E741
+    for _ in range(MAX_ROUNDS):
+        coefficients = products @ O.ravel()
+        before = O
+        O = nearest_orthonormal((coefficients @ products).reshape(3, 3))  # noqa: E741
+        if np.abs(O - before).max() < ALIGNED:
+            break
+    return O
+
+
+def chain_atoms(atoms: NDArray, code: BlockCode) -> ChainedAtoms:
+    """
+    Make cameras of the blocks of all atoms, in one orientation of space.
+
+    Parameters
+    ----------
+    atoms : ndarray of shape (n_atoms, 3, n_points)
+        D_l.
+    code : BlockCode
+        Blocks P_il of the frames.
+
+    Returns
+    -------
+    ChainedAtoms
+        The most used atom comes first, then always the one that shares most frames with
+        those before it. Its blocks become ``P_il G_l``, with G_l the
+        `metric_correction` times the orthogonal matrix that aligns them with the
+        cameras of the shared frames or, where these are fewer than ten, its shape with
+        the first. A frame has the camera R_i next to the block of the first atom that
+        it uses, ``c_il = <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
+    """
+    blocks, active = code
+    n_frames, n_atoms = active.shape
+    cameras, seen = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
+    coefficients, shapes = np.zeros((n_frames, n_atoms)), np.zeros_like(atoms)
+    n_users = active.sum(axis=0)
+    left = [atom for atom in np.argsort(-n_users, kind="stable") if n_users[atom]]
+    first = left[0]
+    while left:
+        n_shared = active[seen].sum(axis=0)
+        atom = left.pop(int(np.argmax(n_shared[left])))
+        users = np.flatnonzero(active[:, atom])
+        shared = seen[users]
+        G = metric_correction(blocks[users, atom])
+        if n_shared[atom] >= FEWEST_SHARED:
+            motion = blocks[users[shared], atom] @ G
+            G = G @ align_blocks(motion, cameras[users[shared]])
+        elif atom != first:
+            shape = np.linalg.pinv(G) @ atoms[atom]
+            G = G @ nearest_orthonormal(shape @ shapes[first].T)
+        motion = blocks[users, atom] @ G
+        cameras[users[~shared]] = nearest_orthonormal(motion[~shared])
+        seen[users] = True
+        coefficients[users, atom] = np.einsum("irc,irc->i", motion, cameras[users]) / 2
+        shapes[atom] = np.linalg.pinv(G) @ atoms[atom]
+    return ChainedAtoms(cameras, coefficients, shapes)
+
+
+class CompressibleNRSfM(ShapeSequenceNRSfM):
+    """
+    Prior-less compressible structure from motion.
+
+    Each shape is a sum of at most `sparsity` of `n_atoms` shapes. Frames are factorised
+    into 2x3 blocks and atoms by block-sparse dictionary learning; then the blocks of
+    each atom are made cameras, and the atoms are brought to one orientation. Row i,
+    reshaped to (n_points, 2), is modelled as::
+
+        shapes_[i] @ motion_[i].T + translation_[i]
+
+    Parameters
+    ----------
+    n_components : int, default=3
+        K, the number of basis shapes besides the mean shape that `transform` and the
+        methods beside it use. K needs at least 3K + 4 points and
+        ``ceil(8 (K + 2) / 5)`` frames.
+    n_atoms : int, default=None
+        Number of atoms, at most one for each frame. None means ``n_components + 1``,
+        so that the shapes are mixtures of as many shapes as in the other methods.
+    sparsity : int, default=2
+        The most atoms of a frame.
+    penalty : float, default=0.06
+        Price of the norm of a block in the relaxed problem that gives the atoms to
+        start from, relative to the root mean square norm of a frame.
+    ridge : float, default=0.01
+        Price of a block when frames are coded, as a share of the energy of the frame,
+        up to 0.25. An atom that would explain less than four times this share is not
+        used. With a small one the residual is least, but frames are split into atoms
+        that nearly cancel, of which no cameras can be made unless the shapes are truly
+        sparse.
+    max_iter : int, default=20
+        The most sweeps of dictionary learning.
+    tol : float, default=1e-4
+        Relative change of the residual in a sweep below which one more is made, the
+        last.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    scale_frames : bool, default=False
+        Whether each centred frame is divided by the root mean square of its coordinates
+        before the fit; the scale is given back to `motion_`. False is for orthographic
+        cameras, as published; photos of any resolution need True.
+    ordered : bool, default=False
+        Whether the rows are successive frames of a camera that turns little from one to
+        the next. Images do not tell the sign of a frame's camera and shape: with True
+        it is the sign with which the camera turns by the lesser angle from the one
+        before, with False the one with which the shapes resemble each other.
+    random_state : int, RandomState instance or None, default=None
+        Draws the first atoms and, of more than 1000 frames, those that the relaxed
+        problem is solved for. The result depends on it: an int makes it the same in
+        every fit.
+
+    Attributes
+    ----------
+    mean_shape_ : ndarray of shape (n_points, 3)
+        Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
+        for image coordinates), z is depth; the mirror image fits as well.
+    basis_ : ndarray of shape (n_components, n_points, 3)
+        Principal components of `shapes_`, by decreasing variance; one standard
+        deviation each.
+    alpha_ : ndarray of shape (n_frames, n_components)
+        Coefficients of the fitted table, as `transform` returns them: of the model of
+        mean and principal components, with cameras as of `decompose`.
+    motion_ : ndarray of shape (n_frames, 2, 3)
+        Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
+    translation_ : ndarray of shape (n_frames, 2)
+        Centroids of the frames, in the units of the table.
+    shapes_ : ndarray of shape (n_frames, n_points, 3)
+        Shapes of the frames, centred, sums of at most `sparsity` atoms. In the units of
+        the table or, with `scale_frames`, of frames of size one.
+    inverse_snr_ : float
+        ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
+        as in the fit, and What the image of `shapes_` in `motion_`. It may exceed one,
+        as the shapes are not fitted to the images again.
+    noise_variance_ : float
+        Mean square error of a coordinate when each shape is replaced by its projection
+        on the model; of frames of size one where frames are scaled.
+    dictionary_residual_ : float
+        The same share as `inverse_snr_` of the factorisation into blocks and atoms,
+        before the blocks are made cameras.
+    n_users_ : ndarray of shape (n_atoms,)
+        Number of frames that use each atom.
+    n_iter_ : int
+        Number of sweeps.
+    n_features_in_ : int
+        Number of columns.
+    feature_names_in_ : ndarray of shape (n_features_in_,)
+        Names of the columns, where the table is a dataframe with string names.
+
+    See Also
+    --------
+    PseudoInverseNRSfM : Shapes of least norm, then of low rank.
+    BlockMatrixNRSfM : Shapes of least nuclear norm.
+    isa_nrsfm.AffineNRSfM : Affine cameras, missing points, independent basis shapes.
+
+    Notes
+    -----
+    The steps are those of the publication: a group-sparse factorisation by the
+    alternating direction method of multipliers, block K-SVD with reweighted ridge
+    regression as its sparse coding, one 3x3 matrix for each atom from an eigenvector,
+    orthogonal Procrustes problems along a chain of atoms, and shapes from the blocks
+    and the atoms. Choices of this implementation are the price of a block in the sparse
+    coding, signs of coefficients as part of the Procrustes problems, bounds on matrices
+    that are not positive definite, and that atoms which share fewer than ten frames
+    with those before are aligned by their shapes.
+
+    The dictionary is unique only where shapes are truly sparse and the points are many:
+    `sparsity` atoms must not span what others do. Tables of low rank, as of a face with
+    few ways to deform, can be coded in many ways; the cameras then depend on
+    `random_state`. Try several, and compare `inverse_snr_`.
+
+    The method factorises the table it is given and knows no other frames. `transform`
+    and the methods beside it therefore fit a model to each frame: the mean and the
+    first `n_components` principal components of `shapes_`, with coefficients drawn from
+    a normal distribution. For the rows of the fitted table too they return the shapes
+    of this model, which are near to `shapes_`, not equal to them. Points that are
+    missing are not possible.
+
+    References
+    ----------
+    C. Kong, S. Lucey, "Prior-less compressible structure from motion", IEEE Conference
+    on Computer Vision and Pattern Recognition, 2016.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.baselines import CompressibleNRSfM
+    >>> from isa_nrsfm.datasets import make_nonrigid_tracks
+    >>> tracks = make_nonrigid_tracks(100, camera="orthographic", random_state=0)
+    >>> model = CompressibleNRSfM(n_components=3, random_state=0).fit(tracks.data)
+    >>> model.shapes_.shape, model.n_users_.shape
+    ((100, 68, 3), (4,))
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **ShapeSequenceNRSfM._parameter_constraints,
+        "n_atoms": [Interval(Integral, 1, None, closed="left"), None],
+        "sparsity": [Interval(Integral, 1, None, closed="left")],
+        "penalty": [Interval(Real, 0, None, closed="left")],
+        # A smaller price is lost in the rounding of the equations.
+        "ridge": [Interval(Real, 1e-12, 0.25, closed="both")],
+        "max_iter": [Interval(Integral, 1, None, closed="left")],
+        "tol": [Interval(Real, 0, None, closed="left")],
+        "random_state": ["random_state"],
+    }
+
+    def __init__(
+        self,
+        n_components: int = 3,
+        *,
+        n_atoms: int | None = None,
+        sparsity: int = 2,
+        penalty: float = 0.06,
+        ridge: float = 0.01,
+        max_iter: int = 20,
+        tol: float = 1e-4,
+        layout: Layout = "interleaved",
+        scale_frames: bool = False,
+        ordered: bool = False,
+        random_state: int | np.random.RandomState | None = None,
+    ):
+        super().__init__(
+            n_components, layout=layout, scale_frames=scale_frames, ordered=ordered
+        )
+        self.n_atoms = n_atoms
+        self.sparsity = sparsity
+        self.penalty = penalty
+        self.ridge = ridge
+        self.max_iter = max_iter
+        self.tol = tol
+        self.random_state = random_state
+
+    def _factorise(self, W: NDArray) -> ShapeSequence:
+        """Return cameras and shapes that are sums of few atoms."""
+        frames, basis = _row_space(W)
+        # The mean square norm of a frame is 2J.
+        unit = np.sqrt(2 * W.shape[1])
+        found = self._dictionary(frames / unit)
+        cameras, coefficients, atoms = chain_atoms(found.atoms, found.code)
+        self.dictionary_residual_ = found.residual
+        self.n_users_ = found.code.active.sum(axis=0)
+        self.n_iter_ = found.n_iter
+        shapes = np.tensordot(coefficients, unit * (atoms @ basis), 1)
+        return ShapeSequence(cameras, shapes.transpose(0, 2, 1))
+
+    def _dictionary(self, frames: NDArray) -> BlockDictionary:
+        """Return the dictionary of frames of mean square norm one."""
+        n_frames = len(frames)
+        n_atoms = self.n_components + 1 if self.n_atoms is None else self.n_atoms
+        if n_atoms > n_frames:
+            raise ValueError(
+                f"n_atoms={n_atoms} needs as many frames (rows), X has "
+                f"n_samples={n_frames}"
+            )
+        if self.sparsity > n_atoms:
+            raise ValueError(
+                f"sparsity={self.sparsity} must not be larger than the number of "
+                f"atoms, n_atoms={n_atoms}"
+            )
+        random_state = check_random_state(self.random_state)
+        drawn = frames
+        if n_frames > RELAXED_FRAMES:
+            drawn = frames[random_state.permutation(n_frames)[:RELAXED_FRAMES]]
+        _, atoms = group_sparse_factors(drawn, n_atoms, self.penalty, random_state)
+        return block_ksvd(
+            frames,
+            atoms,
+            self.sparsity,
+            ridge=self.ridge,
+            max_iter=self.max_iter,
+            tol=self.tol,
+        )
+
+
+def _row_space(W: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return frames (n_frames, 2, rank) over an orthonormal basis (rank, n_points).
+
+    The basis, of at least three rows, is that of what the rows of W span.
+    """
+    triangle = np.linalg.qr(W, mode="r") if len(W) > W.shape[1] else W
+    _, values, basis = np.linalg.svd(triangle, full_matrices=False)
+    rank = max(3, int(np.sum(values > NULL_DIRECTION * values[0])))
+    return (W @ basis[:rank].T).reshape(len(W) // 2, 2, -1), basis[:rank]

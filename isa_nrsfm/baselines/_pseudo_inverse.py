@@ -1,0 +1,204 @@
+"""The pseudo-inverse method: shapes of least norm, then of low rank."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._factorisation import NULL_DIRECTION
+from isa_nrsfm._orthonormal_cameras import nearest_orthonormal, orthonormal_cameras
+from isa_nrsfm._tracks import Layout
+from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.baselines._shape_sequence import ShapeSequence
+
+
+def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
+    """
+    Return the orthographic camera of each frame of a measurement matrix.
+
+    Parameters
+    ----------
+    W : ndarray of shape (2 * n_frames, n_points)
+        Measurement matrix, rows centred.
+    rank : int
+        Number of shapes that the shapes of all frames are mixtures of.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2, 3)
+        Cameras R_i with orthonormal rows, nearest to those that `orthonormal_cameras`
+        finds as a mixture of the first ``3 * rank`` left singular vectors of W. What
+        W has besides is taken for noise.
+
+    Raises
+    ------
+    ValueError
+        If W has less than rank three.
+    """
+    U, S, _ = np.linalg.svd(W, full_matrices=False)
+    n_columns = min(3 * rank, int(np.sum(S > NULL_DIRECTION * S[0])))
+    if n_columns < 3:
+        raise ValueError(
+            "orthographic cameras need a table of rank three or more, once frames are "
+            f"centred; X has rank {n_columns}, as of a flat object that does not deform"
+        )
+    n_left = (len(W) - 3 * rank) * (W.shape[1] - 1 - 3 * rank)
+    noise_variance = float(np.sum(S[3 * rank :] ** 2)) / n_left if n_left > 0 else 0.0
+    motion = U[:, :n_columns] * S[:n_columns]
+    return nearest_orthonormal(orthonormal_cameras(motion, noise_variance).cameras)
+
+
+def least_norm_shapes(W: NDArray, cameras: NDArray) -> NDArray:
+    """
+    Return the shapes of least norm that show a measurement matrix exactly.
+
+    Parameters
+    ----------
+    W : ndarray of shape (2 * n_frames, n_points)
+        Measurement matrix.
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Cameras R_i with orthonormal rows.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_points, 3)
+        ``S_i^T = W_i^T R_i``, that is ``S_i = R_i^+ W_i``: flat, in the image plane.
+    """
+    return W.reshape(len(cameras), 2, -1).transpose(0, 2, 1) @ cameras
+
+
+def truncate_rank(shapes: NDArray, rank: int) -> NDArray:
+    """
+    Return the nearest shapes that are mixtures of a few.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_frames, n_points, 3)
+        Shapes.
+    rank : int
+        Number of shapes that are mixed.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_points, 3)
+        Shapes whose matrix, one row a frame, has this rank: its singular values beyond
+        are set to zero.
+    """
+    U, S, Vt = np.linalg.svd(shapes.reshape(len(shapes), -1), full_matrices=False)
+    return ((U[:, :rank] * S[:rank]) @ Vt[:rank]).reshape(shapes.shape)
+
+
+class PseudoInverseNRSfM(ShapeSequenceNRSfM):
+    """
+    Pseudo-inverse method of non-rigid structure from motion.
+
+    Finds orthographic cameras R_i, then for each frame the shape of least norm that
+    shows exactly what the image does, ``S_i = R_i^+ W_i``, and takes the mixtures of
+    ``n_components + 1`` shapes that are nearest to these. Depth comes from the low rank
+    alone, and is too small. Row i, reshaped to (n_points, 2), is modelled as::
+
+        shapes_[i] @ motion_[i].T + translation_[i]
+
+    Parameters
+    ----------
+    n_components : int, default=3
+        K, the number of basis shapes besides the mean shape: in the literature, which
+        counts the mean shape, K is one more. K needs at least 3K + 4 points and
+        ``ceil(8 (K + 2) / 5)`` frames.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    scale_frames : bool, default=False
+        Whether each centred frame is divided by the root mean square of its coordinates
+        before the fit; the scale is given back to `motion_`. False is for orthographic
+        cameras, as published; photos of any resolution need True.
+    ordered : bool, default=False
+        Whether the rows are successive frames of a camera that turns little from one to
+        the next. Images do not tell the sign of a frame's camera and shape: with True
+        it is the sign with which the camera turns by the lesser angle from the one
+        before, with False the one with which the shapes resemble each other.
+
+    Attributes
+    ----------
+    mean_shape_ : ndarray of shape (n_points, 3)
+        Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
+        for image coordinates), z is depth; the mirror image fits as well.
+    basis_ : ndarray of shape (n_components, n_points, 3)
+        Principal components of `shapes_`, by decreasing variance; one standard
+        deviation each.
+    alpha_ : ndarray of shape (n_frames, n_components)
+        Coefficients of the fitted table, as `transform` returns them: of the model of
+        mean and principal components, with cameras as of `decompose`.
+    motion_ : ndarray of shape (n_frames, 2, 3)
+        Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
+    translation_ : ndarray of shape (n_frames, 2)
+        Centroids of the frames, in the units of the table.
+    shapes_ : ndarray of shape (n_frames, n_points, 3)
+        Shapes of the frames, centred, of rank ``n_components + 1`` as a matrix with
+        one row a frame. In the units of the table or, with `scale_frames`, of frames
+        of size one.
+    inverse_snr_ : float
+        ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
+        as in the fit, and What the image of `shapes_` in `motion_`.
+    noise_variance_ : float
+        Mean square error of a coordinate when each shape is replaced by its projection
+        on the model; of frames of size one where frames are scaled.
+    n_features_in_ : int
+        Number of columns.
+    feature_names_in_ : ndarray of shape (n_features_in_,)
+        Names of the columns, where the table is a dataframe with string names.
+
+    See Also
+    --------
+    BlockMatrixNRSfM : Shapes of least nuclear norm.
+    isa_nrsfm.AffineNRSfM : Affine cameras, missing points, independent basis shapes.
+
+    Notes
+    -----
+    The method factorises the table it is given and knows no other frames. `transform`
+    and the methods beside it therefore fit a model to each frame: the mean and the
+    first `n_components` principal components of `shapes_`, with coefficients drawn from
+    a normal distribution. For the rows of the fitted table too they return the shapes
+    of this model, not `shapes_`. The two differ the more, the less `shapes_` are those
+    of a mean shape that deforms, seen by orthographic cameras: they are close for
+    `BlockMatrixNRSfM`, less so for shapes that lack depth.
+
+    Neither the singular values of the matrix of shapes nor their images depend on the
+    signs of frames, so that `inverse_snr_` does not depend on `ordered`.
+
+    Cameras are found by `isa_nrsfm.calibration.orthonormal_cameras` among the mixtures
+    of the first ``3 (n_components + 1)`` left singular vectors of W, and made exactly
+    orthonormal. A flat object that does not deform does not determine them: `fit`
+    raises a ValueError, as it does for points that are missing.
+
+    References
+    ----------
+    Y. Dai, H. Li, M. He, "A simple prior-free method for non-rigid
+    structure-from-motion factorization", International Journal of Computer Vision 107,
+    2014.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.baselines import PseudoInverseNRSfM
+    >>> from isa_nrsfm.datasets import make_nonrigid_tracks
+    >>> tracks = make_nonrigid_tracks(100, camera="orthographic", random_state=0)
+    >>> model = PseudoInverseNRSfM(n_components=3).fit(tracks.data)
+    >>> model.shapes_.shape, model.alpha_.shape
+    ((100, 68, 3), (100, 3))
+    """
+
+    def __init__(
+        self,
+        n_components: int = 3,
+        *,
+        layout: Layout = "interleaved",
+        scale_frames: bool = False,
+        ordered: bool = False,
+    ):
+        super().__init__(
+            n_components, layout=layout, scale_frames=scale_frames, ordered=ordered
+        )
+
+    def _factorise(self, W: NDArray) -> ShapeSequence:
+        """Return cameras and the shapes of least norm, of rank K + 1."""
+        rank = self.n_components + 1
+        cameras = orthographic_cameras(W, rank)
+        shapes = least_norm_shapes(W, cameras)
+        return ShapeSequence(cameras, truncate_rank(shapes, rank))
