@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from isa_nrsfm._tracks import seen_points
+
 RIGID_RANK = 3
 # A step that lowers the noise variance by less than this share is the last one. Further
 # steps fit the noise more than they improve the missing points.
@@ -132,7 +134,7 @@ def complete_tracks(
     Completion
         Complete tracks. Tracks without missing points are returned as they are.
     """
-    seen = _seen(centred)
+    seen = seen_points(centred)
     if seen.all():
         return Completion(centred, np.zeros((len(centred), 2)))
     rank = _possible_rank(3 * n_components + 3, seen.shape[1])
@@ -167,14 +169,9 @@ def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
         Noise variance of one coordinate in the model of rank 3, relative to the
         squared sizes.
     """
-    seen = _seen(centred)
+    seen = seen_points(centred)
     frames, _ = _by_pattern(centred, seen, sizes)
     return _fit(frames, _possible_rank(RIGID_RANK, seen.shape[1]), TOL, 50).noise
-
-
-def _seen(centred: NDArray) -> NDArray:
-    """Return the mask of seen points (n_frames, n_points)."""
-    return ~np.isnan(centred[..., 0] + centred[..., 1])
 
 
 def _possible_rank(rank: int, n_points: int) -> int:

@@ -48,21 +48,23 @@ from isa_nrsfm._joint_fit import fit_jointly
 from isa_nrsfm._metric_refinement import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._robust import LOSSES, gross_outliers, robust_sizes
+from isa_nrsfm._table_checks import (
+    check_names,
+    check_points,
+    check_size,
+    clean_tracks,
+    warn_if_other_layout,
+)
 from isa_nrsfm._tracks import (
     LAYOUTS,
     Layout,
     centred_tracks,
     check_frames,
-    check_names,
-    check_points,
-    check_size,
-    clean_tracks,
     measurement_matrix,
     relative_precision,
     table_to_tracks,
     tracks_to_table,
     usable_frames,
-    warn_if_other_layout,
     weighting_sizes,
 )
 from isa_nrsfm.isa import PooledFastICA

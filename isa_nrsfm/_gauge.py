@@ -14,6 +14,37 @@ from isa_nrsfm._camera import mean_view
 from isa_nrsfm._factorisation import orientations
 
 
+def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
+    """
+    Return the rotation or reflection of space that shows the mean shape from front.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape, centred.
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        Orthogonal matrix A such that shapes ``S A^T`` and cameras ``M A^T`` are
+        canonical: the x and y axes are as near to the rows of the mean camera as can
+        be. Where the cameras have no common view x, y and z are the principal axes of
+        ``sum_i M_i^T M_i``. The third moment of depth is not negative.
+    """
+    view = mean_view(cameras)
+    if view is None:
+        rows = cameras.reshape(-1, 3)
+        axes = np.linalg.eigh(rows.T @ rows)[1][:, ::-1].T
+        return axes * orientations(axes @ mean_shape.T)[:, None]
+    U, _, Vt = np.linalg.svd(view, full_matrices=False)
+    across = U @ Vt
+    axes = np.vstack([across, np.cross(*across)])
+    axes[2] *= orientations(axes[2:] @ mean_shape.T)[0]
+    return axes
+
+
 def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     """
     Return the affinity of space that makes the mean shape white and seen from front.
@@ -40,18 +71,7 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     scale = np.where(inside, 1.0 / np.sqrt(np.where(inside, variance, 1.0)), 1.0)
     whitening = (axes * scale) @ axes.T
     white_motion = motion @ np.linalg.inv(whitening)
-    white_shape = mean_shape @ whitening
-    view = mean_view(white_motion)
-    if view is None:
-        second = np.einsum("irc,ird->cd", white_motion, white_motion)
-        rotation = np.linalg.eigh(second)[1][:, ::-1].T
-        rotation = rotation * orientations(rotation @ white_shape.T)[:, None]
-    else:
-        U, _, Vt = np.linalg.svd(view, full_matrices=False)
-        across = U @ Vt
-        rotation = np.vstack([across, np.cross(*across)])
-        rotation[2] *= orientations((white_shape @ rotation[2:].T).T)[0]
-    return rotation @ whitening
+    return canonical_rotation(mean_shape @ whitening, white_motion) @ whitening
 
 
 # A basis shape with less than this share of the rigid motion's energy in the images

@@ -49,13 +49,38 @@ def symmetric_power(matrix: NDArray, power: float) -> NDArray:
     return (vectors * np.maximum(eigenvalues, 0) ** power) @ vectors.T
 
 
+def conformal_equations(cameras: NDArray) -> NDArray:
+    """
+    Return what weak-perspective cameras ask of the metric of space.
+
+    Parameters
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Rows m1 and m2.
+
+    Returns
+    -------
+    ndarray of shape (2 * n_frames, 6)
+        Coefficients of ``m1 Q m1^T - m2 Q m2^T`` and of ``2 m1 Q m2^T`` in the six
+        unknowns of Q, see `symmetric_matrix`. Turning a frame in its image plane turns
+        the two into each other.
+    """
+    m1, m2 = np.moveaxis(cameras, 1, 0)
+    return np.vstack(
+        [
+            _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2),
+            2 * _quadratic_terms(m1, m2),
+        ]
+    )
+
+
 def _quadratic_terms(a: NDArray, b: NDArray) -> NDArray:
     """Return the coefficients of a Q b^T in the six unknowns of Q, one row a pair."""
     mixed = a[:, _ROWS] * b[:, _COLUMNS] + a[:, _COLUMNS] * b[:, _ROWS]
     return np.hstack([a * b, mixed / np.sqrt(2)])
 
 
-def _symmetric_matrix(unknowns: NDArray) -> NDArray:
+def symmetric_matrix(unknowns: NDArray) -> NDArray:
     """Return the symmetric 3x3 matrix of six unknowns."""
     matrix = np.diag(unknowns[:3])
     matrix[_ROWS, _COLUMNS] = matrix[_COLUMNS, _ROWS] = unknowns[3:] / np.sqrt(2)
@@ -103,13 +128,7 @@ def _most_metric(motion: NDArray) -> NDArray | None:
     # In coordinates in which the mean of M_i^T M_i is the identity the mean to be kept
     # is the trace of Q: the identity over three plus five unknowns without trace.
     whitening = symmetric_power(gram, -0.5)
-    m1, m2 = np.moveaxis(cameras @ whitening, 1, 0)
-    equations = np.vstack(
-        [
-            _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2),
-            2 * _quadratic_terms(m1, m2),
-        ]
-    )
+    equations = conformal_equations(cameras @ whitening)
     trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     traceless = np.linalg.svd(trace[None])[2][1:].T
     unknowns, _, _, singular_values = np.linalg.lstsq(
@@ -120,7 +139,7 @@ def _most_metric(motion: NDArray) -> NDArray | None:
         or singular_values[-1] <= SMALLEST_SINGULAR_VALUE * singular_values[0]
     ):
         return None
-    return whitening @ _symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
+    return whitening @ symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
 
 
 def anisotropy(motion: NDArray) -> float:

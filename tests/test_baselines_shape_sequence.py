@@ -1,14 +1,12 @@
-"""Sequences of cameras and shapes: signs, orientation and principal components."""
+"""Sequences of cameras and shapes: signs and principal components."""
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
-    canonical_rotation,
     principal_shapes,
     shape_signs,
 )
@@ -62,42 +60,6 @@ class TestCameraSigns:
 
     def test_one_frame_has_a_sign(self):
         assert_array_equal(camera_signs(np.eye(2, 3)[None]), [1.0])
-
-
-class TestCanonicalRotation:
-    def test_cameras_with_a_common_view_look_along_z(self):
-        rng = np.random.default_rng(0)
-        turns = Rotation.from_rotvec(0.3 * rng.normal(size=(30, 3))).as_matrix()
-        cameras = turns[:, :2] @ random_rotation(1)
-        shape = rng.normal(size=(12, 3))
-        A = canonical_rotation(shape, cameras)
-        assert_allclose(A @ A.T, np.eye(3), atol=1e-14)
-        mean = (cameras @ A.T).mean(axis=0)
-        assert_allclose(mean[:, 2], 0, atol=1e-14)
-        assert_allclose(mean[0, 1], mean[1, 0], atol=1e-14)
-        assert np.linalg.det(mean[:, :2]) > 0
-        assert np.sum((shape @ A.T)[:, 2] ** 3) > 0
-
-    def test_cameras_all_round_have_principal_axes(self):
-        rng = np.random.default_rng(0)
-        cameras = Rotation.from_rotvec(rng.normal(size=(30, 3))).as_matrix()[:, :2]
-        cameras = np.concatenate([cameras, -cameras])
-        A = canonical_rotation(rng.normal(size=(12, 3)), cameras)
-        rows = (cameras @ A.T).reshape(-1, 3)
-        second = rows.T @ rows
-        assert_allclose(second, np.diag(np.diag(second)), atol=1e-12)
-        assert (np.diff(np.diag(second)) < 0).all()
-
-    @pytest.mark.parametrize("spread", [0.3, 3.0])
-    def test_any_orientation_of_space_gives_the_same(self, spread):
-        rng = np.random.default_rng(0)
-        cameras = Rotation.from_rotvec(spread * rng.normal(size=(30, 3))).as_matrix()
-        cameras, shape = cameras[:, :2], rng.normal(size=(12, 3))
-        expected = canonical_rotation(shape, cameras)
-        for turn in (random_rotation(1), -np.eye(3)):
-            A = canonical_rotation(shape @ turn.T, cameras @ turn.T)
-            assert_allclose(shape @ turn.T @ A.T, shape @ expected.T, atol=1e-12)
-            assert_allclose(cameras @ turn.T @ A.T, cameras @ expected.T, atol=1e-12)
 
 
 class TestPrincipalShapes:

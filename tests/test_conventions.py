@@ -17,10 +17,12 @@ import isa_nrsfm
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks"]
-OPTIONAL = ["matplotlib", "pandas", "polars", "pyarrow", "skops"]
+OPTIONAL = ["matplotlib", "pandas", "polars", "pooch", "pyarrow", "skops"]
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [
     "isa_nrsfm",
+    "isa_nrsfm.baselines",
+    "isa_nrsfm.calibration",
     "isa_nrsfm.cli",
     "isa_nrsfm.datasets",
     "isa_nrsfm.io",

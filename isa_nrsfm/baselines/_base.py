@@ -22,23 +22,21 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._estimator import Decomposition
 from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._table_checks import check_names, check_size, warn_if_other_layout
 from isa_nrsfm._tracks import (
     LAYOUTS,
     Layout,
     centred_tracks,
-    check_names,
-    check_size,
     measurement_matrix,
     table_to_tracks,
     tracks_to_table,
-    warn_if_other_layout,
     weighting_sizes,
 )
 from isa_nrsfm.baselines._orthographic_frames import OrthographicFrames
 from isa_nrsfm.baselines._shape_sequence import (
     ShapeSequence,
     camera_signs,
-    canonical_rotation,
     principal_shapes,
     shape_signs,
 )

@@ -14,7 +14,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval
 
 from isa_nrsfm._factorisation import NULL_DIRECTION
-from isa_nrsfm._metric import LARGEST_STRETCH, _quadratic_terms, _symmetric_matrix
+from isa_nrsfm._metric import LARGEST_STRETCH, conformal_equations, symmetric_matrix
 from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
 from isa_nrsfm._tracks import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
@@ -75,18 +75,12 @@ def metric_correction(blocks: NDArray) -> NDArray:
         identity. Where Q is not positive definite its axes are kept, and none is
         stretched more than 20 times as much as another.
     """
-    p1, p2 = blocks[:, 0], blocks[:, 1]
-    equations = np.vstack(
-        [
-            _quadratic_terms(p1, p1) - _quadratic_terms(p2, p2),
-            2 * _quadratic_terms(p1, p2),
-        ]
-    )
+    equations = conformal_equations(blocks)
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
     n_determined = min(int(np.sum(values > NULL_DIRECTION * values[0])), 5)
     solutions = vectors[n_determined:]
     traces = solutions[:, :3].sum(axis=1)
-    eigenvalues, axes = np.linalg.eigh(_symmetric_matrix(traces @ solutions))
+    eigenvalues, axes = np.linalg.eigh(symmetric_matrix(traces @ solutions))
     eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / LARGEST_STRETCH**2)
     return axes * np.sqrt(eigenvalues)
 

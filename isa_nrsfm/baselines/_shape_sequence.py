@@ -1,8 +1,7 @@
-"""Sequences of cameras and shapes: signs, orientation and principal components.
+"""Sequences of cameras and shapes: signs and principal components.
 
 Where each frame has a shape of its own, the sign of a frame is free: the camera -R_i
-sees in -S_i what R_i sees in S_i. Nor do the images tell the orientation of space or
-its mirror image.
+sees in -S_i what R_i sees in S_i.
 """
 
 from typing import NamedTuple
@@ -10,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._camera import mean_view
 from isa_nrsfm._factorisation import orientations
 
 # Rounds of `shape_signs`; a few are enough, and each raises the sum.
@@ -87,37 +85,6 @@ def camera_signs(cameras: NDArray) -> NDArray:
 def _sign(values: NDArray) -> NDArray:
     """Return 1.0 or -1.0 for each value."""
     return np.where(values < 0, -1.0, 1.0)
-
-
-def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
-    """
-    Return the rotation or reflection of space that shows the mean shape from front.
-
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        Mean shape, centred.
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras with orthonormal rows.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        Orthogonal matrix A such that shapes ``S A^T`` and cameras ``R A^T`` are
-        canonical: the x and y axes are as near to the rows of the mean camera as can
-        be. Where the cameras have no common view x, y and z are the principal axes of
-        ``sum_i R_i^T R_i``. The third moment of depth is not negative.
-    """
-    view = mean_view(cameras)
-    if view is None:
-        rows = cameras.reshape(-1, 3)
-        axes = np.linalg.eigh(rows.T @ rows)[1][:, ::-1].T
-        return axes * orientations(axes @ mean_shape.T)[:, None]
-    U, _, Vt = np.linalg.svd(view, full_matrices=False)
-    across = U @ Vt
-    axes = np.vstack([across, np.cross(*across)])
-    axes[2] *= orientations(axes[2:] @ mean_shape.T)[0]
-    return axes
 
 
 def principal_shapes(

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._landmark_names import LandmarkColumns, landmark_sets
 from isa_nrsfm._optional import import_optional
+from isa_nrsfm._table_checks import clean_tracks
 from isa_nrsfm._tracks import (
     FEWEST_POINTS,
-    clean_tracks,
     frames_in_one_place,
     seen_points,
     usable_frames,

@@ -1,0 +1,346 @@
+"""Checks of tables."""
+
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from isa_nrsfm._table_checks import (
+    LAYOUT_SAMPLE,
+    check_names,
+    check_points,
+    check_size,
+    clean_tracks,
+    largest_n_components,
+    smallest_n_frames,
+    warn_if_other_layout,
+)
+from isa_nrsfm._tracks import (
+    LAYOUTS,
+    tracks_to_table,
+)
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+def with_missing(tracks, missing, seed=0):
+    """Return tracks with points missing at random, and the mask of those seen."""
+    seen = np.random.default_rng(seed).random(tracks.shape[:2]) >= missing
+    return np.where(seen[..., None], tracks, tracks.dtype.type(np.nan)), seen
+
+
+class TestHalfPoints:
+    def half(self, rng):
+        tracks = rng.normal(size=(6, 9, 2))
+        tracks[4, 2, 0] = tracks[1, 7, 1] = tracks[1, 8, 0] = np.nan
+        tracks[2, 3] = np.nan
+        return tracks
+
+    def test_the_other_coordinate_is_dropped_with_a_warning(self, rng):
+        tracks = self.half(rng)
+        before = tracks.copy()
+        with pytest.warns(
+            UserWarning,
+            match=r"3 point\(s\) in 2 row\(s\) have only one of their two coordinates "
+            r"and count as missing; the first is point 7 in row 1$",
+        ):
+            clean = clean_tracks(tracks)
+        assert_array_equal(tracks, before)
+        seen = ~np.isnan(tracks).any(axis=2)
+        assert_array_equal(clean[seen], tracks[seen])
+        assert np.isnan(clean[~seen]).all()
+        assert clean.dtype == tracks.dtype
+
+    def test_single_precision_stays(self, rng):
+        with pytest.warns(UserWarning, match="3 point"):
+            assert clean_tracks(self.half(rng).astype(np.float32)).dtype == np.float32
+
+    @pytest.mark.parametrize(
+        ("layout", "columns"), [("interleaved", "c14, c15"), ("planar", "c7, c16")]
+    )
+    def test_columns_are_named(self, rng, layout, columns):
+        names = np.array([f"c{i}" for i in range(18)], dtype=object)
+        with pytest.warns(UserWarning, match=rf"point 7 \({columns}\) in row 1"):
+            clean_tracks(self.half(rng), layout, names)
+
+    def test_pairs_of_missing_coordinates_are_no_matter(self, rng):
+        tracks, _ = with_missing(rng.normal(size=(6, 9, 2)), 0.5)
+        assert clean_tracks(tracks) is tracks
+
+
+class TestPoints:
+    def test_point_seen_in_too_few_frames(self, rng):
+        tracks = rng.normal(size=(50, 16, 2))
+        tracks[5:, 4] = np.nan
+        tracks[4:, 9] = np.nan
+        check_points(tracks[:, :9], 2)
+        names = np.array([f"{axis}_{j}" for axis in "xy" for j in range(16)])
+        with pytest.raises(
+            ValueError,
+            match=r"n_components=3 needs every point in at least 6 frames; 2 of 16 "
+            r"point\(s\) are seen in fewer, the first is point 4 \(x_4, y_4\), seen in "
+            r"5",
+        ):
+            check_points(tracks, 3, "planar", names)
+
+    @pytest.mark.parametrize("K", range(1, 21))
+    def test_least_number_of_frames_of_a_point(self, K):
+        least = -(-3 * (K + 1) // 2)
+        assert 2 * least >= 3 * (K + 1) > 2 * (least - 1)
+        # Complete tables that are large enough have it.
+        assert least <= smallest_n_frames(K)
+
+    @pytest.mark.parametrize("K", range(1, 6))
+    def test_count_of_all_equations(self, K):
+        # The smallest complete table has hardly more equations than unknowns.
+        n_frames, n_points = smallest_n_frames(K), 3 * K + 4
+        surplus = n_equations_minus_unknowns(n_frames, n_points, K)
+        tracks = np.random.default_rng(0).normal(size=(n_frames, n_points, 2))
+        check_points(tracks, K)
+        n_hidden = surplus // 2 + 1
+        tracks[np.arange(n_hidden) % n_frames, np.arange(n_hidden) % n_points] = np.nan
+        assert np.isnan(tracks).any(axis=2).sum() == n_hidden
+        with pytest.raises(
+            ValueError,
+            match=rf"too few points are seen for n_components={K}: .* equations, but "
+            r"the shapes have \d+ unknowns",
+        ):
+            check_points(tracks, K)
+
+    def test_groups_of_points_that_are_never_seen_together(self, rng):
+        tracks = rng.normal(size=(100, 20, 2))
+        tracks[:50, 12:] = np.nan
+        tracks[50:, :12] = np.nan
+        with pytest.raises(
+            ValueError,
+            match=r"2 groups, and no frame shows points of two of them; point 12 is "
+            r"the first that is never seen with point 0 or others of its group",
+        ):
+            check_points(tracks, 1)
+        tracks[7] = 0.0
+        check_points(tracks, 1)
+
+
+def n_equations_minus_unknowns(n_frames, n_points, K):
+    """Count: numbers in the table against cameras, coefficients, shapes and gauge."""
+    cameras, coefficients, shapes = 8 * n_frames, K * n_frames, 3 * n_points * (K + 1)
+    gauge = (K + 1) ** 2 + 8 + 3 * (K + 1)  # the last: the origin of each shape
+    return 2 * n_points * n_frames - (cameras + coefficients + shapes - gauge)
+
+
+class TestSize:
+    @pytest.mark.parametrize("K", range(1, 21))
+    def test_counts_of_equations_and_unknowns(self, K):
+        smallest = smallest_n_frames(K)
+        fewest_points = 3 * K + 4
+        assert n_equations_minus_unknowns(smallest, fewest_points, K) >= 0
+        assert n_equations_minus_unknowns(smallest - 1, fewest_points, K) < 0
+        assert n_equations_minus_unknowns(smallest, 10 * fewest_points, K) >= 0
+
+    @pytest.mark.parametrize("n_points", range(4, 60))
+    def test_largest_number_of_basis_shapes(self, n_points):
+        # Centred points span n_points - 1 directions, the model needs 3K + 3.
+        K = largest_n_components(n_points)
+        assert 3 * K + 3 <= n_points - 1 < 3 * (K + 1) + 3
+
+    def test_the_smallest_table_passes(self):
+        for K in range(1, 10):
+            check_size(smallest_n_frames(K), 3 * K + 4, K)
+
+    def test_too_few_points(self):
+        with pytest.raises(
+            ValueError,
+            match=r"n_components=3 needs at least 13 points, X has 12; with 12 points "
+            r"the largest possible n_components is 2",
+        ):
+            check_size(100, 12, 3)
+
+    def test_too_few_points_for_any_number(self):
+        with pytest.raises(
+            ValueError,
+            match=r"n_components=2 needs at least 10 points, X has 6; at least 7 "
+            r"points are needed for n_components=1",
+        ):
+            check_size(100, 6, 2)
+
+    def test_too_few_frames(self):
+        with pytest.raises(
+            ValueError,
+            match=r"n_components=3 needs at least 8 frames \(rows\), X has n_samples=7",
+        ):
+            check_size(7, 68, 3)
+
+
+class TestNames:
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    def test_no_names_and_names_that_say_nothing(self, layout):
+        check_names(None, layout)
+        check_names(np.array(["a", "b", "c", "d"]), layout)
+
+    def test_matching_names(self):
+        check_names(np.array(["x0", "y0", "x1", "y1"]), "interleaved")
+        check_names(np.array(["x0", "x1", "y0", "y1"]), "planar")
+
+    @pytest.mark.parametrize(
+        ("layout", "names", "order"),
+        [
+            ("planar", ["x0", "y0", "x1", "y1", "x2", "y2"], "interleaved"),
+            ("interleaved", ["x0", "x1", "x2", "y0", "y1", "y2"], "planar"),
+            (
+                "interleaved",
+                ["y0", "x0", "y1", "x1", "y2", "x2"],
+                "neither interleaved nor planar",
+            ),
+        ],
+    )
+    def test_contradicting_names(self, layout, names, order):
+        shown = ", ".join(names[:4])
+        with pytest.raises(
+            ValueError,
+            match=rf"layout='{layout}' contradicts the column names \({shown}, ...\), "
+            rf"whose order is {order}$",
+        ):
+            check_names(np.array(names), layout)
+
+
+@pytest.fixture(scope="module")
+def faces():
+    tracks = make_nonrigid_tracks(40, 30, 2, amplitude=0.2, random_state=0)
+    return tracks.data.reshape(40, 30, 2)
+
+
+class TestOtherLayout:
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize(
+        ("true", "given"), [("interleaved", "planar"), ("planar", "interleaved")]
+    )
+    def test_the_other_layout_is_warned_of(self, faces, true, given, scale_frames):
+        X = tracks_to_table(faces, true)
+        with pytest.warns(
+            UserWarning,
+            match=rf"layout='{true}' explains the table much better than "
+            rf"layout='{given}': what is not rigid has 0\.\d+ times the energy",
+        ):
+            warn_if_other_layout(X, given, scale_frames)
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    def test_the_right_layout_is_quiet(self, faces, layout, scale_frames, unit):
+        warn_if_other_layout(
+            unit * tracks_to_table(faces, layout), layout, scale_frames
+        )
+
+    def test_single_precision(self, faces):
+        X = tracks_to_table(faces).astype(np.float32)
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    def test_long_tables_are_sampled_evenly(self, faces):
+        X = tracks_to_table(np.tile(faces, (LAYOUT_SAMPLE // 10, 1, 1)))
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    def test_a_rigid_object_seen_in_the_right_layout(self, rng):
+        tracks = rng.normal(size=(12, 3)) @ rng.normal(size=(20, 3, 2))
+        warn_if_other_layout(tracks_to_table(tracks), "interleaved", True)
+
+    @pytest.mark.parametrize("seed", range(10))
+    def test_tables_that_both_layouts_explain(self, seed):
+        # Four points are rigid in any layout: the residuals are rounding errors.
+        X = np.random.default_rng(seed).normal(size=(20, 8))
+        warn_if_other_layout(X, "interleaved", True)
+        warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("offset", [3.0, 30.0, 300.0])
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    def test_where_the_object_is_in_the_image_is_irrelevant(
+        self, faces, offset, scale_frames, layout
+    ):
+        # The object has size 1 and is moved far away from the corner of the image.
+        X = tracks_to_table(faces + np.array([offset, 0.0]), layout)
+        warn_if_other_layout(X, layout, scale_frames)
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    def test_points_that_coincide_in_the_other_layout(self, scale_frames):
+        # Points (0, 0) and (1, 1): by the other layout all points would be equal.
+        X = np.repeat([[0.0] * 8 + [1.0] * 8], 12, axis=0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            warn_if_other_layout(X, "interleaved", scale_frames)
+
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "akhter_drink",
+            "akhter_yoga",
+            "faces_wild_68_combined",
+            "ict_bu3dfe_like_68",
+            "shark_torresani",
+        ],
+    )
+    def test_real_tables(self, load_data, name):
+        X = tracks_to_table(load_data(name)["W2d"])
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize(("right", "wrong"), [LAYOUTS, LAYOUTS[::-1]])
+    @pytest.mark.parametrize("missing", [0.1, 0.3, 0.6])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            "akhter_yoga",
+            "expressions_dlib_68",
+            "hands_kazuhito_21",
+            "ict_bu3dfe_like_68",
+            "muct_68",
+            "shark_torresani",
+        ],
+    )
+    def test_real_tables_with_missing_points(
+        self, load_data, name, missing, right, wrong, scale_frames
+    ):
+        tracks, _ = with_missing(load_data(name)["W2d"].astype(float), missing)
+        X = tracks_to_table(tracks, right)
+        warn_if_other_layout(X, right, scale_frames)
+        with pytest.warns(UserWarning, match=f"layout='{right}' explains the table"):
+            warn_if_other_layout(X, wrong, scale_frames)
+
+    def test_faces_that_hide_a_side(self, load_data):
+        X = tracks_to_table(load_data("muct_68")["W2d"])
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_generated_faces_with_missing_points(self, seed):
+        X = make_face_tracks(60, missing=0.3, random_state=seed).data
+        warn_if_other_layout(X, "interleaved", True)
+        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
+            warn_if_other_layout(X, "planar", True)
+
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    @pytest.mark.parametrize("missing", [0.3, 0.8, 0.99])
+    def test_tables_that_hardly_show_anything(self, rng, missing, layout):
+        # No warning of arithmetic, whatever is left.
+        for seed in range(5):
+            X = with_missing(rng.normal(size=(30, 20, 2)), missing, seed)[0]
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                warn_if_other_layout(tracks_to_table(X), layout, True)
+
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    def test_a_rigid_object_with_missing_points(self, rng, layout):
+        tracks = rng.normal(size=(30, 3)) @ rng.normal(size=(40, 3, 2))
+        X = tracks_to_table(with_missing(tracks, 0.3)[0], layout)
+        warn_if_other_layout(X, layout, True)
