@@ -383,17 +383,21 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
 
         self.isa_ = self._strategy()
         joint = self.refinement == "joint"
-        result = run_paper_pipeline(
-            W,
-            self.n_components,
-            self.isa_,
-            precision=relative_precision(tracks, sizes),
-            block_recovery=self.block_recovery,
-            refinement="alternating" if joint else self.refinement,
-            max_iter=START_STEPS if joint else self.max_iter,
-            tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
-            report=report,
-        )
+        with warnings.catch_warnings():
+            if joint and self.isa is None:
+                # It makes no difference to the joint refinement, which starts there.
+                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
+            result = run_paper_pipeline(
+                W,
+                self.n_components,
+                self.isa_,
+                precision=relative_precision(tracks, sizes),
+                block_recovery=self.block_recovery,
+                refinement="alternating" if joint else self.refinement,
+                max_iter=START_STEPS if joint else self.max_iter,
+                tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
+                report=report,
+            )
         self.singular_values_ = self._unit * result.singular_values
         self.rank_floor_ = result.rank_floor
         self._n_features_out = self.n_components
