@@ -1,6 +1,11 @@
 """
-Measurements: ``python -m benchmarks.accuracy``, ``.recovery`` and ``.speed``.
+Measurements: ``python -m benchmarks`` and single ones.
 
-Each prints figures and asserts nothing. Sections are named on the command line, all by
+``python -m benchmarks`` measures all methods side by side and writes tables and
+pictures; docs/benchmarks/README.md says how. Its sections are in `_fits`, `_recovered`,
+`_unseen`, `_classification` and `_agreement`.
+
+``python -m benchmarks.accuracy``, ``.recovery`` and ``.speed`` print figures of
+`AffineNRSfM` alone and assert nothing. Sections are named on the command line, all by
 default; ``--seeds`` says how many random seeds each of them takes.
 """

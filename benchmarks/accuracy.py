@@ -21,6 +21,7 @@ from benchmarks._data import (
     SHARK,
     YOGA,
     as_table,
+    halves_of,
     load_arrays,
     load_table,
 )
@@ -121,8 +122,7 @@ def halves(options):
         if X is None:
             continue
         for seed in range(options.seeds):
-            order = np.random.default_rng(seed).permutation(len(X))
-            train, test = X[order[: len(X) // 2]], X[order[len(X) // 2 :]]
+            train, test = (X[rows] for rows in halves_of(len(X), seed))
             joint = held_out(fit(case, train, seed), test)
             other = held_out(fit(case, train, seed, refinement="alternating"), test)
             title = f"{case.title}, {'complete' if complete else 'all'} rows"
@@ -270,8 +270,7 @@ def stiffness(options):
         if arrays is None:
             continue
         X = as_table(arrays["W2d"])
-        order = np.random.default_rng(0).permutation(len(X))
-        train, test = X[order[: len(X) // 2]], X[order[len(X) // 2 :]]
+        train, test = (X[rows] for rows in halves_of(len(X), 0))
         for price in (0.0, 300.0, None):
             held = held_out(fit(case, train, stiffness=price), test)
             model = fit(case, X, stiffness=price)

@@ -113,16 +113,23 @@ def noisy(options):
                 )
 
 
+def chosen_components(X, choices=range(1, 9), folds=3):
+    """Return the n_components that GridSearchCV finds, and the score of each choice."""
+    search = GridSearchCV(
+        AffineNRSfM(random_state=0), {"n_components": choices}, cv=KFold(folds)
+    )
+    search.fit(X)
+    scores = search.cv_results_["mean_test_score"]
+    return search.best_params_["n_components"], scores
+
+
 def grid(options):
     """GridSearchCV over n_components 1 to 8 at 2 % noise: how often it finds K."""
-    search = GridSearchCV(
-        AffineNRSfM(random_state=0), {"n_components": range(1, 9)}, cv=KFold(3)
-    )
     for K in (1, 2, 3, 4, 5):
         found = []
         for seed in range(options.seeds):
             tracks = instance(seed, 68, K, 0.02)
-            found.append(search.fit(tracks.data).best_params_["n_components"])
+            found.append(chosen_components(tracks.data)[0])
         right = sum(k == K for k in found)
         print(f"K={K}: found {right} of {len(found)}, {found}", flush=True)
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks._command import run
-from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, load_table
+from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._factorisation import factorise
 from isa_nrsfm._frame_posterior import fit_posterior
@@ -98,8 +98,7 @@ def half_fitted(case, seed=0):
     X = load_table(case)
     if X is None:
         return None
-    order = np.random.default_rng(seed).permutation(len(X))
-    train, test = order[: len(X) // 2], order[len(X) // 2 :]
+    train, test = halves_of(len(X), seed)
     model = AffineNRSfM(case.n_components, random_state=seed).fit(X[train])
     return model, X[test]
 

@@ -1,0 +1,186 @@
+"""Section classification: expressions from coefficients and from other features."""
+
+import numpy as np
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.decomposition import PCA
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+from sklearn.model_selection import GroupKFold, StratifiedKFold, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from benchmarks._figures import draw_bars
+from benchmarks._jobs import Job
+from benchmarks._markdown import grid, remarks, value
+from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._sets import SET_TITLES, SETS, load
+
+FOLDS = 5
+MAX_ROUNDS, SETTLED = 100, 1e-10
+# Methods without coefficients, and a method with twice as many.
+WITHOUT, MORE = ("floor", "rigid"), "joint_more"
+FEATURES = {
+    **{name: title for name, title in METHOD_TITLES.items() if name not in WITHOUT},
+    MORE: "ISA, joint refinement, 2K",
+    "pca": "PCA of the table, K",
+    "pca_more": "PCA of the table, 3K + 3",
+    "aligned_pca": "PCA of aligned frames, K",
+    "aligned_pca_more": "PCA of aligned frames, 3K + 3",
+    "true_pca": "PCA of the true 3D shapes, K",
+    "true_pca_more": "PCA of the true 3D shapes, 3K + 3",
+}
+
+
+class AlignedFrames(TransformerMixin, BaseEstimator):
+    """
+    Frames moved, scaled and turned in the image to be nearest to their mean.
+
+    Parameters
+    ----------
+    turn : bool, default=True
+        Whether frames are turned; without it they are centred and scaled.
+
+    Attributes
+    ----------
+    mean_ : ndarray of shape (n_points,)
+        The mean of the aligned frames of the fit, complex numbers of mean square one.
+    """
+
+    def __init__(self, turn=True):
+        self.turn = turn
+
+    def fit(self, X, y=None):
+        """Find the mean by generalised Procrustes analysis."""
+        points = unit_points(X)
+        mean = points[0]
+        for _ in range(MAX_ROUNDS if self.turn else 0):
+            turned = nearest_turn(points, mean).mean(axis=0)
+            turned /= np.sqrt(np.mean(np.abs(turned) ** 2))
+            change = np.abs(turned - mean).max()
+            mean = turned
+            if change < SETTLED:
+                break
+        self.mean_ = mean
+        return self
+
+    def transform(self, X):
+        """Return the aligned frames as a table."""
+        points = unit_points(X)
+        if self.turn:
+            points = nearest_turn(points, self.mean_)
+        return np.ascontiguousarray(points).view(float)
+
+
+def unit_points(X):
+    """Return frames as complex numbers x + iy of mean zero and mean square one."""
+    points = np.ascontiguousarray(X, dtype=float).view(complex)
+    points = points - points.mean(axis=1, keepdims=True)
+    return points / np.sqrt(np.mean(np.abs(points) ** 2, axis=1, keepdims=True))
+
+
+def nearest_turn(points, mean):
+    """Return frames turned to be nearest to a mean."""
+    angles = np.angle(points @ mean.conj())
+    return points * np.exp(-1j * angles)[:, None]
+
+
+def features(method, chosen, seed):
+    """Return the transformer of a method for a set."""
+    K = chosen.case.n_components
+    if method == MORE:
+        return METHODS["joint"].make(2 * K, chosen.case.scale_frames, False, seed)
+    if method in METHODS:
+        return METHODS[method].make(K, chosen.case.scale_frames, chosen.ordered, seed)
+    pca = PCA(3 * K + 3 if method.endswith("_more") else K, random_state=seed)
+    if method.startswith("true"):
+        return pca
+    return make_pipeline(AlignedFrames(turn=method.startswith("aligned")), pca)
+
+
+def jobs(section, sets, methods, repeats):
+    """Return a job for each set, features and seed, which says the folds."""
+    return [
+        Job(
+            section,
+            name,
+            method,
+            seed,
+            measure_accuracy,
+            {"name": name, "method": method, "seed": seed},
+            {},
+        )
+        for seed in range(repeats)
+        for name in sets
+        for method in methods
+        if SETS[name].truth or not method.startswith("true")
+    ]
+
+
+def measure_accuracy(measured, name, method, seed):
+    """Cross-validate a pipeline whose features are fitted inside of the folds."""
+    data = load(name)
+    X = data.X
+    if method.startswith("true"):
+        X = data.shapes.reshape(len(X), -1)
+    kind = StratifiedKFold if data.subjects is None else GroupKFold
+    classifier = make_pipeline(
+        features(method, SETS[name], seed),
+        StandardScaler(),
+        LinearDiscriminantAnalysis(),
+    )
+    with measured():
+        scores = cross_val_score(
+            classifier,
+            X,
+            data.labels,
+            groups=data.subjects,
+            cv=kind(FOLDS, shuffle=True, random_state=seed),
+            error_score="raise",
+        )
+    values = {
+        "accuracy": 100 * scores.mean(),
+        "spread": 100 * scores.std(ddof=1),
+        "folds": 100 * scores,
+    }
+    return values, {}
+
+
+def page(records):
+    """Return the tables of the section."""
+    return "\n".join(
+        [
+            "Accuracy in percent, mean of five folds, median over the seeds that draw "
+            "the folds, and range. One classifier, standardised features and linear "
+            "discriminant analysis, in a `Pipeline` with the features, which are "
+            "fitted inside of the folds. Folds hold different subjects on ICT-68. Of "
+            "expressions the subjects are not known: a person may be on both sides of "
+            "a fold, which helps all features.\n",
+            _grid(records, value("accuracy")),
+            "Standard deviation between the folds, percent.\n",
+            _grid(records, value("spread"), digits=2),
+            "Seconds of the five folds.\n",
+            _grid(records, lambda record: record.seconds),
+            remarks(records, FEATURES),
+        ]
+    )
+
+
+def _grid(records, measure, digits=3):
+    """Return a table with a row for each kind of features."""
+    return grid(
+        records, FEATURES, SET_TITLES, measure, corner="features", digits=digits
+    )
+
+
+def draw(records, folder):
+    """Draw the accuracy, and return the name of the file."""
+    file = "classification.png"
+    draw_bars(
+        records,
+        FEATURES,
+        SET_TITLES,
+        value("accuracy"),
+        folder / file,
+        label="accuracy, %",
+        log=False,
+    )
+    return [file]

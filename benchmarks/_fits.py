@@ -1,0 +1,233 @@
+"""Sections reprojection and truth: fits of whole tables, and how good they are."""
+
+import numpy as np
+
+from benchmarks._figures import draw_bars
+from benchmarks._jobs import Job
+from benchmarks._markdown import found, grid, number, remarks, select, value
+from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._sets import SET_TITLES, SETS, load, true_shapes
+from isa_nrsfm.metrics import affine_shape_error, inverse_snr, mean_shape_error_3d
+
+# Where in a table the frames are that pictures show.
+SHOWN = (0.1, 0.35, 0.6, 0.85)
+# The best method that is not a bound.
+BOUNDS = ("floor",)
+ERRORS = {
+    "affine_shape_error": "`affine_shape_error`: one affinity of all frames, a scale "
+    "of each, a share of the shapes' size",
+    "frame_error": "`mean_shape_error_3d(convention='frame')`: a rotation and a scale "
+    "of each frame, a share of the shapes' size",
+    "sequence_error": "`mean_shape_error_3d(convention='sequence')`: one rotation of "
+    "all frames, in extents of the object",
+}
+
+TRUTH = """\
+PI, BMM and Kong-Lucey presume orthographic cameras: of one scale or, where frames are
+scaled, as large as the frame. Those of Shark, ICT-68, drink, pickup and yoga are just
+that, and where rows are successive frames the methods are told so. ISA's cameras are
+affine ones, which absorb part of a deformation; they are calibrated after the fit
+(`isa_nrsfm.calibration`) for the two errors that count angles. Where the cameras are
+affine in truth, these errors have no meaning; where the true shapes are in the space of
+the camera (Shark, flag), `affine_shape_error` has none.
+
+Shapes are those that a method finds for the frames of its table. Median over the seeds
+and, where they differ, range.
+"""
+
+
+def jobs(section, sets, methods, repeats):
+    """Return the fits of each set by each method, seed by seed, long ones first."""
+    sets = sorted(sets, key=lambda name: SETS[name].most_repeats is None)
+    return [
+        Job(
+            section,
+            name,
+            method,
+            seed,
+            measure_fit,
+            {"name": name, "method": method, "seed": seed},
+            {},
+        )
+        for seed in range(repeats)
+        for name in sets
+        for method in methods
+        if seed < runs_of(name, method, repeats)
+    ]
+
+
+def runs_of(name, method, repeats):
+    """Return how many seeds a method takes on a set."""
+    chosen = SETS[name]
+    if not (METHODS[method].is_random or chosen.redrawn):
+        return 1
+    return min(repeats, chosen.most_repeats or repeats)
+
+
+def measure_fit(measured, name, method, seed):
+    """Fit a table, and judge what was found."""
+    chosen, kind = SETS[name], METHODS[method]
+    X = load(name, seed).X
+    K, scale_frames = chosen.case.n_components, chosen.case.scale_frames
+    model = kind.make(K, scale_frames, chosen.ordered, seed)
+    with measured():
+        model.fit(X)
+    result = kind.found(model, X)
+    values = {
+        "n_frames": len(X),
+        "n_points": X.shape[1] // 2,
+        "n_components": K,
+        "inverse_snr": inverse_snr(X, result.X, scale_frames=scale_frames),
+        "n_iter": getattr(model, "n_iter_", None),
+    }
+    if chosen.truth and result.affine is not None:
+        values |= errors_3d(chosen, true_shapes(name, seed), result)
+    frames = (np.array(SHOWN) * len(X)).astype(int)
+    shown = {
+        "frames": frames,
+        "observed": X[frames].reshape(len(frames), -1, 2),
+        "reprojected": result.X[frames].reshape(len(frames), -1, 2),
+    }
+    return values, shown
+
+
+def errors_3d(chosen, truth, result):
+    """
+    Return the errors in 3D that have a meaning for a set.
+
+    Where the truth is in the space of the camera, so are the shapes that are compared;
+    a common affinity of space has no meaning there. Affine cameras do not show angles.
+    Where images have the scale of the
+    truth no scale is fitted for all frames.
+    """
+    shapes, errors = result.euclidean, {}
+    if chosen.truth == "object":
+        errors["affine_shape_error"] = affine_shape_error(truth, result.affine)
+    if chosen.camera == "affine":
+        return errors
+    if chosen.camera == "orthographic":
+        shapes = result.scales[:, None, None] * shapes
+    if chosen.truth == "camera":
+        shapes = shapes @ result.rotations.transpose(0, 2, 1)
+    errors["sequence_error"] = mean_shape_error_3d(
+        truth, shapes, scale=chosen.camera != "orthographic"
+    )
+    errors["frame_error"] = mean_shape_error_3d(truth, shapes, convention="frame")
+    return errors
+
+
+def percent(record):
+    """Return the inverse SNR in percent."""
+    share = record.values.get("inverse_snr")
+    return None if share is None else 100 * share
+
+
+def seconds(record):
+    """Return the seconds of a fit."""
+    return record.seconds
+
+
+def memory(record):
+    """Return the memory of a fit in megabytes."""
+    return record.memory
+
+
+def reprojection_page(records):
+    """Return the tables of the section reprojection."""
+    return "\n".join(
+        [
+            "Inverse SNR in percent, lower is better: median over the seeds and, where "
+            "they differ, range.\n",
+            _grid(records, percent),
+            "Seconds of the fit.\n",
+            _grid(records, seconds),
+            "Memory of the fit, MB: by how much memory in use rose at most.\n",
+            _grid(records, memory, digits=2),
+            not_lowest(records, {"inverse SNR": percent}),
+            remarks(records, METHOD_TITLES),
+        ]
+    )
+
+
+def truth_page(records):
+    """Return the tables of the section truth."""
+    parts = [TRUTH]
+    for name, title in ERRORS.items():
+        chosen = [r for r in records if r.status != "ok" or name in r.values]
+        chosen = [r for r in chosen if r.method not in BOUNDS]
+        parts += [f"{title}. Lower is better.\n", _grid(chosen, value(name))]
+    measures = {"inverse SNR": percent}
+    measures |= {name: value(name) for name in ERRORS}
+    parts += [
+        "Inverse SNR of the same fits in percent.\n",
+        _grid(records, percent),
+        "Seconds of the fit.\n",
+        _grid(records, seconds),
+        not_lowest(records, measures),
+        remarks(records, METHOD_TITLES),
+    ]
+    return "\n".join(parts)
+
+
+def _grid(records, measure, digits=3):
+    """Return a table with a row a method and a column a set."""
+    return grid(
+        records, METHOD_TITLES, SET_TITLES, measure, corner="method", digits=digits
+    )
+
+
+def not_lowest(records, measures, method="joint"):
+    """Return a list of where a method is not the lowest by median, and what is."""
+    lines = []
+    for name, title in SET_TITLES.items():
+        of_set = select(records, set=name)
+        for measure_title, measure in measures.items():
+            medians = {
+                other: float(np.median(values))
+                for other in METHODS
+                if other not in BOUNDS
+                and (values := found(select(of_set, method=other), measure))
+            }
+            if method not in medians:
+                continue
+            lower = [o for o in medians if medians[o] < medians[method]]
+            if lower:
+                listed = ", ".join(
+                    f"{METHOD_TITLES[o]} {number(medians[o])}" for o in lower
+                )
+                own = number(medians[method])
+                lines.append(f"- {title}, {measure_title}: {own}; lower are {listed}\n")
+    name = METHOD_TITLES[method]
+    if not select(records, method=method, status="ok"):
+        return ""
+    if not lines:
+        return f"{name} is the lowest on every set here.\n"
+    return f"{name} is not the lowest in\n\n{''.join(lines)}"
+
+
+def draw_reprojection(records, folder):
+    """Draw the inverse SNR, and return the name of the file."""
+    file = "reprojection_errors.png"
+    label = "inverse SNR, %"
+    draw_bars(records, METHOD_TITLES, SET_TITLES, percent, folder / file, label=label)
+    return [file]
+
+
+def draw_truth(records, folder):
+    """Draw the errors in 3D, and return the names of the files."""
+    titles = {name: t for name, t in METHOD_TITLES.items() if name not in BOUNDS}
+    files = []
+    for name, text in ERRORS.items():
+        if any(record.values.get(name) is not None for record in records):
+            files.append(f"truth_{name}.png")
+            label = text.replace("`", "").partition(":")[0]
+            draw_bars(
+                records,
+                titles,
+                SET_TITLES,
+                value(name),
+                folder / files[-1],
+                label=f"{label}, {text.rpartition(', ')[2]}",
+                log=False,
+            )
+    return files

@@ -1,0 +1,513 @@
+import json
+import time
+
+import numpy as np
+import pytest
+from isolated_runs import MEGABYTE, misbehave, sleep, use_memory
+from scenes import random_rotation
+
+import benchmarks.__main__ as command
+from benchmarks import _agreement, _data, _fits, _methods, _recovered, _sets, _unseen
+from benchmarks._agreement import compare
+from benchmarks._classification import AlignedFrames
+from benchmarks._figures import draw_bars, draw_reprojections
+from benchmarks._isolated import run_isolated
+from benchmarks._jobs import Job, Limits, run_jobs
+from benchmarks._markdown import cell, grid, number, select, table, value
+from benchmarks._methods import METHODS, Found, TruncatedTable
+from benchmarks._results import Record, Results
+from benchmarks._sections import SECTIONS
+from benchmarks._sets import SETS, Set
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.metrics import inverse_snr
+
+# Tables of few points: that FastICA does not converge makes no difference here.
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+def record(**changes):
+    """Return a record of a run that took two seconds."""
+    plain = Record(
+        section="truth",
+        set="drink",
+        method="joint",
+        seed=0,
+        status="ok",
+        values={"inverse_snr": 0.01},
+        parameters={},
+        seconds=2.0,
+        memory=10.0,
+        environment="now",
+    )
+    return plain._replace(**changes)
+
+
+# Processes
+
+
+def test_seconds_and_memory_are_those_of_what_is_measured():
+    outcome = run_isolated(
+        use_memory, {"n_before": 400, "n_inside": 150}, time_limit=30
+    )
+    assert outcome.status == "ok"
+    assert outcome.values == {"total": 150 * MEGABYTE / 8}
+    assert 0.3 <= outcome.seconds < 3.0
+    assert 145 < outcome.memory < 250
+
+
+@pytest.mark.parametrize(
+    ("how", "status", "message"),
+    [
+        ("raise", "error", "ValueError: expected this; got that"),
+        ("die", "error", "the process ended with exit code 3"),
+        ("hang", "over time", "over 0.5 s"),
+    ],
+)
+def test_what_a_method_does_wrong_is_reported(how, status, message):
+    since = time.perf_counter()
+    outcome = run_isolated(misbehave, {"how": how}, time_limit=0.5)
+    assert (outcome.status, outcome.message) == (status, message)
+    assert outcome.values is None
+    assert outcome.seconds is None
+    assert time.perf_counter() - since < 30
+
+
+def test_memory_is_limited():
+    outcome = run_isolated(
+        use_memory, {"n_before": 0, "n_inside": 8000}, time_limit=30, memory_limit=4
+    )
+    assert outcome.status == "error"
+    assert "MemoryError" in outcome.message
+
+
+def test_what_was_too_slow_is_not_run_again():
+    jobs = [
+        Job("truth", "drink", method, seed, sleep, {"seconds": seconds}, {})
+        for seed in (0, 1)
+        for method, seconds in (("slow", 60), ("fast", 0.1))
+    ]
+    limits = Limits(time=0.5, memory=None, threads=1)
+    since = time.perf_counter()
+    done = list(run_jobs(jobs, limits, 1, "now"))
+    assert time.perf_counter() - since < 40
+    assert {(r.method, r.seed, r.status) for r, _ in done} == {
+        ("slow", 0, "over time"),
+        ("slow", 1, "over time"),
+        ("fast", 0, "ok"),
+        ("fast", 1, "ok"),
+    }
+    for kept, arrays in done:
+        if kept.status == "ok":
+            assert kept.values == {"seconds": 0.1}
+            np.testing.assert_array_equal(arrays["array"], [0, 1, 2])
+        else:
+            assert kept.message == "over 0.5 s"
+            assert kept.values == {}
+            assert arrays == {}
+
+
+# Results and tables
+
+
+def test_results_are_kept_rounded_and_replaced_as_a_group(tmp_path):
+    path = tmp_path / "folder" / "results.json"
+    first = Results(path)
+    key = first.begin(threads=1)
+    values = {"a": np.float64(1 / 3), "b": np.nan, "c": np.arange(2), "d": None}
+    for seed in range(3):
+        first.add(record(seed=seed, values=values, environment=key))
+    first.add(record(section="held_out", environment=key))
+    first.save()
+
+    second = Results(path)
+    assert [r.seed for r in second.of("truth")] == [0, 1, 2]
+    assert second.records[0].values == {
+        "a": 0.333333,
+        "b": None,
+        "c": [0, 1],
+        "d": None,
+    }
+    assert second.environments[key]["threads"] == 1
+    assert second.environments[key]["numpy"] == np.__version__
+    # Two seeds take the place of three, other groups stay.
+    second.environments["later"] = {"threads": 2}
+    for seed in range(2):
+        second.add(record(seed=seed, environment="later"))
+    second.save()
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    assert [(r["section"], r["seed"]) for r in stored["records"]] == [
+        ("held_out", 0),
+        ("truth", 0),
+        ("truth", 1),
+    ]
+    assert set(stored["environments"]) == {key, "later"}
+
+
+@pytest.mark.parametrize(
+    ("figure", "text"),
+    [
+        (None, ""),
+        (0.0, "0"),
+        (1e-29, "0"),
+        (0.0012345, "0.00123"),
+        (12.3456, "12.3"),
+        (1234.6, "1235"),
+        (1.5e-7, "1.50e-07"),
+        (3.1e7, "3.10e+07"),
+    ],
+)
+def test_numbers(figure, text):
+    assert number(figure) == text
+
+
+def test_cells_say_median_range_and_failures():
+    ok = [record(seed=i, values={"error": e}) for i, e in enumerate((0.1, 0.3, 0.2))]
+    slow = record(seed=3, status="over time", message="over 60 s", values={})
+    wrong = record(seed=4, status="error", message="ValueError: no", values={})
+    error = value("error")
+    assert cell(ok, error) == "0.200 (0.100 to 0.300)"
+    assert cell(ok[:1], error) == "0.100"
+    assert cell([*ok[:1], wrong], error) == "0.100, 1 failed"
+    assert cell([slow, wrong], error) == "over 60 s"
+    assert cell([wrong], error) == "error"
+    assert cell([], error) == ""
+    assert cell(ok, value("another")) == ""
+
+
+def test_tables_have_a_row_a_method_and_a_column_a_set():
+    records = [
+        record(values={"error": 0.5}),
+        record(method="pi", set="yoga", values={"error": 0.25}),
+    ]
+    titles = {"floor": "floor", "pi": "PI", "joint": "joint"}
+    sets = {"yoga": "yoga, K=4", "shark": "shark", "drink": "drink, K=3"}
+    assert grid(records, titles, sets, value("error"), corner="method") == table(
+        ["method", "yoga, K=4", "drink, K=3"],
+        [["PI", "0.250", ""], ["joint", "", "0.500"]],
+    )
+    assert table(["a", "b"], [["c", "d"]]) == "| a | b |\n| --- | --: |\n| c | d |\n"
+
+
+def test_records_are_selected_by_attributes_and_parameters():
+    records = [record(parameters={"noise": n}, seed=n) for n in (1, 2)]
+    assert select(records, section="truth", noise=2) == records[1:]
+    assert select(records, points=3) == []
+
+
+def test_the_page_says_where_the_joint_refinement_is_not_the_lowest():
+    records = [
+        record(values={"inverse_snr": 0.01, "frame_error": 0.3}),
+        record(method="rigid", values={"inverse_snr": 0.02, "frame_error": 0.2}),
+        record(method="floor", values={"inverse_snr": 0.001}),
+        record(method="bmm", status="over time", message="over 9 s", values={}),
+    ]
+    page = _fits.truth_page(records)
+    line = "- drink, K=3, frame_error: 0.300; lower are rigid mean shape 0.200\n"
+    assert page.partition("not the lowest in\n\n")[2].startswith(line + "\n")
+    assert "| BMM | over 9 s |" in page
+    records[1] = records[1]._replace(values={"inverse_snr": 0.02, "frame_error": 0.4})
+    assert "ISA, joint refinement is the lowest" in _fits.truth_page(records)
+
+
+def test_the_page_of_recovery_varies_one_setting_at_a_time():
+    listed = _recovered.jobs("recovery", ["synthetic"], ["isa2", "joint"], 2)
+    assert len(listed) == 2 * 2 * (5 + 5 + 5 - 2)
+    records = [
+        record(
+            section=job.section,
+            set=job.set,
+            method=job.method,
+            seed=job.seed,
+            parameters=job.parameters,
+            values={"similarity_modulo": job.parameters["n_points"] / 1000 + job.seed},
+        )
+        for job in listed
+    ]
+    page = _recovered.page(records)
+    titles = "ISA2, paper's refinement | ISA, joint refinement |"
+    assert f"| points | {titles}" in page
+    assert f"| basis shapes K | {titles}" in page
+    both = "0.6500 (0.1500 to 1.150)"
+    assert f"| 150 | {both} | {both} |" in page
+    both = "0.5680 (0.06800 to 1.068)"
+    assert f"| 0.05 | {both} | {both} |" in page
+
+
+def test_the_page_of_held_out_points_tells_what_was_chosen():
+    half, found = {"part": "halves"}, {"part": "choice", "n_components": 2}
+    records = [
+        record(set="ict_68", parameters=half, values={"held_out": 0.25}),
+        record(set="synthetic", parameters=found, values={"found": 2}),
+        record(set="synthetic", parameters=found, values={"found": 3}, seed=1),
+    ]
+    for K, error in ((1, 0.3), (2, 0.1), (3, 0.2)):
+        parameters = {"part": "curve", "n_components": K}
+        records.append(record(parameters=parameters, values={"held_out": error}))
+    page = _unseen.page(records)
+    assert "| ISA, joint refinement | 0.250 |" in page
+    assert "| 2 | 1 of 2 | 2, 3 |" in page
+    assert "| K | 1 | 2 | 3 |" in page
+    assert "| held-out error, % | 0.300 | **0.100** | 0.200 |" in page
+
+
+def test_the_page_of_agreement_has_the_spread_of_the_pairs():
+    values = {"basis": [0.9, 0.7, 0.8], "shapes": [0.1, 0.1, 0.1]}
+    page = _agreement.page([record(values=values), record(method="isa1", values={})])
+    assert "| joint, independent shapes | 0.8000 (0.7000 to 0.9000) |" in page
+    assert "| joint, independent shapes | 0.100 |" in page
+    assert "subspace_distance" not in page
+
+
+# Sets and methods
+
+
+def test_dense_shapes_and_tracks_follow_their_model():
+    rng = np.random.default_rng(0)
+    arrays = {
+        "mean": rng.normal(size=(6, 3)),
+        "identity": rng.normal(size=(2, 6, 3)),
+        "expression": rng.normal(size=(3, 6, 3)),
+        "identity_coeffs": rng.normal(size=(250, 2)),
+        "expression_coeffs": rng.normal(size=(250, 3)),
+        "R": np.array([random_rotation(i) for i in range(250)]),
+    }
+    i = 249
+    shape = arrays["mean"].copy()
+    for k in range(2):
+        shape += arrays["identity_coeffs"][i, k] * arrays["identity"][k]
+    for k in range(3):
+        shape += arrays["expression_coeffs"][i, k] * arrays["expression"][k]
+    tracks = _data.dense_tracks(arrays)
+    assert tracks.shape == (250, 6, 2)
+    np.testing.assert_allclose(tracks[i], shape @ arrays["R"][i, :2].T)
+    np.testing.assert_allclose(_data.dense_shapes(arrays, [i])[0], shape)
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    return make_nonrigid_tracks(
+        60, 30, 2, camera="orthographic", noise=0.01, random_state=0
+    )
+
+
+@pytest.mark.parametrize("truth", ["object", "camera"])
+@pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])
+def test_true_shapes_and_cameras_have_no_error(tracks, truth, camera):
+    rotations = np.concatenate(
+        [tracks.motion, np.cross(tracks.motion[:, 0], tracks.motion[:, 1])[:, None]],
+        axis=1,
+    )
+    # In another orientation of space, mirrored, and of another size.
+    turn = 0.5 * random_rotation(1) @ np.diag([1.0, 1.0, -1.0])
+    shapes = tracks.shapes @ turn
+    mirror = np.diag([1.0, 1.0, -1.0])
+    found = Found(
+        tracks.data,
+        affine=tracks.shapes @ np.random.default_rng(0).normal(size=(3, 3)),
+        euclidean=shapes,
+        rotations=mirror @ rotations @ turn / 0.5,
+        scales=np.full(len(shapes), 2.0),
+    )
+    wanted = tracks.shapes
+    if truth == "camera":
+        wanted = wanted @ rotations.transpose(0, 2, 1)
+    errors = _fits.errors_3d(Set("", None, truth, camera), wanted, found)
+    expected = {"sequence_error", "frame_error"}
+    assert set(errors) == expected | (
+        {"affine_shape_error"} if truth == "object" else set()
+    )
+    np.testing.assert_allclose(list(errors.values()), 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("scale_frames", [True, False])
+def test_rank_floor_is_that_of_a_fit(tracks, monkeypatch, scale_frames):
+    model = AffineNRSfM(2, scale_frames=scale_frames, random_state=0).fit(tracks.data)
+    for large in (1000, 10):
+        monkeypatch.setattr(_methods, "LARGE", large)
+        floor = TruncatedTable(9, scale_frames).fit(tracks.data)
+        error = inverse_snr(tracks.data, floor.X_, scale_frames=scale_frames)
+        np.testing.assert_allclose(error, model.rank_floor_, rtol=1e-8)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_methods_find_explains_the_table(tracks, method):
+    kind = METHODS[method]
+    model = kind.make(2, True, False, 0).fit(tracks.data)
+    found = kind.found(model, tracks.data)
+    error = inverse_snr(tracks.data, found.X, scale_frames=True)
+    known = getattr(model, "inverse_snr_", error)
+    np.testing.assert_allclose(error, known, rtol=1e-6)
+    assert error < 0.2
+    if found.euclidean is None:
+        return
+    # Euclidean shapes in their cameras are the same images.
+    cameras = found.scales[:, None, None] * found.rotations[:, :2]
+    images = found.euclidean @ cameras.transpose(0, 2, 1)
+    if method != "rigid":  # whose cameras are affine
+        table = images.reshape(len(images), -1)
+        assert inverse_snr(found.X, table, scale_frames=True) < 1e-10
+    eye = found.rotations @ found.rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(eye, np.broadcast_to(np.eye(3), eye.shape), atol=1e-8)
+
+
+def test_every_set_and_method_of_a_section_is_known():
+    for section in SECTIONS.values():
+        assert set(section.sets) | set(section.other_sets) <= set(SETS)
+
+
+def test_deterministic_methods_run_once_unless_tables_are_drawn_anew():
+    listed = _fits.jobs("truth", ["drink", "synthetic"], ["pi", "joint"], 3)
+    runs = {
+        (name, method): [j.seed for j in listed if (j.set, j.method) == (name, method)]
+        for name in ("drink", "synthetic")
+        for method in ("pi", "joint")
+    }
+    assert runs.pop(("drink", "pi")) == [0]
+    assert all(seeds == [0, 1, 2] for seeds in runs.values())
+    assert [job.seed for job in listed] == sorted(job.seed for job in listed)
+
+
+def test_synthetic_tables_are_drawn_by_seed():
+    one, other = _sets.load("synthetic", 1), _sets.load("synthetic", 2)
+    assert one.X.shape[1] == other.X.shape[1] == 2 * one.shapes.shape[1]
+    assert not np.array_equal(one.X[:5], other.X[:5])
+    np.testing.assert_array_equal(one.X, _sets.load("synthetic", 1).X)
+    np.testing.assert_array_equal(one.shapes, _sets.true_shapes("synthetic", 1))
+
+
+# Features and agreement
+
+
+def test_aligned_frames_do_not_depend_on_place_size_and_turn(tracks):
+    rng = np.random.default_rng(0)
+    angle, size = rng.uniform(0, 6, len(tracks.tracks)), rng.uniform(0.5, 2, 60)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    moved = tracks.tracks @ (size * turn).transpose(2, 0, 1) + rng.normal(
+        size=(60, 1, 2)
+    )
+    aligned = AlignedFrames().fit(tracks.data)
+    expected = aligned.transform(tracks.data)
+    np.testing.assert_allclose(
+        aligned.transform(moved.reshape(60, -1)), expected, atol=1e-10
+    )
+    # The mean is that of the aligned frames, up to its size.
+    mean = expected.mean(axis=0)
+    own = aligned.mean_.view(float)
+    cosine = mean @ own / np.linalg.norm(mean) / np.linalg.norm(own)
+    assert cosine == pytest.approx(1.0, abs=1e-9)
+    plain = AlignedFrames(turn=False).fit_transform(tracks.data).reshape(60, -1, 2)
+    np.testing.assert_allclose(plain.mean(axis=1), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.sum(plain**2, axis=(1, 2)), 30.0)
+
+
+def test_equal_fits_agree(tracks):
+    model = AffineNRSfM(2, random_state=0).fit(tracks.data)
+    same = compare(model, model, tracks.data)
+    assert same["subspaces"] == pytest.approx(0.0, abs=1e-7)
+    assert same["shapes"] == pytest.approx(0.0, abs=1e-7)
+    assert same["basis"] == pytest.approx(1.0)
+    assert same["mean_basis"] == pytest.approx(1.0)
+
+
+# Pictures
+
+
+def test_reprojections_are_drawn_on_the_same_axes_for_all_methods(
+    tracks, tmp_path, monkeypatch
+):
+    figures = []
+    monkeypatch.setattr(
+        "benchmarks._figures.save", lambda figure, path: figures.append(figure)
+    )
+    frames = np.array([3, 8, 20])
+    observed = tracks.tracks[frames]
+    shown = {
+        method: {"frames": frames, "observed": observed, "reprojected": k * observed}
+        for k, method in ((3, "pi"), (1, "joint"))
+    }
+    titles = {"joint": "ISA, joint", "pi": "PI", "bmm": "BMM"}
+    draw_reprojections(shown, titles, "synthetic", tmp_path / "a.png")
+    axes = np.array(figures[0].axes).reshape(2, 3)
+    assert [row[0].get_ylabel() for row in axes] == ["ISA,\njoint", "PI"]
+    for panels in axes.T:
+        assert panels[0].get_xlim() == panels[1].get_xlim()
+        assert panels[0].get_ylim() == panels[1].get_ylim()
+    assert axes[0, 1].get_title() == "frame 8\ninverse SNR 0 %"
+    assert axes[1, 1].get_title() == "inverse SNR 400 %"
+
+
+def test_bars_are_drawn_for_what_there_is(tmp_path):
+    records = [
+        record(values={"error": 0.01}),
+        record(values={"error": 0.02}, seed=1),
+        record(method="pi", status="over time", message="over 5 s", values={}),
+        record(method="pi", set="yoga", values={"error": 0.1}),
+    ]
+    titles = {"pi": "PI", "joint": "joint", "bmm": "BMM"}
+    sets = {"drink": "drink", "yoga": "yoga", "shark": "shark"}
+    path = tmp_path / "bars.png"
+    draw_bars(records, titles, sets, value("error"), path, label="error, %")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    nothing = tmp_path / "nothing.png"
+    draw_bars([], titles, sets, value("error"), nothing, label="error, %")
+    assert not nothing.exists()
+
+
+# The command
+
+
+def test_command_measures_writes_and_rewrites(tmp_path, capsys):
+    chosen = ["truth", "--sets", "synthetic", "--methods", "rigid", "floor"]
+    output = ["--output", str(tmp_path)]
+    command.main([*chosen, "--repeats", "1", "--jobs", "2", *output])
+    printed = capsys.readouterr().out
+    assert "[2/2] truth synthetic" in printed
+    page = (tmp_path / "truth.md").read_text(encoding="utf-8")
+    assert "| rigid mean shape | " in page
+    assert "time_limit 600" in page
+    stored = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert {r["method"] for r in stored["records"]} == {"rigid", "floor"}
+    pictures = sorted(path.name for path in tmp_path.glob("*.png"))
+    assert pictures == [
+        "truth_affine_shape_error.png",
+        "truth_frame_error.png",
+        "truth_sequence_error.png",
+    ]
+
+    (tmp_path / "truth.md").unlink()
+    command.main(["--tables-only", *output])
+    assert (tmp_path / "truth.md").read_text(encoding="utf-8") == page
+    assert sorted(path.name for path in tmp_path.glob("*.md")) == ["truth.md"]
+
+
+def test_absent_sets_are_skipped_by_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ISA_NRSFM_DATA", str(tmp_path / "nowhere"))
+    command.main(["reprojection", "--output", str(tmp_path)])
+    printed = capsys.readouterr().out
+    for name, file in (
+        ("shark", "shark_torresani"),
+        ("flag", "flag_mocap_30x250"),
+        ("faces_wild", "faces_wild_68_combined"),
+        ("ict_dense", "ict_bu3dfe_like_basis"),
+    ):
+        line = (
+            f"reprojection {name}: skipped, no {file}.npz in the folder ISA_NRSFM_DATA"
+        )
+        assert line in printed
+    assert not list(tmp_path.glob("*.md"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["speed"], "no section speed here; there are reprojection, truth"),
+        (["truth", "--sets", "muct_68"], "no set muct_68 here; there are shark"),
+        (["recovery", "--methods", "pca"], "no method pca here; there are isa1"),
+        (["--repeats", "0"], "--repeats, --jobs and --threads must be 1 or more"),
+    ],
+)
+def test_command_refuses_what_it_does_not_know(arguments, message, capsys):
+    with pytest.raises(SystemExit):
+        command.main(arguments)
+    assert message in capsys.readouterr().err
