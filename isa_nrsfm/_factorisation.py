@@ -9,10 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
+from scipy.sparse.linalg import svds
 
 # A direction whose singular value is below this share of the first is null, whatever
 # the precision of the table: it has less than 1e-20 of the energy.
 NULL_DIRECTION = 1e-10
+# Where both sides of W are longer than this only the leading triplets are computed.
+DENSE = 1500
 
 
 class Factorisation(NamedTuple):
@@ -34,8 +37,10 @@ class Factorisation(NamedTuple):
         B', centred and white, orthogonal to B_0. `n_signals` is 3K, or the least
         multiple of three that holds every direction with a singular value above
         rounding errors.
-    singular_values : ndarray of shape (min(2 * n_frames, n_points),)
-        All singular values of W, decreasing.
+    singular_values : ndarray of shape (3K + 3,)
+        Largest singular values of W, decreasing; fewer if W does not have as many.
+    rest : float
+        Energy of W outside these, the sum of the squares of the others.
     """
 
     rigid_motion: NDArray
@@ -43,6 +48,7 @@ class Factorisation(NamedTuple):
     motion: NDArray
     signals: NDArray
     singular_values: NDArray
+    rest: float
 
 
 def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factorisation:
@@ -65,11 +71,9 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
     """
     n_points = W.shape[1]
     root = np.sqrt(n_points)
-    # The left singular vectors are W V / S: the triangular factor has S and V.
-    R = np.linalg.qr(W, mode="r") if len(W) > n_points else W
-    _, S, Vt = np.linalg.svd(R, full_matrices=False)
+    S, Vt, rest = _leading_triplets(W, 3 * n_components + 3)
     null = max(NULL_DIRECTION, precision) * S[0]
-    rank = int(np.sum(S[: 3 * n_components + 3] > null))
+    rank = int(np.sum(S > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
 
@@ -78,7 +82,28 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
     B = _complete(Vt, 3 * max(1, -(-(rank - 3) // 3))) * root
     M = W @ B.T / n_points
     M[:, max(rank - 3, 0) :] = 0.0
-    return Factorisation(W @ B_0.T / n_points, B_0, M, B, S)
+    return Factorisation(W @ B_0.T / n_points, B_0, M, B, S, rest)
+
+
+def _leading_triplets(W: NDArray, k: int) -> tuple[NDArray, NDArray, float]:
+    """
+    Return the largest singular values, their right vectors and the remaining energy.
+
+    A W that is large both ways is not factorised as a whole: the subspace of its
+    leading right vectors comes from the Krylov method of ARPACK (Lehoucq, Sorensen,
+    Yang, "ARPACK users' guide", 1998), the triplets from W projected to it, so that
+    small singular values are as precise as the others.
+    """
+    if min(W.shape) > max(DENSE, 4 * k):
+        start = np.linalg.norm(W, axis=0)  # the same whatever the order of the frames
+        V = svds(W, k, v0=start if len(W) > W.shape[1] else W @ start)[2].T
+        _, S, rotation = np.linalg.svd(W @ V, full_matrices=False)
+        rest = max(float(np.vdot(W, W) - S @ S), 0.0)
+        return S, rotation @ V.T, rest
+    # The left singular vectors are W V / S: the triangular factor has S and V.
+    R = np.linalg.qr(W, mode="r") if len(W) > W.shape[1] else W
+    _, S, Vt = np.linalg.svd(R, full_matrices=False)
+    return S[:k], Vt[:k], float(np.sum(S[k:] ** 2))
 
 
 def orientations(rows: NDArray) -> NDArray:

@@ -137,13 +137,13 @@ def run_paper_pipeline(
     used = 3 * len(E)
     covariance = np.zeros((3 * n_components, 3 * n_components))
     covariance[:used, :used] = products.gram * (n_points / n_rows)
-    energy = factors.singular_values**2
+    energy = np.sum(factors.singular_values**2) + factors.rest
     return PaperResult(
         factors.rigid_shape.T,
         basis.transpose(0, 2, 1),
         covariance,
-        factors.singular_values[: 3 * n_components + 3],
-        float(energy[3 * n_components + 3 :].sum() / energy.sum()),
+        factors.singular_values,
+        float(factors.rest / energy),
         n_iter,
         converged,
         factors,

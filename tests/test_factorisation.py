@@ -5,6 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames, rotate_frames
 
+import isa_nrsfm._factorisation as module
 from isa_nrsfm._factorisation import factorise, orientations
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
@@ -54,7 +55,8 @@ class TestIdentities:
         assert f.rigid_shape.shape == (3, n_points)
         assert f.motion.shape == (2 * n_frames, 3 * K)
         assert f.signals.shape == (3 * K, n_points)
-        assert f.singular_values.shape == (min(2 * n_frames, n_points),)
+        n_values = min(2 * n_frames, n_points, 3 * K + 3)
+        assert f.singular_values.shape == (n_values,)
 
     def test_shape_and_signals_are_centred_and_white_together(self, size, K):
         f = factorise(centred_matrix(0, *size), K)
@@ -74,7 +76,9 @@ class TestIdentities:
         W = centred_matrix(0, *size)
         f = factorise(W, K)
         S = np.linalg.svd(W, compute_uv=False)
-        assert_allclose(f.singular_values, S, atol=1e-12 * S[0])
+        k = 3 * K + 3
+        assert_allclose(f.singular_values, S[:k], atol=1e-12 * S[0])
+        assert_allclose(f.rest, np.sum(S[k:] ** 2), atol=1e-14 * np.sum(S**2))
 
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units(self, size, K, unit):
@@ -204,3 +208,33 @@ class TestOrientations:
 
     def test_zero_rows(self):
         assert_array_equal(orientations(np.zeros((2, 5))), 1)
+
+
+class TestLargeBothWays:
+    @pytest.fixture
+    def krylov(self, monkeypatch):
+        monkeypatch.setattr(module, "DENSE", 30)
+
+    @pytest.mark.parametrize("size", [(60, 70), (25, 90)])
+    @pytest.mark.parametrize("noise", [1e-2, 1e-6])
+    def test_the_leading_triplets_are_those_of_the_whole(
+        self, size, noise, monkeypatch
+    ):
+        W = low_rank(0, 8, *size) + noise * centred_matrix(1, *size)
+        whole = factorise(W, 2)
+        monkeypatch.setattr(module, "DENSE", 30)
+        leading = factorise(W, 2)
+        for got, expected in zip(leading[:5], whole[:5], strict=True):
+            assert_allclose(got, expected, atol=1e-10 * np.abs(expected).max())
+        assert_allclose(leading.rest, whole.rest, atol=1e-14 * np.sum(W**2))
+
+    def test_null_directions_are_left_out(self, krylov):
+        f = factorise(low_rank(0, 5, 60, 70), 2)
+        assert (f.singular_values[5:] < 1e-12 * f.singular_values[0]).all()
+        assert_allclose(f.signals @ f.signals.T / 70, np.eye(3), atol=1e-12)
+
+    def test_frames_in_another_order(self, krylov):
+        W = low_rank(0, 8, 60, 70) + 1e-2 * centred_matrix(1, 60, 70)
+        permuted, _ = permute_frames(W, 3)
+        f, g = factorise(W, 2), factorise(permuted, 2)
+        assert_allclose(g.signals, f.signals, atol=1e-10)

@@ -360,7 +360,7 @@ class TestDegenerate:
         assert_allclose(result.energy, best, rtol=1e-6)
         assert_allclose(result.E[0, :, 2], 0, atol=1e-9)
 
-        total = np.sum(f.singular_values**2)
+        total = np.sum(f.singular_values**2) + f.rest
         inverse_snr = (np.sum(f.motion**2) - result.energy.sum()) * 91 / total
         assert_allclose(inverse_snr, 0.00160, atol=1e-5)
 
