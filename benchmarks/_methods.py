@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse.linalg import svds
 from sklearn.base import BaseEstimator
 
+from benchmarks._sets import rotations_of
 from isa_nrsfm import AffineNRSfM, FastISA, baselines
 from isa_nrsfm._frame_fit import compose, project
 from isa_nrsfm._tracks import (
@@ -160,11 +161,8 @@ def found_by_baseline(model, X):
     """Return what a baseline has found in its table: its own shapes and cameras."""
     images = project(model.shapes_, model.motion_, model.translation_)
     scales = np.linalg.norm(model.motion_, axis=(1, 2)) / np.sqrt(2)
-    across = model.motion_ / scales[:, None, None]
-    depth = np.cross(across[:, 0], across[:, 1])
-    rotations = np.concatenate([across, depth[:, None]], axis=1)
     X_found, shapes = tracks_to_table(images), model.shapes_
-    return Found(X_found, shapes, shapes, rotations, scales)
+    return Found(X_found, shapes, shapes, rotations_of(model.motion_), scales)
 
 
 def found_by_rigid(model, X):

@@ -72,12 +72,15 @@ class Table(NamedTuple):
         Expression and person of each row.
     shapes : ndarray of shape (n_frames, n_points, 3) or None
         True shapes; those of dense faces are computed by `true_shapes`.
+    cameras : ndarray of shape (n_frames, 2 or 3, 3) or None
+        True cameras, where shapes are in the space of the object.
     """
 
     X: np.ndarray
     labels: np.ndarray | None = None
     subjects: np.ndarray | None = None
     shapes: np.ndarray | None = None
+    cameras: np.ndarray | None = None
 
 
 SYNTHETIC = Case("synthetic", "", 3, True)
@@ -133,11 +136,12 @@ def load(name, seed=0):
             SYNTHETIC_NOISE,
             camera=chosen.camera,
         )
-        return Table(tracks.data, shapes=tracks.shapes)
+        return Table(tracks.data, shapes=tracks.shapes, cameras=tracks.motion)
     arrays = load_arrays(chosen.case)
     if chosen.case is DENSE:
         return Table(as_table(dense_tracks(arrays)))
-    tracks, rest = arrays["W2d"], (arrays.get(k) for k in ("labels", "subjects", "S3d"))
+    tracks = arrays["W2d"]
+    rest = (arrays.get(k) for k in ("labels", "subjects", "S3d", "R"))
     complete = ~np.isnan(tracks).any(axis=(1, 2))
     rest = (None if array is None else array[complete] for array in rest)
     return Table(as_table(tracks[complete].astype(float)), *rest)
@@ -149,3 +153,19 @@ def true_shapes(name, seed=0):
     if chosen.case is DENSE:
         return dense_shapes(load_arrays(chosen.case), slice(None))
     return load(name, seed).shapes if chosen.truth else None
+
+
+def shapes_in_camera(name, seed=0):
+    """Return the true shapes in the axes of each frame's camera, z is depth."""
+    shapes = true_shapes(name, seed)
+    if SETS[name].truth == "camera":
+        return shapes
+    dense = SETS[name].case is DENSE
+    cameras = load_arrays(DENSE)["R"] if dense else load(name, seed).cameras
+    return shapes @ rotations_of(cameras).transpose(0, 2, 1)
+
+
+def rotations_of(cameras):
+    """Return the rotations (n_frames, 3, 3) of scaled orthographic cameras."""
+    rows = cameras[:, :2] / np.linalg.norm(cameras[:, :2], axis=2, keepdims=True)
+    return np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
