@@ -11,7 +11,7 @@ from isa_nrsfm.metrics import affine_shape_error, inverse_snr, mean_shape_error_
 
 # Where in a table the frames are that pictures show.
 SHOWN = (0.1, 0.35, 0.6, 0.85)
-# The best method that is not a bound.
+# What no method can be below.
 BOUNDS = ("floor",)
 ERRORS = {
     "affine_shape_error": "`affine_shape_error`: one affinity of all frames, a scale "

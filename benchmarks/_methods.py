@@ -5,12 +5,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse.linalg import svds
 from sklearn.base import BaseEstimator
 
-from benchmarks._sets import rotations_of
 from isa_nrsfm import AffineNRSfM, FastISA, baselines
+from isa_nrsfm._factorisation import leading_triplets
 from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._metric_upgrade import nearest_rotations
 from isa_nrsfm._tracks import (
     centred_tracks,
     measurement_matrix,
@@ -24,9 +24,6 @@ from isa_nrsfm.calibration import (
     euclidean_shapes,
     metric_upgrade,
 )
-
-# Of larger matrices a few singular vectors are found by iteration.
-LARGE = 1000
 
 
 class Found(NamedTuple):
@@ -107,19 +104,12 @@ class TruncatedTable(BaseEstimator):
         centred, translation = centred_tracks(table_to_tracks(X))
         sizes = weighting_sizes(centred, self.scale_frames)[:, None, None]
         W = measurement_matrix(centred / sizes)
-        V = leading_directions(W, self.rank)
+        V = leading_triplets(W, self.rank)[1].T
         self.motion_ = sizes * (W @ V).reshape(len(X), 2, -1)
         self.mean_shape_ = V
         images = V @ self.motion_.transpose(0, 2, 1)
         self.X_ = tracks_to_table(images + translation[:, None])
         return self
-
-
-def leading_directions(W, rank):
-    """Return the first right singular vectors of a matrix, as columns."""
-    if min(W.shape) > LARGE:
-        return svds(W, k=rank, random_state=0)[2].T
-    return np.linalg.svd(W, full_matrices=False)[2][:rank].T
 
 
 def ours(n_components, scale_frames, ordered, seed, **parameters):
@@ -162,7 +152,7 @@ def found_by_baseline(model, X):
     images = project(model.shapes_, model.motion_, model.translation_)
     scales = np.linalg.norm(model.motion_, axis=(1, 2)) / np.sqrt(2)
     X_found, shapes = tracks_to_table(images), model.shapes_
-    return Found(X_found, shapes, shapes, rotations_of(model.motion_), scales)
+    return Found(X_found, shapes, shapes, nearest_rotations(model.motion_)[0], scales)
 
 
 def found_by_rigid(model, X):

@@ -23,6 +23,7 @@ from benchmarks._data import (
     load_arrays,
 )
 from benchmarks.recovery import instance
+from isa_nrsfm._metric_upgrade import nearest_rotations
 
 
 class Set(NamedTuple):
@@ -162,10 +163,5 @@ def shapes_in_camera(name, seed=0):
         return shapes
     dense = SETS[name].case is DENSE
     cameras = load_arrays(DENSE)["R"] if dense else load(name, seed).cameras
-    return shapes @ rotations_of(cameras).transpose(0, 2, 1)
-
-
-def rotations_of(cameras):
-    """Return the rotations (n_frames, 3, 3) of scaled orthographic cameras."""
-    rows = cameras[:, :2] / np.linalg.norm(cameras[:, :2], axis=2, keepdims=True)
-    return np.concatenate([rows, np.cross(rows[:, 0], rows[:, 1])[:, None]], axis=1)
+    rotations, _ = nearest_rotations(cameras[:, :2])
+    return shapes @ rotations.transpose(0, 2, 1)

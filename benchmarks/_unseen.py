@@ -7,7 +7,13 @@ from benchmarks._data import halves_of
 from benchmarks._jobs import Job
 from benchmarks._markdown import cell, grid, remarks, select, table, value
 from benchmarks._methods import METHOD_TITLES, METHODS
-from benchmarks._sets import SET_TITLES, SETS, load
+from benchmarks._sets import (
+    SET_TITLES,
+    SETS,
+    SYNTHETIC_NOISE,
+    SYNTHETIC_POINTS,
+    load,
+)
 from benchmarks.accuracy import held_out
 from benchmarks.recovery import chosen_components, instance
 
@@ -18,7 +24,6 @@ CHOICES = {"ict_68": range(1, 14, 2), "drink": range(1, 9)}
 CHOOSES = "joint"
 FOLDS = 3
 TRUE_NUMBERS = range(1, 6)
-SYNTHETIC_POINTS, SYNTHETIC_NOISE = 68, 0.02
 
 
 def jobs(section, sets, methods, repeats):

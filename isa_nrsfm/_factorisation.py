@@ -71,7 +71,7 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
     """
     n_points = W.shape[1]
     root = np.sqrt(n_points)
-    S, Vt, rest = _leading_triplets(W, 3 * n_components + 3)
+    S, Vt, rest = leading_triplets(W, 3 * n_components + 3)
     null = max(NULL_DIRECTION, precision) * S[0]
     rank = int(np.sum(S > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
@@ -85,10 +85,28 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
     return Factorisation(W @ B_0.T / n_points, B_0, M, B, S, rest)
 
 
-def _leading_triplets(W: NDArray, k: int) -> tuple[NDArray, NDArray, float]:
+def leading_triplets(W: NDArray, k: int) -> tuple[NDArray, NDArray, float]:
     """
-    Return the largest singular values, their right vectors and the remaining energy.
+    Return the largest singular values of a matrix, and their right vectors.
 
+    Parameters
+    ----------
+    W : ndarray of shape (n_rows, n_columns)
+        The matrix.
+    k : int
+        How many are wanted.
+
+    Returns
+    -------
+    values : ndarray of shape (k,)
+        Singular values, decreasing; fewer if W does not have as many.
+    vectors : ndarray of shape (k, n_columns)
+        Their right singular vectors as rows. The left ones are ``W V / S``.
+    rest : float
+        Energy of W outside these.
+
+    Notes
+    -----
     A W that is large both ways is not factorised as a whole: the subspace of its
     leading right vectors comes from the Krylov method of ARPACK (Lehoucq, Sorensen,
     Yang, "ARPACK users' guide", 1998), the triplets from W projected to it, so that

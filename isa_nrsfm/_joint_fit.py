@@ -55,7 +55,8 @@ N_RANDOM_STARTS = 6
 # the noise of many points can be small enough to need it.
 POLISH = 0.01
 FEW_FRAMES = 2000
-# Tables with less noise are exact: there it would cost many steps, and gain nothing.
+# Tables with less noise are exact: there it can take more steps than are allowed. They
+# may end some way from the optimum without it.
 NOISELESS = 1e-9
 # Leading directions of the lifted motion per basis shape that these starts mix.
 DIRECTIONS = 4
@@ -157,8 +158,7 @@ def fit_jointly(
     rigid = _Rigid.of(sample.W, factors)
     best, price = _best(sample, starts, rigid, stiffness)
     best = _finished(best, problems, price)
-    drifted = _anisotropy(best) > DRIFTED * rigid.anisotropy
-    if stiffness is None and price == 0 and drifted:
+    if stiffness is None and price == 0 and rigid.ratio(best) > DRIFTED:
         stiff = sample.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
         stiff = _finished(stiff, problems, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
@@ -193,16 +193,16 @@ class _Rigid(NamedTuple):
         cameras = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
         return cls(cameras, float(np.mean(_rigid_rest(W, factors) ** 2)))
 
+    def ratio(self, result: JointResult) -> float:
+        """Return the anisotropy of a refinement's cameras relative to these."""
+        cameras = anisotropy(result.state.motion.transpose(2, 0, 1))
+        return cameras / self.anisotropy if self.anisotropy > 0 else 1.0
+
 
 def _rigid_rest(W: NDArray, factors: Factorisation) -> NDArray:
     """Return what a measurement matrix has beside its projection to the rigid shape."""
     shape = factors.rigid_shape
     return W - W @ np.linalg.pinv(shape, rcond=1e-10) @ shape
-
-
-def _anisotropy(result: JointResult) -> float:
-    """Return the anisotropy of the cameras of a refinement."""
-    return anisotropy(result.state.motion.transpose(2, 0, 1))
 
 
 def _best(
@@ -217,7 +217,7 @@ def _best(
     if rigid.anisotropy > ISOTROPIC:
         stiff = problem.best(starts, STIFFNESS)
         if (
-            _anisotropy(stiff) < CLEARLY_LESS * rigid.anisotropy
+            rigid.ratio(stiff) < CLEARLY_LESS
             and stiff.state.noise < STILL_MOVING * rigid.noise
         ):
             return stiff, STIFFNESS

@@ -7,7 +7,7 @@ from isolated_runs import MEGABYTE, misbehave, sleep, use_memory
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
-from benchmarks import _agreement, _data, _fits, _methods, _recovered, _sets, _unseen
+from benchmarks import _agreement, _data, _fits, _recovered, _sets, _unseen
 from benchmarks._agreement import compare
 from benchmarks._classification import AlignedFrames
 from benchmarks._figures import draw_bars, draw_reprojections
@@ -18,7 +18,7 @@ from benchmarks._methods import METHODS, Found, TruncatedTable
 from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, _factorisation
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -315,10 +315,11 @@ def test_true_shapes_and_cameras_have_no_error(tracks, camera):
 
 
 @pytest.mark.parametrize("scale_frames", [True, False])
-def test_rank_floor_is_that_of_a_fit(tracks, monkeypatch, scale_frames):
+def test_rank_floor_is_that_of_a_fit(monkeypatch, scale_frames):
+    tracks = make_nonrigid_tracks(60, 40, 2, noise=0.01, random_state=0)
     model = AffineNRSfM(2, scale_frames=scale_frames, random_state=0).fit(tracks.data)
-    for large in (1000, 10):
-        monkeypatch.setattr(_methods, "LARGE", large)
+    for dense in (1000, 10):
+        monkeypatch.setattr(_factorisation, "DENSE", dense)
         floor = TruncatedTable(9, scale_frames).fit(tracks.data)
         error = inverse_snr(tracks.data, floor.X_, scale_frames=scale_frames)
         np.testing.assert_allclose(error, model.rank_floor_, rtol=1e-8)

@@ -68,7 +68,6 @@ class TestTruth:
         shapes = model.reconstruct(faces.data, camera="weak_perspective")
         assert frame_error(faces.shapes, shapes) < 0.012
 
-    @pytest.mark.filterwarnings("ignore:FastICA did not converge")
     @pytest.mark.parametrize(
         ("name", "n_components", "errors"),
         [

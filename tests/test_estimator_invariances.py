@@ -11,7 +11,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 # The warning about the layout has tests of its own.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:layout=:UserWarning"),
-    # The joint refinement only starts from what FastICA finds.
+    # Of the paper's pipeline: the joint refinement does not say so.
     pytest.mark.filterwarnings("ignore:FastICA did not converge"),
 ]
 

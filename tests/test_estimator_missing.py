@@ -8,7 +8,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
-# The joint refinement only starts from what FastICA finds.
+# Of the paper's pipeline: the joint refinement does not say so.
 pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
 
 K = 2

@@ -11,9 +11,6 @@ from isa_nrsfm._held_out import FOLD_SEED, N_FOLDS, held_out_error
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
-# The joint refinement only starts from what FastICA finds.
-pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
-
 NOISE = 0.02
 
 

@@ -370,6 +370,18 @@ class TestStiffness:
         assert affine_shape_error(truth, frames_of(result, tracks)[1]) < 0.02
 
 
+def test_rigid_cameras_that_show_no_anisotropy_compare_with_none():
+    tracks, _ = random_table()
+    W = measurements(tracks, scale_frames=False)
+    problem = module._Problem(W, tracks, None, 3, 0.1)
+    shapes = lifted_shapes(factorise(W, 2), lifted_directions(factorise(W, 2), 2))
+    result = problem.refined(problem.start(shapes), 0.0)
+    assert module._Rigid(0.0, 1.0).ratio(result) == 1.0
+    of_half = module._Rigid(0.5, 1.0).ratio(result)
+    assert of_half != 1.0
+    assert module._Rigid(0.25, 1.0).ratio(result) == pytest.approx(2 * of_half)
+
+
 class TestLargeTables:
     @pytest.fixture
     def small_limits(self, monkeypatch):

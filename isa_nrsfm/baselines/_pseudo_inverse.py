@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._factorisation import NULL_DIRECTION
+from isa_nrsfm._factorisation import NULL_DIRECTION, leading_triplets
 from isa_nrsfm._orthonormal_cameras import nearest_orthonormal, orthonormal_cameras
 from isa_nrsfm._tracks import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
@@ -33,16 +33,16 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
     ValueError
         If W has less than rank three.
     """
-    U, S, _ = np.linalg.svd(W, full_matrices=False)
-    n_columns = min(3 * rank, int(np.sum(S > NULL_DIRECTION * S[0])))
+    S, Vt, rest = leading_triplets(W, 3 * rank)
+    n_columns = int(np.sum(S > NULL_DIRECTION * S[0]))
     if n_columns < 3:
         raise ValueError(
             "orthographic cameras need a table of rank three or more, once frames are "
             f"centred; X has rank {n_columns}, as of a flat object that does not deform"
         )
     n_left = (len(W) - 3 * rank) * (W.shape[1] - 1 - 3 * rank)
-    noise_variance = float(np.sum(S[3 * rank :] ** 2)) / n_left if n_left > 0 else 0.0
-    motion = U[:, :n_columns] * S[:n_columns]
+    noise_variance = rest / n_left if n_left > 0 else 0.0
+    motion = W @ Vt[:n_columns].T
     return nearest_orthonormal(orthonormal_cameras(motion, noise_variance).cameras)
 
 
