@@ -11,12 +11,15 @@ distinct set of seen points.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._sampling import spread
 from isa_nrsfm._tracks import seen_points
 
 RIGID_RANK = 3
@@ -39,6 +42,10 @@ EXACT = 1e-20
 LEAST_FREEDOM = 0.02
 # Numbers in the largest array of a block of frames.
 BLOCK_NUMBERS = 2**20
+# With more frames the model is found from so many of them, and from as many that show
+# each point, if there are.
+MODEL_FRAMES = 10_000
+FEWEST_SHOWN = 200
 
 
 class Completion(NamedTuple):
@@ -86,8 +93,17 @@ class _Posterior(NamedTuple):
     cross: NDArray
 
 
-class _Model(NamedTuple):
-    """Low-rank model: ``B`` (rank, n_points), rows centred, and the noise variance."""
+class CompletionModel(NamedTuple):
+    """
+    Low-rank model of the rows of a measurement matrix.
+
+    Attributes
+    ----------
+    B : ndarray of shape (rank, n_points)
+        Directions, rows centred.
+    noise : float
+        Noise variance of a coordinate.
+    """
 
     B: NDArray
     noise: float
@@ -137,14 +153,132 @@ def complete_tracks(
     seen = seen_points(centred)
     if seen.all():
         return Completion(centred, np.zeros((len(centred), 2)))
-    rank = _possible_rank(3 * n_components + 3, seen.shape[1])
-    frames, order = _by_pattern(centred, seen, sizes)
-    model = _fit(frames, rank, tol, max_iter)
+    model = completion_model(centred, sizes, n_components, tol=tol, max_iter=max_iter)
+    return filled_in(centred, sizes, model)
 
+
+def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameBlocks:
+    """
+    Return the frames of a table with their missing points filled in.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points) of size one, centred over the points
+        that are seen; NaN where a point is not seen.
+    n_points : int
+        Number of points.
+    n_components : int
+        K, the number of basis shapes.
+
+    Returns
+    -------
+    FrameBlocks
+        The frames, centred over all points, as of `complete_tracks`. The model of a
+        table with many frames is that of some of them.
+    """
+    n_frames = rows.n_frames
+    frames = np.arange(n_frames)
+    if n_frames > MODEL_FRAMES:
+        frames = _telling_frames(rows, n_points)
+    tracks = rows.take(frames).transpose(0, 2, 1)
+    model = completion_model(tracks, np.ones(len(tracks)), n_components)
+    return rows.derive(partial(_filled_rows, model=model))
+
+
+def _telling_frames(rows: FrameBlocks, n_points: int) -> NDArray:
+    """
+    Return frames that show all points, whatever the order of the table.
+
+    They are spread evenly over the shares of the energy that the frames have in x, and
+    so are those that are added for points that they hardly show.
+    """
+    order = np.argsort(np.concatenate(list(rows.map(_share_of_x))), kind="stable")
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[spread(order, MODEL_FRAMES)] = True
+    shown = np.zeros(n_points)
+    for block in rows.map(_seen_rows, chosen):
+        shown += block.sum(axis=0)
+    for point in map(int, np.flatnonzero(shown < FEWEST_SHOWN)):
+        seen = np.concatenate(list(rows.map(partial(_sees, point=point))))
+        showing = order[seen[order]]
+        chosen[spread(showing, min(FEWEST_SHOWN, len(showing)))] = True
+    return np.flatnonzero(chosen)
+
+
+def _share_of_x(rows: NDArray) -> NDArray:
+    """Return the share of the energy of frames that is in their first row."""
+    energy = np.nansum(rows**2, axis=2)
+    return energy[:, 0] / energy.sum(axis=1)
+
+
+def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:
+    """Return which points the chosen frames of a block show."""
+    return ~np.isnan(rows[chosen, 0])
+
+
+def _sees(rows: NDArray, point: int) -> NDArray:
+    """Return which frames of a block show a point."""
+    return ~np.isnan(rows[:, 0, point])
+
+
+def _filled_rows(rows: NDArray, model: CompletionModel) -> NDArray:
+    """Return frames (n_frames, 2, n_points) with their missing points filled in."""
+    tracks = rows.transpose(0, 2, 1)
+    centred = filled_in(tracks, np.ones(len(tracks)), model).centred
+    return np.ascontiguousarray(centred.transpose(0, 2, 1))
+
+
+def completion_model(
+    centred: NDArray,
+    sizes: NDArray,
+    n_components: int,
+    *,
+    tol: float = TOL,
+    max_iter: int = 200,
+) -> CompletionModel:
+    """
+    Return the low-rank model that `complete_tracks` fills missing points in with.
+
+    Parameters
+    ----------
+    centred, sizes, n_components, tol, max_iter
+        As there.
+
+    Returns
+    -------
+    CompletionModel
+        The model.
+    """
+    rank = _possible_rank(3 * n_components + 3, centred.shape[1])
+    frames, _ = _by_pattern(centred, seen_points(centred), sizes)
+    return _fit(frames, rank, tol, max_iter)
+
+
+def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Completion:
+    """
+    Return tracks with their missing points as a low-rank model expects them.
+
+    Parameters
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks, centred over the seen points of each frame, NaN where not seen.
+    sizes : ndarray of shape (n_frames,)
+        What each frame is divided by.
+    model : CompletionModel
+        The model of frames of size one.
+
+    Returns
+    -------
+    Completion
+        Complete tracks.
+    """
+    seen = seen_points(centred)
+    frames, order = _by_pattern(centred, seen, sizes)
     fitted = np.empty_like(frames.rows)
     for block, posterior, _ in _posteriors(frames, model):
         fitted[block] = posterior.z @ model.B + posterior.t
-    expected = np.empty_like(centred)
+    expected = np.empty(centred.shape)
     expected[order] = fitted.transpose(0, 2, 1)
     expected *= sizes[:, None, None]
     tracks = np.where(seen[..., None], centred, expected)
@@ -193,13 +327,13 @@ def _by_pattern(
     return _Frames(rows, pattern[order], seen[first].astype(np.float64)), order
 
 
-def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> _Model:
+def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionModel:
     """Return the model of frames, grown from the rank of a rigid object."""
     ranks = [rank]
     while ranks[0] > RIGID_RANK:
         ranks.insert(0, max(RIGID_RANK, (ranks[0] + 1) // 2))
     rows = frames.rows
-    model = _Model(np.zeros((0, rows.shape[2])), np.inf)
+    model = CompletionModel(np.zeros((0, rows.shape[2])), np.inf)
     for wanted in ranks:
         model = _grown(model, wanted, rows, frames)
         for step in range(max_iter if wanted == rank else STEPS_WHILE_GROWING):
@@ -211,7 +345,9 @@ def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> _Model:
     return model
 
 
-def _grown(model: _Model, rank: int, residual: NDArray, frames: _Frames) -> _Model:
+def _grown(
+    model: CompletionModel, rank: int, residual: NDArray, frames: _Frames
+) -> CompletionModel:
     """Return the model with the principal axes of its residual as further rows of B."""
     is_first = not len(model.B)
     moment = _second_moment(residual, frames, is_first)
@@ -223,7 +359,7 @@ def _grown(model: _Model, rank: int, residual: NDArray, frames: _Frames) -> _Mod
     if is_first:
         rest = (np.trace(moment) - values.sum()) / n_points
         noise = max(rest, LEAST_WEIGHT**2 * values[-1], LEAST_NOISE)
-    return _Model(np.vstack([model.B, (axes * np.sqrt(weights)).T]), noise)
+    return CompletionModel(np.vstack([model.B, (axes * np.sqrt(weights)).T]), noise)
 
 
 def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
@@ -253,7 +389,7 @@ def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
 
 
 def _posteriors(
-    frames: _Frames, model: _Model
+    frames: _Frames, model: CompletionModel
 ) -> Iterator[tuple[slice, _Posterior, NDArray]]:
     """Yield blocks of frames, what the model says of them, and their seen points."""
     B, ridge = model.B, model.ridge
@@ -282,7 +418,9 @@ def _posteriors(
         yield block, _Posterior(z, t, covariance, cross), seen[pattern]
 
 
-def _em_step(model: _Model, frames: _Frames) -> tuple[_Model, NDArray, float]:
+def _em_step(
+    model: CompletionModel, frames: _Frames
+) -> tuple[CompletionModel, NDArray, float]:
     """Return the model after one step, the residual of the old one, its mean square."""
     rows, ridge = frames.rows, model.ridge
     rank, n_points = model.B.shape
@@ -324,7 +462,7 @@ def _em_step(model: _Model, frames: _Frames) -> tuple[_Model, NDArray, float]:
     B = np.linalg.cholesky(mean_moment).T @ B
     # The fixed point of EM's step for the variance, in one step (MacKay 1992).
     freedom = max(n_numbers - n_fitted, LEAST_FREEDOM * n_numbers)
-    return _Model(B, energy / freedom), residual, energy / n_numbers
+    return CompletionModel(B, energy / freedom), residual, energy / n_numbers
 
 
 def _symmetric(packed: NDArray, size: int, upper: tuple[NDArray, ...]) -> NDArray:

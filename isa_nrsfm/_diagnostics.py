@@ -131,8 +131,8 @@ def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
     ----------
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
-    covariance : ndarray of shape (n_frames, n_components, n_components)
-        Their covariances.
+    covariance : ndarray of shape (n_components, n_components)
+        Mean of their covariances.
 
     Returns
     -------
@@ -142,7 +142,7 @@ def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
         which there is no variance at all.
     """
     known = alpha / np.sqrt(len(alpha))
-    variance, axes = np.linalg.eigh(known.T @ known + covariance.mean(axis=0))
+    variance, axes = np.linalg.eigh(known.T @ known + covariance)
     kept = variance > NO_VARIANCE * variance[-1]
     white = axes[:, kept] / np.sqrt(variance[kept])
     shares = np.zeros(len(kept))

@@ -1,5 +1,6 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
+import os
 import time
 import warnings
 from numbers import Integral, Real
@@ -21,15 +22,19 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._camera import reference_camera
-from isa_nrsfm._completion import complete_tracks
-from isa_nrsfm._deformation_metric import deformation_metric, euclidean_frames
+from isa_nrsfm._completion import complete_rows
+from isa_nrsfm._deformation_metric import deformation_metric
 from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
+from isa_nrsfm._factorisation import Factorisation, block_triplets, factorise
 from isa_nrsfm._frame_fit import (
     FrameFit,
     PosteriorFrames,
     RigidFrames,
     compose,
+    posterior_blocks,
+    posterior_moments,
     project,
+    reprojection_error,
 )
 from isa_nrsfm._frame_posterior import spread_starts
 from isa_nrsfm._gauge import (
@@ -38,7 +43,6 @@ from isa_nrsfm._gauge import (
     mode_covariance,
     reorder_blocks,
 )
-from isa_nrsfm._held_out import held_out_error
 from isa_nrsfm._independent_gauge import (
     INDEPENDENCE,
     FrameMap,
@@ -47,26 +51,19 @@ from isa_nrsfm._independent_gauge import (
 from isa_nrsfm._joint_fit import fit_jointly
 from isa_nrsfm._metric_refinement import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
-from isa_nrsfm._robust import LOSSES, gross_outliers, robust_sizes
-from isa_nrsfm._table_checks import (
-    check_names,
-    check_points,
-    check_size,
-    clean_tracks,
-    warn_if_other_layout,
+from isa_nrsfm._robust import LOSSES, gross_outliers
+from isa_nrsfm._sampling import Sample, sample_frames
+from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
+from isa_nrsfm._table_checks import check_names
+from isa_nrsfm._table_model import TableModel
+from isa_nrsfm._table_sources import (
+    CHECKS,
+    Table,
+    column_sample,
+    is_on_dask,
+    is_stored,
 )
-from isa_nrsfm._tracks import (
-    LAYOUTS,
-    Layout,
-    centred_tracks,
-    check_frames,
-    measurement_matrix,
-    relative_precision,
-    table_to_tracks,
-    tracks_to_table,
-    usable_frames,
-    weighting_sizes,
-)
+from isa_nrsfm._tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.isa import PooledFastICA
 
 # Tolerances where none is given: for each frame, of minus twice the log likelihood, and
@@ -77,6 +74,8 @@ JOINT_TOL, PAPER_TOL = 0.05, 1e-10
 START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
+# What a fit may keep of the frames.
+OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 
 
 class Decomposition(NamedTuple):
@@ -167,8 +166,18 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         it explains (1e-10 by default).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
+    keep_frames : bool, str or path-like, default=True
+        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept. A path is
+        that of a folder for files of these names, ``alpha.npy`` and so on, of which
+        they are memory maps.
+    working_memory : float or None, default=None
+        Megabytes that a block of a table takes that is not in memory (a memory map or a
+        table of `isa_nrsfm.io.open_table`); None is scikit-learn's setting
+        `working_memory`. The result does not depend on it. A few numbers for each frame
+        are in memory besides, about 1 kB.
     n_jobs : int or None, default=None
-        Number of joblib workers for strategies that use them.
+        Number of threads that work on the frames, and of joblib workers for strategies
+        that use them. The result does not depend on it.
     verbose : int, default=0
         Above zero, print a line for each stage.
 
@@ -284,6 +293,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
+        "keep_frames": ["boolean", str, HasMethods("__fspath__")],
+        "working_memory": [None, Interval(Real, 0, None, closed="neither")],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
     }
@@ -303,6 +314,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         max_iter: int = 1000,
         tol: float | None = None,
         random_state: Any = None,
+        keep_frames: Any = True,
+        working_memory: float | None = None,
         n_jobs: int | None = None,
         verbose: int = 0,
     ):
@@ -318,6 +331,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.max_iter = max_iter
         self.tol = tol
         self.random_state = random_state
+        self.keep_frames = keep_frames
+        self.working_memory = working_memory
         self.n_jobs = n_jobs
         self.verbose = verbose
 
@@ -348,77 +363,74 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             linear without the joint refinement.
         """
         report = StageReport(self.verbose)
-        X = validate_data(
-            self,
-            X,
-            dtype=[np.float64, np.float32],
-            ensure_all_finite="allow-nan",
-            ensure_min_samples=2,
-            ensure_min_features=2,
-        )
+        for name in OF_FRAMES:
+            self.__dict__.pop(name, None)
         if self.refinement != "joint" and self.loss != "linear":
             raise ValueError(
                 f"loss={self.loss!r} needs refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
+        source = self._opened(X, reset=True)
+        if self.refinement != "joint" or self.loss != "linear":
+            source.need_memory(
+                f"refinement={self.refinement!r} with loss={self.loss!r}"
+            )
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
-        tracks = clean_tracks(table_to_tracks(X, self.layout), self.layout, names)
-        check_size(len(tracks), tracks.shape[1], self.n_components)
-        check_frames(tracks)
-        check_points(tracks, self.n_components, self.layout, names)
-        centred, translation = centred_tracks(tracks)
-        warn_if_other_layout(X, self.layout, self.scale_frames)
-        sizes = self._sizes(centred)
-        unit = centred / sizes[:, None, None]
-        self._frame_sizes = sizes
+        table = scaled_table(
+            source,
+            self.n_components,
+            layout=self.layout,
+            names=names,
+            scale_frames=self.scale_frames,
+            robust=self.loss != "linear",
+        )
+        rows, sizes, n_points = table.rows, table.sizes, table.n_points
         self._unit = 1.0 if self.scale_frames else float(sizes[0])
-        outliers = np.zeros(unit.shape[:2], dtype=bool)
+        outliers, used, complete = None, rows, table.complete
         if self.loss != "linear":
-            outliers = gross_outliers(unit)
-        used, _ = centred_tracks(np.where(outliers[..., None], np.nan, unit))
-        completion = complete_tracks(used, np.ones(len(unit)), self.n_components)
-        W = measurement_matrix(completion.centred)
+            outliers = gross_outliers(rows.whole().transpose(0, 2, 1))
+            used = rows.derive(rows_without, outliers)
+            complete = complete and not outliers.any()
+        if not complete:
+            used = complete_rows(used, n_points, self.n_components)
         report("table")
 
-        self.isa_ = self._strategy()
         joint = self.refinement == "joint"
+        shape = 2 * len(sizes), n_points
+        triplets = block_triplets(used, shape, 3 * self.n_components + 3)
+        if joint:
+            sample = sample_frames(used, n_points, triplets.vectors[:3])
+        else:
+            sample = Sample(used.whole().reshape(shape), [])
+        factors = factorise(sample.W, self.n_components, table.precision, triplets)
+        report("factorisation")
+        self.isa_ = self._strategy()
         with warnings.catch_warnings():
             if joint and self.isa is None:
                 # It makes no difference to the joint refinement, which starts there.
                 warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
             result = run_paper_pipeline(
-                W,
+                factors,
                 self.n_components,
                 self.isa_,
-                precision=relative_precision(tracks, sizes),
                 block_recovery=self.block_recovery,
                 refinement="alternating" if joint else self.refinement,
                 max_iter=START_STEPS if joint else self.max_iter,
                 tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
                 report=report,
             )
-        self.singular_values_ = self._unit * result.singular_values
-        self.rank_floor_ = result.rank_floor
+        self.singular_values_ = self._unit * triplets.values
+        self.rank_floor_ = triplets.rest_share
         self._n_features_out = self.n_components
         if joint:
-            frames = self._refine_jointly(unit, sizes, outliers, W, result, X.dtype)
+            frames = self._refine_jointly(table, outliers, sample, factors, result)
             report("joint refinement, gauge and coefficients")
         else:
-            frames = self._keep(centred, sizes, completion.centred, result, X.dtype)
+            frames = self._keep(table, sample.W, result)
             report("gauge and coefficients")
-        frames = frames._replace(translation=frames.translation + translation)
-        self.inverse_snr_ = self._inverse_snr(tracks, sizes, frames)
-        cameras = frames.motion / sizes[:, None, None]
-        energy = image_energies(cameras, self.basis_, frames.alpha)
-        self.energy_share_ = energy / (energy.sum() or 1.0)
-        self.reference_motion_ = reference_camera(cameras, sizes).astype(X.dtype)
-        self.reference_translation_ = frames.translation.mean(axis=0).astype(X.dtype)
-        self.motion_, self.translation_, self.alpha_, deviation = as_type(
-            frames, X.dtype
-        )
-        if joint:
-            self.alpha_std_ = deviation
+        self._describe(table, frames)
+        self._keep_frames(table, frames)
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -437,7 +449,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ndarray of shape (n_frames, n_components)
             `alpha_`.
         """
-        return self.fit(X).alpha_.copy()
+        self.fit(X)
+        return self.alpha_.copy() if self.keep_frames else self.transform(X)
 
     def transform(self, X: Any) -> NDArray:
         """
@@ -473,8 +486,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2) and
             alpha (n_frames, n_components).
         """
-        X = self._validated(X)
-        return Decomposition(*as_type(self._fit_frames(X), X.dtype)[:3])
+        table = self._opened(X)
+        return Decomposition(*self._model.decompose(table)[:3])
 
     def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """
@@ -523,15 +536,12 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             raise ValueError(
                 f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
             )
-        motion, _, alpha = self.decompose(X)
-        if camera is None:
-            return compose(self.mean_shape_, self.basis_, alpha)
-        metric = deformation_metric(self.motion_, self.alpha_)
-        frames = euclidean_frames(metric, motion, alpha, self.mean_shape_, self.basis_)
-        shapes = frames.shapes
-        if camera == "orthographic":
-            shapes = frames.scales[:, None, None] * shapes
-        return shapes.astype(motion.dtype, copy=False)
+        table = self._opened(X)
+        metric = None
+        if camera is not None:
+            self._need_frames("reconstruct with a camera")
+            metric = deformation_metric(self.motion_, self.alpha_)
+        return self._model.reconstruct(table, metric, camera == "orthographic")
 
     def reproject(self, X: Any) -> NDArray:
         """
@@ -548,9 +558,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             Points of the fitted shapes in the fitted cameras. NaN for rows of which too
             little is seen.
         """
-        motion, translation, alpha = self.decompose(X)
-        shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return tracks_to_table(project(shapes, motion, translation), self.layout)
+        table = self._opened(X)
+        return self._model.reproject(table)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -614,13 +623,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             scaled as in the fit; larger is better. Points whose frame the others do not
             determine are left out.
         """
-        tracks, usable = self._usable(self._validated(X))
-        tracks = tracks[usable]
-        sizes = self._sizes_like_fit(centred_tracks(tracks)[0])
-        error = held_out_error(
-            self._frames, self.mean_shape_, self.basis_, tracks, sizes
-        )
-        return -error
+        table = self._opened(X)
+        return -self._model.held_out_error(table)
 
     def diagnostics(self) -> Diagnostics:
         """
@@ -649,11 +653,12 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 "diagnostics needs a model with refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
+        self._need_frames("diagnostics")
         return diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
-            self.motion_ / self._frame_sizes[:, None, None],
-            self.alpha_.astype(np.float64),
+            np.asarray(self.motion_) / self._frame_sizes[:, None, None],
+            np.asarray(self.alpha_, dtype=np.float64),
             self.noise_variance_ / self._unit**2,
             self.reliability_,
         )
@@ -693,15 +698,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         return np.random.RandomState(seed)
 
-    def _keep(
-        self,
-        centred: NDArray,
-        sizes: NDArray,
-        completed: NDArray,
-        result: PaperResult,
-        dtype: Any,
-    ) -> FrameFit:
+    def _keep(self, table: ScaledTable, W: NDArray, result: PaperResult) -> FrameFit:
         """Set the shapes of the paper's pipeline and return the fit of the frames."""
+        dtype = table.dtype
+        completed = W.reshape(len(table.sizes), 2, -1).transpose(0, 2, 1)
         paper = RigidFrames(result.mean_shape, result.basis)
         rigid = paper.fit(completed, np.ones(len(completed)))
         gauge = canonical_gauge(
@@ -714,26 +714,27 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self._converged(result.converged, result.n_iter)
         # The coefficients are those that transform gives, from the stored shapes.
         frames = RigidFrames(self.mean_shape_, self.basis_)
-        self._frames: RigidFrames | PosteriorFrames = frames
-        return frames.fit(centred, sizes)
+        self._model = self._table_model(frames)
+        unit = table.rows.whole().transpose(0, 2, 1)
+        return frames.fit(unit * table.sizes[:, None, None], table.sizes)
 
     def _refine_jointly(
         self,
-        unit: NDArray,
-        sizes: NDArray,
-        outliers: NDArray,
-        W: NDArray,
+        table: ScaledTable,
+        outliers: NDArray | None,
+        sample: Sample,
+        factors: Factorisation,
         result: PaperResult,
-        dtype: Any,
     ) -> FrameFit:
         """Set the shapes of the joint refinement and return the fit of the frames."""
         shapes = np.concatenate([result.mean_shape[None], result.basis])
         fitted = fit_jointly(
-            unit,
-            outliers,
-            W,
-            result.factors,
+            table.rows,
+            table.n_seen,
+            sample,
+            factors,
             shapes.transpose(0, 2, 1),
+            outliers=outliers,
             loss=self.loss,
             stiffness=self.stiffness,
             random_state=self._random_state(),
@@ -747,24 +748,71 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             self.loss,
             FrameMap.identity(self.n_components),
         )
-        posterior = frames.posterior(unit)
-        self.reliability_ = reliabilities(posterior.alpha, posterior.covariance)
-        gauge = independent_gauge(
-            fitted.shapes, posterior.motion, posterior.alpha, self.independence
-        )
+        posteriors = posterior_blocks(frames, fitted.frames, table.rows)
+        motion, alpha, covariance = posterior_moments(posteriors)
+        self.reliability_ = reliabilities(alpha, covariance)
+        gauge = independent_gauge(fitted.shapes, motion, alpha, self.independence)
         frames = frames._replace(gauge=gauge.frames)
-        self._frames = frames
-        self.mean_shape_ = gauge.mean_shape.astype(dtype)
-        self.basis_ = gauge.basis.astype(dtype)
+        self.mean_shape_ = gauge.mean_shape.astype(table.dtype)
+        self.basis_ = gauge.basis.astype(table.dtype)
+        self._model = self._table_model(frames)
         self.noise_variance_ = self._unit**2 * fitted.noise_variance
         self.stiffness_ = fitted.stiffness
         self.objective_history_ = fitted.history
         self.gradient_norm_ = fitted.gradient_norm
         self._converged(fitted.converged, len(fitted.history) - 1)
-        shown = frames.shown(posterior, sizes)
-        covariance = mode_covariance(shown.motion / sizes[:, None, None], shown.alpha)
+        shown = FrameFit.of_blocks(posteriors.map(frames.shown, table.sizes))
+        cameras = shown.motion / table.sizes[:, None, None]
+        covariance = mode_covariance(cameras, shown.alpha)
         self.mode_covariance_ = self._unit**2 * covariance
         return shown
+
+    def _table_model(self, frames: RigidFrames | PosteriorFrames) -> TableModel:
+        """Return the model of tables that belongs to a model of frames."""
+        return TableModel(
+            frames,
+            self.mean_shape_,
+            self.basis_,
+            self.layout,
+            getattr(self, "feature_names_in_", None),
+            None if self.scale_frames else self._unit,
+        )
+
+    def _describe(self, table: ScaledTable, frames: FrameFit) -> None:
+        """Set what is said of the fit of all frames, relative to their centroids."""
+        sizes, dtype = table.sizes, table.dtype
+        cameras = frames.motion / sizes[:, None, None]
+        position = frames.translation / sizes[:, None]
+        shapes = np.concatenate([self.mean_shape_[None], self.basis_])
+        self.inverse_snr_ = reprojection_error(
+            table.rows, shapes.transpose(0, 2, 1), cameras, position, frames.alpha
+        )
+        energy = image_energies(cameras, self.basis_, frames.alpha)
+        self.energy_share_ = energy / (energy.sum() or 1.0)
+        self.reference_motion_ = reference_camera(cameras, sizes).astype(dtype)
+        translation = frames.translation + table.translation
+        self.reference_translation_ = translation.mean(axis=0).astype(dtype)
+
+    def _keep_frames(self, table: ScaledTable, frames: FrameFit) -> None:
+        """Set what was found for each frame, in memory or in files, if it is wanted."""
+        translation = frames.translation + table.translation
+        kept = frames._replace(translation=translation).astype(table.dtype)
+        if isinstance(self.keep_frames, str | os.PathLike):
+            kept = kept.in_files(self.keep_frames)
+        if self.keep_frames:
+            self._frame_sizes = table.sizes
+            kept = FrameFit(*map(table.rows.spread, kept))
+            self.motion_, self.translation_, self.alpha_, deviation = kept
+            if self.refinement == "joint":
+                self.alpha_std_ = deviation
+
+    def _need_frames(self, what: str) -> None:
+        """Refuse what depends on the frames of the fit where they were not kept."""
+        if not hasattr(self, "motion_"):
+            raise ValueError(
+                f"{what} needs the cameras and coefficients of the fitted table; fit "
+                f"with keep_frames=True, got keep_frames={self.keep_frames!r}"
+            )
 
     def _converged(self, converged: bool, n_iter: int) -> None:
         """Set the number of steps, and warn where they were too few."""
@@ -777,65 +825,18 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 stacklevel=5,
             )
 
-    def _validated(self, X: Any) -> NDArray:
-        """Return a table for the fitted model as an array."""
-        check_is_fitted(self)
-        return validate_data(
-            self,
-            X,
-            dtype=[np.float64, np.float32],
-            ensure_all_finite="allow-nan",
-            reset=False,
-        )
-
-    def _sizes(self, centred: NDArray) -> NDArray:
-        """Return what frames are divided by before they are compared."""
-        if self.loss == "linear":
-            return weighting_sizes(centred, self.scale_frames)
-        sizes = robust_sizes(centred)
-        return (
-            sizes
-            if self.scale_frames
-            else np.full_like(sizes, np.sqrt(np.mean(sizes**2)))
-        )
-
-    def _usable(self, X: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the tracks of a valid table, and which of its frames are usable."""
-        names = getattr(self, "feature_names_in_", None)
-        tracks = clean_tracks(table_to_tracks(X, self.layout), self.layout, names)
-        return tracks, usable_frames(tracks)
-
-    def _sizes_like_fit(self, centred: NDArray) -> NDArray:
-        """Return the sizes of frames, or the one size of the fit for all."""
-        if self.scale_frames and len(centred):
-            return self._sizes(centred)
-        return np.full(len(centred), self._unit)
-
-    def _fit_frames(self, X: NDArray) -> FrameFit:
-        """Return the fit of the frames of a valid table."""
-        tracks, usable = self._usable(X)
-        frames = FrameFit.unknown(len(tracks), self.n_components)
-        if usable.any():
-            centred, translation = centred_tracks(tracks[usable])
-            fit = self._frames.fit(centred, self._sizes_like_fit(centred))
-            fit = fit._replace(translation=fit.translation + translation)
-            for whole, part in zip(frames, fit, strict=True):
-                whole[usable] = part
-        return frames
-
-    def _inverse_snr(self, tracks: NDArray, sizes: NDArray, frames: FrameFit) -> float:
-        """Return the inverse SNR of fitted frames, weighted as in the fit."""
-        shapes = compose(self.mean_shape_, self.basis_, frames.alpha)
-        model = project(shapes, frames.motion, frames.translation)
-        centred, _ = centred_tracks(tracks)
-        scale = sizes[:, None, None]
-        noise = np.nansum(((tracks - model) / scale) ** 2)
-        return float(noise / np.nansum((centred / scale) ** 2))
-
-
-def as_type(frames: FrameFit, dtype: Any) -> FrameFit:
-    """Return a fit in the type of the table."""
-    return FrameFit(*(part.astype(dtype, copy=False) for part in frames))
+    def _opened(self, X: Any, reset: bool = False) -> Table:
+        """Return a table, for the fit or for the fitted model, in blocks."""
+        if not reset:
+            check_is_fitted(self)
+        if is_stored(X) or is_on_dask(X):
+            validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
+            if is_on_dask(X):
+                return Table.on_dask(X)
+            return Table.stored(X, self.working_memory)
+        least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
+        X = validate_data(self, X, reset=reset, **CHECKS, **least)
+        return Table.in_memory(X, self.n_jobs if reset else 1, whole=not reset)
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

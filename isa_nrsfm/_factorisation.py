@@ -4,18 +4,54 @@ The rigid part is the factorisation of Tomasi and Kanade (1992); the non-rigid p
 is what the next 3K singular triplets hold (Brandt et al. 2018, section 3).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
-from scipy.sparse.linalg import svds
+
+from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._sampling import spread
 
 # A direction whose singular value is below this share of the first is null, whatever
 # the precision of the table: it has less than 1e-20 of the energy.
 NULL_DIRECTION = 1e-10
 # Where both sides of W are longer than this only the leading triplets are computed.
 DENSE = 1500
+# Directions beyond those that are wanted that the search for them follows, the most
+# passes over the matrix, and the gain of one, relative to what is left, that ends it.
+OVERSAMPLING = 10
+MOST_PASSES = 12
+CONVERGED = 1e-6
+# What is left counts as at least this share of the energy: rounding errors.
+ROUNDING = 1e-14
+# So many times its width is stacked before a triangular factor is made of it.
+STACKED = 6
+
+
+class Triplets(NamedTuple):
+    """
+    Leading singular values of a matrix, and their right vectors.
+
+    Attributes
+    ----------
+    values : ndarray of shape (k,)
+        Singular values, decreasing; fewer if the matrix does not have as many.
+    vectors : ndarray of shape (k, n_columns)
+        Their right singular vectors as rows. The left ones are ``W V / S``.
+    rest : float
+        Energy of the matrix outside these.
+    """
+
+    values: NDArray
+    vectors: NDArray
+    rest: float
+
+    @property
+    def rest_share(self) -> float:
+        """Share of the energy that is outside these."""
+        return float(self.rest / (np.sum(self.values**2) + self.rest))
 
 
 class Factorisation(NamedTuple):
@@ -51,7 +87,12 @@ class Factorisation(NamedTuple):
     rest: float
 
 
-def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factorisation:
+def factorise(
+    W: NDArray,
+    n_components: int,
+    precision: float = 0.0,
+    triplets: Triplets | None = None,
+) -> Factorisation:
     """
     Return the rigid and the non-rigid factors of a measurement matrix.
 
@@ -63,15 +104,20 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
         K, the number of basis shapes.
     precision : float, default=0.0
         Rounding error of the entries of W, relative to their root mean square.
+    triplets : Triplets, optional
+        The 3K + 3 leading triplets of a matrix of which W holds some of the frames, by
+        default of W.
 
     Returns
     -------
     Factorisation
-        The factors.
+        The factors; of the larger matrix those that belong to these frames.
     """
     n_points = W.shape[1]
     root = np.sqrt(n_points)
-    S, Vt, rest = leading_triplets(W, 3 * n_components + 3)
+    if triplets is None:
+        triplets = leading_triplets(W, 3 * n_components + 3)
+    S, Vt, rest = triplets
     null = max(NULL_DIRECTION, precision) * S[0]
     rank = int(np.sum(S > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
@@ -85,7 +131,7 @@ def factorise(W: NDArray, n_components: int, precision: float = 0.0) -> Factoris
     return Factorisation(W @ B_0.T / n_points, B_0, M, B, S, rest)
 
 
-def leading_triplets(W: NDArray, k: int) -> tuple[NDArray, NDArray, float]:
+def leading_triplets(W: NDArray, k: int) -> Triplets:
     """
     Return the largest singular values of a matrix, and their right vectors.
 
@@ -98,30 +144,131 @@ def leading_triplets(W: NDArray, k: int) -> tuple[NDArray, NDArray, float]:
 
     Returns
     -------
-    values : ndarray of shape (k,)
-        Singular values, decreasing; fewer if W does not have as many.
-    vectors : ndarray of shape (k, n_columns)
-        Their right singular vectors as rows. The left ones are ``W V / S``.
-    rest : float
-        Energy of W outside these.
+    Triplets
+        As of `block_triplets`.
+    """
+    return block_triplets(MemoryBlocks([W], [len(W)]), W.shape, k)
+
+
+def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Triplets:
+    """
+    Return the largest singular values of a matrix in blocks, and their right vectors.
+
+    Parameters
+    ----------
+    blocks : FrameBlocks
+        Blocks of the matrix (n_frames, ..., n_columns), each frame some of its rows.
+    shape : tuple of int
+        Numbers of its rows and columns.
+    k : int
+        How many are wanted.
+
+    Returns
+    -------
+    Triplets
+        The triplets.
 
     Notes
     -----
-    A W that is large both ways is not factorised as a whole: the subspace of its
-    leading right vectors comes from the Krylov method of ARPACK (Lehoucq, Sorensen,
-    Yang, "ARPACK users' guide", 1998), the triplets from W projected to it, so that
-    small singular values are as precise as the others.
+    The right singular vectors of a tall matrix are those of its triangular factor,
+    which is put together from those of the blocks (Demmel, Grigori, Hoemmen, Langou,
+    "Communication-optimal parallel and sequential QR and LU factorizations", 2012).
+
+    A matrix that is large both ways is not factorised as a whole: the subspace of its
+    leading right vectors comes from a block Krylov method (Golub, Van Loan, "Matrix
+    computations", 2013, section 10.3.6), the triplets from the matrix projected to it,
+    so that small singular values are as precise as the others.
     """
-    if min(W.shape) > max(DENSE, 4 * k):
-        start = np.linalg.norm(W, axis=0)  # the same whatever the order of the frames
-        V = svds(W, k, v0=start if len(W) > W.shape[1] else W @ start)[2].T
-        _, S, rotation = np.linalg.svd(W @ V, full_matrices=False)
-        rest = max(float(np.vdot(W, W) - S @ S), 0.0)
-        return S, rotation @ V.T, rest
-    # The left singular vectors are W V / S: the triangular factor has S and V.
-    R = np.linalg.qr(W, mode="r") if len(W) > W.shape[1] else W
-    _, S, Vt = np.linalg.svd(R, full_matrices=False)
-    return S[:k], Vt[:k], float(np.sum(S[k:] ** 2))
+    n_rows, n_columns = shape
+    if min(shape) > max(DENSE, 4 * k):
+        V = _leading_subspace(blocks, n_columns, k)
+        energy = sum(blocks.map(_energy))
+        _, S, rotation = np.linalg.svd(_triangle(blocks, k, V), full_matrices=False)
+        rest = max(float(energy - S @ S), 0.0)
+        return Triplets(S, rotation @ V.T, rest)
+    if n_rows > n_columns:
+        matrix = _triangle(blocks, n_columns)
+    else:
+        matrix = blocks.whole().reshape(-1, n_columns)
+    _, S, Vt = np.linalg.svd(matrix, full_matrices=False)
+    return Triplets(S[:k], Vt[:k], float(np.sum(S[k:] ** 2)))
+
+
+def _matrix(block: NDArray) -> NDArray:
+    """Return the rows of a block."""
+    return block.reshape(-1, block.shape[-1])
+
+
+def _energy(block: NDArray) -> float:
+    """Return the sum of the squares of a block."""
+    return float(np.vdot(block, block))
+
+
+def _first_half(block: NDArray) -> NDArray:
+    """Return the share of the energy of frames that is in the first half of them."""
+    square = block.reshape(len(block), -1) ** 2
+    energy = square.sum(axis=1)
+    half = square[:, : square.shape[1] // 2].sum(axis=1)
+    return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
+
+
+def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:
+    """Return the triangular factor of a tall matrix, or of its product with V."""
+    pending: list[NDArray] = []
+    for part in blocks.map(partial(_block_triangle, V=V)):
+        pending.append(part)
+        if sum(map(len, pending)) > STACKED * width:
+            pending = [_qr_factor(np.concatenate(pending))]
+    return _qr_factor(np.concatenate(pending))
+
+
+def _qr_factor(matrix: NDArray) -> NDArray:
+    """Return the triangular factor of a matrix."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"))
+
+
+def _block_triangle(block: NDArray, V: NDArray | None) -> NDArray:
+    """Return the triangular factor of a block, or the block if it is not tall."""
+    matrix = _matrix(block)
+    if V is not None:
+        matrix = matrix @ V
+    return _qr_factor(matrix) if len(matrix) > matrix.shape[1] else matrix
+
+
+def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
+    """
+    Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
+
+    It starts from those of some of the rows, and ends when another pass over the matrix
+    adds less than 1e-6 of what is left to the energy that is found.
+    """
+    width = k + OVERSAMPLING
+    n_frames = blocks.n_frames
+    # The same frames in whatever order they come.
+    order = np.argsort(np.concatenate(list(blocks.map(_first_half))), kind="stable")
+    sample = _matrix(blocks.take(np.sort(spread(order, min(n_frames, 4 * width)))))
+    last = np.linalg.qr(sample.T @ np.linalg.svd(sample @ sample.T)[0][:, :width])[0]
+    basis, products = last, np.zeros((n_columns, 0))
+    energy = sum(blocks.map(_energy))
+    found = 0.0
+    for _ in range(MOST_PASSES):
+        products = np.hstack([products, sum(blocks.map(partial(_squared, V=last)))])
+        gram = basis.T @ products
+        values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
+        before, found = found, float(values[-k:].sum())
+        if found - before <= CONVERGED * max(energy - found, ROUNDING * energy):
+            break
+        last = products[:, -width:]
+        for _ in range(2):  # twice is enough
+            last = np.linalg.qr(last - basis @ (basis.T @ last))[0]
+        basis = np.hstack([basis, last])
+    return basis @ axes[:, -k:]
+
+
+def _squared(block: NDArray, V: NDArray) -> NDArray:
+    """Return the product of a block's transpose, the block and V."""
+    matrix = _matrix(block)
+    return matrix.T @ (matrix @ V)
 
 
 def orientations(rows: NDArray) -> NDArray:

@@ -5,16 +5,25 @@ There are two models of a frame: `RigidFrames`, the paper's, takes the camera of
 rigid fit, `PosteriorFrames` the most probable camera and coefficients.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._camera import rigid_cameras
-from isa_nrsfm._frame_posterior import FramePosterior, fit_posterior
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_posterior import FramePosterior, fit_posterior, fit_prepared
+from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._independent_gauge import FrameMap
+from isa_nrsfm._joint_frames import JointFrames
 from isa_nrsfm._robust import distant_points, robust_weights
 from isa_nrsfm._tracks import measurement_matrix, seen_points
+
+if TYPE_CHECKING:
+    import os
 
 # A basis shape whose image has less than this share of the energy that the camera could
 # show of it is seen end on: its image is rounding errors.
@@ -44,6 +53,28 @@ class FrameFit(NamedTuple):
     translation: NDArray
     alpha: NDArray
     alpha_std: NDArray
+
+    def astype(self, dtype: Any) -> "FrameFit":
+        """Return the fit in another type of numbers."""
+        return type(self)(*(part.astype(dtype, copy=False) for part in self))
+
+    @classmethod
+    def of_blocks(cls, parts: "Iterable[FrameFit]") -> "FrameFit":
+        """Return the fits of consecutive blocks of frames as one."""
+        parts = list(parts)
+        if len(parts) == 1:
+            return parts[0]
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def in_files(self, folder: "str | os.PathLike[str]") -> "FrameFit":
+        """Return the fit as memory maps of files in a folder, named like the parts."""
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
+        for name, part in self._asdict().items():
+            np.save(path / f"{name}.npy", part)
+        return type(self)(
+            *(np.load(path / f"{name}.npy", mmap_mode="r") for name in self._fields)
+        )
 
     @classmethod
     def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":
@@ -198,6 +229,29 @@ class PosteriorFrames(NamedTuple):
         translation = posterior.translation * sizes[:, None]
         return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
 
+    def prepared_posterior(self, block: list[FrameTracks]) -> FramePosterior:
+        """
+        Return the fit of frames that are ready for products, before the gauge.
+
+        Parameters
+        ----------
+        block : list of FrameTracks
+            Frames of size one, in the coordinates of the shapes, of which each point
+            counts alike.
+
+        Returns
+        -------
+        FramePosterior
+            The fit, that of `posterior`.
+        """
+        fits = [
+            fit_prepared(part, self.shapes, self.noise_variance, starts=self.starts)
+            for part in block
+        ]
+        if len(fits) == 1:
+            return fits[0]
+        return FramePosterior(*map(np.concatenate, zip(*fits, strict=True)))
+
     def posterior(self, tracks: NDArray) -> FramePosterior:
         """Return the fit of frames of size one, before the gauge."""
         if self.loss == "linear":
@@ -234,6 +288,115 @@ class PosteriorFrames(NamedTuple):
             for whole, values in zip(fit, refit, strict=True):
                 whole[changing] = values
         return fit
+
+
+def posterior_blocks(
+    model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
+) -> FrameBlocks:
+    """
+    Return the fits of all frames of a table, before the gauge.
+
+    Parameters
+    ----------
+    model : PosteriorFrames
+        The model of a frame.
+    frames : JointFrames
+        The frames as the joint refinement took them.
+    rows : FrameBlocks
+        The frames themselves (n_frames, 2, n_points), NaN where a point is missing.
+
+    Returns
+    -------
+    FrameBlocks
+        Blocks of FramePosterior.
+    """
+    if model.loss != "linear":
+        return rows.derive(partial(_row_posterior, model=model))
+    shapes = frames.coordinates(model.shapes)
+    return frames.blocks.derive(model._replace(shapes=shapes).prepared_posterior)
+
+
+def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
+    """Return the fit of frames (n_frames, 2, n_points) of size one."""
+    return model.posterior(rows.transpose(0, 2, 1))
+
+
+def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return what a gauge needs to know of the fits of frames.
+
+    Parameters
+    ----------
+    posteriors : FrameBlocks
+        Blocks of FramePosterior.
+
+    Returns
+    -------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    covariance : ndarray of shape (n_components, n_components)
+        Mean of their covariances.
+    """
+    motion, alpha, covariance = zip(*posteriors.map(_moments), strict=True)
+    total = np.sum(covariance, axis=0) / posteriors.n_frames
+    return np.concatenate(motion), np.concatenate(alpha), total
+
+
+def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
+    """Return cameras, coefficients and the sum of their covariances of a block."""
+    return posterior.motion, posterior.alpha, posterior.covariance.sum(axis=0)
+
+
+def reprojection_error(
+    rows: FrameBlocks,
+    shapes: NDArray,
+    motion: NDArray,
+    position: NDArray,
+    alpha: NDArray,
+) -> float:
+    """
+    Return the inverse SNR of the images of shapes.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of centred frames (n_frames, 2, n_points), NaN where a point is missing.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    position : ndarray of shape (n_frames, 2)
+        Images of the origin.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    float
+        ``||W - What||_F^2 / ||W||_F^2`` over the points that are seen.
+    """
+    stacked = shapes.reshape(-1, shapes.shape[2])
+    energies = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
+    noise, signal = np.sum(list(energies), axis=0)
+    return float(noise / signal)
+
+
+def _energies(
+    rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
+) -> tuple[float, float]:
+    """Return the energy of what shapes leave of frames, and that of the frames."""
+    images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
+    images += position[:, :, None]
+    np.subtract(rows, images, out=images)
+    return _energy(images), _energy(rows)
+
+
+def _energy(rows: NDArray) -> float:
+    """Return the sum of the squares of numbers, of those that are not NaN."""
+    energy = float(np.vdot(rows, rows))
+    return float(np.nansum(rows**2)) if np.isnan(energy) else energy
 
 
 def distances(
@@ -273,6 +436,27 @@ def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:
     """Set camera, position and coefficients of some frames."""
     for whole, part in zip(fit, values, strict=False):
         whole[frames] = part
+
+
+def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
+    """
+    Return the motion of the mean shape and the basis shapes.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (2 * n_frames, 3 * n_components + 3)
+        ``(1, alpha_i) (x) M_i``, whose product with the stacked shapes
+        (3 * n_components + 3, n_points) is the measurement matrix.
+    """
+    c = np.concatenate([np.ones((len(alpha), 1)), alpha], axis=1)
+    return np.einsum("ik,irc->irkc", c, motion).reshape(2 * len(alpha), -1)
 
 
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frame_products import (
     FrameGram,
     FrameProducts,
+    FrameTracks,
     SharedGram,
     determines_camera,
     frame_products,
@@ -155,9 +156,146 @@ def fit_posterior(
         fewer than four points of a solid) do not determine a camera and have NaN.
     """
     tracks = np.asarray(tracks)
-    n_frames, n_components = len(tracks), len(shapes) - 1
     missing = np.isnan(tracks[..., 0]) | np.isnan(tracks[..., 1])
     seen = np.where(missing, 0.0, 1.0 if weights is None else weights)
+    return _best_fits(
+        _Tracks(tracks, seen),
+        shapes,
+        noise_variance,
+        initial=initial,
+        starts=starts,
+        camera_precision=camera_precision,
+        max_steps=max_steps,
+    )
+
+
+def fit_prepared(
+    frames: FrameTracks,
+    shapes: NDArray,
+    noise_variance: NDArray | float,
+    *,
+    initial: NDArray | None = None,
+    starts: NDArray | None = None,
+    max_steps: int = MAX_STEPS,
+) -> FramePosterior:
+    """
+    Return the fits of `fit_posterior` for frames that are ready for products.
+
+    Parameters
+    ----------
+    frames : FrameTracks
+        The frames. They may be given in other coordinates than points: what counts is
+        their inner products with the shapes.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes in these coordinates; centred if they are points.
+    noise_variance, initial, starts, max_steps
+        As of `fit_posterior`.
+
+    Returns
+    -------
+    FramePosterior
+        The best fit of each frame.
+    """
+    return _best_fits(
+        _Prepared(frames),
+        shapes,
+        noise_variance,
+        initial=initial,
+        starts=starts,
+        max_steps=max_steps,
+    )
+
+
+class _Tracks(NamedTuple):
+    """Frames that are given by their tracks."""
+
+    tracks: NDArray  # (n_frames, n_points, 2)
+    weights: NDArray  # (n_frames, n_points)
+
+    @property
+    def n_points(self) -> float:
+        """Number of points of a frame."""
+        return self.weights.shape[1]
+
+    @property
+    def weight(self) -> NDArray:
+        """Sum of the weights of each frame."""
+        return self.weights.sum(axis=1)
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(self.tracks[frames], self.weights[frames])
+
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+        """Yield blocks of the frames that determine a camera, and their products."""
+        tracks, weights = self
+        complete = (weights == 1.0).all(axis=1)
+        frames = np.flatnonzero(complete)
+        for first in range(0, len(frames), COMPLETE_BLOCK):
+            block = frames[first : first + COMPLETE_BLOCK]
+            yield block, frame_products(frame_tracks(tracks[block]), shapes)
+        frames = np.flatnonzero(~complete)
+        for first in range(0, len(frames), WEIGHTED_BLOCK):
+            block = frames[first : first + WEIGHTED_BLOCK]
+            part = frame_tracks(tracks[block], weights[block])
+            yield _determined(block, frame_products(part, shapes), shapes)
+
+
+class _Prepared(NamedTuple):
+    """Frames that are ready for products."""
+
+    frames: FrameTracks
+
+    @property
+    def n_points(self) -> float:
+        """Number of points of a frame, also where it is given in other coordinates."""
+        if self.frames.weights is None:
+            return self.frames.weight[0]
+        return len(self.frames.weights)
+
+    @property
+    def weight(self) -> NDArray:
+        """Sum of the weights of each frame."""
+        return self.frames.weight
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(self.frames.take(frames))
+
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+        """Yield blocks of the frames that determine a camera, and their products."""
+        complete = self.frames.weights is None
+        length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
+        for first in range(0, len(self.weight), length):
+            block = np.arange(first, min(first + length, len(self.weight)))
+            part = self.frames.take(slice(first, first + length))
+            products = frame_products(part, shapes)
+            yield (
+                (block, products) if complete else _determined(block, products, shapes)
+            )
+
+
+def _determined(
+    frames: NDArray, products: FrameProducts, shapes: NDArray
+) -> tuple[NDArray, FrameProducts]:
+    """Return those of some frames that determine a camera, and their products."""
+    usable = np.flatnonzero(determines_camera(products, shapes[0]))
+    return frames[usable], products.take(usable)
+
+
+def _best_fits(
+    frames: _Tracks | _Prepared,
+    shapes: NDArray,
+    noise_variance: NDArray | float,
+    *,
+    initial: NDArray | None,
+    starts: NDArray | None,
+    camera_precision: NDArray | None = None,
+    max_steps: int,
+) -> FramePosterior:
+    """Return the best fits of `fit_posterior`."""
+    weight, n_components = frames.weight, len(shapes) - 1
+    n_frames = len(weight)
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
     first = np.zeros((n_frames, n_components)) if initial is None else initial
     extra = np.zeros((0, n_components)) if starts is None else np.asarray(starts)
@@ -166,17 +304,19 @@ def fit_posterior(
     if camera_precision is not None:
         prior = space @ camera_precision @ space.T
 
-    def fit(frames: NDArray, initial: NDArray, max_steps: int) -> FramePosterior:
-        given = tracks[frames], seen[frames], variance[frames], initial
-        return _fit(*given, white, prior, max_steps)
+    def fit(chosen: NDArray | None, initial: NDArray, max_steps: int) -> FramePosterior:
+        if chosen is None:
+            return _fit(frames, variance, initial, white, prior, max_steps)
+        part = frames.take(chosen), variance[chosen], initial
+        return _fit(*part, white, prior, max_steps)
 
-    fits = fit(np.arange(n_frames), first, min(FIRST_STEPS, max_steps))
+    fits = fit(None, first, min(FIRST_STEPS, max_steps))
     if max_steps > FIRST_STEPS:
         # The few frames that take longer are brought together: short rows are slow.
         slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
         if len(slow):
             _put(fits, slow, fit(slow, fits.alpha[slow], max_steps))
-    poor = np.flatnonzero(_poorly_explained(fits, seen, variance))
+    poor = np.flatnonzero(_poorly_explained(fits, weight, variance))
     if len(extra) and len(poor):
         number = np.repeat(np.arange(len(extra)), len(poor))
         others = fit(np.tile(poor, len(extra)), extra[number], max_steps)
@@ -192,8 +332,7 @@ def fit_posterior(
 
 
 def _fit(
-    tracks: NDArray,
-    seen: NDArray,
+    frames: _Tracks | _Prepared,
     variance: NDArray,
     initial: NDArray,
     shapes: NDArray,
@@ -212,11 +351,11 @@ def _fit(
         converged=np.zeros(n_frames, dtype=bool),
         start=np.full(n_frames, -1),
     )
-    for frames, products in _frame_blocks(tracks, seen, shapes):
-        problem = _problem(products, variance[frames], prior, tracks.shape[1])
-        first = np.ascontiguousarray(initial[frames].T)
+    for block, products in frames.blocks(shapes):
+        problem = _problem(products, variance[block], prior, frames.n_points)
+        first = np.ascontiguousarray(initial[block].T)
         alpha, converged = _descend(problem, first, max_steps)
-        _write(fits, frames, products, problem, alpha, converged, prior)
+        _write(fits, block, products, problem, alpha, converged, prior)
     return fits
 
 
@@ -259,23 +398,6 @@ def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
     return alpha[chosen]
 
 
-def _frame_blocks(
-    tracks: NDArray, weights: NDArray, shapes: NDArray
-) -> Iterator[tuple[NDArray, FrameProducts]]:
-    """Yield blocks of the frames that determine a camera, and their products."""
-    complete = (weights == 1.0).all(axis=1)
-    frames = np.flatnonzero(complete)
-    for first in range(0, len(frames), COMPLETE_BLOCK):
-        block = frames[first : first + COMPLETE_BLOCK]
-        yield block, frame_products(frame_tracks(tracks[block]), shapes)
-    frames = np.flatnonzero(~complete)
-    for first in range(0, len(frames), WEIGHTED_BLOCK):
-        block = frames[first : first + WEIGHTED_BLOCK]
-        products = frame_products(frame_tracks(tracks[block], weights[block]), shapes)
-        usable = np.flatnonzero(determines_camera(products, shapes[0]))
-        yield block[usable], products.take(usable)
-
-
 class _Problem(NamedTuple):
     """What the search for n frames needs, shapes in white space."""
 
@@ -297,7 +419,7 @@ class _Problem(NamedTuple):
 
 
 def _problem(
-    products: FrameProducts, variance: NDArray, prior: NDArray, n_points: int
+    products: FrameProducts, variance: NDArray, prior: NDArray, n_points: float
 ) -> _Problem:
     """Return the problem with its ridges, each relative to the frame."""
     energy, weight = products.energy, products.weight
@@ -357,7 +479,7 @@ def _write(
 
 
 def _poorly_explained(
-    fits: FramePosterior, seen: NDArray, variance: NDArray
+    fits: FramePosterior, weight: NDArray, variance: NDArray
 ) -> NDArray:
     """
     Return whether objectives are much larger than the noise explains.
@@ -366,7 +488,7 @@ def _poorly_explained(
     model. With the true camera and shape it is chi-squared with two degrees of freedom
     a point, less the eight of camera and position.
     """
-    freedom = np.maximum(2.0 * seen.sum(axis=1) - 8.0, 1.0)
+    freedom = np.maximum(2.0 * weight - 8.0, 1.0)
     return fits.objective > SUSPICIOUS * variance * freedom
 
 

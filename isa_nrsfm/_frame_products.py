@@ -170,6 +170,16 @@ class FrameTracks(NamedTuple):
     weight: NDArray
     energy: NDArray
 
+    def take(self, frames: NDArray | slice) -> Self:
+        """Return some of the frames."""
+        return type(self)(
+            self.weighted[..., frames],
+            None if self.weights is None else self.weights[..., frames],
+            self.centroid[:, frames],
+            self.weight[frames],
+            self.energy[frames],
+        )
+
 
 class FrameProducts(NamedTuple):
     """
@@ -239,6 +249,20 @@ def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks
     weighted = centred * W[:, None]
     energy = np.einsum("jri,jri->i", weighted, centred)
     return FrameTracks(weighted, W, centroid, weight, energy)
+
+
+def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
+    """Return frames of several blocks, all with weights or none, as one block."""
+    if len(parts) == 1:
+        return parts[0]
+    weighted, weights, centroid, weight, energy = zip(*parts, strict=True)
+    return FrameTracks(
+        np.concatenate(weighted, axis=-1),
+        None if weights[0] is None else np.concatenate(weights, axis=-1),
+        np.concatenate(centroid, axis=-1),
+        np.concatenate(weight),
+        np.concatenate(energy),
+    )
 
 
 def _share(weight: NDArray) -> NDArray:

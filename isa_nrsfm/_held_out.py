@@ -15,15 +15,15 @@ N_FOLDS = 5
 FOLD_SEED = 0
 
 
-def held_out_error(
+def held_out_energies(
     frames: RigidFrames | PosteriorFrames,
     mean_shape: NDArray,
     basis: NDArray,
     tracks: NDArray,
     sizes: NDArray,
-) -> float:
+) -> tuple[float, float]:
     """
-    Return the inverse SNR of points that are held out of the fit of their frame.
+    Return the energy of the error, and of the signal, of points that are held out.
 
     The points are divided into five parts, the same for all frames and tables. Each
     part is predicted from the others, frame by frame: camera, position and coefficients
@@ -44,10 +44,10 @@ def held_out_error(
 
     Returns
     -------
-    float
-        ``sum ||m - mhat||^2 / sum ||m - centroid_i||^2`` over the points, in units of
-        the sizes. Points whose frame is not determined by the others are left out; NaN
-        if that leaves none.
+    noise, signal : float
+        ``sum ||m - mhat||^2`` and ``sum ||m - centroid_i||^2`` over the points, in
+        units of the sizes. Points whose frame is not determined by the others are left
+        out.
     """
     n_points = tracks.shape[1]
     folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
@@ -68,4 +68,4 @@ def held_out_error(
         counted = seen[np.ix_(usable, held)] & np.isfinite(model).all(axis=2)
         noise += np.sum((weight * (part[:, held] - model) ** 2)[counted])
         signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
-    return float(noise / signal) if signal > 0 else float("nan")
+    return float(noise), float(signal)

@@ -11,6 +11,7 @@ first, and taken if it brings them nearer. Otherwise the free fit is taken, unle
 cameras are much farther from orthographic ones than those of the rigid fit.
 """
 
+from functools import cached_property, partial
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -19,12 +20,21 @@ from sklearn.utils.parallel import _threadpool_controller_decorator
 
 from isa_nrsfm._camera import rigid_cameras
 from isa_nrsfm._factorisation import Factorisation, orientations
-from isa_nrsfm._frame_fit import RigidFrames, compose, project
-from isa_nrsfm._frame_posterior import fit_posterior
-from isa_nrsfm._joint_refinement import JointResult, JointState, refine_joint
-from isa_nrsfm._marginal_likelihood import MarginalLikelihood
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_fit import RigidFrames, compose, project, stacked_motion
+from isa_nrsfm._frame_posterior import fit_prepared
+from isa_nrsfm._frame_products import FrameTracks
+from isa_nrsfm._joint_frames import JointFrames
+from isa_nrsfm._joint_refinement import (
+    JointResult,
+    JointState,
+    refine_joint,
+    regular,
+)
+from isa_nrsfm._marginal_likelihood import MarginalLikelihood, totals
 from isa_nrsfm._metric import anisotropy
 from isa_nrsfm._robust import ROUNDING, median_noise, robust_weights
+from isa_nrsfm._sampling import SMALL_TABLE, Sample, rigid_energy
 from isa_nrsfm._tracks import seen_points
 
 # Price of the basis shapes, per unit of the energy that they move in an image whose
@@ -42,14 +52,14 @@ DRIFTED = 1.5
 TOO_STIFF = 4.0
 # A stiff fit that leaves more than this share of what a rigid one leaves does not move.
 STILL_MOVING = 0.5
-# With more frames than that the first steps are made on so many of them, the next ones
-# on so many times more, and the last ones on all.
-SAMPLE_FRAMES = 600
-GROWTH = 4
 # Steps of the fit of frames that then brings the cameras of all frames close.
 ALIGNING_STEPS = 2
-# In tables with fewer coordinates than this several starts are tried.
-SMALL_TABLE = 150_000
+# Complete frames with more points than so many times the rows of all shapes are given
+# by directions, to which so many times at most those of a step in all points are added.
+WIDE = 8
+WIDENINGS = 20
+# Singular values of shapes below this share of the largest are rounding errors.
+FLAT = 1e-12
 N_RANDOM_STARTS = 6
 # Tables of few frames are refined to this share of the tolerance: it costs little, and
 # the noise of many points can be small enough to need it.
@@ -90,6 +100,8 @@ class JointFit(NamedTuple):
         As in `JointResult`.
     converged : bool
         Whether the refinement has converged.
+    frames : JointFrames
+        The frames as they were fitted in the end.
     """
 
     shapes: NDArray
@@ -99,17 +111,19 @@ class JointFit(NamedTuple):
     history: NDArray
     gradient_norm: float
     converged: bool
+    frames: JointFrames
 
 
 # The products are of small blocks: more threads would wait for each other.
 @_threadpool_controller_decorator(limits=1, user_api="blas")
 def fit_jointly(
-    tracks: NDArray,
-    outliers: NDArray,
-    W: NDArray,
+    rows: FrameBlocks,
+    n_seen: NDArray,
+    sample: Sample,
     factors: Factorisation,
     paper_shapes: NDArray,
     *,
+    outliers: NDArray | None = None,
     loss: str,
     stiffness: float | None,
     random_state: np.random.RandomState,
@@ -121,16 +135,20 @@ def fit_jointly(
 
     Parameters
     ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Centred tracks, each divided by the size of its frame; NaN where missing.
-    outliers : ndarray of bool, shape (n_frames, n_points)
-        Points that are left out at first; a robust loss takes them in again.
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix, completed where points are missing or outliers.
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
+        NaN where a point is missing.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that each frame shows.
+    sample : Sample
+        The frames that the first steps are made on.
     factors : Factorisation
-        Of W.
+        Of their measurement matrix.
     paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes of the paper's pipeline.
+    outliers : ndarray of bool, shape (n_frames, n_points), optional
+        Points that are left out at first and that a robust loss takes in again; to be
+        given with such a loss.
     loss : {"linear", "huber", "cauchy"}
         How points count that are far from the model.
     stiffness : float or None
@@ -148,28 +166,44 @@ def fit_jointly(
     JointFit
         The fit of lowest objective for the stiffness that is given or chosen.
     """
-    seen = seen_points(tracks)
-    used = seen & ~outliers
-    problem = _Problem(W, tracks, None if used.all() else used * 1.0, max_iter, tol)
-    small = W.size < SMALL_TABLE
-    problems = [problem] if small else _growing(problem, factors)
-    sample = problems[0]
-    starts = _starts(sample, factors, paper_shapes, random_state if small else None)
+    n_shapes, _, n_points = paper_shapes.shape
+    complete = bool((n_seen == n_points).all())
+    wide = complete and loss == "linear" and n_points > WIDE * 3 * n_shapes
+    if wide:
+        frames = JointFrames.along(rows, _directions(factors))
+    elif loss == "linear":
+        frames = JointFrames.of_points(rows, complete)
+    else:
+        used = seen_points(rows.whole().transpose(0, 2, 1))
+        if outliers is not None:
+            used &= ~outliers
+        weights = None if used.all() else used * 1.0
+        frames = JointFrames.of_points(rows, complete, weights)
+    problems = [
+        _Problem(frames.take(part), sample.W, max_iter, tol) for part in sample.parts
+    ]
+    problem = _Problem(frames, sample.W, max_iter, tol)
+    problems.append(problem)
+    first = problems[0]
+    small = sample.W.size < SMALL_TABLE
+    starts = _starts(first, factors, paper_shapes, random_state if small else None)
     rigid = _Rigid.of(sample.W, factors)
-    best, price = _best(sample, starts, rigid, stiffness)
+    best, price = _best(first, starts, rigid, stiffness)
     best = _finished(best, problems, price)
     if stiffness is None and price == 0 and rigid.ratio(best) > DRIFTED:
-        stiff = sample.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
+        stiff = first.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
         stiff = _finished(stiff, problems, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
+    if wide:
+        best, problem = _widened(best, problem, rows, price)
     noise, n_fitted = best.state.noise, 0
     if loss != "linear":
         # The scale of the noise is that of the residual with the coefficients fitted.
-        best, noise = _reweighted(problem, best, loss, price)
-        n_fitted = len(paper_shapes) - 1
-    shapes = best.state.shapes
-    noise *= _freedom_correction(seen, len(shapes), n_fitted)
+        best, noise = _reweighted(problem, rows, used, best, loss, price)
+        n_fitted = n_shapes - 1
+    shapes = problem.frames.points(best.state.shapes)
+    noise *= _freedom_correction(n_seen, n_points, n_shapes, n_fitted)
     return JointFit(
         shapes - shapes.mean(axis=2, keepdims=True),
         best.alpha,
@@ -178,7 +212,55 @@ def fit_jointly(
         best.history,
         best.gradient_norm,
         best.converged,
+        problem.frames,
     )
+
+
+def _directions(factors: Factorisation) -> NDArray:
+    """Return orthonormal directions (n_directions, n_points) of all factors."""
+    shapes = np.concatenate([factors.rigid_shape, factors.signals])
+    shapes = shapes[shapes.any(axis=1)]
+    return shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+
+
+def _widened(
+    result: JointResult, problem: "_Problem", rows: FrameBlocks, stiffness: float
+) -> tuple[JointResult, "_Problem"]:
+    """
+    Return the refinement in all points of one along some directions, and its problem.
+
+    The shapes that the frames ask for, with cameras and coefficients as they are, are
+    those of a step of expectation maximisation. Together with those of before they give
+    the directions for the next refinement, until there is nothing to gain.
+    """
+    tol = problem.final_tol
+    for _ in range(WIDENINGS):
+        state = result.state
+        before = problem.frames.points(state.shapes)
+        passed = problem.likelihood(stiffness)(*state)
+        curvature = regular(passed.shape_curvature)[0]
+        pulled = sum(
+            rows.map(_pulled, state.motion.transpose(2, 0, 1), passed.alpha.T)
+        ).reshape(len(curvature), -1)
+        after = np.linalg.solve(curvature, pulled)
+        change = after - before.reshape(after.shape)
+        gain = float(np.vdot(change, curvature @ change)) / state.noise
+        if gain < tol * problem.frames.n_frames:
+            break
+        both = np.concatenate([after, before.reshape(after.shape)])
+        _, size, directions = np.linalg.svd(both, full_matrices=False)
+        frames = JointFrames.along(rows, directions[size > FLAT * size[0]])
+        problem = problem.of(frames)
+        shapes = frames.coordinates(after.reshape(before.shape))
+        refined = problem.refined(state._replace(shapes=shapes), stiffness, tol)
+        history = np.concatenate([result.history, refined.history])
+        result = refined._replace(history=history)
+    return result, problem
+
+
+def _pulled(rows: NDArray, motion: NDArray, alpha: NDArray) -> NDArray:
+    """Return ``sum_i (c_i (x) M_i)^T W_i`` of a block."""
+    return stacked_motion(motion, alpha).T @ rows.reshape(2 * len(rows), -1)
 
 
 class _Rigid(NamedTuple):
@@ -191,7 +273,7 @@ class _Rigid(NamedTuple):
     def of(cls, W: NDArray, factors: Factorisation) -> Self:
         """Return the cameras' anisotropy, and what the rigid shape leaves of W."""
         cameras = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
-        return cls(cameras, float(np.mean(_rigid_rest(W, factors) ** 2)))
+        return cls(cameras, _rigid_noise(W, factors.rigid_shape))
 
     def ratio(self, result: JointResult) -> float:
         """Return the anisotropy of a refinement's cameras relative to these."""
@@ -199,10 +281,10 @@ class _Rigid(NamedTuple):
         return cameras / self.anisotropy if self.anisotropy > 0 else 1.0
 
 
-def _rigid_rest(W: NDArray, factors: Factorisation) -> NDArray:
-    """Return what a measurement matrix has beside its projection to the rigid shape."""
-    shape = factors.rigid_shape
-    return W - W @ np.linalg.pinv(shape, rcond=1e-10) @ shape
+def _rigid_noise(W: NDArray, shape: NDArray) -> float:
+    """Return the mean square that a rigid shape leaves of a measurement matrix."""
+    rows = W.reshape(len(W) // 2, 2, -1)
+    return float(rigid_energy(rows, shape).sum()) / W.size
 
 
 def _best(
@@ -233,33 +315,10 @@ def _finished(
         state = result.state
         if problem is not problems[0]:
             state = problem.aligned(state)
-        few = problem is problems[-1] and len(problem.tracks) <= FEW_FRAMES
-        share = POLISH if few and state.noise > NOISELESS else 1.0
-        result = problem.refined(state, stiffness, tol=share * problem.tol)
+        last = problem is problems[-1]
+        tol = problem.final_tol if last else problem.tol
+        result = problem.refined(state, stiffness, tol)
     return result
-
-
-def _growing(problem: "_Problem", factors: Factorisation) -> list["_Problem"]:
-    """Return problems of more and more of the frames, the last of all."""
-    n_frames = len(problem.tracks)
-    order = _by_rigidity(problem.W, factors)
-    problems: list[_Problem] = []
-    n = SAMPLE_FRAMES
-    while n < (n_frames if not problems else n_frames / 2):
-        problems.append(problem.take(_spread(order, n)))
-        n *= GROWTH
-    return [*problems, problem]
-
-
-def _by_rigidity(W: NDArray, factors: Factorisation) -> NDArray:
-    """Return the frames from the most to the least rigid one."""
-    rest = _rigid_rest(W, factors).reshape(len(W) // 2, -1)
-    return np.argsort(np.sum(rest**2, axis=1), kind="stable")
-
-
-def _spread(order: NDArray, n: int) -> NDArray:
-    """Return n of the frames at equal distances in an order."""
-    return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
 
 
 def _starts(
@@ -285,12 +344,17 @@ def _starts(
 
 
 def _reweighted(
-    problem: "_Problem", result: JointResult, loss: str, stiffness: float
+    problem: "_Problem",
+    rows: FrameBlocks,
+    used: NDArray,
+    result: JointResult,
+    loss: str,
+    stiffness: float,
 ) -> tuple[JointResult, float]:
     """Return the refinement with weights of a robust loss, and the noise variance."""
-    tracks = problem.tracks
+    tracks = rows.whole().transpose(0, 2, 1)
     seen = seen_points(tracks)
-    weights = np.zeros(seen.shape)
+    counted, weights = used * 1.0, np.zeros(seen.shape)
     for _ in range(REWEIGHTINGS):
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
@@ -300,7 +364,6 @@ def _reweighted(
             np.zeros(2),
         )
         rest = np.where(seen[..., None], tracks - model, 0.0)
-        counted = problem.weights if problem.weights is not None else seen * 1.0
         position = np.einsum("ij,ijc->ic", counted, rest)
         rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
         distance = np.linalg.norm(rest, axis=2)
@@ -309,12 +372,15 @@ def _reweighted(
         weights[seen] = robust_weights(loss, distance[seen] / deviation)
         if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
             break
-        problem = _Problem(problem.W, tracks, weights, problem.max_iter, problem.tol)
-        result = problem.refined(result.state, stiffness)
+        problem = problem.of(JointFrames.of_points(rows, False, weights))
+        counted = weights
+        result = problem.refined(result.state, stiffness, problem.tol)
     return result, deviation**2
 
 
-def _freedom_correction(seen: NDArray, n_shapes: int, n_fitted: int) -> float:
+def _freedom_correction(
+    n_seen: NDArray, n_points: int, n_shapes: int, n_fitted: int
+) -> float:
     """
     Return numbers seen divided by the degrees of freedom of the residual.
 
@@ -323,12 +389,11 @@ def _freedom_correction(seen: NDArray, n_shapes: int, n_fitted: int) -> float:
     out take none, those that are fitted to a frame take one each. At least a tenth of
     the numbers counts as free.
     """
-    n_frames, n_points = seen.shape
-    n_seen = 2.0 * seen.sum()
+    n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
     unknowns = (
         (8 + n_fitted) * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     )
-    return float(n_seen / max(n_seen - unknowns, 0.1 * n_seen))
+    return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))
 
 
 def lifted_directions(factors: Factorisation, n_directions: int) -> NDArray:
@@ -394,66 +459,75 @@ def lifted_shapes(factors: Factorisation, directions: NDArray) -> NDArray:
 class _Problem:
     """The joint refinement of some frames, from given shapes."""
 
-    def __init__(
-        self,
-        W: NDArray,
-        tracks: NDArray,
-        weights: NDArray | None,
-        max_iter: int,
-        tol: float,
-    ):
-        self.W, self.tracks, self.weights = W, tracks, weights
+    def __init__(self, frames: JointFrames, W: NDArray, max_iter: int, tol: float):
+        self.frames, self.W = frames, W
         self.max_iter, self.tol = max_iter, tol
 
-    def take(self, frames: NDArray) -> Self:
-        """Return the problem of some of the frames."""
-        W = self.W.reshape(len(self.tracks), 2, -1)[frames].reshape(-1, self.W.shape[1])
-        weights = None if self.weights is None else self.weights[frames]
-        return type(self)(W, self.tracks[frames], weights, self.max_iter, self.tol)
+    @property
+    def final_tol(self) -> float:
+        """The tolerance of the last steps: with few frames they cost little."""
+        return self.tol * (POLISH if self.frames.n_frames <= FEW_FRAMES else 1.0)
+
+    def of(self, frames: JointFrames) -> Self:
+        """Return the problem of the same frames in other coordinates or weights."""
+        return type(self)(frames, self.W, self.max_iter, self.tol)
 
     def start(self, shapes: NDArray) -> JointState:
         """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
         motion = rigid_cameras(self.W, shapes[0].T)
-        rest = self.W - motion.reshape(-1, 3) @ shapes[0]
-        noise = FIRST_NOISE * float(np.mean(rest**2))
+        noise = FIRST_NOISE * _rigid_noise(self.W, shapes[0])
+        shapes = self.frames.coordinates(shapes)
         return JointState(shapes, motion.transpose(1, 2, 0), noise)
 
     def scaled(self, shapes: NDArray) -> NDArray:
         """Return shapes whose coefficients, with rigid cameras, have unit variance."""
         frames = RigidFrames(shapes[0].T, shapes[1:].transpose(0, 2, 1))
-        tracks = self.W.reshape(len(self.tracks), 2, -1).transpose(0, 2, 1)
+        tracks = self.W.reshape(len(self.W) // 2, 2, -1).transpose(0, 2, 1)
         size = frames.fit(tracks, np.ones(len(tracks))).alpha.std(axis=0)
         return np.concatenate([shapes[:1], size[:, None, None] * shapes[1:]])
 
     def aligned(self, state: JointState) -> JointState:
         """Return a state with cameras close to the best for its shapes and noise."""
-        shapes = state.shapes - state.shapes.mean(axis=2, keepdims=True)
-        fit = fit_posterior(
-            self.tracks,
-            shapes,
-            state.noise,
-            weights=self.weights,
-            max_steps=ALIGNING_STEPS,
-        )
-        return JointState(shapes, fit.motion.transpose(1, 2, 0), state.noise)
+        shapes = state.shapes
+        if self.frames.directions is None:
+            shapes = shapes - shapes.mean(axis=2, keepdims=True)
+        aligned = partial(_aligned_cameras, shapes=shapes, noise=state.noise)
+        motion = np.concatenate(list(self.frames.blocks.map(aligned)))
+        return JointState(shapes, motion.transpose(1, 2, 0), state.noise)
+
+    @cached_property
+    def totals(self) -> tuple[float, float]:
+        """Number of coordinates that the frames show, and their energy."""
+        return totals(self.frames.blocks)
+
+    def likelihood(self, stiffness: float) -> MarginalLikelihood:
+        """Return the objective."""
+        return MarginalLikelihood(self.frames.blocks, stiffness, self.totals)
 
     def likelier(self, *starts: NDArray) -> NDArray:
         """Return the shapes that are more likely to start with."""
-        likelihood = MarginalLikelihood(self.tracks, self.weights, 0.0)
+        likelihood = self.likelihood(0.0)
         return min(starts, key=lambda shapes: likelihood(*self.start(shapes)).value)
 
     def best(self, starts: list[NDArray], stiffness: float) -> JointResult:
         """Return the best of the joint refinements from some shapes."""
-        results = [self.refined(self.start(shapes), stiffness) for shapes in starts]
+        results = [
+            self.refined(self.start(shapes), stiffness, self.tol) for shapes in starts
+        ]
         return min(results, key=lambda result: result.history[-1])
 
-    def refined(
-        self, state: JointState, stiffness: float, tol: float | None = None
-    ) -> JointResult:
+    def refined(self, state: JointState, stiffness: float, tol: float) -> JointResult:
         """Return the joint refinement of a state."""
         return refine_joint(
-            MarginalLikelihood(self.tracks, self.weights, stiffness),
-            state,
-            max_iter=self.max_iter,
-            tol=self.tol if tol is None else tol,
+            self.likelihood(stiffness), state, max_iter=self.max_iter, tol=tol
         )
+
+
+def _aligned_cameras(
+    block: list[FrameTracks], shapes: NDArray, noise: float
+) -> NDArray:
+    """Return cameras (n_frames, 2, 3) close to the best for given shapes."""
+    fits = [
+        fit_prepared(part, shapes, noise, max_steps=ALIGNING_STEPS) for part in block
+    ]
+    return np.concatenate([fit.motion for fit in fits])

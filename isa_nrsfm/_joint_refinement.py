@@ -151,11 +151,7 @@ class _Point:
             min(self.passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
         self.vector = _stacked(state.shapes, state.motion, np.log(state.noise))
-        curvature = self.passed.shape_curvature
-        size = curvature.shape[-1]
-        # Points that no frame shows have no curvature, and no gradient either.
-        ridge = RIDGE * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
-        self.shape_metric = np.linalg.inv(curvature + ridge * np.eye(size))
+        self.shape_metric = np.linalg.inv(regular(self.passed.shape_curvature))
         self.motion_metric = inverse3(self.passed.motion_curvature)
 
     def precondition(self, vector: NDArray) -> NDArray:
@@ -179,6 +175,14 @@ class _Point:
             vector[first:-1].reshape(motion.shape),
             vector[-1],
         )
+
+
+def regular(curvature: NDArray) -> NDArray:
+    """Return curvatures (n, m, m) of shapes with a trace of a ridge."""
+    size = curvature.shape[-1]
+    # Points that no frame shows have no curvature, and no gradient either.
+    ridge = RIDGE * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
+    return curvature + ridge * np.eye(size)
 
 
 def _stacked(shapes: NDArray, motion: NDArray, noise: float) -> NDArray:

@@ -19,11 +19,13 @@ Frames are the last index of all arrays here, and everything is a sum over block
 frames: how they are split makes no difference.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._frame_products import (
     FrameTracks,
     SharedGram,
@@ -74,9 +76,11 @@ class Passed(NamedTuple):
     residual: float
 
 
-class MarginalLikelihood:
+def prepared_frames(
+    tracks: NDArray, weights: NDArray | None = None, block_frames: int = BLOCK_FRAMES
+) -> list[FrameTracks]:
     """
-    The objective and its derivatives, as a sum over blocks of frames.
+    Return tracks ready for the passes, in blocks whose small matrices fit the cache.
 
     Parameters
     ----------
@@ -84,10 +88,61 @@ class MarginalLikelihood:
         Tracks; NaN where a point is missing.
     weights : ndarray of shape (n_frames, n_points) or None
         Weights of the points, zero for those that are missing; None for ones.
+    block_frames : int, default=1024
+        Frames of a block.
+
+    Returns
+    -------
+    list of FrameTracks
+        The blocks.
+    """
+    return [
+        frame_tracks(
+            tracks[start : start + block_frames],
+            None if weights is None else weights[start : start + block_frames],
+        )
+        for start in range(0, len(tracks), block_frames)
+    ]
+
+
+def likelihood_of(
+    tracks: NDArray,
+    weights: NDArray | None,
+    stiffness: float,
+    block_frames: int = BLOCK_FRAMES,
+) -> "MarginalLikelihood":
+    """
+    Return the objective for tracks in memory.
+
+    Parameters
+    ----------
+    tracks, weights, block_frames
+        As of `prepared_frames`.
+    stiffness : float
+        As of `MarginalLikelihood`.
+
+    Returns
+    -------
+    MarginalLikelihood
+        The objective.
+    """
+    blocks = [[block] for block in prepared_frames(tracks, weights, block_frames)]
+    lengths = [len(block.weight) for (block,) in blocks]
+    return MarginalLikelihood(MemoryBlocks(blocks, lengths), stiffness)
+
+
+class MarginalLikelihood:
+    """
+    The objective and its derivatives, as a sum over blocks of frames.
+
+    Parameters
+    ----------
+    frames : FrameBlocks
+        Blocks as of `prepared_frames`, either all with weights or none.
     stiffness : float
         Factor of ``sum_i tr H_i``.
-    block_frames : int, default=1024
-        Frames that are worked on at a time.
+    known : tuple of float, optional
+        What `totals` returns for these blocks, where it is known.
 
     Attributes
     ----------
@@ -101,23 +156,14 @@ class MarginalLikelihood:
 
     def __init__(
         self,
-        tracks: NDArray,
-        weights: NDArray | None,
+        frames: FrameBlocks,
         stiffness: float,
-        block_frames: int = BLOCK_FRAMES,
+        known: tuple[float, float] | None = None,
     ):
-        self.n_frames = len(tracks)
+        self.frames = frames
+        self.n_frames = frames.n_frames
         self.stiffness = stiffness
-        self.blocks = [
-            frame_tracks(
-                tracks[start : start + block_frames],
-                None if weights is None else weights[start : start + block_frames],
-            )
-            for start in range(0, len(tracks), block_frames)
-        ]
-        n_seen = tracks[..., 0].size if weights is None else np.count_nonzero(weights)
-        self.n_seen = 2.0 * n_seen
-        self.square = float(sum(block.energy.sum() for block in self.blocks))
+        self.n_seen, self.square = totals(frames) if known is None else known
 
     def __call__(self, shapes: NDArray, motion: NDArray, noise: float) -> Passed:
         """
@@ -137,38 +183,114 @@ class MarginalLikelihood:
         Passed
             The sums over the frames.
         """
-        gram, pairs = shared_gram(shapes), shape_pairs(len(shapes))
-        parts, start = [], 0
-        for block in self.blocks:
-            frames = slice(start, start + len(block.weight))
-            parts.append(
-                _pass_over(
-                    block,
-                    shapes,
-                    gram,
-                    pairs,
-                    motion[:, :, frames],
-                    noise,
-                    self.stiffness,
-                )
-            )
-            start = frames.stop
-        fields: Any = Passed(*zip(*parts, strict=True))
-        curvature = kronecker_matrices(
-            np.sum(fields.shape_curvature, axis=0), len(shapes)
+        n_shapes = len(shapes)
+        over_block = partial(
+            _pass_over_block,
+            shapes=shapes,
+            gram=shared_gram(shapes),
+            noise=noise,
+            stiffness=self.stiffness,
         )
-        rows = shapes.reshape(3 * len(shapes), -1).T[:, :, None]
+        alpha = np.empty((n_shapes - 1, self.n_frames))
+        motion_gradient = np.empty((2, 3, self.n_frames))
+        motion_curvature = np.empty((6, self.n_frames))
+        totals: Any = (0.0,) * 5
+        cameras = motion.transpose(2, 0, 1)
+        passes = self.frames.map(over_block, cameras)
+        for frames, part in zip(self.frames.slices, passes, strict=True):
+            alpha[:, frames] = part.alpha
+            motion_gradient[:, :, frames] = part.motion_gradient
+            motion_curvature[:, frames] = part.motion_curvature
+            totals = [a + b for a, b in zip(totals, _sums(part), strict=True)]
+        value, shape_gradient, noise_gradient, packed, residual = totals
+        curvature = kronecker_matrices(packed, n_shapes)
+        rows = shapes.reshape(3 * n_shapes, -1).T[:, :, None]
         pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
         return Passed(
-            float(np.sum(fields.value) + self.n_seen * np.log(noise)),
-            np.sum(fields.shape_gradient, axis=0) + (2 / noise) * pulled,
-            np.concatenate(fields.motion_gradient, axis=-1),
-            float(np.sum(fields.noise_gradient) + self.n_seen),
+            float(value + self.n_seen * np.log(noise)),
+            shape_gradient + (2 / noise) * pulled,
+            motion_gradient,
+            float(noise_gradient + self.n_seen),
             curvature,
-            np.concatenate(fields.motion_curvature, axis=-1),
-            np.concatenate(fields.alpha, axis=-1),
-            float(np.sum(fields.residual)),
+            motion_curvature,
+            alpha,
+            float(residual),
         )
+
+
+def totals(frames: FrameBlocks) -> tuple[float, float]:
+    """
+    Return the number of coordinates that frames show, and their energy.
+
+    Parameters
+    ----------
+    frames : FrameBlocks
+        Blocks as of `prepared_frames`.
+
+    Returns
+    -------
+    n_seen : float
+        Number of coordinates with a positive weight.
+    square : float
+        Weighted energy of the centred tracks.
+    """
+    n_seen, square = np.sum(list(frames.map(_totals)), axis=0)
+    return float(n_seen), float(square)
+
+
+def _totals(block: list[FrameTracks]) -> tuple[float, float]:
+    """Return the number of coordinates that a block shows, and its energy."""
+    n_seen = square = 0.0
+    for frames in block:
+        if frames.weights is None:
+            n_seen += frames.weight.sum()
+        else:
+            n_seen += np.count_nonzero(frames.weights)
+        square += frames.energy.sum()
+    return 2.0 * n_seen, square
+
+
+def _sums(part: Passed) -> tuple[float, NDArray, float, NDArray, float]:
+    """Return what is a sum over the frames."""
+    return (
+        part.value,
+        part.shape_gradient,
+        part.noise_gradient,
+        part.shape_curvature,
+        part.residual,
+    )
+
+
+def _pass_over_block(
+    block: list[FrameTracks],
+    motion: NDArray,
+    shapes: NDArray,
+    gram: SharedGram,
+    noise: float,
+    stiffness: float,
+) -> Passed:
+    """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
+    pairs = shape_pairs(len(shapes))
+    motion, start, parts = motion.transpose(1, 2, 0), 0, []
+    for frames in block:
+        end = start + len(frames.weight)
+        part = motion[:, :, start:end]
+        parts.append(_pass_over(frames, shapes, gram, pairs, part, noise, stiffness))
+        start = end
+    if len(parts) == 1:
+        return parts[0]
+    sums: Any = (sum(part) for part in zip(*map(_sums, parts), strict=True))
+    value, shape_gradient, noise_gradient, shape_curvature, residual = sums
+    return Passed(
+        value,
+        shape_gradient,
+        np.concatenate([part.motion_gradient for part in parts], axis=-1),
+        noise_gradient,
+        shape_curvature,
+        np.concatenate([part.motion_curvature for part in parts], axis=-1),
+        np.concatenate([part.alpha for part in parts], axis=-1),
+        residual,
+    )
 
 
 def _pass_over(

@@ -1,8 +1,8 @@
-"""The paper's pipeline: from a measurement matrix to basis shapes.
+"""The paper's pipeline: from a factorisation to basis shapes.
 
 Brandt, Ackermann, Grasshof, "Uncalibrated Non-Rigid Factorisation by Independent
-Subspace Analysis" (2018): factorisation, independent subspaces, block structure,
-refinement, each in a module of its own.
+Subspace Analysis" (2018): independent subspaces, block structure, refinement, each in
+a module of its own.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from isa_nrsfm._block_structure import (
     recover_blocks,
     structure_energies,
 )
-from isa_nrsfm._factorisation import Factorisation, factorise
+from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._refinement import refine_alternating
 
 # Fixed-point iterations from random starts are chaotic at first: rounding errors, such
@@ -45,30 +45,21 @@ class PaperResult(NamedTuple):
         ``B_k = E_k B_ISA,k``; zero for subspaces without motion.
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
         ``(J / 2I) M_ISA^T M_ISA``, in the order of the basis.
-    singular_values : ndarray of shape (3 * n_components + 3,)
-        Largest singular values of W.
-    rank_floor : float
-        Share of the energy of W outside them.
     n_iter : int
         Steps of the refinement, 1 without one.
     converged : bool
         Whether it has converged.
-    factors : Factorisation
-        Of W.
     """
 
     mean_shape: NDArray
     basis: NDArray
     mode_covariance: NDArray
-    singular_values: NDArray
-    rank_floor: float
     n_iter: int
     converged: bool
-    factors: Factorisation
 
 
 def run_paper_pipeline(
-    W: NDArray,
+    factors: Factorisation,
     n_components: int,
     isa: Any,
     *,
@@ -77,15 +68,14 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
-    precision: float = 0.0,
 ) -> PaperResult:
     """
-    Run the stages of the paper on a measurement matrix.
+    Run the stages of the paper after the factorisation.
 
     Parameters
     ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix, rows centred.
+    factors : Factorisation
+        Of the measurement matrix.
     n_components : int
         K.
     isa : object
@@ -100,18 +90,13 @@ def run_paper_pipeline(
         Tolerance of the refinement.
     report : callable
         Is told what has been done.
-    precision : float, default=0.0
-        Rounding error of the entries of W, relative to their root mean square.
 
     Returns
     -------
     PaperResult
         Shapes before a gauge is chosen.
     """
-    n_rows, n_points = W.shape
-    factors = factorise(W, n_components, precision)
-    report("factorisation")
-
+    n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = frame_products(factors.rigid_motion, factors.motion)
     moments = lifted_moments(products)
     components = _independent_subspaces(
@@ -137,16 +122,12 @@ def run_paper_pipeline(
     used = 3 * len(E)
     covariance = np.zeros((3 * n_components, 3 * n_components))
     covariance[:used, :used] = products.gram * (n_points / n_rows)
-    energy = np.sum(factors.singular_values**2) + factors.rest
     return PaperResult(
         factors.rigid_shape.T,
         basis.transpose(0, 2, 1),
         covariance,
-        factors.singular_values,
-        float(factors.rest / energy),
         n_iter,
         converged,
-        factors,
     )
 
 

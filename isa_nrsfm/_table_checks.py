@@ -1,9 +1,12 @@
 """What a table has to be before it is factorised, and what is said if it is not."""
 
 import warnings
+from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import bmat, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from isa_nrsfm._completion import rigid_noise
@@ -21,12 +24,133 @@ from isa_nrsfm._tracks import (
 # A warning is due when the other layout leaves less than this share of the energy that
 # the given one leaves unexplained. On real tables the right one leaves 0.04 to 0.5.
 CLEARLY_BETTER = 0.6
-# So many frames, evenly spread, are enough to tell the layouts apart.
+# So many frames, evenly spread, are enough to tell the layouts apart, and fewer of many
+# points: so many numbers, but not less than so many frames.
 LAYOUT_SAMPLE = 1000
+LAYOUT_NUMBERS = 2_000_000
+FEWEST_SAMPLE = 100
 # Smaller tables, in frames or points, do not tell the layouts apart.
 FEWEST_TO_TELL = 10
 # A share of unexplained energy below this is rounding errors.
 ROUNDING = 1e-12
+
+
+class HalfPoints(NamedTuple):
+    """
+    Points of which only one of the two coordinates is there.
+
+    Attributes
+    ----------
+    n_points : int
+        How many there are.
+    n_rows : int
+        In how many rows.
+    first : tuple of int, or None
+        Row and point of the first one.
+    """
+
+    n_points: int
+    n_rows: int
+    first: tuple[int, int] | None
+
+    @classmethod
+    def merged(cls, parts: "Sequence[HalfPoints]", lengths: list[int]) -> Self:
+        """Return those of consecutive blocks of rows."""
+        start, first = 0, None
+        for part, length in zip(parts, lengths, strict=True):
+            if first is None and part.first is not None:
+                first = (start + part.first[0], part.first[1])
+            start += length
+        n_points = sum(part.n_points for part in parts)
+        return cls(n_points, sum(part.n_rows for part in parts), first)
+
+    def warn(self, layout: Layout, names: NDArray | None, stacklevel: int) -> None:
+        """Warn if there are such points."""
+        if self.first is None:
+            return
+        row, point = self.first
+        warnings.warn(
+            f"{self.n_points} point(s) in {self.n_rows} row(s) have only one of "
+            "their two coordinates and count as missing; the first is "
+            f"{_describe_point(point, layout, names)} in row {row}",
+            stacklevel=stacklevel + 1,
+        )
+
+
+class PointReport(NamedTuple):
+    """
+    In which frames points are seen.
+
+    Attributes
+    ----------
+    n_frames : ndarray of int, shape (n_points,)
+        Number of frames that show each point.
+    group : ndarray of int, shape (n_points,)
+        The same number for points that frames connect, by showing both of them or
+        points connected to them.
+    """
+
+    n_frames: NDArray
+    group: NDArray
+
+    @classmethod
+    def of(cls, seen: NDArray) -> Self:
+        """Return the report of some frames (n_frames, n_points)."""
+        n_frames = seen.sum(axis=0)
+        if seen.all(axis=1).any():
+            return cls(n_frames, np.zeros(len(n_frames), dtype=np.intp))
+        shown = csr_array(seen)
+        graph = bmat([[None, shown.T], [shown, None]])
+        return cls(
+            n_frames, connected_components(graph, directed=False)[1][: len(n_frames)]
+        )
+
+    @classmethod
+    def merged(cls, reports: "Sequence[PointReport]") -> Self:
+        """Return the report of all frames of some."""
+        n_points = len(reports[0].group)
+        points = np.arange(n_points)
+        firsts = []
+        for report in reports:
+            # Each point is tied to the first one of its group.
+            _, first, number = np.unique(
+                report.group, return_index=True, return_inverse=True
+            )
+            firsts.append(first[number])
+        rows, columns = np.tile(points, len(reports)), np.concatenate(firsts)
+        ties = csr_array((np.ones(len(rows)), (rows, columns)), (n_points, n_points))
+        _, group = connected_components(ties, directed=False)
+        return cls(np.sum([report.n_frames for report in reports], axis=0), group)
+
+
+def without_half_points(tracks: NDArray) -> tuple[NDArray, HalfPoints]:
+    """
+    Return tracks in which the two coordinates of a point are missing together.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        The tracks, NaN where a coordinate is missing.
+
+    Returns
+    -------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        The tracks themselves, or a copy where points of which one coordinate is
+        missing have lost the other, too.
+    half : HalfPoints
+        What these are.
+    """
+    if not np.isnan(tracks.sum()):  # faster than to look at each
+        return tracks, HalfPoints(0, 0, None)
+    missing = np.isnan(tracks)
+    half = missing[..., 0] != missing[..., 1]
+    if not half.any():
+        return tracks, HalfPoints(0, 0, None)
+    row, point = np.argwhere(half)[0]
+    found = HalfPoints(
+        int(half.sum()), int(half.any(axis=1).sum()), (int(row), int(point))
+    )
+    return np.where(half[..., None], tracks.dtype.type(np.nan), tracks), found
 
 
 def clean_tracks(
@@ -55,18 +179,9 @@ def clean_tracks(
     UserWarning
         If there are such points.
     """
-    missing = np.isnan(tracks)
-    half = missing[..., 0] != missing[..., 1]
-    if not half.any():
-        return tracks
-    row, point = np.argwhere(half)[0]
-    warnings.warn(
-        f"{half.sum()} point(s) in {half.any(axis=1).sum()} row(s) have only one of "
-        "their two coordinates and count as missing; the first is "
-        f"{_describe_point(point, layout, names)} in row {row}",
-        stacklevel=4,
-    )
-    return np.where(half[..., None], tracks.dtype.type(np.nan), tracks)
+    tracks, half = without_half_points(tracks)
+    half.warn(layout, names, stacklevel=4)
+    return tracks
 
 
 def check_names(names: NDArray | None, layout: Layout) -> None:
@@ -116,13 +231,14 @@ def check_size(n_frames: int, n_points: int, n_components: int) -> None:
 
 
 def check_points(
-    tracks: NDArray,
+    report: PointReport,
+    n_seen: NDArray,
     n_components: int,
     layout: Layout = "interleaved",
     names: NDArray | None = None,
 ) -> None:
     """
-    Refuse tracks whose seen points do not determine the shapes.
+    Refuse tables whose seen points do not determine the shapes.
 
     A point has 3 (K + 1) unknowns and two equations in each frame that shows it. A
     frame that shows n points has 2 n equations, of which 8 + K go into its camera and
@@ -131,8 +247,10 @@ def check_points(
 
     Parameters
     ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a point is not seen.
+    report : PointReport
+        In which frames points are seen.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that each frame shows.
     n_components : int
         K, the number of basis shapes.
     layout : {"interleaved", "planar"}
@@ -146,20 +264,20 @@ def check_points(
         If a point is seen in too few frames, if too few points are seen in all, or if
         the points fall into groups that no frame shows together.
     """
-    seen = seen_points(tracks)
-    if seen.all():
+    n_frames, group = report
+    if (n_frames == len(n_seen)).all():
         return
     n_shapes = n_components + 1
-    n_frames, least = seen.sum(axis=0), -(-3 * n_shapes // 2)
+    least = -(-3 * n_shapes // 2)
     few = n_frames < least
     if few.any():
-        point = few.argmax()
+        point = int(few.argmax())
         raise ValueError(
             f"n_components={n_components} needs every point in at least {least} "
             f"frames; {few.sum()} of {len(few)} point(s) are seen in fewer, the first "
             f"is {_describe_point(point, layout, names)}, seen in {n_frames[point]}"
         )
-    equations = np.maximum(2 * seen.sum(axis=1) - 8 - n_components, 0).sum()
+    equations = np.maximum(2 * n_seen - 8 - n_components, 0).sum()
     unknowns = 3 * n_shapes * (len(few) - 1) - n_shapes**2 - 8
     if equations < unknowns:
         raise ValueError(
@@ -168,15 +286,13 @@ def check_points(
             f"{unknowns} unknowns; take fewer basis shapes or leave out points that "
             "are rarely seen"
         )
-    counts = seen.astype(np.float64)
-    n_groups, group = connected_components(counts.T @ counts, directed=False)
-    if n_groups > 1:
-        apart = (group != group[0]).argmax()
+    if (group != group[0]).any():
+        apart = int((group != group[0]).argmax())
         raise ValueError(
-            f"the points fall into {n_groups} groups, and no frame shows points of "
-            f"two of them; {_describe_point(apart, layout, names)} is the first that "
-            f"is never seen with {_describe_point(0, layout, names)} or others of its "
-            "group"
+            f"the points fall into {len(np.unique(group))} groups, and no frame shows "
+            f"points of two of them; {_describe_point(apart, layout, names)} is the "
+            f"first that is never seen with {_describe_point(0, layout, names)} or "
+            "others of its group"
         )
 
 
@@ -188,17 +304,37 @@ def _describe_point(point: int, layout: Layout, names: NDArray | None) -> str:
     return f"point {point} ({x}, {y})"
 
 
+def layout_sample(n_frames: int, n_columns: int) -> slice:
+    """Return which frames, evenly spread, tell the layouts apart."""
+    enough = max(min(LAYOUT_SAMPLE, LAYOUT_NUMBERS // n_columns), FEWEST_SAMPLE)
+    return slice(None, None, max(-(-n_frames // enough), 1))
+
+
 def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None:
     """
     Warn where the columns in the other layout are nearer to a rigid object.
 
     What no rigid object explains of the table is compared, not its share: in the wrong
     layout the distance between the coordinates x and y adds energy that is explained.
+
+    Parameters
+    ----------
+    X : ndarray of shape (n_frames, 2 * n_points)
+        The table, or what `layout_sample` takes of it.
+    layout : {"interleaved", "planar"}
+        What is said to be the order of its columns.
+    scale_frames : bool
+        Whether frames count alike.
+
+    Warns
+    -----
+    UserWarning
+        If the other layout explains much more.
     """
     if min(len(X), X.shape[1] // 2) < FEWEST_TO_TELL:
         return
     other = next(name for name in LAYOUTS if name != layout)
-    sample = np.ascontiguousarray(X[:: -(-len(X) // LAYOUT_SAMPLE)], dtype=np.float64)
+    sample = np.ascontiguousarray(X[layout_sample(*X.shape)], dtype=np.float64)
     both = [table_to_tracks(sample, name) for name in (layout, other)]
     both = _without_rarely_seen(both)
     if min(min(tracks.shape[:2]) for tracks in both) < FEWEST_TO_TELL:

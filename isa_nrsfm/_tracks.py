@@ -5,7 +5,7 @@ A *table* has one row a frame and two columns a point, shape ``(n_frames,
 that is not seen in a frame is NaN.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,35 @@ LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
 FEWEST_POINTS = 4
 # Coordinates that differ by so many units in the last place of the largest are equal.
 EQUAL = 4
+
+
+class FrameReport(NamedTuple):
+    """
+    What frames show.
+
+    Attributes
+    ----------
+    translation : ndarray of shape (n_frames, 2)
+        Centroids of the seen points, NaN for frames without any.
+    square : ndarray of shape (n_frames,)
+        Sum of the squares of the coordinates relative to these.
+    largest : ndarray of shape (n_frames,)
+        Largest magnitude of a coordinate as it came, zero for frames without any.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that are seen.
+    in_one_place : ndarray of bool, shape (n_frames,)
+        Whether the root mean square distance of the seen points from their centroid is
+        within rounding errors of its coordinates; False for frames without any point.
+    on_line : ndarray of bool, shape (n_frames,)
+        Whether points are missing and the others on one line, up to rounding.
+    """
+
+    translation: NDArray
+    square: NDArray
+    largest: NDArray
+    n_seen: NDArray
+    in_one_place: NDArray
+    on_line: NDArray
 
 
 def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
@@ -36,14 +65,19 @@ def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
         The tracks.
     """
     n_frames, n_columns = X.shape
+    refuse_odd(n_columns)
+    if layout == "planar":
+        return X.reshape(n_frames, 2, -1).transpose(0, 2, 1)
+    return X.reshape(n_frames, -1, 2)
+
+
+def refuse_odd(n_columns: int) -> None:
+    """Refuse a number of columns that is odd."""
     if n_columns % 2:
         raise ValueError(
             "X must have two columns per point (x and y), an even number; "
             f"got n_features={n_columns}"
         )
-    if layout == "planar":
-        return X.reshape(n_frames, 2, -1).transpose(0, 2, 1)
-    return X.reshape(n_frames, -1, 2)
 
 
 def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
@@ -81,6 +115,8 @@ def seen_points(tracks: NDArray) -> NDArray:
     ndarray of bool, shape (n_frames, n_points)
         Whether both coordinates are there.
     """
+    if not np.isnan(tracks.sum()):  # faster than to look at each
+        return np.ones(tracks.shape[:2], dtype=bool)
     missing = np.isnan(tracks)
     return ~(missing[..., 0] | missing[..., 1])
 
@@ -107,21 +143,17 @@ def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
         If all seen points of a frame are equal, up to rounding.
     """
     centred, translation, seen = _centre(tracks)
-    coincide = _coincide(centred, translation, seen, tracks.dtype)
-    if coincide.any():
-        which = "points" if seen[coincide].all() else "seen points"
-        raise ValueError(
-            f"each frame must have at least two different points; all {which} are "
-            f"equal in {coincide.sum()} frame(s), the first is row {coincide.argmax()}"
-        )
+    square = np.einsum("ijc,ijc->i", centred, centred)
+    coincide = _coincide(square, translation, seen.sum(axis=1), tracks.dtype)
+    _refuse_one_place(coincide, np.asarray(~seen.all(axis=1)))
     if not seen.all():
         centred[~seen] = np.nan
     return centred, translation
 
 
-def frames_in_one_place(tracks: NDArray) -> NDArray:
+def report_frames(tracks: NDArray) -> FrameReport:
     """
-    Tell in which frames all seen points are equal.
+    Return what frames show.
 
     Parameters
     ----------
@@ -130,11 +162,21 @@ def frames_in_one_place(tracks: NDArray) -> NDArray:
 
     Returns
     -------
-    ndarray of bool, shape (n_frames,)
-        Whether the root mean square distance of the seen points from their centroid is
-        within rounding errors of its coordinates; False for frames without any point.
+    FrameReport
+        The report.
     """
-    return _coincide(*_centre(tracks), tracks.dtype)
+    centred, translation, seen = _centre(tracks)
+    square = np.einsum("ijc,ijc->i", centred, centred)
+    n_seen = seen.sum(axis=1)
+    filled = _zero_where_unseen(tracks, seen)
+    return FrameReport(
+        translation,
+        square,
+        np.maximum(filled.max(axis=(1, 2)), -filled.min(axis=(1, 2))),
+        n_seen,
+        _coincide(square, translation, n_seen, tracks.dtype),
+        _collinear(centred, translation, seen, tracks.dtype),
+    )
 
 
 def usable_frames(tracks: NDArray) -> NDArray:
@@ -155,10 +197,9 @@ def usable_frames(tracks: NDArray) -> NDArray:
         it is rather that they lie on a line of the object, which leaves the camera
         free to turn around it.
     """
-    centred, translation, seen = _centre(tracks)
-    enough = seen.sum(axis=1) >= FEWEST_POINTS
-    coincide = _coincide(centred, translation, seen, tracks.dtype)
-    return enough & ~coincide & ~_collinear(centred, translation, seen, tracks.dtype)
+    report = report_frames(tracks)
+    enough = report.n_seen >= FEWEST_POINTS
+    return enough & ~report.in_one_place & ~report.on_line
 
 
 def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
@@ -184,15 +225,16 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
 
 
-def relative_precision(tracks: NDArray, sizes: NDArray) -> float:
+def relative_precision(report: FrameReport, dtype: np.dtype, sizes: NDArray) -> float:
     """
     Return how precisely the numbers of a table say where the points are.
 
     Parameters
     ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks as they came, in single or double precision, NaN where a point is
-        not seen.
+    report : FrameReport
+        What the frames show.
+    dtype : dtype
+        Type of the numbers of the table.
     sizes : ndarray of shape (n_frames,)
         Sizes of the frames.
 
@@ -202,9 +244,8 @@ def relative_precision(tracks: NDArray, sizes: NDArray) -> float:
         Spacing of the largest coordinate of a frame relative to its size, root mean
         square over the frames.
     """
-    largest = np.abs(_zero_where_unseen(tracks, seen_points(tracks))).max(axis=(1, 2))
-    spacing = np.finfo(tracks.dtype).eps * largest
-    return float(np.sqrt(np.mean((spacing.astype(np.float64) / sizes) ** 2)))
+    spacing = np.finfo(dtype).eps * report.largest.astype(np.float64)
+    return float(np.sqrt(np.mean((spacing / sizes) ** 2)))
 
 
 def measurement_matrix(centred: NDArray) -> NDArray:
@@ -214,42 +255,69 @@ def measurement_matrix(centred: NDArray) -> NDArray:
     )
 
 
-def check_frames(tracks: NDArray) -> None:
+def check_frames(report: FrameReport, n_points: int) -> None:
     """
-    Refuse tracks with frames that do not show enough to determine their camera.
+    Refuse frames that do not show enough to determine their camera.
 
     Parameters
     ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a point is not seen.
+    report : FrameReport
+        What the frames show.
+    n_points : int
+        Number of points of a frame.
 
     Raises
     ------
     ValueError
         If a frame shows fewer than four points, or has missing points and shows the
         others on one line (see `usable_frames`). Those with all points in one place
-        are left to `centred_tracks`.
+        are left to `check_places`.
     """
-    centred, translation, seen = _centre(tracks)
-    if seen.all():
-        return
-    n_seen = seen.sum(axis=1)
-    few = n_seen < FEWEST_POINTS
+    n_seen, n_frames = report.n_seen, len(report.n_seen)
+    few = (n_seen < FEWEST_POINTS) & (n_seen < n_points)
     if few.any():
         row = few.argmax()
         raise ValueError(
             f"each frame must show at least {FEWEST_POINTS} points to determine its "
-            f"camera; {few.sum()} of {len(tracks)} frame(s) show fewer (the others are "
+            f"camera; {few.sum()} of {n_frames} frame(s) show fewer (the others are "
             f"NaN), the first is row {row} with {n_seen[row]} point(s): leave such "
             "rows out"
         )
-    line = _collinear(centred, translation, seen, tracks.dtype)
-    line &= ~_coincide(centred, translation, seen, tracks.dtype)
+    line = report.on_line & ~report.in_one_place
     if line.any():
         raise ValueError(
             "the points that a frame shows must not all lie on one line where others "
-            f"are missing (NaN); they do in {line.sum()} of {len(tracks)} frame(s), "
+            f"are missing (NaN); they do in {line.sum()} of {n_frames} frame(s), "
             f"the first is row {line.argmax()}: leave such rows out"
+        )
+
+
+def check_places(report: FrameReport, n_points: int) -> None:
+    """
+    Refuse frames whose seen points are all equal, up to rounding.
+
+    Parameters
+    ----------
+    report : FrameReport
+        What the frames show.
+    n_points : int
+        Number of points of a frame.
+
+    Raises
+    ------
+    ValueError
+        If there are such frames.
+    """
+    _refuse_one_place(report.in_one_place, report.n_seen < n_points)
+
+
+def _refuse_one_place(coincide: NDArray, incomplete: NDArray) -> None:
+    """Refuse frames with all seen points in one place."""
+    if coincide.any():
+        which = "seen points" if incomplete[coincide].any() else "points"
+        raise ValueError(
+            f"each frame must have at least two different points; all {which} are "
+            f"equal in {coincide.sum()} frame(s), the first is row {coincide.argmax()}"
         )
 
 
@@ -274,11 +342,9 @@ def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _coincide(
-    centred: NDArray, translation: NDArray, seen: NDArray, dtype: np.dtype
+    square: NDArray, translation: NDArray, n_seen: NDArray, dtype: np.dtype
 ) -> NDArray:
     """Tell in which frames all seen points are equal, up to rounding."""
-    n_seen = seen.sum(axis=1)
-    square = np.einsum("ijc,ijc->i", centred, centred)
     rounding = EQUAL * np.finfo(dtype).eps * np.linalg.norm(translation, axis=1)
     return (n_seen > 0) & (square <= n_seen * rounding**2)
 

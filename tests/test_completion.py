@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 import isa_nrsfm._completion as completion
 from isa_nrsfm._completion import (
+    CompletionModel,
     _by_pattern,
     _em_step,
     _fit,
-    _Model,
     complete_tracks,
     rigid_noise,
 )
@@ -160,7 +160,7 @@ def test_a_step_with_fixed_noise_raises_the_likelihood(small):
     B = np.random.default_rng(0).normal(size=(4, 9))
     for _ in range(20):
         before = log_likelihood(B, 0.01, *small)
-        B = _em_step(_Model(B, 0.01), frames)[0].B
+        B = _em_step(CompletionModel(B, 0.01), frames)[0].B
         assert log_likelihood(B, 0.01, *small) > before
 
 
@@ -168,7 +168,7 @@ def test_the_residual_of_a_step_is_that_of_least_squares_with_a_ridge(small):
     centred, seen, sizes = small
     frames, order = _by_pattern(centred, seen, sizes)
     B = np.random.default_rng(0).normal(size=(3, 9))
-    _, residual, mean_square = _em_step(_Model(B, 0.1), frames)
+    _, residual, mean_square = _em_step(CompletionModel(B, 0.1), frames)
     n_numbers = 2 * seen.sum()
     assert_allclose(mean_square, np.sum(residual**2) / n_numbers)
     for i, rows in zip(order, residual, strict=True):

@@ -6,7 +6,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames, rotate_frames
 
 import isa_nrsfm._factorisation as module
-from isa_nrsfm._factorisation import factorise, orientations
+from isa_nrsfm._factorisation import (
+    block_triplets,
+    factorise,
+    leading_triplets,
+    orientations,
+)
+from isa_nrsfm._frame_blocks import MemoryBlocks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
 
@@ -224,9 +230,26 @@ class TestLargeBothWays:
         whole = factorise(W, 2)
         monkeypatch.setattr(module, "DENSE", 30)
         leading = factorise(W, 2)
+        # Energies converge as the squares of the directions.
+        kept = np.sum(whole.singular_values**2)
+        got = np.sum(leading.singular_values**2)
+        assert abs(got - kept) < 1e-6 * whole.rest + 1e-14 * kept
+        assert_allclose(leading.rest, whole.rest, rtol=1e-6, atol=1e-14 * kept)
         for got, expected in zip(leading[:5], whole[:5], strict=True):
-            assert_allclose(got, expected, atol=1e-10 * np.abs(expected).max())
-        assert_allclose(leading.rest, whole.rest, atol=1e-14 * np.sum(W**2))
+            assert_allclose(got, expected, atol=1e-4 * np.abs(expected).max())
+
+    @pytest.mark.parametrize("block_frames", [1, 7, 60])
+    @pytest.mark.parametrize("size", [(60, 70), (40, 25), (60, 8)])
+    def test_blocks_make_no_difference(self, size, block_frames, monkeypatch):
+        monkeypatch.setattr(module, "DENSE", 30)
+        W = low_rank(0, 8, *size) + 1e-2 * centred_matrix(1, *size)
+        frames = W.reshape(len(W) // 2, 2, -1)
+        expected = leading_triplets(W, 5)
+        found = block_triplets(MemoryBlocks.of(frames, block_frames), W.shape, 5)
+        assert_allclose(found.values, expected.values, rtol=1e-7)
+        assert_allclose(found.rest, expected.rest, rtol=1e-6)
+        signs = np.sign(np.vecdot(found.vectors, expected.vectors))
+        assert_allclose(found.vectors * signs[:, None], expected.vectors, atol=1e-3)
 
     def test_null_directions_are_left_out(self, krylov):
         f = factorise(low_rank(0, 5, 60, 70), 2)

@@ -467,7 +467,7 @@ def fitted_shapes(tracks, n_components):
     model.fit(tracks.reshape(len(tracks), -1).astype(float))
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
-    frames = model._frames
+    frames = model._model.frames
     return centred / size, frames.shapes, frames.starts, frames.noise_variance
 
 
@@ -536,7 +536,7 @@ class TestStarts:
         tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
         poor = module._poorly_explained(
             fit_posterior(tracks, shapes, NOISE**2),
-            np.ones((30, 20)),
+            np.full(30, 20.0),
             np.full(30, NOISE**2),
         )
         assert poor[3]

@@ -7,7 +7,7 @@ from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frame_fit import PosteriorFrames, RigidFrames, compose, project
-from isa_nrsfm._held_out import FOLD_SEED, N_FOLDS, held_out_error
+from isa_nrsfm._held_out import FOLD_SEED, N_FOLDS, held_out_energies
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -34,6 +34,12 @@ def scene(seed=0, n_frames=12, n_points=23):
         FrameMap.identity(2),
     )
     return frames, shapes, tracks
+
+
+def error_of(*scene):
+    """Return the inverse SNR of points that are held out."""
+    noise, signal = held_out_energies(*scene)
+    return noise / signal
 
 
 def by_plain_loops(frames, shapes, tracks, sizes):
@@ -71,7 +77,7 @@ def test_by_plain_loops(model, missing):
         frames = RigidFrames(shapes[0], shapes[1:])
     tracks = hide(tracks, missing)
     sizes = np.linspace(1, 3, len(tracks))
-    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    error = error_of(frames, shapes[0], shapes[1:], tracks, sizes)
     assert_allclose(error, by_plain_loops(frames, shapes, tracks, sizes), rtol=1e-8)
 
 
@@ -88,16 +94,16 @@ def test_it_is_larger_than_the_error_of_fitted_points():
         compose(shapes[0], shapes[1:], fit.alpha), fit.motion, fit.translation
     )
     signal = np.sum((tracks - tracks.mean(axis=1, keepdims=True)) ** 2)
-    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    error = error_of(frames, shapes[0], shapes[1:], tracks, sizes)
     assert error > 1.2 * np.sum((tracks - images) ** 2) / signal
 
 
 def test_frames_that_show_too_little_are_left_out():
     frames, shapes, tracks = scene()
     sizes = np.ones(len(tracks))
-    expected = held_out_error(frames, shapes[0], shapes[1:], tracks[:8], sizes[:8])
+    expected = error_of(frames, shapes[0], shapes[1:], tracks[:8], sizes[:8])
     tracks[8:, 4:] = np.nan  # four points: with one held out too few are left
-    error = held_out_error(frames, shapes[0], shapes[1:], tracks, sizes)
+    error = error_of(frames, shapes[0], shapes[1:], tracks, sizes)
     folds = np.random.RandomState(FOLD_SEED).permutation(23) % N_FOLDS
     if all(
         np.any(folds[:4] == fold) == (np.sum(folds[:4] == fold) > 0) for fold in folds
@@ -105,11 +111,12 @@ def test_frames_that_show_too_little_are_left_out():
         assert_allclose(error, expected, rtol=1e-9)
 
 
-def test_nothing_that_can_be_held_out_is_nan():
+def test_nothing_that_can_be_held_out_has_no_energy():
     frames, shapes, tracks = scene()
     tracks[:, 3:] = np.nan
-    error = held_out_error(frames, shapes[0], shapes[1:], tracks, np.ones(len(tracks)))
-    assert np.isnan(error)
+    ones = np.ones(len(tracks))
+    energies = held_out_energies(frames, shapes[0], shapes[1:], tracks, ones)
+    assert energies == (0.0, 0.0)
 
 
 # --- score --------------------------------------------------------------------------

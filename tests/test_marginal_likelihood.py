@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._marginal_likelihood import MarginalLikelihood
+from isa_nrsfm._marginal_likelihood import likelihood_of
 
 NOISE = 0.05
 STIFFNESS = 7.0
@@ -22,7 +22,7 @@ class Scene(NamedTuple):
 
     def at(self, stiffness=0.0, noise=NOISE, **options):
         """Return the objective and its derivatives."""
-        likelihood = MarginalLikelihood(self.tracks, self.weights, stiffness, **options)
+        likelihood = likelihood_of(self.tracks, self.weights, stiffness, **options)
         return likelihood(self.shapes, self.motion, noise)
 
 
@@ -126,7 +126,7 @@ class TestValue:
 
     def test_counts_of_the_table(self):
         scene = random_scene("missing")
-        likelihood = MarginalLikelihood(scene.tracks, scene.weights, 0.0)
+        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
         assert likelihood.n_frames == len(scene.tracks)
         assert likelihood.n_seen == np.isfinite(scene.tracks).sum()
         energy = sum(
@@ -278,7 +278,7 @@ class TestBlocks:
         # More frames than a block has: the cameras are dealt out in the right order.
         scene = random_scene("complete", n_frames=2100, n_points=4, n_components=1)
         whole = scene.at(STIFFNESS, block_frames=2100)
-        assert len(MarginalLikelihood(scene.tracks, None, 0.0).blocks) == 3
+        assert len(likelihood_of(scene.tracks, None, 0.0).frames.lengths) == 3
         assert_same(scene.at(STIFFNESS), whole)
 
     @KINDS

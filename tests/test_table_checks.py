@@ -8,6 +8,7 @@ from numpy.testing import assert_array_equal
 
 from isa_nrsfm._table_checks import (
     LAYOUT_SAMPLE,
+    PointReport,
     check_names,
     check_points,
     check_size,
@@ -73,12 +74,21 @@ class TestHalfPoints:
         assert clean_tracks(tracks) is tracks
 
 
+def checked(tracks, *options):
+    """Check the points of tracks, in one block and in many."""
+    seen = ~np.isnan(tracks).any(axis=2)
+    for length in (len(seen), 7):
+        blocks = [seen[start : start + length] for start in range(0, len(seen), length)]
+        report = PointReport.merged([PointReport.of(block) for block in blocks])
+        check_points(report, seen.sum(axis=1), *options)
+
+
 class TestPoints:
     def test_point_seen_in_too_few_frames(self, rng):
         tracks = rng.normal(size=(50, 16, 2))
         tracks[5:, 4] = np.nan
         tracks[4:, 9] = np.nan
-        check_points(tracks[:, :9], 2)
+        checked(tracks[:, :9], 2)
         names = np.array([f"{axis}_{j}" for axis in "xy" for j in range(16)])
         with pytest.raises(
             ValueError,
@@ -86,7 +96,7 @@ class TestPoints:
             r"point\(s\) are seen in fewer, the first is point 4 \(x_4, y_4\), seen in "
             r"5",
         ):
-            check_points(tracks, 3, "planar", names)
+            checked(tracks, 3, "planar", names)
 
     @pytest.mark.parametrize("K", range(1, 21))
     def test_least_number_of_frames_of_a_point(self, K):
@@ -101,7 +111,7 @@ class TestPoints:
         n_frames, n_points = smallest_n_frames(K), 3 * K + 4
         surplus = n_equations_minus_unknowns(n_frames, n_points, K)
         tracks = np.random.default_rng(0).normal(size=(n_frames, n_points, 2))
-        check_points(tracks, K)
+        checked(tracks, K)
         n_hidden = surplus // 2 + 1
         tracks[np.arange(n_hidden) % n_frames, np.arange(n_hidden) % n_points] = np.nan
         assert np.isnan(tracks).any(axis=2).sum() == n_hidden
@@ -110,7 +120,7 @@ class TestPoints:
             match=rf"too few points are seen for n_components={K}: .* equations, but "
             r"the shapes have \d+ unknowns",
         ):
-            check_points(tracks, K)
+            checked(tracks, K)
 
     def test_groups_of_points_that_are_never_seen_together(self, rng):
         tracks = rng.normal(size=(100, 20, 2))
@@ -121,9 +131,9 @@ class TestPoints:
             match=r"2 groups, and no frame shows points of two of them; point 12 is "
             r"the first that is never seen with point 0 or others of its group",
         ):
-            check_points(tracks, 1)
+            checked(tracks, 1)
         tracks[7] = 0.0
-        check_points(tracks, 1)
+        checked(tracks, 1)
 
 
 def n_equations_minus_unknowns(n_frames, n_points, K):

@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
 from isa_nrsfm._table_checks import (
+    PointReport,
     check_points,
     clean_tracks,
 )
@@ -16,9 +17,9 @@ from isa_nrsfm._tracks import (
     LAYOUTS,
     centred_tracks,
     check_frames,
-    frames_in_one_place,
     measurement_matrix,
     relative_precision,
+    report_frames,
     seen_points,
     table_to_tracks,
     tracks_to_table,
@@ -143,8 +144,11 @@ class TestMissingPoints:
             assert_allclose(centred[i, mask], part[0], atol=1e-14)
             assert_allclose(translation[i], place[0], atol=1e-14)
             assert_allclose(sizes[i], size[0])
-            alone = relative_precision(tracks[i : i + 1, mask], size)
-            assert_allclose(relative_precision(tracks[i : i + 1], size), alone)
+            alone, together = (
+                relative_precision(report_frames(each), dtype, size)
+                for each in (tracks[i : i + 1, mask], tracks[i : i + 1])
+            )
+            assert_allclose(together, alone)
 
     def test_sizes_of_unscaled_frames_are_one_size(self, rng):
         centred, _ = centred_tracks(with_missing(rng.normal(size=(30, 9, 2)), 0.4)[0])
@@ -178,7 +182,7 @@ class TestMissingPoints:
             warnings.simplefilter("error")
             centred, translation = centred_tracks(tracks)
             assert_array_equal(usable_frames(tracks), [True, False, True, False])
-            assert not frames_in_one_place(tracks).any()
+            assert not report_frames(tracks).in_one_place.any()
         assert_array_equal(np.isnan(centred).all(axis=(1, 2)), [0, 1, 0, 1])
         assert_array_equal(np.isnan(translation).all(axis=1), [0, 1, 0, 1])
 
@@ -187,9 +191,9 @@ class TestFrames:
     def test_equal_seen_points(self, rng):
         tracks, seen = with_missing(100 * rng.normal(size=(30, 9, 2)), 0.3)
         tracks[[3, 8]] = np.where(seen[[3, 8], :, None], 0.1, np.nan)
-        assert_array_equal(np.flatnonzero(frames_in_one_place(tracks)), [3, 8])
+        assert_array_equal(np.flatnonzero(report_frames(tracks).in_one_place), [3, 8])
         assert not usable_frames(tracks)[[3, 8]].any()
-        check_frames(tracks[[3, 8]])
+        check_frames(report_frames(tracks[[3, 8]]), tracks.shape[1])
         with pytest.raises(
             ValueError,
             match=r"all seen points are equal in 2 frame\(s\), the first is row 3",
@@ -202,21 +206,25 @@ class TestFrames:
         place = unit * rng.normal(size=(50, 1, 2))
         noise = rng.normal(size=(50, 9, 2)) * np.linalg.norm(place, axis=2)[..., None]
         eps = np.finfo(dtype).eps
-        assert frames_in_one_place((place + 0.5 * eps * noise).astype(dtype)).all()
-        assert not frames_in_one_place((place + 40 * eps * noise).astype(dtype)).any()
+        near, far = (
+            report_frames((place + size * eps * noise).astype(dtype)).in_one_place
+            for size in (0.5, 40)
+        )
+        assert near.all()
+        assert not far.any()
 
     def test_fewest_points(self, rng):
         tracks = np.full((9, 8, 2), np.nan)
         for n in range(9):
             tracks[n, :n] = rng.normal(size=(n, 2))
         assert_array_equal(usable_frames(tracks), np.arange(9) >= FEWEST_POINTS)
-        check_frames(tracks[FEWEST_POINTS:])
+        check_frames(report_frames(tracks[FEWEST_POINTS:]), tracks.shape[1])
         with pytest.raises(
             ValueError,
             match=r"each frame must show at least 4 points .*; 3 of 8 frame\(s\) show "
             r"fewer .*, the first is row 0 with 1 point\(s\)",
         ):
-            check_frames(tracks[1:])
+            check_frames(report_frames(tracks[1:]), tracks.shape[1])
 
     def test_fewest_points_determine_an_affine_camera(self, rng):
         # Four points of space and a one for the translation: 4 x 4, of full rank.
@@ -232,7 +240,7 @@ class TestFrames:
         line = along * np.concatenate([np.cos(angle), np.sin(angle)], axis=2)
         tracks = (unit * (line + 5 * rng.normal(size=(40, 1, 2)))).astype(dtype)
         assert usable_frames(tracks).all()  # complete: a flat object seen edge on
-        check_frames(tracks)
+        check_frames(report_frames(tracks), tracks.shape[1])
         tracks[::2, 3] = np.nan
         assert_array_equal(usable_frames(tracks), np.arange(40) % 2 == 1)
         with pytest.raises(
@@ -240,7 +248,7 @@ class TestFrames:
             match=r"not all lie on one line where others are missing \(NaN\); they "
             r"do in 20 of 40 frame\(s\), the first is row 0",
         ):
-            check_frames(tracks)
+            check_frames(report_frames(tracks), tracks.shape[1])
 
     def test_points_nearly_on_a_line(self, rng):
         line = rng.normal(size=(40, 9, 1)) * rng.normal(size=(40, 1, 2))
@@ -250,8 +258,9 @@ class TestFrames:
     def test_complete_and_real_frames_are_usable(self, load_data):
         tracks = load_data("muct_68")["W2d"].astype(float)
         assert usable_frames(tracks).all()
-        check_frames(tracks)
-        check_points(tracks, 9)
+        check_frames(report_frames(tracks), tracks.shape[1])
+        seen = ~np.isnan(tracks).any(axis=2)
+        check_points(PointReport.of(seen), seen.sum(axis=1), 9)
 
 
 class TestMeasurementMatrix:

@@ -247,7 +247,7 @@ def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
 
 def _fitted_frames(estimator: AffineNRSfM, X: Any) -> FrameFit:
     """Return cameras, coefficients and their standard deviations for a table."""
-    return estimator._fit_frames(estimator._validated(X))
+    return estimator._model.decompose(estimator._opened(X))
 
 
 def _strategy(args: Namespace) -> Any:

@@ -12,7 +12,7 @@ from isa_nrsfm._optional import import_optional
 from isa_nrsfm._table_checks import clean_tracks
 from isa_nrsfm._tracks import (
     FEWEST_POINTS,
-    frames_in_one_place,
+    report_frames,
     seen_points,
     usable_frames,
 )
@@ -108,9 +108,10 @@ def _reasons(
     tracks: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> list[tuple[str, NDArray[np.bool_]]]:
     """Tell in which frames what is the matter, each with one reason."""
-    n_seen = seen_points(tracks).sum(axis=1)
+    report = report_frames(tracks)
+    n_seen = report.n_seen
     few = n_seen < FEWEST_POINTS
-    in_one_place = frames_in_one_place(tracks) & ~few
+    in_one_place = report.in_one_place & ~few
     return [
         ("all points missing", n_seen == 0),
         (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),

@@ -1,0 +1,260 @@
+"""Frames in blocks: the one place that knows who computes a block, and where.
+
+All stages of the fit are sums over frames, or go frame by frame. They are written as
+functions of a block of frames, and run here: on arrays in memory, in threads, on tables
+that are read from disk block by block, or on a dask cluster.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class FrameBlocks(ABC):
+    """
+    Consecutive blocks of the frames of a table.
+
+    A block is whatever a function made of it, rows of a table for instance.
+
+    Parameters
+    ----------
+    lengths : sequence of int
+        How many frames each block has.
+    """
+
+    def __init__(self, lengths: Sequence[int]):
+        self.lengths = list(lengths)
+        ends = np.cumsum(self.lengths, dtype=int)
+        self.slices = [
+            slice(int(end) - length, int(end))
+            for end, length in zip(ends, self.lengths, strict=True)
+        ]
+
+    @property
+    def n_frames(self) -> int:
+        """The number of frames of all blocks."""
+        return sum(self.lengths)
+
+    @abstractmethod
+    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
+        """
+        Yield what a function makes of each block, in order.
+
+        Parameters
+        ----------
+        function : callable
+            Called with a block and the rows of the arrays that belong to its frames.
+        *by_frame : ndarray of shape (n_frames, ...)
+            Arrays with a row for each frame.
+
+        Yields
+        ------
+        object
+            What the function returns.
+        """
+
+    @abstractmethod
+    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+        """
+        Return the blocks that a function makes of these, where these are.
+
+        Blocks in memory are computed at once and kept, those that are read from disk
+        are computed whenever they are needed.
+        """
+
+    def take(self, frames: NDArray) -> NDArray:
+        """
+        Return some of the frames, of blocks that are arrays.
+
+        Parameters
+        ----------
+        frames : ndarray of int, shape (n_chosen,)
+            Which frames, each at most once, in any order.
+
+        Returns
+        -------
+        ndarray of shape (n_chosen, ...)
+            The frames in this order.
+        """
+        chosen = np.zeros(self.n_frames, dtype=bool)
+        chosen[frames] = True
+        found = np.concatenate(list(self.map(_rows, chosen)))
+        order = np.empty(len(frames), dtype=int)
+        order[np.argsort(frames)] = np.arange(len(frames))
+        return found[order]
+
+    def gather(
+        self,
+        function: Callable[..., Any],
+        shapes: tuple[tuple[int, ...], ...],
+        dtype: Any,
+    ) -> tuple[Any, ...]:
+        """
+        Return arrays with what a function says of all frames.
+
+        Parameters
+        ----------
+        function : callable
+            Returns a tuple of arrays with a row for each frame of a block.
+        shapes : tuple of tuple of int
+            Shapes of the rows of these arrays.
+        dtype : dtype
+            Their type.
+
+        Returns
+        -------
+        tuple of ndarray
+            The arrays for all frames.
+        """
+        parts = list(self.map(function))
+        if len(parts) == 1:
+            return tuple(parts[0])
+        if not parts:
+            return tuple(np.empty((0, *shape), dtype=dtype) for shape in shapes)
+        return tuple(map(np.concatenate, zip(*parts, strict=True)))
+
+    def spread(self, values: NDArray) -> Any:
+        """Return an array with a row for each frame as these blocks show arrays."""
+        return values
+
+    def whole(self) -> NDArray:
+        """Return all frames, of blocks that are arrays."""
+        return np.concatenate(list(self.map(_same)))
+
+    def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
+        """
+        Return larger blocks where these are many small ones in memory.
+
+        Parameters
+        ----------
+        join : callable
+            Makes one block of a list of consecutive ones.
+        n_frames : int
+            The most frames of a block.
+
+        Returns
+        -------
+        FrameBlocks
+            The same frames.
+        """
+        return self
+
+    def parts(self, arrays: tuple[NDArray, ...], block: int) -> tuple[NDArray, ...]:
+        """Return the rows of arrays that belong to the frames of a block."""
+        return tuple(array[self.slices[block]] for array in arrays)
+
+
+def _rows(block: NDArray, chosen: NDArray) -> NDArray:
+    """Return the chosen frames of a block."""
+    return block[chosen]
+
+
+def _same(block: Any) -> Any:
+    """Return a block as it is."""
+    return block
+
+
+class MemoryBlocks(FrameBlocks):
+    """
+    Blocks in memory.
+
+    Parameters
+    ----------
+    blocks : sequence
+        The blocks.
+    lengths : sequence of int
+        How many frames each has.
+    n_threads : int, default=1
+        Threads that work on blocks at the same time.
+    """
+
+    def __init__(
+        self, blocks: Sequence[Any], lengths: Sequence[int], n_threads: int = 1
+    ):
+        super().__init__(lengths)
+        self.blocks = blocks
+        self.n_threads = n_threads
+
+    @classmethod
+    def of(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
+        """Return an array (n_frames, ...) in blocks of so many frames."""
+        starts = range(0, len(array), block_frames)
+        blocks = [array[start : start + block_frames] for start in starts]
+        return cls(blocks, [len(block) for block in blocks], n_threads)
+
+    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
+        """Yield what a function makes of each block, in order."""
+
+        def run(number: int) -> Any:
+            return function(self.blocks[number], *self.parts(by_frame, number))
+
+        numbers = range(len(self.blocks))
+        if min(self.n_threads, len(self.blocks)) < 2:
+            yield from map(run, numbers)
+            return
+        with ThreadPoolExecutor(self.n_threads) as pool:
+            yield from pool.map(run, numbers)
+
+    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+        """Return the blocks that a function makes of these."""
+        blocks = list(self.map(function, *by_frame))
+        return type(self)(blocks, self.lengths, self.n_threads)
+
+    def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
+        """Return blocks of at most so many frames, made of as many as can be."""
+        groups: list[list[int]] = []
+        size = 0
+        for number, length in enumerate(self.lengths):
+            if not groups or size + length > n_frames:
+                groups.append([])
+                size = 0
+            groups[-1].append(number)
+            size += length
+        blocks = [join([self.blocks[number] for number in group]) for group in groups]
+        lengths = [sum(self.lengths[number] for number in group) for group in groups]
+        return type(self)(blocks, lengths, self.n_threads)
+
+
+class StoredBlocks(FrameBlocks):
+    """
+    Blocks that are read, and computed, whenever they are needed.
+
+    Parameters
+    ----------
+    read : callable
+        Returns a block, given its number.
+    lengths : sequence of int
+        How many frames each block has.
+    """
+
+    def __init__(self, read: Callable[[int], Any], lengths: Sequence[int]):
+        super().__init__(lengths)
+        self.read = read
+
+    @classmethod
+    def of(cls, table: Any, block_frames: int) -> Self:
+        """Return what can be sliced along its frames in blocks of so many."""
+        starts = range(0, table.shape[0], block_frames)
+        slices = [slice(s, min(s + block_frames, table.shape[0])) for s in starts]
+
+        def read(number: int) -> NDArray:
+            return np.asarray(table[slices[number]])
+
+        return cls(read, [part.stop - part.start for part in slices])
+
+    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
+        """Yield what a function makes of each block, in order."""
+        for number in range(len(self.lengths)):
+            yield function(self.read(number), *self.parts(by_frame, number))
+
+    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+        """Return the blocks that a function makes of these when they are read."""
+
+        def read(number: int) -> Any:
+            return function(self.read(number), *self.parts(by_frame, number))
+
+        return type(self)(read, self.lengths)

@@ -1,0 +1,140 @@
+"""Frames ready for the passes of the joint refinement, by points or by directions.
+
+The shapes of greatest likelihood are combinations of the rows of the measurement
+matrix. Of a table with many points and none missing, frames need to be known only by
+their inner products with directions that the shapes are made of, and by their energy:
+a pass over them then costs the same for any number of points.
+"""
+
+from functools import partial
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._frame_products import FrameTracks, joined_frames
+from isa_nrsfm._marginal_likelihood import BLOCK_FRAMES, prepared_frames
+from isa_nrsfm._tracks import seen_points
+
+
+class JointFrames(NamedTuple):
+    """
+    Frames of a table, ready for passes over them.
+
+    Attributes
+    ----------
+    blocks : FrameBlocks
+        Blocks as of `prepared_frames`.
+    directions : ndarray of shape (n_directions, n_points) or None
+        Orthonormal rows: the frames are given by their inner products with these, and
+        by their energy; None where they are given by their points.
+    """
+
+    blocks: FrameBlocks
+    directions: NDArray | None
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.blocks.n_frames
+
+    @classmethod
+    def of_points(
+        cls, rows: FrameBlocks, complete: bool, weights: NDArray | None = None
+    ) -> Self:
+        """
+        Return frames given by their points.
+
+        Parameters
+        ----------
+        rows : FrameBlocks
+            Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
+        complete : bool
+            Whether no point is missing.
+        weights : ndarray of shape (n_frames, n_points), optional
+            Weights of the points, by default one for those that are seen.
+
+        Returns
+        -------
+        JointFrames
+            The frames.
+        """
+        if weights is not None:
+            return cls(rows.derive(_weighted_frames, weights), None)
+        return cls(rows.derive(partial(_plain_frames, complete=complete)), None)
+
+    @classmethod
+    def along(cls, rows: FrameBlocks, directions: NDArray) -> Self:
+        """
+        Return complete frames given by their products with some directions.
+
+        Parameters
+        ----------
+        rows : FrameBlocks
+            Blocks of frames (n_frames, 2, n_points).
+        directions : ndarray of shape (n_directions, n_points)
+            Orthonormal rows, each with sum zero.
+
+        Returns
+        -------
+        JointFrames
+            The frames.
+        """
+        blocks = rows.derive(partial(_compressed_frames, directions=directions))
+        return cls(blocks.regrouped(_joined, BLOCK_FRAMES), directions)
+
+    def coordinates(self, shapes: NDArray) -> NDArray:
+        """Return shapes (..., n_points) in the coordinates of the frames."""
+        return shapes if self.directions is None else shapes @ self.directions.T
+
+    def points(self, shapes: NDArray) -> NDArray:
+        """Return the points of shapes in the coordinates of the frames."""
+        return shapes if self.directions is None else shapes @ self.directions
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames, in the order of the table."""
+        chosen = np.zeros(self.n_frames, dtype=bool)
+        chosen[frames] = True
+        taken = [part for block in self.blocks.map(_taken, chosen) for part in block]
+        lengths = [len(part.weight) for part in taken]
+        blocks = MemoryBlocks([[part] for part in taken], lengths)
+        return type(self)(blocks.regrouped(_joined, BLOCK_FRAMES), self.directions)
+
+
+def _plain_frames(rows: NDArray, complete: bool) -> list[FrameTracks]:
+    """Return frames ready for passes, points that are missing having weight zero."""
+    tracks = rows.transpose(0, 2, 1)
+    return prepared_frames(tracks, None if complete else seen_points(tracks) * 1.0)
+
+
+def _weighted_frames(rows: NDArray, weights: NDArray) -> list[FrameTracks]:
+    """Return frames ready for passes, with weights."""
+    return prepared_frames(rows.transpose(0, 2, 1), weights)
+
+
+def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
+    """Return complete frames ready for passes, by products with some directions."""
+    n_frames, _, n_points = rows.shape
+    products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
+    frames = FrameTracks(
+        np.ascontiguousarray(products.transpose(2, 1, 0)),
+        None,
+        np.zeros((2, n_frames)),
+        np.full(n_frames, float(n_points)),
+        np.vecdot(rows, rows).sum(axis=1),
+    )
+    starts = range(0, n_frames, BLOCK_FRAMES)
+    return [frames.take(slice(start, start + BLOCK_FRAMES)) for start in starts]
+
+
+def _taken(block: list[FrameTracks], chosen: NDArray) -> list[FrameTracks]:
+    """Return the chosen frames of a block."""
+    ends = np.cumsum([len(part.weight) for part in block])
+    parts = zip(block, np.split(chosen, ends[:-1]), strict=True)
+    return [part.take(np.flatnonzero(which)) for part, which in parts if which.any()]
+
+
+def _joined(blocks: list[list[FrameTracks]]) -> list[FrameTracks]:
+    """Return the frames of several blocks as one."""
+    return [joined_frames([part for block in blocks for part in block])]

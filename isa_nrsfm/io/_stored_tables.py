@@ -1,0 +1,149 @@
+"""Tables in files that are read block by block, as they are needed."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm._stored_table import StoredTable
+
+if TYPE_CHECKING:
+    import os
+
+SUFFIXES = (".npy", ".parquet")
+
+
+def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
+    """
+    Open a table that need not fit into memory.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A ``.npy`` file with an array (n_frames, 2 * n_points), a ``.parquet`` file with
+        these columns and no others, or a folder of files of one of these kinds, which
+        are put below each other in the order of their names. Other files in the folder
+        are refused, but for hidden ones.
+
+    Returns
+    -------
+    StoredTable or memmap
+        The table; the memory map of a single ``.npy`` file.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file, or none in the folder.
+    ValueError
+        If files are of another kind, do not fit together, or do not hold a table of
+        numbers.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from isa_nrsfm.io import open_table
+    >>> with TemporaryDirectory() as folder:
+    ...     np.save(Path(folder, "part0.npy"), np.zeros((30, 136)))
+    ...     np.save(Path(folder, "part1.npy"), np.zeros((20, 136)))
+    ...     open_table(folder).shape
+    (50, 136)
+    """
+    path = Path(path)
+    if path.is_dir():
+        files = sorted(p for p in path.iterdir() if not p.name.startswith((".", "_")))
+    else:
+        files = [path]
+    if not files:
+        raise FileNotFoundError(f"{path} has no {' or '.join(SUFFIXES)} files")
+    kinds = {file.suffix for file in files}
+    if len(kinds) > 1 or not kinds <= set(SUFFIXES):
+        raise ValueError(
+            f"{path} must be or hold files of one kind, {' or '.join(SUFFIXES)}; got "
+            + ", ".join(file.name for file in files[:4])
+            + (", ..." if len(files) > 4 else "")
+        )
+    if kinds == {".parquet"}:
+        return _open_parquet(files)
+    arrays = [_mapped(file) for file in files]
+    _same_shape(files, [array.shape[1] for array in arrays], "columns")
+    if len(files) == 1:
+        return arrays[0]
+    _same_shape(files, [array.dtype for array in arrays], "numbers of type")
+    parts = [(len(array), _rows_of(array)) for array in arrays]
+    return StoredTable(parts, arrays[0].shape[1], arrays[0].dtype)
+
+
+def _mapped(file: Path) -> NDArray:
+    """Return the memory map of an array."""
+    array = np.load(file, mmap_mode="r")
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise ValueError(
+            f"{file} must hold a table of real numbers, (n_frames, 2 * n_points); got "
+            f"an array of shape {array.shape} and type {array.dtype}"
+        )
+    return array
+
+
+def _rows_of(array: NDArray) -> Callable[[int, int], NDArray]:
+    """Return what reads rows of an array."""
+
+    def read(first: int, last: int) -> NDArray:
+        return np.asarray(array[first:last])
+
+    return read
+
+
+def _same_shape(files: list[Path], values: list[Any], what: str) -> None:
+    """Refuse files that do not fit together."""
+    for file, value in zip(files, values, strict=True):
+        if value != values[0]:
+            raise ValueError(
+                f"all files must have the same {what}: {files[0].name} has "
+                f"{values[0]}, {file.name} {value}"
+            )
+
+
+def _open_parquet(files: list[Path]) -> StoredTable:
+    """Return the table that parquet files hold."""
+    parquet = import_optional("pyarrow.parquet", extra="parquet")
+    types = import_optional("pyarrow.types", extra="parquet")
+    opened = [parquet.ParquetFile(file) for file in files]
+    names = [table.schema_arrow.names for table in opened]
+    _same_shape(files, names, "columns")
+    kinds = set()
+    for file, table in zip(files, opened, strict=True):
+        for field in table.schema_arrow:
+            if not (types.is_floating(field.type) or types.is_integer(field.type)):
+                raise ValueError(
+                    f"{file} must hold columns of numbers only; column {field.name!r} "
+                    f"is of type {field.type}"
+                )
+            kinds.add(str(field.type))
+    dtype = np.dtype(np.float32 if kinds == {"float"} else np.float64)
+    parts = [(table.metadata.num_rows, _row_groups(table, dtype)) for table in opened]
+    return StoredTable(parts, len(names[0]), dtype, np.array(names[0], dtype=object))
+
+
+def _row_groups(table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
+    """Return what reads rows of a parquet file, only the groups that are needed."""
+    sizes = [
+        table.metadata.row_group(group).num_rows
+        for group in range(table.metadata.num_row_groups)
+    ]
+    ends = np.cumsum(sizes, dtype=int)
+
+    def read(first: int, last: int) -> NDArray:
+        groups = np.flatnonzero((ends > first) & (ends - sizes < last))
+        begin = ends[groups[0]] - sizes[groups[0]]
+        found = table.read_row_groups(groups.tolist()).slice(
+            first - begin, last - first
+        )
+        columns = [np.asarray(column, dtype=dtype) for column in found.columns]
+        return np.stack(columns, axis=1)
+
+    return read

@@ -1,0 +1,159 @@
+"""Tables on dask: threads, a cluster, workers that are lost, joblib's backend."""
+
+import os
+import signal
+
+import joblib
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from sklearn.model_selection import GridSearchCV
+
+from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._dask_blocks import DaskBlocks
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+array = pytest.importorskip("dask.array")
+distributed = pytest.importorskip("distributed")
+
+K = 2
+ATTRIBUTES = ("mean_shape_", "basis_", "alpha_", "alpha_std_", "motion_")
+FRAMES = (70, 150, 0, 80)
+
+
+def table(missing=0.0):
+    X = make_nonrigid_tracks(300, 20, K, noise=0.01, random_state=0).data
+    if missing:
+        hidden = np.random.default_rng(0).random((300, 20)) < missing
+        X = np.where(np.repeat(hidden, 2, axis=1), np.nan, X)
+    return X
+
+
+def chunked(X, columns=40):
+    return array.from_array(X, chunks=(FRAMES, columns))
+
+
+def assert_same_model(got, expected):
+    for name in ATTRIBUTES:
+        value = getattr(expected, name)
+        found = np.asarray(getattr(got, name))
+        assert_allclose(found, value, rtol=0, atol=1e-8 * np.abs(value).max())
+    assert got.inverse_snr_ == pytest.approx(expected.inverse_snr_, rel=1e-8)
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with distributed.LocalCluster(**options) as cluster:
+        with distributed.Client(cluster):
+            yield cluster
+
+
+class TestThreads:
+    @pytest.mark.parametrize("missing", [0.0, 0.1])
+    def test_fit_is_that_in_memory(self, missing):
+        X = table(missing)
+        model = AffineNRSfM(K, random_state=0).fit(chunked(X, columns=16))
+        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+
+    def test_results_are_dask_arrays(self):
+        X = table()
+        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
+        plain = AffineNRSfM(K, random_state=0).fit(X)
+        for name in ("alpha_", "motion_", "translation_", "alpha_std_"):
+            assert isinstance(getattr(model, name), array.Array)
+            assert getattr(model, name).chunks[0] == (70, 150, 80)
+        for name in ("transform", "reconstruct", "reproject"):
+            got = getattr(model, name)(chunked(X))
+            assert isinstance(got, array.Array)
+            assert_allclose(got.compute(), getattr(plain, name)(X), atol=1e-8)
+        assert model.score(chunked(X)) == pytest.approx(plain.score(X), rel=1e-8)
+        assert_allclose(
+            model.diagnostics().weak_deviations,
+            plain.diagnostics().weak_deviations,
+            rtol=1e-6,
+        )
+
+    def test_chunks_of_unknown_length(self):
+        X = table()
+        unknown = chunked(np.column_stack([X, np.arange(300)]), columns=41)
+        unknown = unknown[unknown[:, 40] % 7 != 0][:, :40]
+        model = AffineNRSfM(K, random_state=0).fit(unknown)
+        expected = AffineNRSfM(K, random_state=0).fit(X[np.arange(300) % 7 != 0])
+        assert_same_model(model, expected)
+
+    def test_errors(self):
+        with pytest.raises(ValueError, match="got n_features=39"):
+            AffineNRSfM(K).fit(chunked(table())[:, :39])
+        with pytest.raises(ValueError, match=r"on dask, need refinement='joint'"):
+            AffineNRSfM(K, loss="huber").fit(chunked(table()))
+        X = table()
+        X[200, 3] = np.inf
+        with pytest.raises(ValueError, match="infinity"):
+            AffineNRSfM(K).fit(chunked(X))
+
+
+class TestCluster:
+    def test_fit_is_that_in_memory(self, cluster):
+        X = table(0.1)
+        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
+        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+
+    def test_a_worker_that_is_killed_does_not_change_the_result(
+        self, cluster, monkeypatch
+    ):
+        X = table()
+        compute, maps = DaskBlocks.map, []
+
+        def map_and_kill(self, *args):
+            maps.append(args)
+            if len(maps) == 20:
+                first = next(iter(cluster.workers.values()))
+                os.kill(first.pid, signal.SIGKILL)
+            return compute(self, *args)
+
+        monkeypatch.setattr(DaskBlocks, "map", map_and_kill)
+        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
+        assert len(maps) > 20
+        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+
+    def test_nothing_as_large_as_the_table_comes_back(self, cluster, monkeypatch):
+        # But for a table so small that it is taken whole by the first stages.
+        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._sampling.SAMPLE_FRAMES", 40)
+        compute, largest = DaskBlocks.map, []
+
+        def measured(self, *args):
+            found = list(compute(self, *args))
+            largest.append(sum(map(size_of, found)))
+            return iter(found)
+
+        monkeypatch.setattr(DaskBlocks, "map", measured)
+        X = np.tile(table(), (4, 1))
+        blocks = array.from_array(X, chunks=(400, 40))
+        AffineNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
+        # Cameras, their gradients and curvatures, coefficients: 24 numbers a frame.
+        assert max(largest) < 0.7 * X.size
+
+
+def size_of(found):
+    """Return how many numbers arrays in tuples and lists have."""
+    if isinstance(found, tuple | list):
+        return sum(map(size_of, found))
+    return np.size(found)
+
+
+class TestJoblib:
+    def test_grid_search_and_restarts(self, cluster):
+        X = table()
+        isa = FastISA(n_init=4, n_jobs=2)
+        search = GridSearchCV(
+            AffineNRSfM(isa=isa, refinement="alternating", random_state=0),
+            {"n_components": [1, 2]},
+            cv=2,
+            n_jobs=2,
+        )
+        plain = search.fit(X).cv_results_["mean_test_score"]
+        with joblib.parallel_config("dask"):
+            on_cluster = search.fit(X).cv_results_["mean_test_score"]
+        assert_allclose(on_cluster, plain, rtol=1e-8)

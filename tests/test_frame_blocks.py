@@ -1,0 +1,99 @@
+"""Blocks of frames: any way of splitting and computing them gives the same."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from isa_nrsfm._frame_blocks import MemoryBlocks, StoredBlocks
+
+N_FRAMES = 23
+
+
+def blocks_of(kind, array, length):
+    if kind == "stored":
+        return StoredBlocks.of(array, length)
+    return MemoryBlocks.of(array, length, n_threads=3 if kind == "threads" else 1)
+
+
+@pytest.fixture(params=["memory", "threads", "stored"])
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def array():
+    return np.random.default_rng(0).normal(size=(N_FRAMES, 4))
+
+
+def scaled(block, factors):
+    return block * factors[:, None]
+
+
+@pytest.mark.parametrize("length", [1, 5, 23, 100])
+class TestBlocks:
+    def test_map_yields_blocks_with_their_rows_in_order(self, kind, array, length):
+        blocks = blocks_of(kind, array, length)
+        factors = np.arange(N_FRAMES)
+        got = list(blocks.map(scaled, factors))
+        assert [len(block) for block in got] == blocks.lengths
+        assert blocks.n_frames == N_FRAMES
+        assert_array_equal(np.concatenate(got), array * factors[:, None])
+
+    def test_derived_blocks_can_be_derived_from(self, kind, array, length):
+        factors = np.arange(N_FRAMES)
+        blocks = blocks_of(kind, array, length).derive(scaled, factors)
+        blocks = blocks.derive(scaled, 2.0 * factors)
+        assert_array_equal(
+            blocks.whole(), array * factors[:, None] * 2 * factors[:, None]
+        )
+
+    def test_take_returns_frames_in_the_order_asked_for(self, kind, array, length):
+        order = np.random.default_rng(1).permutation(N_FRAMES)[:9]
+        assert_array_equal(blocks_of(kind, array, length).take(order), array[order])
+
+    def test_gather_concatenates_each_of_several_results(self, kind, array, length):
+        blocks = blocks_of(kind, array, length)
+        first, second = blocks.gather(lambda b: (b, b[:, 0]), ((4,), ()), float)
+        assert_array_equal(first, array)
+        assert_array_equal(second, array[:, 0])
+
+
+def test_stored_blocks_are_computed_when_they_are_needed(array):
+    calls = []
+
+    def recorded(block):
+        calls.append(len(block))
+        return block
+
+    stored = StoredBlocks.of(array, 10).derive(recorded)
+    assert calls == []
+    list(stored.map(len))
+    stored.whole()
+    assert calls == [10, 10, 3] * 2
+    calls.clear()
+    kept = MemoryBlocks.of(array, 10).derive(recorded)
+    kept.whole()
+    assert calls == [10, 10, 3]
+
+
+@pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
+def test_small_blocks_are_regrouped(array, n_frames, lengths):
+    blocks = MemoryBlocks.of(array, 3)
+    larger = blocks.regrouped(np.concatenate, n_frames)
+    assert larger.lengths == lengths
+    assert_array_equal(larger.whole(), array)
+
+
+def test_an_error_in_a_thread_is_raised(array):
+    def fail(block):
+        raise ValueError("no good")
+
+    with pytest.raises(ValueError, match="no good"):
+        list(MemoryBlocks.of(array, 2, n_threads=2).map(fail))
+
+
+def test_no_frames():
+    blocks = MemoryBlocks.of(np.empty((0, 4)), 5)
+    (got,) = blocks.gather(lambda b: (b,), ((4,),), np.float32)
+    assert got.shape == (0, 4)
+    assert got.dtype == np.float32

@@ -1,0 +1,75 @@
+"""Which frames of a large table the first stages work on."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scenes import measurements, permute_frames
+
+from isa_nrsfm import _sampling as module
+from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._frame_blocks import MemoryBlocks
+from isa_nrsfm._sampling import rigid_energy, sample_frames, spread
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+
+@pytest.fixture
+def small_limits(monkeypatch):
+    monkeypatch.setattr(module, "SMALL_TABLE", 1000)
+    monkeypatch.setattr(module, "SAMPLE_FRAMES", 40)
+
+
+def matrix(n_frames, n_points=20):
+    tracks = make_nonrigid_tracks(n_frames, n_points, 2, noise=0.02, random_state=0)
+    return measurements(tracks.data.reshape(n_frames, n_points, 2))
+
+
+def sample(W, block_frames=64):
+    rows = MemoryBlocks.of(W.reshape(len(W) // 2, 2, -1), block_frames)
+    return sample_frames(rows, W.shape[1], factorise(W, 2).rigid_shape)
+
+
+def test_parts_grow_to_half_of_the_frames(small_limits, monkeypatch):
+    for n_frames, sizes in ((40, []), (41, [40]), (321, [40, 160]), (700, [40, 160])):
+        found = sample(matrix(n_frames))
+        assert [len(part) for part in found.parts] == sizes
+        assert all((np.diff(part) > 0).all() for part in found.parts)
+    monkeypatch.setattr(module, "MOST_SAMPLED", 160)
+    assert [len(part) for part in sample(matrix(700)).parts] == [40]
+
+
+def test_measurement_matrix_is_that_of_the_first_part(small_limits):
+    W = matrix(100)
+    found = sample(W)
+    rows = W.reshape(100, 2, -1)[found.parts[0]]
+    assert_array_equal(found.W, rows.reshape(80, -1))
+    assert_array_equal(sample(matrix(40)).W, matrix(40))
+
+
+def test_small_tables_are_taken_whole():
+    W = matrix(700)
+    found = sample(W)
+    assert found.parts == []
+    assert_array_equal(found.W, W)
+
+
+def test_frames_are_spread_from_the_most_to_the_least_rigid_one(small_limits):
+    W = matrix(100)
+    factors = factorise(W, 2)
+    rest = W - factors.rigid_motion @ factors.rigid_shape
+    energy = np.sum(rest.reshape(100, -1) ** 2, axis=1)
+    np.testing.assert_allclose(
+        rigid_energy(W.reshape(100, 2, -1), factors.rigid_shape), energy
+    )
+    chosen = spread(np.argsort(energy), 21)
+    assert len(set(chosen)) == 21
+    assert (np.diff(energy[chosen]) > 0).all()
+    assert energy[chosen[0]] == energy.min()
+    assert energy[chosen[-1]] == energy.max()
+    assert_array_equal(sample(W).parts[0], np.sort(spread(np.argsort(energy), 40)))
+
+
+def test_the_same_frames_in_any_order_and_blocks(small_limits):
+    W = matrix(100)
+    permuted, order = permute_frames(W, 1)
+    expected = sample(W).parts[0]
+    assert_array_equal(np.sort(order[sample(permuted, 7).parts[0]]), expected)

@@ -1,0 +1,286 @@
+"""Tables that are read block by block: files, the fit, and what is said of bad ones."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import isa_nrsfm._completion as completion
+import isa_nrsfm._sampling as sampling
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._estimator import OF_FRAMES
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import open_table
+
+pa = pytest.importorskip("pyarrow")
+pq = pytest.importorskip("pyarrow.parquet")
+
+K = 2
+OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
+# Megabytes: blocks of 1, of a few and of all frames.
+NEEDED = r"needs the cameras .* keep_frames=False"
+MEMORIES = (0.01, 0.5, 1000)
+
+
+def table(missing=0.0, n_points=20, n_frames=300):
+    tracks = make_nonrigid_tracks(n_frames, n_points, K, noise=0.01, random_state=0)
+    X = tracks.data
+    if missing:
+        hidden = np.random.default_rng(0).random((n_frames, n_points)) < missing
+        X = np.where(np.repeat(hidden, 2, axis=1), np.nan, X)
+    return X
+
+
+def estimator(**params):
+    return AffineNRSfM(K, random_state=0, **params)
+
+
+@pytest.fixture
+def sampled(monkeypatch):
+    """Small tables are worked on as large ones are."""
+    monkeypatch.setattr(sampling, "SMALL_TABLE", 1000)
+    monkeypatch.setattr(sampling, "SAMPLE_FRAMES", 50)
+    monkeypatch.setattr(completion, "MODEL_FRAMES", 100)
+    monkeypatch.setattr(completion, "FEWEST_SHOWN", 20)
+
+
+def memmap(X, path):
+    np.save(path / "table.npy", X)
+    return np.load(path / "table.npy", mmap_mode="r")
+
+
+def folder(X, path, kind, n_files=3):
+    """Write a table to several files of a folder and open that."""
+    path = path / kind
+    path.mkdir()
+    for number, part in enumerate(np.array_split(X, n_files)):
+        file = path / f"part{number}.{kind}"
+        if kind == "npy":
+            np.save(file, part)
+        else:
+            names = [f"{axis}{j}" for j in range(X.shape[1] // 2) for axis in "xy"]
+            columns = pa.table(dict(zip(names, part.T, strict=True)))
+            pq.write_table(columns, file, row_group_size=17)
+    return open_table(path)
+
+
+def assert_same_model(got, expected):
+    for name in OF_SHAPES + OF_FRAMES:
+        value = getattr(expected, name)
+        atol = 1e-8 * np.abs(value).max()
+        assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
+    assert got.inverse_snr_ == pytest.approx(expected.inverse_snr_, rel=1e-8)
+    assert got.noise_variance_ == pytest.approx(expected.noise_variance_, rel=1e-8)
+    assert got.rank_floor_ == pytest.approx(expected.rank_floor_, rel=1e-6)
+
+
+class TestFit:
+    @pytest.mark.parametrize("missing", [0.0, 0.1])
+    def test_block_size_makes_no_difference(self, sampled, tmp_path, missing):
+        X = table(missing)
+        expected = estimator().fit(X)
+        for megabytes in MEMORIES:
+            got = estimator(working_memory=megabytes).fit(memmap(X, tmp_path))
+            assert_same_model(got, expected)
+            assert got.score(memmap(X, tmp_path)) == pytest.approx(
+                expected.score(X), rel=1e-8
+            )
+
+    @pytest.mark.parametrize("n_points", [100, 400])
+    def test_of_many_points(self, monkeypatch, tmp_path, n_points):
+        # Shapes along directions, and with the more points a Krylov method, too.
+        monkeypatch.setattr("isa_nrsfm._factorisation.DENSE", 300)
+        X = table(n_points=n_points, n_frames=160)
+        expected = estimator().fit(X)
+        got = estimator(working_memory=1).fit(memmap(X, tmp_path))
+        assert_same_model(got, expected)
+
+    @pytest.mark.parametrize("kind", ["npy", "parquet"])
+    def test_of_folders(self, tmp_path, kind):
+        X = table(0.1)
+        stored = folder(X, tmp_path, kind)
+        assert stored.shape == X.shape
+        got = estimator(working_memory=0.5).fit(stored)
+        assert_same_model(got, estimator().fit(X))
+        if kind == "parquet":
+            assert_array_equal(got.feature_names_in_[:2], ["x0", "y0"])
+        assert_allclose(got.transform(stored), got.alpha_, atol=1e-12)
+
+    def test_threads_make_no_difference(self, sampled):
+        X = np.tile(table(), (5, 1))
+        one, two = (estimator(n_jobs=n).fit(X) for n in (1, 2))
+        for name in OF_SHAPES + OF_FRAMES:
+            assert_array_equal(getattr(one, name), getattr(two, name))
+
+    @pytest.mark.parametrize("scale_frames", [True, False])
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    def test_of_other_layouts_and_weights(self, tmp_path, layout, scale_frames):
+        X = table()
+        if layout == "planar":
+            X = X.reshape(len(X), -1, 2).transpose(0, 2, 1).reshape(X.shape)
+        params = {"layout": layout, "scale_frames": scale_frames}
+        got = estimator(working_memory=0.5, **params).fit(memmap(X, tmp_path))
+        assert_same_model(got, estimator(**params).fit(X))
+
+    def test_single_precision_is_kept(self, tmp_path):
+        X = table().astype(np.float32)
+        got = estimator(working_memory=0.5).fit(memmap(X, tmp_path))
+        assert got.basis_.dtype == got.alpha_.dtype == np.float32
+        assert_allclose(got.alpha_, estimator().fit(X).alpha_, atol=1e-5)
+
+    def test_whole_numbers(self, tmp_path):
+        X = np.round(1000 * table()).astype(np.int16)
+        got = estimator(working_memory=0.5).fit(memmap(X, tmp_path))
+        assert_same_model(got, estimator().fit(X))
+
+
+class TestNewTables:
+    def test_all_methods_read_blocks(self, tmp_path):
+        X = table(0.1)
+        X[7] = np.nan
+        model = estimator(working_memory=0.05).fit(table())
+        stored = memmap(X, tmp_path)
+        for name in ("transform", "reconstruct", "reproject"):
+            got, expected = (getattr(model, name)(each) for each in (stored, X))
+            assert type(got) is np.ndarray
+            assert_allclose(got, expected, rtol=1e-10, atol=1e-12)
+        assert np.isnan(model.transform(stored)[7]).all()
+        for got, expected in zip(
+            model.decompose(stored), model.decompose(X), strict=True
+        ):
+            assert_allclose(got, expected, rtol=1e-10, atol=1e-12)
+        for camera in ("orthographic", "weak_perspective"):
+            assert_allclose(
+                model.reconstruct(stored, camera),
+                model.reconstruct(X, camera),
+                rtol=1e-8,
+                atol=1e-10,
+            )
+
+
+class TestKeepFrames:
+    def test_in_files(self, tmp_path):
+        X = table()
+        plain = estimator().fit(X)
+        model = estimator(keep_frames=tmp_path / "found").fit(X)
+        for name in OF_FRAMES:
+            array = getattr(model, name)
+            assert isinstance(array, np.memmap)
+            assert_array_equal(array, getattr(plain, name))
+            assert_array_equal(np.load(tmp_path / f"found/{name[:-1]}.npy"), array)
+        assert_allclose(
+            model.diagnostics().weak_deviations, plain.diagnostics().weak_deviations
+        )
+
+    def test_not_at_all(self):
+        X = table()
+        model, plain = estimator(keep_frames=False), estimator().fit(X)
+        assert_array_equal(model.fit_transform(X), plain.alpha_)
+        for name in OF_FRAMES:
+            assert not hasattr(model, name)
+        assert_array_equal(model.basis_, plain.basis_)
+        assert_array_equal(model.reproject(X), plain.reproject(X))
+        with pytest.raises(ValueError, match=NEEDED):
+            model.diagnostics()
+        with pytest.raises(ValueError, match=NEEDED):
+            model.reconstruct(X, "orthographic")
+
+    def test_another_fit_forgets_them(self):
+        model = estimator().fit(table())
+        model.set_params(keep_frames=False).fit(table())
+        assert not hasattr(model, "alpha_")
+
+
+class TestErrors:
+    def test_infinite_values(self, tmp_path):
+        X = table()
+        X[250, 3] = np.inf
+        with pytest.raises(ValueError, match="Input X contains infinity"):
+            estimator(working_memory=0.5).fit(memmap(X, tmp_path))
+
+    @pytest.mark.parametrize(
+        ("row", "message"),
+        [
+            (np.nan, r"1 of 300 frame\(s\) show fewer .* the first is row 250"),
+            (1.0, r"equal in 1 frame\(s\), the first is row 250"),
+        ],
+    )
+    def test_rows_are_named(self, tmp_path, row, message):
+        X = table()
+        X[250] = row
+        with pytest.raises(ValueError, match=message):
+            estimator(working_memory=0.05).fit(memmap(X, tmp_path))
+
+    def test_half_points_are_warned_of_once(self, tmp_path):
+        X = table()
+        X[[40, 250], 3] = np.nan
+        with pytest.warns(
+            UserWarning, match=r"2 point\(s\) in 2 row\(s\).*row 40"
+        ) as w:
+            estimator(working_memory=0.05).fit(memmap(X, tmp_path))
+        assert len(w) == 1
+
+    def test_number_of_columns(self, tmp_path):
+        X = table()
+        with pytest.raises(ValueError, match="an even number; got n_features=39"):
+            estimator().fit(memmap(X[:, :-1], tmp_path))
+        model = estimator().fit(X)
+        with pytest.raises(ValueError, match="expecting 40 features"):
+            model.transform(memmap(X[:, :-2], tmp_path))
+
+    def test_what_needs_memory(self, tmp_path):
+        stored = memmap(table(), tmp_path)
+        for params in ({"refinement": "alternating"}, {"loss": "huber"}):
+            with pytest.raises(ValueError, match=r"read in blocks.*loss='linear'"):
+                estimator(**params).fit(stored)
+
+    def test_other_dimensions(self, tmp_path):
+        with pytest.raises(ValueError, match="Expected 2D array, got 1D"):
+            estimator().fit(memmap(table()[:, 0], tmp_path))
+
+
+class TestOpenTable:
+    @pytest.mark.parametrize("kind", ["npy", "parquet"])
+    def test_slices_are_rows(self, tmp_path, kind):
+        X = table(0.1)
+        stored = folder(X, tmp_path, kind, n_files=4)
+        assert len(stored) == len(X)
+        for rows in (slice(0, 10), slice(70, 230), slice(290, 400), slice(5, 5)):
+            assert_array_equal(stored[rows], X[rows])
+        with pytest.raises(TypeError, match="slice without steps"):
+            stored[3]
+
+    def test_one_array_is_mapped(self, tmp_path):
+        np.save(tmp_path / "table.npy", table())
+        assert isinstance(open_table(tmp_path / "table.npy"), np.memmap)
+
+    def test_single_precision_parquet(self, tmp_path):
+        stored = folder(table().astype(np.float32), tmp_path, "parquet")
+        assert stored.dtype == stored[:3].dtype == np.float32
+
+    def test_empty_folder(self, tmp_path):
+        (tmp_path / ".hidden").write_text("")
+        with pytest.raises(FileNotFoundError, match=r"has no .npy or .parquet files"):
+            open_table(tmp_path)
+
+    def test_other_files(self, tmp_path):
+        np.save(tmp_path / "a.npy", table())
+        (tmp_path / "b.csv").write_text("x0,y0")
+        with pytest.raises(ValueError, match=r"one kind.*got a.npy, b.csv"):
+            open_table(tmp_path)
+
+    def test_files_that_do_not_fit_together(self, tmp_path):
+        np.save(tmp_path / "a.npy", table())
+        np.save(tmp_path / "b.npy", table()[:, :30])
+        with pytest.raises(ValueError, match=r"same columns: a.npy has 40, b.npy 30"):
+            open_table(tmp_path)
+
+    def test_arrays_that_are_no_tables(self, tmp_path):
+        np.save(tmp_path / "a.npy", np.zeros((3, 4, 2)))
+        with pytest.raises(ValueError, match=r"table of real numbers.*\(3, 4, 2\)"):
+            open_table(tmp_path)
+
+    def test_columns_of_text(self, tmp_path):
+        file = tmp_path / "a.parquet"
+        pq.write_table(pa.table({"x0": [1.0], "name": ["b"]}), file)
+        with pytest.raises(ValueError, match="column 'name' is of type string"):
+            open_table(file)
