@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks._figures import draw_curves
 from benchmarks._jobs import Job
-from benchmarks._markdown import found, number, remarks, select, table, value
+from benchmarks._markdown import found, remarks, select, table, value
 from benchmarks._methods import METHOD_TITLES, METHODS
 from benchmarks._sweep import Sweep
 from benchmarks.recovery import instance
@@ -41,11 +41,11 @@ N_LARGEST = 3
 
 TEXT = """\
 Tables of `make_nonrigid_tracks` with weak-perspective cameras and {noise:g} % noise, in
-which one of I={n_frames}, J={n_points}, K={n_components} is varied; each fit has a
-process of its own with one thread of linear algebra, and memory is what it takes beyond
-the table. Exponents are slopes in log-log over the {n_largest} largest settings. Small
-tables cost more than their size tells, because they are fitted from several starts, and
-large ones less, because the first steps are taken on some of the frames.
+which one of I={n_frames}, J={n_points}, K={n_components} is varied; each fit has
+a process of its own with one thread, and memory is what it takes beyond the table.
+Exponents are slopes in log-log over the {n_largest} largest settings. Small tables cost
+more than their size tells, because they are fitted from several starts, and large ones
+less, because the first steps are taken on some of the frames.
 """
 
 
@@ -102,30 +102,34 @@ def seconds_of_svd(measured, W):
 
 
 def exponent(settings, method, measure):
-    """Return the slope in log-log over the largest settings, None with too few."""
+    """Return the slope in log-log over the largest settings, if there are several."""
     points = [
         (setting, np.median(values))
         for setting, records in settings.items()
         if (values := found(select(records, method=method), measure))
     ]
     if len(points) < 2:
-        return None
-    return np.polyfit(*np.log(sorted(points)[-N_LARGEST:]).T, 1)[0]
+        return ""
+    return f"{np.polyfit(*np.log(sorted(points)[-N_LARGEST:]).T, 1)[0]:.2f}"
 
 
 def page(records):
     """Return the tables of the section."""
-    methods = [name for name in TITLES if select(records, method=name)]
     text = TEXT.format(noise=100 * NOISE, n_largest=N_LARGEST, **SWEEP.base)
     parts = [text]
     for title, measure in MEASURES.items():
-        parts.append(f"## {title}\n")
-        parts += SWEEP.tables(records, TITLES, measure)
+        titles = {
+            name: heading
+            for name, heading in TITLES.items()
+            if found(select(records, method=name), measure)
+        }
         rows = [
-            [axis, *(number(exponent(settings, name, measure)) for name in methods)]
+            [axis, *(exponent(settings, name, measure) for name in titles)]
             for axis, settings in SWEEP.panels(records)
         ]
-        parts.append(table(["exponent", *(TITLES[name] for name in methods)], rows))
+        parts.append(f"## {title}\n")
+        parts += SWEEP.tables(records, titles, measure)
+        parts.append(table(["exponent", *titles.values()], rows))
     return "\n".join([*parts, remarks(records, TITLES)])
 
 

@@ -259,7 +259,7 @@ def test_the_page_of_cost_has_exponents(tmp_path):
     page = _cost.page(records)
     assert "| frames I | 1.50 | 1.50 |" in page
     assert "| points J | 1.00 | 1.00 |" in page
-    assert "| basis shapes K | 1.00 |  |" in page
+    assert "| basis shapes K | 1.00 |\n" in page
     assert _cost.draw(records, tmp_path) == ["cost.png"]
     assert (tmp_path / "cost.png").is_file()
 
