@@ -3,7 +3,9 @@ Measurements: ``python -m benchmarks`` and single ones.
 
 ``python -m benchmarks`` measures all methods side by side and writes tables and
 pictures; docs/benchmarks/README.md says how. Its sections are in `_fits`, `_recovered`,
-`_unseen`, `_classification` and `_agreement`.
+`_unseen`, `_classification`, `_agreement` and `_cost`.
+
+`asv_suite`, with asv.conf.json, is a suite for airspeed velocity.
 
 ``python -m benchmarks.accuracy``, ``.recovery`` and ``.speed`` print figures of
 `AffineNRSfM` alone and assert nothing. Sections are named on the command line, all by

@@ -200,9 +200,9 @@ def _set_decades(panel, values):
     panel.minorticks_off()
 
 
-def draw_curves(panels, titles, path, *, measure, label):
+def draw_curves(panels, titles, path, *, measures, log=False):
     """
-    Draw a panel a setting with a curve a method: median and range over the seeds.
+    Draw a column a setting and a row a measure, with a curve a method.
 
     Parameters
     ----------
@@ -212,46 +212,62 @@ def draw_curves(panels, titles, path, *, measure, label):
         Titles of the methods, in order.
     path : path-like
         The png file.
-    measure : callable
-        Returns a number of a record, or None.
-    label : str
-        Name and unit of the numbers.
+    measures : dict of callable
+        By name and unit, what returns a number of a record, or None. Curves are
+        medians over the seeds, with their range.
+    log : bool, default=False
+        Whether both axes are logarithmic. Otherwise settings are evenly spaced.
     """
     figure, axes = pyplot().subplots(
-        1,
+        len(measures),
         len(panels),
         squeeze=False,
-        sharey=True,
-        figsize=(1.25 * PANEL_WIDTH * len(panels), 1.5 * PANEL_HEIGHT + 0.5),
+        sharex="col",
+        sharey="row",
+        figsize=(
+            1.25 * PANEL_WIDTH * len(panels),
+            1.5 * PANEL_HEIGHT * len(measures) + 0.5,
+        ),
         layout="constrained",
     )
-    for (axis, settings), panel in zip(panels, axes[0], strict=True):
-        for method in titles:
-            points = [
-                (place, *np.percentile(values, (0, 50, 100)))
-                for place, records in enumerate(settings.values())
-                if (values := found(select(records, method=method), measure))
-            ]
-            if not points:
-                continue
-            places, least, median, most = np.array(points).T
-            colour = COLOURS.get(method, OTHER_COLOUR)
-            panel.plot(
-                places,
-                median,
-                color=colour,
-                marker=MARKERS.get(method, "x"),
-                markersize=5,
-                label=titles[method],
-            )
-            panel.fill_between(places, least, most, color=colour, alpha=0.15, lw=0)
-        panel.set_xticks(range(len(settings)), [f"{setting:g}" for setting in settings])
+    for (label, measure), row in zip(measures.items(), axes, strict=True):
+        for (_, settings), panel in zip(panels, row, strict=True):
+            _draw_curves_of(panel, settings, titles, measure, log)
+        row[0].set_ylabel(label)
+    for (axis, _), panel in zip(panels, axes[-1], strict=True):
         panel.set_xlabel(axis)
-        panel.spines[["top", "right"]].set_visible(False)
-        panel.grid(linewidth=0.4, alpha=0.6)
-    axes[0, 0].set_ylabel(label)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(
         handles, labels, loc="outside lower center", ncols=len(labels), frameon=False
     )
     save(figure, path)
+
+
+def _draw_curves_of(panel, settings, titles, measure, log):
+    """Draw a curve a method in a panel."""
+    places = settings if log else range(len(settings))
+    for method in titles:
+        points = [
+            (place, *np.percentile(values, (0, 50, 100)))
+            for place, records in zip(places, settings.values(), strict=True)
+            if (values := found(select(records, method=method), measure))
+        ]
+        if not points:
+            continue
+        at, least, median, most = np.array(points).T
+        colour = COLOURS.get(method, OTHER_COLOUR)
+        panel.plot(
+            at,
+            median,
+            color=colour,
+            marker=MARKERS.get(method, "x"),
+            markersize=5,
+            label=titles[method],
+        )
+        panel.fill_between(at, least, most, color=colour, alpha=0.15, lw=0)
+    if log:
+        panel.set(xscale="log", yscale="log")
+    else:
+        panel.set_xticks(places, [f"{setting:g}" for setting in settings])
+    panel.spines[["top", "right"]].set_visible(False)
+    panel.grid(linewidth=0.4, alpha=0.6)

@@ -130,7 +130,7 @@ def _serve(sender, function: Callable, arguments: dict, memory_limit, threads) -
 
     @contextmanager
     def measured():
-        before = _reset_peak_memory()
+        before = reset_peak_memory()
         sender.send(("measuring",))
         since = time.perf_counter()
         yield
@@ -151,7 +151,7 @@ def _serve(sender, function: Callable, arguments: dict, memory_limit, threads) -
     sender.send((*report, list(dict.fromkeys(texts))))
 
 
-def _reset_peak_memory() -> float:
+def reset_peak_memory() -> float:
     """Return the peak of this process, after lowering it to what it uses if allowed."""
     try:
         Path("/proc/self/clear_refs").write_text("5")

@@ -2,23 +2,25 @@
 
 from benchmarks._figures import draw_curves
 from benchmarks._jobs import Job
-from benchmarks._markdown import cell, remarks, select, table, value
+from benchmarks._markdown import remarks, value
 from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._sweep import Sweep
 from benchmarks.recovery import instance, least_similarity
 from isa_nrsfm.metrics import affine_shape_error
 
-# One of them is varied at a time, the others are as here.
-BASE = {"n_points": 68, "n_components": 3, "noise": 0.02}
-VARIED = {
-    "n_points": (25, 40, 68, 150, 500),
-    "n_components": (1, 2, 3, 5, 9),
-    "noise": (0.0, 0.005, 0.01, 0.02, 0.05),
-}
-AXES = {
-    "n_points": "points",
-    "n_components": "basis shapes K",
-    "noise": "noise (share of the points' root mean square)",
-}
+SWEEP = Sweep(
+    base={"n_points": 68, "n_components": 3, "noise": 0.02},
+    varied={
+        "n_points": (25, 40, 68, 150, 500),
+        "n_components": (1, 2, 3, 5, 9),
+        "noise": (0.0, 0.005, 0.01, 0.02, 0.05),
+    },
+    axes={
+        "n_points": "points",
+        "n_components": "basis shapes K",
+        "noise": "noise (share of the points' root mean square)",
+    },
+)
 # By name: what is said of it, and significant digits.
 MEASURES = {
     "similarity_modulo": (
@@ -33,12 +35,6 @@ MEASURES = {
     ),
     "affine_shape_error": ("`affine_shape_error` of the frames, lower is better.", 3),
 }
-
-
-def settings():
-    """Return the settings that are measured, each once."""
-    listed = [BASE | {name: v} for name, values in VARIED.items() for v in values]
-    return list({tuple(setting.items()): setting for setting in listed}.values())
 
 
 def jobs(section, sets, methods, repeats):
@@ -56,7 +52,7 @@ def jobs(section, sets, methods, repeats):
         for seed in range(repeats)
         for name in sets
         for method in methods
-        for setting in settings()
+        for setting in SWEEP.settings()
     ]
 
 
@@ -76,63 +72,27 @@ def measure_recovery(measured, method, seed, **setting):
     return values, {}
 
 
-def along(records, name):
-    """Return the records in which everything but one setting is as in `BASE`."""
-    others = {key: BASE[key] for key in BASE if key != name}
-    return select(records, **others)
-
-
 def page(records):
     """Return the tables of the section."""
-    methods = [name for name in METHODS if select(records, method=name)]
     parts = [
         "Tables of `make_nonrigid_tracks`; weak-perspective and affine cameras, 300 to "
         "500 frames and amplitudes of 15 to 20 %, by seed. Where nothing else is said "
-        f"{BASE['n_points']} points, K={BASE['n_components']}, "
-        f"{100 * BASE['noise']:g} % noise. Median over the seeds and range.\n"
+        f"{SWEEP.base['n_points']} points, K={SWEEP.base['n_components']}, "
+        f"{100 * SWEEP.base['noise']:g} % noise. Median over the seeds and range.\n"
     ]
     for measure, (title, digits) in MEASURES.items():
         parts.append(title + "\n")
-        for name, axis in AXES.items():
-            rows = [
-                [
-                    f"{setting:g}",
-                    *(
-                        cell(
-                            select(
-                                along(records, name), method=method, **{name: setting}
-                            ),
-                            value(measure),
-                            digits,
-                        )
-                        for method in methods
-                    ),
-                ]
-                for setting in VARIED[name]
-            ]
-            titles = [METHOD_TITLES[method] for method in methods]
-            parts.append(table([axis, *titles], rows))
+        parts += SWEEP.tables(records, METHOD_TITLES, value(measure), digits)
     return "\n".join([*parts, remarks(records, METHOD_TITLES)])
 
 
 def draw(records, folder):
     """Draw the similarity of the basis shapes, and return the name of the file."""
     file = "recovery.png"
-    panels = [
-        (
-            axis,
-            {
-                setting: select(along(records, name), **{name: setting})
-                for setting in VARIED[name]
-            },
-        )
-        for name, axis in AXES.items()
-    ]
     draw_curves(
-        panels,
+        SWEEP.panels(records),
         METHOD_TITLES,
         folder / file,
-        measure=value("similarity_modulo"),
-        label="lowest similarity of a basis shape",
+        measures={"lowest similarity of a basis shape": value("similarity_modulo")},
     )
     return [file]

@@ -3,7 +3,14 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from benchmarks import _agreement, _classification, _fits, _recovered, _unseen
+from benchmarks import (
+    _agreement,
+    _classification,
+    _cost,
+    _fits,
+    _recovered,
+    _unseen,
+)
 from benchmarks._methods import METHODS
 from benchmarks._sets import SETS
 
@@ -102,5 +109,14 @@ SECTIONS = {
         ("ict_68", "drink", "faces_wild", "synthetic"),
         tuple(_agreement.COMPARISONS),
         tuple(SETS),
+    ),
+    "cost": Section(
+        "Cost of a fit",
+        _cost.jobs,
+        _cost.page,
+        ("synthetic",),
+        ("joint", _cost.SVD),
+        other_methods=("isa2",),
+        draw=_cost.draw,
     ),
 }

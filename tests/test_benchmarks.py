@@ -1,5 +1,6 @@
 import json
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from isolated_runs import MEGABYTE, misbehave, sleep, use_memory
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
-from benchmarks import _agreement, _data, _fits, _recovered, _sets, _unseen
+from benchmarks import _agreement, _cost, _data, _fits, _recovered, _sets, _unseen
 from benchmarks._agreement import compare
 from benchmarks._classification import AlignedFrames
 from benchmarks._figures import draw_bars, draw_reprojections
@@ -232,6 +233,42 @@ def test_the_page_of_recovery_varies_one_setting_at_a_time():
     assert f"| 150 | {both} | {both} |" in page
     both = "0.5680 (0.06800 to 1.068)"
     assert f"| 0.05 | {both} | {both} |" in page
+
+
+def test_the_page_of_cost_has_exponents(tmp_path):
+    listed = _cost.jobs("cost", ["synthetic"], ["joint", "svd"], 2)
+    settings = _cost.SWEEP.settings()
+    assert len(settings) == 6 + 6 + 5 - 2
+    assert [job.method for job in listed].count("joint") == 2 * len(settings)
+    assert [job.method for job in listed].count("svd") == len(settings)
+    records = [
+        record(
+            section=job.section,
+            set=job.set,
+            method=job.method,
+            seed=job.seed,
+            parameters=job.parameters,
+            values={
+                "cpu_seconds": job.parameters["n_frames"] ** 1.5
+                * job.parameters["n_points"]
+            },
+            memory=float(job.parameters["n_components"]),
+        )
+        for job in listed
+    ]
+    page = _cost.page(records)
+    assert "| frames I | 1.50 | 1.50 |" in page
+    assert "| points J | 1.00 | 1.00 |" in page
+    assert "| basis shapes K | 1.00 |\n" in page
+    assert _cost.draw(records, tmp_path) == ["cost.png"]
+    assert (tmp_path / "cost.png").is_file()
+
+
+@pytest.mark.parametrize("method", _cost.TITLES)
+def test_cost_is_measured_of_each_method(method):
+    setting = {"n_frames": 40, "n_points": 20, "n_components": 2}
+    values, _ = _cost.measure_cost(nullcontext, method, 0, **setting)
+    assert 0 < values["cpu_seconds"] < 60
 
 
 def test_the_page_of_held_out_points_tells_what_was_chosen():
