@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._gauss_newton import fit_without_noise
 from isa_nrsfm._marginal_likelihood import MarginalLikelihood, Passed
 from isa_nrsfm._small_matrices import inverse3
 
@@ -20,6 +21,8 @@ MEMORY = 20
 # The noise variance is at least this share of the mean square of the tracks: tables
 # without noise are fitted, too.
 NOISE_FLOOR = 1e-11
+# Tables with less are taken for such, and Gauss-Newton steps are tried.
+EXACT = 1e-7
 # The logarithm of the noise variance changes by at most so much in a step.
 LARGEST_NOISE_STEP = 1.5
 # A step has to gain this share of what the slope promises.
@@ -104,8 +107,21 @@ def refine_joint(
     point = _Point(likelihood, start, floor)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(maxlen=MEMORY)
     history = [point.value]
-    small_steps = 0
+    small_steps, tried = 0, False
+    exact = EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
+        if not tried and point.state.noise < exact:
+            tried = True
+            import time
+            t=time.process_time()
+            state = _without_noise(likelihood, point, floor)
+            reached = _Point(likelihood, state, floor)
+            print("GN", len(history), time.process_time()-t, point.value, point.state.noise, '->', reached.value, reached.state.noise, reached.passed.residual/likelihood.n_seen)
+            if reached.value < point.value:
+                memory.clear()
+                point = reached
+                history.append(point.value)
+                continue
         step = -_inverse_hessian_product(point, memory)
         if not point.gradient @ step < 0:
             memory.clear()
@@ -133,6 +149,17 @@ def refine_joint(
         small_steps >= 2 and bool(np.isfinite(point.value)),
         point.passed.alpha.T,
     )
+
+
+def _without_noise(
+    likelihood: MarginalLikelihood, point: "_Point", floor: float
+) -> JointState:
+    """Return the state that leaves least of the tracks, and the noise that it says."""
+    shapes, motion, noise = point.state
+    alpha = point.passed.alpha
+    shapes, motion = fit_without_noise(likelihood.blocks, shapes, motion, alpha)
+    left = likelihood(shapes, motion, floor).residual / likelihood.n_seen
+    return JointState(shapes, motion, max(left, floor))
 
 
 class _Point:
