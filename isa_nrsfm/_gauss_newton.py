@@ -58,6 +58,8 @@ DEPENDENT = 1e-9
 # The seen points of a frame determine the others if they keep this share of the energy
 # of each direction of the row space.
 DETERMINED = 1e-3
+# Ridge, relative to the trace, for matrices that can be singular.
+RIDGE = 1e-14
 COMPLETION_STEPS = 60
 
 
@@ -100,7 +102,11 @@ class FramesAndShapes(NamedTuple):
 
 
 def fit_without_noise(
-    blocks: Sequence[FrameTracks], shapes: NDArray, motion: NDArray, alpha: NDArray
+    blocks: Sequence[FrameTracks],
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    stiffness: float,
 ) -> tuple[NDArray, NDArray]:
     """
     Return shapes and cameras that leave as little as possible of tracks.
@@ -115,11 +121,13 @@ def fit_without_noise(
         Cameras to start from.
     alpha : ndarray of shape (n_components, n_frames)
         Coefficients to start from.
+    stiffness : float
+        As in `MarginalLikelihood`.
 
     Returns
     -------
     shapes : ndarray of shape (n_shapes, 3, n_points)
-        Shapes whose coefficients have mean zero and unit covariance.
+        Shapes, in the basis of greatest marginal likelihood.
     motion : ndarray of shape (2, 3, n_frames)
         Cameras.
     """
@@ -138,7 +146,8 @@ def fit_without_noise(
     shapes = (found.shapes @ V.T).reshape(n_shapes, 3, n_points)
     alpha = alpha.copy()
     alpha[:, table.frames] = found.alpha.T
-    return _all_frames(W, seen, shapes, motion, alpha)
+    motion, alpha = _all_frames(W, seen, shapes, motion, alpha)
+    return likely_basis(shapes, motion, alpha, stiffness), motion
 
 
 def compressed(
@@ -220,7 +229,7 @@ def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
         moments = (seen.T @ moments).reshape(n_points, rank, rank)
         moved = (W - place) * seen[:, None]
         right = np.einsum("irj,irk->jk", moved, z)
-        ridge = 1e-14 * np.trace(moments, axis1=1, axis2=2).mean() * np.eye(rank)
+        ridge = RIDGE * np.trace(moments, axis1=1, axis2=2).mean() * np.eye(rank)
         V = np.linalg.solve(moments + ridge, right[..., None])[..., 0]
         V = np.linalg.qr(V - V.mean(axis=0))[0]
     return filled
@@ -341,7 +350,7 @@ def normal_equations(frames: _Frames, state: FramesAndShapes) -> _System:
     n_frames, _, size = X.shape
     n_directions = state.shapes.shape[1]
     E = np.tensordot(X, X, axes=([0, 1], [0, 1]))
-    E += 1e-14 * np.trace(E) * np.eye(size)
+    E += RIDGE * np.trace(E) * np.eye(size)
     root = np.linalg.cholesky(E).T
     X = solve_triangular(root, X.reshape(-1, size).T, trans="T").T.reshape(X.shape)
     Q, rest = frames.tangent, frames.rest[..., None]
@@ -410,17 +419,55 @@ def _table(blocks: Sequence[FrameTracks]) -> tuple[NDArray, NDArray]:
 def _all_frames(
     W: NDArray, seen: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return shapes in the basis of unit coefficients, and the cameras of all frames."""
-    fit = fit_posterior(
-        W.swapaxes(1, 2), shapes, 0.0, weights=seen, initial=alpha.T
-    )
+    """Return cameras and coefficients of all frames for given shapes."""
+    fit = fit_posterior(W.swapaxes(1, 2), shapes, 0.0, weights=seen, initial=alpha.T)
     known = np.isfinite(fit.alpha).all(axis=1)
-    motion = np.where(known, fit.motion.transpose(1, 2, 0), motion)
-    mean = fit.alpha[known].mean(axis=0)
-    rest = fit.alpha[known] - mean
-    covariance = rest.T @ rest / len(rest)
-    covariance += 1e-12 * np.trace(covariance) * np.eye(len(mean))
-    root = np.linalg.cholesky(covariance)
-    basis = np.tensordot(root.T, shapes[1:], 1)
+    return (
+        np.where(known, fit.motion.transpose(1, 2, 0), motion),
+        np.where(known, fit.alpha.T, alpha),
+    )
+
+
+def likely_basis(
+    shapes: NDArray, motion: NDArray, alpha: NDArray, stiffness: float
+) -> NDArray:
+    """
+    Return the same shapes in the basis of greatest marginal likelihood.
+
+    Without noise it is free to shift the mean shape, and to mix the basis shapes by any
+    A: alpha becomes ``A^-1 (alpha - mean)``, and the objective changes by
+
+        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + stiffness tr(A^T H A)
+
+    with H the sum over the frames of ``<M B_k, M B_l>``. Where the covariance of the
+    coefficients is the identity and H is diagonal, A is diagonal, too.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras.
+    alpha : ndarray of shape (n_components, n_frames)
+        Coefficients.
+    stiffness : float
+        As in `MarginalLikelihood`.
+
+    Returns
+    -------
+    ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes.
+    """
+    n_frames = motion.shape[2]
+    mean = alpha.mean(axis=1)
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
-    return np.concatenate([mean_shape[None], basis]), motion
+    rest = alpha - mean[:, None]
+    covariance = rest @ rest.T / n_frames
+    covariance += RIDGE * np.trace(covariance) * np.eye(len(mean))
+    basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
+    cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
+    energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
+    price = stiffness * np.maximum(energy, 0.0)
+    scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))
+    basis = scale[:, None, None] * np.tensordot(axes.T, basis, 1)
+    return np.concatenate([mean_shape[None], basis])

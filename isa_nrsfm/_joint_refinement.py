@@ -29,6 +29,8 @@ LARGEST_NOISE_STEP = 1.5
 SUFFICIENT_DECREASE = 1e-4
 # A step shorter than this finds nothing but rounding errors.
 SHORTEST_STEP = 1e-8
+# The sum of squares in the objective is precise to this share of that of the tracks.
+ROUNDING = 1e-15
 # Ridge, relative to the mean diagonal, for shapes that the table does not determine.
 RIDGE = 1e-12
 
@@ -138,7 +140,9 @@ def refine_joint(
         if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
             memory.append((moved, change, curvature))
         gain = point.value - reached.value
-        small_steps = small_steps + 1 if gain < tol * likelihood.n_frames else 0
+        rounding = ROUNDING * likelihood.square / reached.state.noise
+        small = gain < max(tol * likelihood.n_frames, rounding)
+        small_steps = small_steps + 1 if small else 0
         point = reached
         history.append(point.value)
     slope = point.gradient @ point.precondition(point.gradient)
@@ -157,7 +161,9 @@ def _without_noise(
     """Return the state that leaves least of the tracks, and the noise that it says."""
     shapes, motion, noise = point.state
     alpha = point.passed.alpha
-    shapes, motion = fit_without_noise(likelihood.blocks, shapes, motion, alpha)
+    shapes, motion = fit_without_noise(
+        likelihood.blocks, shapes, motion, alpha, likelihood.stiffness
+    )
     left = likelihood(shapes, motion, floor).residual / likelihood.n_seen
     return JointState(shapes, motion, max(left, floor))
 

@@ -36,6 +36,9 @@ from isa_nrsfm._small_matrices import COLUMNS, ROWS, invert_positive, unpack3
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 1024
+# With noise below this share of the mean square of the tracks the equations of the
+# coefficients are solved once more for what the first solution leaves.
+TINY_NOISE = 1e-7
 
 
 class Passed(NamedTuple):
@@ -138,6 +141,7 @@ class MarginalLikelihood:
             The sums over the frames.
         """
         gram, pairs = shared_gram(shapes), shape_pairs(len(shapes))
+        tiny_noise = noise * self.n_seen < TINY_NOISE * self.square
         parts, start = [], 0
         for block in self.blocks:
             frames = slice(start, start + len(block.weight))
@@ -150,6 +154,7 @@ class MarginalLikelihood:
                     motion[:, :, frames],
                     noise,
                     self.stiffness,
+                    tiny_noise,
                 )
             )
             start = frames.stop
@@ -179,6 +184,7 @@ def _pass_over(
     motion: NDArray,
     noise: float,
     stiffness: float,
+    tiny_noise: bool,
 ) -> Passed:
     """
     Return the parts of `Passed` for one block, but for what is common to all.
@@ -203,6 +209,11 @@ def _pass_over(
     along = seen[1:] - H[1:, 0]
     alpha = np.einsum("kli,li->ki", Q, along)
     explained = np.einsum("ki,ki->i", alpha, along)
+    if tiny_noise:
+        # Divided by so little, what rounding leaves of the equations counts.
+        left = along - np.einsum("kli,li->ki", H[1:, 1:], alpha) - noise * alpha
+        alpha += np.einsum("kli,li->ki", Q, left)
+        explained += np.einsum("ki,ki->i", alpha, left)
     rest = block.energy - 2 * seen[0] + H[0, 0] - explained  # with s2 |alpha|^2
     rest = np.maximum(rest, 0.0)  # less is rounding errors
     value = np.sum(rest / noise + logdet - len(diagonal) * np.log(noise))
