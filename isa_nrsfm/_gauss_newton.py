@@ -1,33 +1,33 @@
 """Shapes of a table without noise, by Gauss-Newton steps on the reprojection residual.
 
-Without noise all that the marginal likelihood asks for is a residual of zero, and the
-search for its maximum converges slowly: directions in which the residual is nearly flat
-gain only as fast as the noise is small. Here the residual of frames i
+Without noise all that the marginal likelihood asks for is a residual of zero. The
+search for its maximum comes there slowly: along directions that hardly change the
+images it gains no faster than the noise is small. Here the residual itself,
 
     sum_i || W_i - M_i sum_k c_ik B_k ||^2,   c_i = (1, alpha_i),
 
-is minimised itself. It is linear in the shapes: with ``X_i = c_i^T (x) M_i`` (2 x (3K +
-3)) and all shapes stacked as b it is ``W_i - X_i b``. Camera and coefficients of a
-frame are eliminated: for given shapes the residual is projected off the tangent space
-of ``M_i S_i``, spanned by the changes ``dM S_i`` and ``M_i B_k`` (variable projection:
-Golub, Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares
-problems whose variables separate", 1973, in the form of Kaufman, 1975). With Q_i an
-orthonormal basis of it and ``E = sum_i X_i^T X_i`` the steps d of the shapes solve
+is minimised. With ``X_i = c_i^T (x) M_i`` (2 x (3K + 3)) and all shapes stacked as b
+it is that of ``W_i - X_i b``. Camera and coefficients of a frame are eliminated: its
+residual is projected off the tangent space of ``M_i S_i``, spanned by ``dM S_i`` and
+``M_i B_k`` (variable projection: Golub, Pereyra, "The differentiation of
+pseudo-inverses and nonlinear least squares problems whose variables separate", 1973;
+the derivative of the projector is left out, as by Kaufman, "A variable projection
+method for solving separable nonlinear least squares problems", 1975). With Q_i an
+orthonormal basis of that space and ``E = sum_i X_i^T X_i`` a step d of the shapes is
 
     (I - sum_i G_i G_i^T + damping I) vec(E^1/2 d) = vec(E^-1/2 sum_i X_i^T P_i R_i),
     G_i = (E^-1/2 X_i^T (x) I) Q_i,   P_i R_i = R_i - Q_i Q_i^T R_i
 
-(Levenberg-Marquardt: Nocedal, Wright, "Numerical optimization", 2006, chapter 10). In
-these coordinates the matrix has eigenvalues from 0 to 1, zero for the changes of the
-basis that images do not tell: the damping leaves those as they are. The steps go along
-with every change of the basis of space and of the shapes.
+(Levenberg-Marquardt: Nocedal, Wright, "Numerical optimization", 2006, chapter 10). The
+matrix has eigenvalues from 0 to 1, zero for changes of the basis that images do not
+tell: the damping holds those still. The steps do not depend on the basis of space or
+of the shapes, but go along with it.
 
 The rows of the shapes lie in the row space of W, which has no more dimensions than
-there are rows of shapes: tables are taken to a basis of it, and the number of points
-does not matter. Where points are missing the row space comes from alternating least
-squares, and the frames that do not determine their missing points are left out. Without
-noise a part of the frames is as good as all, so that only as many are taken as keep a
-step short.
+there are rows. Tables are taken to a basis of it, so that the number of points does
+not matter. Where points are missing the row space comes from alternating least squares
+over frames whose seen points determine the others. Without noise a part of the frames
+is as good as all: only as many are taken as keep a step short.
 """
 
 from collections.abc import Sequence
@@ -35,51 +35,34 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frame_posterior import fit_posterior
 from isa_nrsfm._frame_products import FrameTracks
 
 # Multiplications of a step: it takes a part of a second.
-STEP_COST = 2e9
+STEP_COST = 4e9
 MAX_STEPS = 50
-# The damping at the start, where it ends, and how it changes with a step.
+# The damping at the start, its bounds, and how a step changes it.
 FIRST_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-14
 LARGEST_DAMPING = 1e2
 EASED, RAISED = 0.05, 8.0
-# A residual whose root mean square is this share of that of the tracks is rounding.
+# A residual that is this share of the tracks is rounding errors.
 ROUNDING = 1e-15
 # A step that lowers the sum of squares by less than this share gains little; two of
 # them, one after the other, end the search.
 LITTLE = 1e-2
-# A change of a frame that others make up for, up to this share, is no direction.
+# A change of a frame of which the others leave less than this share is none.
 DEPENDENT = 1e-9
+# Points with at least this weight are seen.
+COUNTED = 0.5
 # The seen points of a frame determine the others if they keep this share of the energy
 # of each direction of the row space.
 DETERMINED = 1e-3
+COMPLETION_STEPS = 60
 # Ridge, relative to the trace, for matrices that can be singular.
 RIDGE = 1e-14
-COMPLETION_STEPS = 60
-
-
-class Compressed(NamedTuple):
-    """
-    Frames in a basis of the row space of their tracks.
-
-    Attributes
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_directions)
-        Tracks, ``W_i V``.
-    basis : ndarray of shape (n_points, n_directions)
-        V, orthonormal and centred columns.
-    frames : ndarray of shape (n_frames,)
-        Which of the frames these are.
-    """
-
-    rows: NDArray
-    basis: NDArray
-    frames: NDArray
 
 
 class FramesAndShapes(NamedTuple):
@@ -89,7 +72,7 @@ class FramesAndShapes(NamedTuple):
     Attributes
     ----------
     shapes : ndarray of shape (3 * n_shapes, n_directions)
-        B_0, ..., B_K, stacked.
+        b: B_0, ..., B_K in the basis of the row space, stacked.
     motion : ndarray of shape (n_frames, 2, 3)
         Cameras.
     alpha : ndarray of shape (n_frames, n_components)
@@ -107,14 +90,15 @@ def fit_without_noise(
     motion: NDArray,
     alpha: NDArray,
     stiffness: float,
-) -> tuple[NDArray, NDArray]:
+) -> tuple[NDArray, NDArray] | None:
     """
     Return shapes and cameras that leave as little as possible of tracks.
 
     Parameters
     ----------
     blocks : sequence of FrameTracks
-        The tracks.
+        The tracks. Points with a weight below one half count as missing, the others
+        alike.
     shapes : ndarray of shape (n_shapes, 3, n_points)
         B_0, ..., B_K to start from, close enough for the residual to be small.
     motion : ndarray of shape (2, 3, n_frames)
@@ -129,76 +113,89 @@ def fit_without_noise(
     shapes : ndarray of shape (n_shapes, 3, n_points)
         Shapes, in the basis of greatest marginal likelihood.
     motion : ndarray of shape (2, 3, n_frames)
-        Cameras.
+        Cameras. Those of frames whose points do not determine one are as they came.
+
+    None is returned where a step would take too long for a number of frames that tells
+    the shapes, or where too few frames determine their missing points.
     """
     n_shapes, _, n_points = shapes.shape
-    size = 3 * n_shapes
-    n_frames = int(STEP_COST / (size**4 * (5 + n_shapes)))
-    W, seen = _table(blocks)
-    table = compressed(W, seen, shapes.reshape(size, n_points), max(n_frames, size))
-    V = table.basis
+    b = shapes.reshape(3 * n_shapes, n_points)
+    n_frames = int(STEP_COST / (len(b) ** 4 * (5 + n_shapes)))
+    if n_frames < len(b):
+        return None
+    W, frames = complete_frames(blocks, b, n_frames)
+    if len(frames) < min(len(b), alpha.shape[1]):
+        return None
+    rows, V = compressed(W, b)
     start = FramesAndShapes(
-        shapes.reshape(size, n_points) @ V,
-        motion[..., table.frames].transpose(2, 0, 1),
-        alpha[:, table.frames].T,
+        b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
     )
-    found = minimise(table.rows, start)
-    shapes = (found.shapes @ V.T).reshape(n_shapes, 3, n_points)
+    found = minimise(rows, start)
+    shapes = (found.shapes @ V.T).reshape(shapes.shape)
     alpha = alpha.copy()
-    alpha[:, table.frames] = found.alpha.T
-    motion, alpha = _all_frames(W, seen, shapes, motion, alpha)
+    alpha[:, frames] = found.alpha.T
+    motion, alpha = _all_frames(blocks, shapes, motion, alpha)
     return likely_basis(shapes, motion, alpha, stiffness), motion
 
 
-def compressed(
-    W: NDArray, seen: NDArray, shapes: NDArray, n_frames: int
-) -> Compressed:
+def complete_frames(
+    blocks: Sequence[FrameTracks], shapes: NDArray, n_frames: int
+) -> tuple[NDArray, NDArray]:
     """
-    Return frames in a basis of the row space of their tracks.
+    Return frames without missing points, and which ones they are.
 
     Parameters
     ----------
-    W : ndarray of shape (n_frames, 2, n_points)
-        Tracks in any place; zero where a point is missing.
-    seen : ndarray of shape (n_frames, n_points)
-        1.0 for points that are seen, 0.0 for the others.
-    shapes : ndarray of shape (n_directions, n_points)
-        Rows that nearly span the row space.
+    blocks : sequence of FrameTracks
+        The tracks.
+    shapes : ndarray of shape (n_rows, n_points)
+        Rows that nearly span the row space of the tracks.
     n_frames : int
-        The most frames to take, spread over those whose seen points determine the
-        others.
+        About how many frames to take, spread over all that determine their missing
+        points.
 
     Returns
     -------
-    Compressed
-        The frames.
+    W : ndarray of shape (n_chosen, 2, n_points)
+        Tracks, centred over all points.
+    frames : ndarray of shape (n_chosen,)
+        The numbers of these frames.
     """
     V = np.linalg.qr(shapes.T)[0]
-    if seen.all():
-        frames = _spread(np.arange(len(W)), n_frames)
-        W = W[frames]
-    else:
-        ones = np.ones((1, len(V)))
-        frames = _determined(seen, np.vstack([V.T, ones / np.sqrt(len(V))]))
-        frames = _spread(frames, n_frames)
-        W = _completed(W[frames], seen[frames], V)
-    W = (W - W.mean(axis=2, keepdims=True)).reshape(-1, len(V))
-    # Two steps of subspace iteration: what is outside of the row space is tiny.
-    for _ in range(2):
-        V = np.linalg.qr(W.T @ np.linalg.qr(W @ V)[0])[0]
-    V -= V.mean(axis=0)
-    return Compressed((W @ V).reshape(len(frames), 2, -1), V, frames)
+    n_all = sum(len(block.weight) for block in blocks)
+    tracks, masks, frames, first = [], [], [], 0
+    for block in blocks:
+        W, seen = _tracks_of(block)
+        chosen = np.arange(len(W)) if seen.all() else _determined(seen, V)
+        n = min(len(chosen), int(np.ceil(n_frames * len(W) / n_all)))
+        places = np.linspace(0, len(chosen) - 1, n).round().astype(int)
+        chosen = chosen[places]
+        tracks.append(W[chosen])
+        masks.append(seen[chosen])
+        frames.append(first + chosen)
+        first += len(W)
+    W, seen = np.concatenate(tracks), np.concatenate(masks)
+    if len(W) and not seen.all():
+        W = _completed(W, seen, V)
+    return W - W.mean(axis=2, keepdims=True), np.concatenate(frames)
 
 
-def _spread(frames: NDArray, n: int) -> NDArray:
-    """Return at most n of the frames, at equal distances."""
-    places = np.linspace(0, len(frames) - 1, min(n, len(frames)))
-    return frames[places.round().astype(int)]
+def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray]:
+    """Return tracks (n_frames, 2, n_points), zero where missing, and 1.0 where seen."""
+    weighted = block.weighted.transpose(2, 1, 0)
+    if block.weights is None:
+        return weighted, np.ones((len(weighted), weighted.shape[2]))
+    weights = block.weights.T
+    seen = weights >= COUNTED
+    factor = np.where(seen, 1.0 / np.where(seen, weights, 1.0), 0.0)
+    return factor[:, None] * weighted, 1.0 * seen
 
 
-def _determined(seen: NDArray, rows: NDArray) -> NDArray:
-    """Return the frames whose seen points determine the coefficients of all rows."""
-    gram = (seen @ _squares(rows.T)).reshape(-1, len(rows), len(rows))
+def _determined(seen: NDArray, V: NDArray) -> NDArray:
+    """Return the frames whose seen points determine position and coefficients of V."""
+    n_points = len(V)
+    rows = np.hstack([V, np.full((n_points, 1), n_points**-0.5)])
+    gram = (seen @ _squares(rows)).reshape(len(seen), rows.shape[1], -1)
     least = np.linalg.eigvalsh(gram)[:, 0]
     return np.flatnonzero(least > DETERMINED)
 
@@ -233,6 +230,32 @@ def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
         V = np.linalg.solve(moments + ridge, right[..., None])[..., 0]
         V = np.linalg.qr(V - V.mean(axis=0))[0]
     return filled
+
+
+def compressed(W: NDArray, shapes: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return tracks in a basis of their row space.
+
+    Parameters
+    ----------
+    W : ndarray of shape (n_frames, 2, n_points)
+        Complete tracks, centred.
+    shapes : ndarray of shape (n_rows, n_points)
+        Rows that nearly span the row space.
+
+    Returns
+    -------
+    rows : ndarray of shape (n_frames, 2, n_directions)
+        ``W_i V``.
+    V : ndarray of shape (n_points, n_directions)
+        The basis, orthonormal columns.
+    """
+    flat = W.reshape(-1, W.shape[2])
+    V = np.linalg.qr(shapes.T)[0]
+    # Subspace iteration converges at once: what is outside of the row space is tiny.
+    for _ in range(2):
+        V = np.linalg.qr(flat.T @ np.linalg.qr(flat @ V)[0])[0]
+    return W @ V, V
 
 
 def motion_rows(motion: NDArray, alpha: NDArray) -> NDArray:
@@ -320,7 +343,9 @@ def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
     square = float(np.vdot(frames.rest, frames.rest))
     damping, small_steps, system = FIRST_DAMPING, 0, None
     for _ in range(MAX_STEPS):
-        if square <= ROUNDING**2 * energy or small_steps >= 2 or damping > LARGEST_DAMPING:
+        if square <= ROUNDING**2 * energy or small_steps == 2:
+            break
+        if damping > LARGEST_DAMPING:
             break
         if system is None:
             system = normal_equations(frames, state)
@@ -398,34 +423,22 @@ def _better(
     )
 
 
-def _table(blocks: Sequence[FrameTracks]) -> tuple[NDArray, NDArray]:
-    """Return tracks (n_frames, 2, n_points), zero where missing, and what is seen."""
-    tracks, seen = [], []
-    for block in blocks:
-        weighted = block.weighted.transpose(2, 1, 0)
-        if block.weights is None:
-            tracks.append(weighted)
-            seen.append(np.ones(weighted[:, 0].shape))
-        else:
-            W = block.weights.T[:, None]
-            shown = np.broadcast_to(W > 0, weighted.shape)
-            tracks.append(
-                np.divide(weighted, W, where=shown, out=np.zeros(weighted.shape))
-            )
-            seen.append(1.0 * (W[:, 0] > 0))
-    return np.concatenate(tracks), np.concatenate(seen)
-
-
 def _all_frames(
-    W: NDArray, seen: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray
+    blocks: Sequence[FrameTracks], shapes: NDArray, motion: NDArray, alpha: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Return cameras and coefficients of all frames for given shapes."""
-    fit = fit_posterior(W.swapaxes(1, 2), shapes, 0.0, weights=seen, initial=alpha.T)
-    known = np.isfinite(fit.alpha).all(axis=1)
-    return (
-        np.where(known, fit.motion.transpose(1, 2, 0), motion),
-        np.where(known, fit.alpha.T, alpha),
-    )
+    motion, alpha, first = motion.copy(), alpha.copy(), 0
+    for block in blocks:
+        W, seen = _tracks_of(block)
+        frames = np.arange(first, first + len(W))
+        fit = fit_posterior(
+            W.swapaxes(1, 2), shapes, 0.0, weights=seen, initial=alpha[:, frames].T
+        )
+        known = np.isfinite(fit.alpha).all(axis=1)
+        motion[..., frames[known]] = fit.motion[known].transpose(1, 2, 0)
+        alpha[:, frames[known]] = fit.alpha[known].T
+        first += len(W)
+    return motion, alpha
 
 
 def likely_basis(
@@ -463,7 +476,7 @@ def likely_basis(
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
     rest = alpha - mean[:, None]
     covariance = rest @ rest.T / n_frames
-    covariance += RIDGE * np.trace(covariance) * np.eye(len(mean))
+    covariance += (RIDGE * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
     cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
     energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))

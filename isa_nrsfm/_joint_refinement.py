@@ -4,6 +4,8 @@ Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a
 memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
 7.2). Its first metric is the curvature that expectation maximisation would use, so that
 a step without memory is a step of that, and it is brought up to date at each step.
+Tables without noise, where it is slow, are taken over by Gauss-Newton steps once the
+noise is small enough to tell.
 """
 
 from collections import deque
@@ -21,8 +23,10 @@ MEMORY = 20
 # The noise variance is at least this share of the mean square of the tracks: tables
 # without noise are fitted, too.
 NOISE_FLOOR = 1e-11
-# Tables with less are taken for such, and Gauss-Newton steps are tried.
+# With less than this share Gauss-Newton steps are tried, and once more each time that
+# the noise has fallen to a part of that.
 EXACT = 1e-7
+CLOSER = 0.1
 # The logarithm of the noise variance changes by at most so much in a step.
 LARGEST_NOISE_STEP = 1.5
 # A step has to gain this share of what the slope promises.
@@ -109,17 +113,13 @@ def refine_joint(
     point = _Point(likelihood, start, floor)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(maxlen=MEMORY)
     history = [point.value]
-    small_steps, tried = 0, False
-    exact = EXACT * likelihood.square / likelihood.n_seen
+    small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
-        if not tried and point.state.noise < exact:
-            tried = True
-            import time
-            t=time.process_time()
-            state = _without_noise(likelihood, point, floor)
-            reached = _Point(likelihood, state, floor)
-            print("GN", len(history), time.process_time()-t, point.value, point.state.noise, '->', reached.value, reached.state.noise, reached.passed.residual/likelihood.n_seen)
-            if reached.value < point.value:
+        if point.state.noise < exact:
+            reached = _without_noise(likelihood, point, floor)
+            # Once is enough. Where it leads nowhere it may from closer by.
+            exact = 0.0 if reached else CLOSER * point.state.noise
+            if reached:
                 memory.clear()
                 point = reached
                 history.append(point.value)
@@ -157,15 +157,19 @@ def refine_joint(
 
 def _without_noise(
     likelihood: MarginalLikelihood, point: "_Point", floor: float
-) -> JointState:
-    """Return the state that leaves least of the tracks, and the noise that it says."""
-    shapes, motion, noise = point.state
-    alpha = point.passed.alpha
-    shapes, motion = fit_without_noise(
-        likelihood.blocks, shapes, motion, alpha, likelihood.stiffness
+) -> "_Point | None":
+    """Return where Gauss-Newton steps lead to, None if the objective is no lower."""
+    shapes, motion, _ = point.state
+    if not np.isfinite(point.value):
+        return None
+    found = fit_without_noise(
+        likelihood.blocks, shapes, motion, point.passed.alpha, likelihood.stiffness
     )
-    left = likelihood(shapes, motion, floor).residual / likelihood.n_seen
-    return JointState(shapes, motion, max(left, floor))
+    if found is None:
+        return None
+    left = likelihood(*found, floor).residual / likelihood.n_seen
+    reached = _Point(likelihood, JointState(*found, max(left, floor)), floor)
+    return reached if reached.value < point.value else None
 
 
 class _Point:
