@@ -41,7 +41,7 @@ from isa_nrsfm._frame_posterior import fit_posterior
 from isa_nrsfm._frame_products import FrameTracks
 
 # Multiplications of a step: it takes a part of a second.
-STEP_COST = 4e9
+STEP_COST = 2e9
 MAX_STEPS = 50
 # The damping at the start, its bounds, and how a step changes it.
 FIRST_DAMPING = 1e-3
