@@ -115,10 +115,10 @@ def refine_joint(
     history = [point.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
-        if point.state.noise < exact:
+        if point.left < exact:
             reached = _without_noise(likelihood, point, floor)
             # Once is enough. Where it leads nowhere it may from closer by.
-            exact = 0.0 if reached else CLOSER * point.state.noise
+            exact = 0.0 if reached else CLOSER * point.left
             if reached:
                 memory.clear()
                 point = reached
@@ -158,7 +158,7 @@ def refine_joint(
 def _without_noise(
     likelihood: MarginalLikelihood, point: "_Point", floor: float
 ) -> "_Point | None":
-    """Return where Gauss-Newton steps lead to, None if the objective is no lower."""
+    """Return where Gauss-Newton steps lead to, None if it is no better."""
     shapes, motion, _ = point.state
     if not np.isfinite(point.value):
         return None
@@ -168,6 +168,8 @@ def _without_noise(
     if found is None:
         return None
     left = likelihood(*found, floor).residual / likelihood.n_seen
+    if left > point.left:
+        return None
     reached = _Point(likelihood, JointState(*found, max(left, floor)), floor)
     return reached if reached.value < point.value else None
 
@@ -180,6 +182,8 @@ class _Point:
         self.n_seen = likelihood.n_seen
         self.passed: Passed = likelihood(*state)
         self.value = self.passed.value
+        # A coordinate: what the noise says, or the residual where it says more.
+        self.left = max(state.noise, self.passed.residual / likelihood.n_seen)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             self.passed.shape_gradient,
