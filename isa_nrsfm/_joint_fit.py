@@ -65,9 +65,6 @@ N_RANDOM_STARTS = 6
 # the noise of many points can be small enough to need it.
 POLISH = 0.01
 FEW_FRAMES = 2000
-# Tables with less noise are exact: there it can take more steps than are allowed. They
-# may end some way from the optimum without it.
-NOISELESS = 1e-9
 # Leading directions of the lifted motion per basis shape that these starts mix.
 DIRECTIONS = 4
 # Added to the diagonal of the rigid cameras' Gram matrices, relative to the trace.

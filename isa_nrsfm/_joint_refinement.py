@@ -4,6 +4,8 @@ Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a
 memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
 7.2). Its first metric is the curvature that expectation maximisation would use, so that
 a step without memory is a step of that, and it is brought up to date at each step.
+Tables without noise, where it is slow, are taken over by Gauss-Newton steps once the
+noise is small enough to tell.
 """
 
 from collections import deque
@@ -12,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._gauss_newton import fit_without_noise
 from isa_nrsfm._marginal_likelihood import MarginalLikelihood, Passed
 from isa_nrsfm._small_matrices import inverse3
 
@@ -20,12 +23,18 @@ MEMORY = 20
 # The noise variance is at least this share of the mean square of the tracks: tables
 # without noise are fitted, too.
 NOISE_FLOOR = 1e-11
+# With less than this share Gauss-Newton steps are tried, and once more each time that
+# the noise has fallen to a part of that.
+EXACT = 1e-7
+CLOSER = 0.1
 # The logarithm of the noise variance changes by at most so much in a step.
 LARGEST_NOISE_STEP = 1.5
 # A step has to gain this share of what the slope promises.
 SUFFICIENT_DECREASE = 1e-4
 # A step shorter than this finds nothing but rounding errors.
 SHORTEST_STEP = 1e-8
+# The sum of squares in the objective is precise to this share of that of the tracks.
+ROUNDING = 1e-15
 # Ridge, relative to the mean diagonal, for shapes that the table does not determine.
 RIDGE = 1e-12
 
@@ -104,8 +113,17 @@ def refine_joint(
     point = _Point(likelihood, start, floor)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(maxlen=MEMORY)
     history = [point.value]
-    small_steps = 0
+    small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
+        if point.left < exact:
+            reached = _without_noise(likelihood, point, floor)
+            # Once is enough. Where it leads nowhere it may from closer by.
+            exact = 0.0 if reached else CLOSER * point.left
+            if reached:
+                memory.clear()
+                point = reached
+                history.append(point.value)
+                continue
         step = -_inverse_hessian_product(point, memory)
         if not point.gradient @ step < 0:
             memory.clear()
@@ -122,7 +140,9 @@ def refine_joint(
         if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
             memory.append((moved, change, curvature))
         gain = point.value - reached.value
-        small_steps = small_steps + 1 if gain < tol * likelihood.n_frames else 0
+        rounding = ROUNDING * likelihood.square / reached.state.noise
+        small = gain < max(tol * likelihood.n_frames, rounding)
+        small_steps = small_steps + 1 if small else 0
         point = reached
         history.append(point.value)
     slope = point.gradient @ point.precondition(point.gradient)
@@ -135,6 +155,25 @@ def refine_joint(
     )
 
 
+def _without_noise(
+    likelihood: MarginalLikelihood, point: "_Point", floor: float
+) -> "_Point | None":
+    """Return where Gauss-Newton steps lead to, None if it is no better."""
+    shapes, motion, _ = point.state
+    if not np.isfinite(point.value):
+        return None
+    found = fit_without_noise(
+        likelihood.frames, shapes, motion, point.passed.alpha, likelihood.stiffness
+    )
+    if found is None:
+        return None
+    left = likelihood(*found, floor).residual / likelihood.n_seen
+    if left > point.left:
+        return None
+    reached = _Point(likelihood, JointState(*found, max(left, floor)), floor)
+    return reached if reached.value < point.value else None
+
+
 class _Point:
     """A state with the objective, its gradient and its curvature there."""
 
@@ -143,6 +182,8 @@ class _Point:
         self.n_seen = likelihood.n_seen
         self.passed: Passed = likelihood(*state)
         self.value = self.passed.value
+        # A coordinate: what the noise says, or the residual where it says more.
+        self.left = max(state.noise, self.passed.residual / likelihood.n_seen)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             self.passed.shape_gradient,

@@ -38,6 +38,9 @@ from isa_nrsfm._small_matrices import COLUMNS, ROWS, invert_positive, unpack3
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 1024
+# With noise below this share of the mean square of the tracks the equations of the
+# coefficients are solved once more for what the first solution leaves.
+TINY_NOISE = 1e-7
 
 
 class Passed(NamedTuple):
@@ -190,6 +193,7 @@ class MarginalLikelihood:
             gram=shared_gram(shapes),
             noise=noise,
             stiffness=self.stiffness,
+            tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
         )
         alpha = np.empty((n_shapes - 1, self.n_frames))
         motion_gradient = np.empty((2, 3, self.n_frames))
@@ -268,6 +272,7 @@ def _pass_over_block(
     gram: SharedGram,
     noise: float,
     stiffness: float,
+    tiny_noise: bool,
 ) -> Passed:
     """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
     pairs = shape_pairs(len(shapes))
@@ -275,7 +280,9 @@ def _pass_over_block(
     for frames in block:
         end = start + len(frames.weight)
         part = motion[:, :, start:end]
-        parts.append(_pass_over(frames, shapes, gram, pairs, part, noise, stiffness))
+        parts.append(
+            _pass_over(frames, shapes, gram, pairs, part, noise, stiffness, tiny_noise)
+        )
         start = end
     if len(parts) == 1:
         return parts[0]
@@ -301,6 +308,7 @@ def _pass_over(
     motion: NDArray,
     noise: float,
     stiffness: float,
+    tiny_noise: bool,
 ) -> Passed:
     """
     Return the parts of `Passed` for one block, but for what is common to all.
@@ -325,6 +333,11 @@ def _pass_over(
     along = seen[1:] - H[1:, 0]
     alpha = np.einsum("kli,li->ki", Q, along)
     explained = np.einsum("ki,ki->i", alpha, along)
+    if tiny_noise:
+        # Divided by so little, what rounding leaves of the equations counts.
+        left = along - np.einsum("kli,li->ki", H[1:, 1:], alpha) - noise * alpha
+        alpha += np.einsum("kli,li->ki", Q, left)
+        explained += np.einsum("ki,ki->i", alpha, left)
     rest = block.energy - 2 * seen[0] + H[0, 0] - explained  # with s2 |alpha|^2
     rest = np.maximum(rest, 0.0)  # less is rounding errors
     value = np.sum(rest / noise + logdet - len(diagonal) * np.log(noise))

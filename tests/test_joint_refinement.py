@@ -341,6 +341,54 @@ class TestWithoutNoise:
         assert result.state.noise == pytest.approx(floor, rel=1e-6)
         assert likelihood(*result.state).residual < 1e-9 * likelihood.square
 
+    @KINDS
+    @pytest.mark.parametrize("stiffness", [0.0, 10.0])
+    def test_residual_is_rounding_errors(self, kind, stiffness):
+        scene = random_scene(noise=0.0, kind=kind)
+        result = refined(scene, stiffness=stiffness)
+        assert result.converged
+        assert (np.diff(result.history) <= 0).all()
+        weights = 1.0 if scene.weights is None else np.sqrt(scene.weights)[..., None]
+        for i, (frame, camera) in enumerate(
+            zip(scene.tracks, result.state.motion.transpose(2, 0, 1), strict=True)
+        ):
+            root = np.broadcast_to(
+                weights if kind == "complete" else weights[i], (25, 1)
+            )
+            seen = root[:, 0] > 0
+            columns = [(camera @ B).T[seen] for B in result.state.shapes]
+            columns += [np.broadcast_to(axis, (seen.sum(), 2)) for axis in np.eye(2)]
+            columns = [(root[seen] * column).ravel() for column in columns]
+            rest = (root[seen] * frame[seen]).ravel() - columns[0]
+            rest -= (
+                np.array(columns[1:]).T
+                @ np.linalg.lstsq(np.array(columns[1:]).T, rest, rcond=None)[0]
+            )
+            assert_allclose(rest, 0.0, atol=1e-6)
+
+    def test_tables_with_noise_are_left_alone(self, monkeypatch):
+        def refuse(*args):
+            raise AssertionError
+
+        monkeypatch.setattr(module, "fit_without_noise", refuse)
+        assert refined(random_scene(noise=2e-3)).converged
+        with pytest.raises(AssertionError):
+            refined(random_scene(noise=0.0))
+
+    def test_tries_again_from_closer_by(self, monkeypatch):
+        likelihood = MarginalLikelihood(random_scene(noise=0.0).tracks, None, 0.0)
+        noises = []
+
+        def fail(blocks, shapes, motion, alpha, stiffness):
+            passed = likelihood(shapes, motion, 1e-12)
+            noises.append(passed.residual / likelihood.n_seen)
+
+        monkeypatch.setattr(module, "fit_without_noise", fail)
+        result = refined(random_scene(noise=0.0))
+        assert result.converged
+        assert 2 <= len(noises) <= 5
+        assert (np.diff(noises) < 0).all()
+
     def test_starts_at_the_floor_where_the_start_has_no_noise(self):
         scene = random_scene()
         start = disturbed(scene.truth)._replace(noise=0.0)

@@ -124,6 +124,27 @@ class TestValue:
             residual += np.sum((root * (points.T - model)) ** 2)
         assert passed.residual == pytest.approx(residual, rel=1e-11)
 
+    def test_is_precise_where_the_noise_is_tiny(self):
+        # Basis shapes that are nearly the same make the equations ill-conditioned.
+        scene = random_scene("complete", n_components=2)
+        scene.shapes[2] = scene.shapes[1] + 1e-5 * scene.shapes[2]
+        c = np.vstack([np.ones(11), np.random.default_rng(1).normal(size=(2, 11))])
+        tracks = np.einsum("rai,kaj,ki->ijr", scene.motion, scene.shapes, c)
+        scene = scene._replace(tracks=tracks)
+        noise = 1e-11
+        expected = 0.0
+        for points, shapes, _, M, _ in frame_by_frame(scene):
+            images = np.array([(M @ B).ravel() for B in shapes])
+            y = points.T.ravel() - images[0]
+            stacked = np.vstack([images[1:].T, np.sqrt(noise) * np.eye(2)])
+            Q, R = np.linalg.qr(stacked)
+            z = np.concatenate([y, [0.0, 0.0]])
+            expected += np.sum((z - Q @ (Q.T @ z)) ** 2) / noise
+            expected += 2 * np.log(np.abs(np.diag(R))).sum()
+            expected += (len(y) - 2) * np.log(noise)
+        rounding = 1e-15 * np.sum(tracks**2) / noise
+        assert scene.at(noise=noise).value == pytest.approx(expected, abs=rounding)
+
     def test_counts_of_the_table(self):
         scene = random_scene("missing")
         likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)

@@ -1,0 +1,522 @@
+"""Shapes of a table without noise, by Gauss-Newton steps on the reprojection residual.
+
+Without noise all that the marginal likelihood asks for is a residual of zero. The
+search for its maximum comes there slowly: along directions that hardly change the
+images it gains no faster than the noise is small. Here the residual itself,
+
+    sum_i || W_i - M_i sum_k c_ik B_k ||^2,   c_i = (1, alpha_i),
+
+is minimised. With ``X_i = c_i^T (x) M_i`` (2 x (3K + 3)) and all shapes stacked as b
+it is that of ``W_i - X_i b``. Camera and coefficients of a frame are eliminated: its
+residual is projected off the tangent space of ``M_i S_i``, spanned by ``dM S_i`` and
+``M_i B_k`` (variable projection: Golub, Pereyra, "The differentiation of
+pseudo-inverses and nonlinear least squares problems whose variables separate", 1973;
+the derivative of the projector is left out, as by Kaufman, "A variable projection
+method for solving separable nonlinear least squares problems", 1975). With Q_i an
+orthonormal basis of that space and ``E = sum_i X_i^T X_i`` a step d of the shapes is
+
+    (I - sum_i G_i G_i^T + damping I) vec(E^1/2 d) = vec(E^-1/2 sum_i X_i^T P_i R_i),
+    G_i = (E^-1/2 X_i^T (x) I) Q_i,   P_i R_i = R_i - Q_i Q_i^T R_i
+
+(Levenberg-Marquardt: Nocedal, Wright, "Numerical optimization", 2006, chapter 10). The
+matrix has eigenvalues from 0 to 1, zero for changes of the basis that images do not
+tell: the damping holds those still. The steps do not depend on the basis of space or
+of the shapes, but go along with it.
+
+The rows of the shapes lie in the row space of W, which has no more dimensions than
+there are rows. Tables are taken to a basis of it, so that the number of points does
+not matter. Where points are missing the row space comes from alternating least squares
+over frames whose seen points determine the others. Without noise a part of the frames
+is as good as all: only as many are taken as keep a step short.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_posterior import fit_posterior, fit_prepared
+from isa_nrsfm._frame_products import FrameTracks
+
+# Multiplications of a step: it takes a part of a second.
+STEP_COST = 2e9
+MAX_STEPS = 50
+# The damping at the start, its bounds, and how a step changes it.
+FIRST_DAMPING = 1e-3
+SMALLEST_DAMPING = 1e-14
+LARGEST_DAMPING = 1e2
+EASED, RAISED = 0.05, 8.0
+# A residual that is this share of the tracks is rounding errors.
+ROUNDING = 1e-15
+# A step that lowers the sum of squares by less than this share gains little; two of
+# them, one after the other, end the search.
+LITTLE = 1e-2
+# A change of a frame of which the others leave less than this share is none.
+DEPENDENT = 1e-9
+# Points with at least this weight are seen.
+COUNTED = 0.5
+# The seen points of a frame determine the others if they keep this share of the energy
+# of each direction of the row space.
+DETERMINED = 1e-3
+COMPLETION_STEPS = 60
+# Ridge, relative to the trace, for matrices that can be singular.
+RIDGE = 1e-14
+
+
+class FramesAndShapes(NamedTuple):
+    """
+    Unknowns of the search.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (3 * n_shapes, n_directions)
+        b: B_0, ..., B_K in the basis of the row space, stacked.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    """
+
+    shapes: NDArray
+    motion: NDArray
+    alpha: NDArray
+
+
+def fit_without_noise(
+    blocks: FrameBlocks,
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    stiffness: float,
+) -> tuple[NDArray, NDArray] | None:
+    """
+    Return shapes and cameras that leave as little as possible of tracks.
+
+    Parameters
+    ----------
+    blocks : FrameBlocks
+        Blocks as of `prepared_frames`. Points with a weight below one half count as
+        missing, the others alike.
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        B_0, ..., B_K to start from, close enough for the residual to be small.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras to start from.
+    alpha : ndarray of shape (n_components, n_frames)
+        Coefficients to start from.
+    stiffness : float
+        As in `MarginalLikelihood`.
+
+    Returns
+    -------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Shapes, in the basis of greatest marginal likelihood.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras. Those of frames whose points do not determine one are as they came.
+
+    None is returned where a step would take too long for a number of frames that tells
+    the shapes, or where too few frames determine their missing points.
+    """
+    n_shapes, _, n_points = shapes.shape
+    b = shapes.reshape(3 * n_shapes, n_points)
+    n_frames = int(STEP_COST / (len(b) ** 4 * (5 + n_shapes)))
+    if n_frames < len(b):
+        return None
+    W, frames = complete_frames(blocks, b, n_frames)
+    if len(frames) < min(len(b), alpha.shape[1]):
+        return None
+    rows, V = compressed(W, b)
+    start = FramesAndShapes(
+        b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
+    )
+    found = minimise(rows, start)
+    shapes = (found.shapes @ V.T).reshape(shapes.shape)
+    alpha = alpha.copy()
+    alpha[:, frames] = found.alpha.T
+    motion, alpha = _all_frames(blocks, shapes, motion, alpha)
+    return likely_basis(shapes, motion, alpha, stiffness), motion
+
+
+def complete_frames(
+    blocks: FrameBlocks, shapes: NDArray, n_frames: int
+) -> tuple[NDArray, NDArray]:
+    """
+    Return frames without missing points, and which ones they are.
+
+    Parameters
+    ----------
+    blocks : FrameBlocks
+        Blocks as of `prepared_frames`.
+    shapes : ndarray of shape (n_rows, n_points)
+        Rows that nearly span the row space of the tracks.
+    n_frames : int
+        About how many frames to take, spread over all that determine their missing
+        points.
+
+    Returns
+    -------
+    W : ndarray of shape (n_chosen, 2, n_points)
+        Tracks, centred over all points.
+    frames : ndarray of shape (n_chosen,)
+        The numbers of these frames.
+    """
+    V = np.linalg.qr(shapes.T)[0]
+    chosen = partial(_chosen, V=V, share=n_frames / blocks.n_frames)
+    tracks, masks, frames = [], [], []
+    for part, found in zip(blocks.slices, blocks.map(chosen), strict=True):
+        for W, seen, places in found:
+            tracks.append(W)
+            masks.append(seen)
+            frames.append(part.start + places)
+    W = np.concatenate(tracks)
+    if masks[0] is not None:
+        seen = np.concatenate(masks)
+        if len(W) and not seen.all():
+            W = _completed(W, seen, V)
+        W = W - W.mean(axis=2, keepdims=True)
+    return W, np.concatenate(frames)
+
+
+def _chosen(
+    block: list[FrameTracks], V: NDArray, share: float
+) -> list[tuple[NDArray, NDArray | None, NDArray]]:
+    """Return tracks, seen points and numbers of a share of the frames of a block."""
+    found, first = [], 0
+    for part in block:
+        W, seen = _tracks_of(part)
+        usable = np.arange(len(W))
+        if seen is not None and not seen.all():
+            usable = _determined(seen, V)
+        n = min(len(usable), int(np.ceil(share * len(W))))
+        places = np.linspace(0, len(usable) - 1, n).round().astype(int)
+        frames = usable[places]
+        seen = None if seen is None else seen[frames]
+        found.append((W[frames], seen, first + frames))
+        first += len(W)
+    return found
+
+
+def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray | None]:
+    """
+    Return tracks (n_frames, 2, n_points), zero where missing, and 1.0 where seen.
+
+    The second is None for frames without weights. They need not be given by points.
+    """
+    weighted = block.weighted.transpose(2, 1, 0)
+    if block.weights is None:
+        return weighted, None
+    weights = block.weights.T
+    seen = weights >= COUNTED
+    factor = np.where(seen, 1.0 / np.where(seen, weights, 1.0), 0.0)
+    return factor[:, None] * weighted, 1.0 * seen
+
+
+def _determined(seen: NDArray, V: NDArray) -> NDArray:
+    """Return the frames whose seen points determine position and coefficients of V."""
+    n_points = len(V)
+    rows = np.hstack([V, np.full((n_points, 1), n_points**-0.5)])
+    gram = (seen @ _squares(rows)).reshape(len(seen), rows.shape[1], -1)
+    least = np.linalg.eigvalsh(gram)[:, 0]
+    return np.flatnonzero(least > DETERMINED)
+
+
+def _squares(rows: NDArray) -> NDArray:
+    """Return the products of all pairs of entries of rows (n, k) as (n, k * k)."""
+    return (rows[:, :, None] * rows[:, None]).reshape(len(rows), -1)
+
+
+def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
+    """Return tracks with the missing points of the nearest table of low rank."""
+    n_points, rank = V.shape
+    n_seen = max(2.0 * seen.sum(), 1.0)
+    square, filled = np.inf, W
+    for _ in range(COMPLETION_STEPS):
+        rows = np.hstack([V, np.ones((n_points, 1))])
+        gram = (seen @ _squares(rows)).reshape(-1, rank + 1, rank + 1)
+        factors = np.linalg.solve(gram, (W @ rows).swapaxes(1, 2)).swapaxes(1, 2)
+        model = factors @ rows.T
+        previous = square
+        filled = np.where(seen[:, None] > 0, W, model)
+        square = np.sum((filled - model) ** 2) / n_seen
+        if not LITTLE * previous > 0 or square > (1 - LITTLE) * previous:
+            break
+        # The points of least squares for the coefficients of the frames.
+        z, place = factors[..., :rank], factors[..., rank:]
+        moments = np.einsum("irk,irl->ikl", z, z).reshape(len(z), -1)
+        moments = (seen.T @ moments).reshape(n_points, rank, rank)
+        moved = (W - place) * seen[:, None]
+        right = np.einsum("irj,irk->jk", moved, z)
+        ridge = RIDGE * np.trace(moments, axis1=1, axis2=2).mean() * np.eye(rank)
+        V = np.linalg.solve(moments + ridge, right[..., None])[..., 0]
+        V = np.linalg.qr(V - V.mean(axis=0))[0]
+    return filled
+
+
+def compressed(W: NDArray, shapes: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return tracks in a basis of their row space.
+
+    Parameters
+    ----------
+    W : ndarray of shape (n_frames, 2, n_points)
+        Complete tracks, centred.
+    shapes : ndarray of shape (n_rows, n_points)
+        Rows that nearly span the row space.
+
+    Returns
+    -------
+    rows : ndarray of shape (n_frames, 2, n_directions)
+        ``W_i V``.
+    V : ndarray of shape (n_points, n_directions)
+        The basis, orthonormal columns.
+    """
+    flat = W.reshape(-1, W.shape[2])
+    V = np.linalg.qr(shapes.T)[0]
+    # Subspace iteration converges at once: what is outside of the row space is tiny.
+    for _ in range(2):
+        V = np.linalg.qr(flat.T @ np.linalg.qr(flat @ V)[0])[0]
+    return W @ V, V
+
+
+def motion_rows(motion: NDArray, alpha: NDArray) -> NDArray:
+    """Return ``X_i = c_i^T (x) M_i`` (n_frames, 2, 3 * n_shapes)."""
+    c = np.hstack([np.ones((len(alpha), 1)), alpha])
+    rows = c[:, None, :, None] * motion[:, :, None]
+    return rows.reshape(len(c), 2, -1)
+
+
+def frame_tangents(state: FramesAndShapes) -> NDArray:
+    """
+    Return the derivatives of the images by cameras and coefficients.
+
+    Parameters
+    ----------
+    state : FramesAndShapes
+        Where.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2 * n_directions, 6 + n_components)
+        Of ``M_i S_i``, rows one after the other, by the rows of M_i and by alpha_i.
+    """
+    b, motion, alpha = state
+    n_frames, n_components = alpha.shape
+    shapes = b.reshape(n_components + 1, 3, -1)
+    frame_shapes = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    n_directions = b.shape[1]
+    tangents = np.zeros((n_frames, 2, n_directions, 6 + n_components))
+    for row in range(2):
+        cameras = slice(3 * row, 3 * row + 3)
+        tangents[:, row, :, cameras] = frame_shapes.swapaxes(1, 2)
+    tangents[..., 6:] = np.einsum("ira,kad->irdk", motion, shapes[1:])
+    return tangents.reshape(n_frames, 2 * n_directions, -1)
+
+
+class _Frames(NamedTuple):
+    """Frames at a state: residuals, and what cameras and coefficients do about them."""
+
+    rest: NDArray  # W_i - X_i b (n, 2 n_directions)
+    tangent: NDArray  # Q_i (n, 2 n_directions, 6 + K)
+    factor: NDArray  # of the tangents, Q_i times it (n, 6 + K, 6 + K)
+
+    @classmethod
+    def at(cls, rows: NDArray, state: FramesAndShapes) -> "_Frames":
+        """Return the frames with their residual and their tangent space."""
+        rest = rows - motion_rows(state.motion, state.alpha) @ state.shapes
+        tangents = frame_tangents(state)
+        size = np.linalg.norm(tangents, axis=1)
+        Q, R = np.linalg.qr(tangents)
+        diagonal = np.arange(R.shape[-1])
+        kept = np.abs(R[:, diagonal, diagonal]) > DEPENDENT * size
+        Q *= kept[:, None]
+        R *= kept[..., None]
+        R[:, diagonal, diagonal] += ~kept
+        return cls(rest.reshape(len(rows), -1), Q, R)
+
+    def moved(self, state: FramesAndShapes, rest: NDArray) -> FramesAndShapes:
+        """Return cameras and coefficients after the step that a residual asks for."""
+        along = self.tangent.swapaxes(1, 2) @ rest[..., None]
+        step = np.linalg.solve(self.factor, along)[..., 0]
+        motion = state.motion + step[:, :6].reshape(-1, 2, 3)
+        return FramesAndShapes(state.shapes, motion, state.alpha + step[:, 6:])
+
+
+def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
+    """
+    Return the state of least residual that Levenberg-Marquardt steps lead to.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_directions)
+        Tracks of the frames.
+    start : FramesAndShapes
+        Where to start.
+
+    Returns
+    -------
+    FramesAndShapes
+        Where it ended. The residual is never larger than that of the start.
+    """
+    state = start
+    energy = float(np.vdot(rows, rows))
+    frames = _Frames.at(rows, state)
+    square = float(np.vdot(frames.rest, frames.rest))
+    damping, small_steps, system = FIRST_DAMPING, 0, None
+    for _ in range(MAX_STEPS):
+        if square <= ROUNDING**2 * energy or small_steps == 2:
+            break
+        if damping > LARGEST_DAMPING:
+            break
+        if system is None:
+            system = normal_equations(frames, state)
+        trial = _stepped(rows, state, frames, system, damping)
+        after = _Frames.at(rows, trial)
+        reached = float(np.vdot(after.rest, after.rest))
+        if not reached < square:
+            damping *= RAISED
+            continue
+        small_steps = small_steps + 1 if reached > (1 - LITTLE) * square else 0
+        damping = max(EASED * damping, SMALLEST_DAMPING)
+        state, frames, square, system = trial, after, reached, None
+    return state
+
+
+class _System(NamedTuple):
+    """Equations of a step of the shapes, frames eliminated."""
+
+    matrix: NDArray  # I - sum_i G_i G_i^T
+    slope: NDArray  # E^-1/2 sum_i X_i^T P_i R_i (3 n_shapes, n_directions)
+    root: NDArray  # upper triangular factor of E
+
+
+def normal_equations(frames: _Frames, state: FramesAndShapes) -> _System:
+    """Return the equations of a step, as in the head of this module."""
+    X = motion_rows(state.motion, state.alpha)
+    n_frames, _, size = X.shape
+    n_directions = state.shapes.shape[1]
+    E = np.tensordot(X, X, axes=([0, 1], [0, 1]))
+    E += RIDGE * np.trace(E) * np.eye(size)
+    root = np.linalg.cholesky(E).T
+    X = solve_triangular(root, X.reshape(-1, size).T, trans="T").T.reshape(X.shape)
+    Q, rest = frames.tangent, frames.rest[..., None]
+    rest = rest - Q @ (Q.swapaxes(1, 2) @ rest)
+    rest = rest.reshape(2 * n_frames, n_directions)
+    G = X.swapaxes(1, 2) @ Q.reshape(n_frames, 2, -1)
+    G = G.reshape(n_frames, size * n_directions, -1).swapaxes(0, 1)
+    G = G.reshape(size * n_directions, -1)
+    matrix = np.eye(len(G)) - G @ G.T
+    return _System(matrix, X.reshape(-1, size).T @ rest, root)
+
+
+def _stepped(
+    rows: NDArray,
+    state: FramesAndShapes,
+    frames: _Frames,
+    system: _System,
+    damping: float,
+) -> FramesAndShapes:
+    """Return the state after a step of the shapes, and two of the frames."""
+    matrix = system.matrix + damping * np.eye(len(system.matrix))
+    step = np.linalg.solve(matrix, system.slope.ravel()).reshape(state.shapes.shape)
+    step = solve_triangular(system.root, step)
+    X = motion_rows(state.motion, state.alpha)
+    rest = frames.rest - (X @ step).reshape(len(rows), -1)
+    moved = state._replace(shapes=state.shapes + step)
+    moved = _better(rows, moved, frames.moved(moved, rest))
+    frames = _Frames.at(rows, moved)
+    return _better(rows, moved, frames.moved(moved, frames.rest))
+
+
+def _better(
+    rows: NDArray, first: FramesAndShapes, second: FramesAndShapes
+) -> FramesAndShapes:
+    """Return the cameras and coefficients of each frame that leave less."""
+    left = [
+        np.sum((rows - motion_rows(s.motion, s.alpha) @ s.shapes) ** 2, axis=(1, 2))
+        for s in (first, second)
+    ]
+    better = left[1] < left[0]
+    return FramesAndShapes(
+        first.shapes,
+        np.where(better[:, None, None], second.motion, first.motion),
+        np.where(better[:, None], second.alpha, first.alpha),
+    )
+
+
+def _all_frames(
+    blocks: FrameBlocks, shapes: NDArray, motion: NDArray, alpha: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return cameras and coefficients of all frames for given shapes."""
+    motion, alpha = motion.copy(), alpha.copy()
+    fits = blocks.map(partial(_fitted, shapes=shapes), alpha.T.copy())
+    for part, (cameras, coefficients) in zip(blocks.slices, fits, strict=True):
+        known = np.isfinite(coefficients).all(axis=1)
+        frames = np.arange(part.start, part.stop)[known]
+        motion[..., frames] = cameras[known].transpose(1, 2, 0)
+        alpha[:, frames] = coefficients[known].T
+    return motion, alpha
+
+
+def _fitted(
+    block: list[FrameTracks], initial: NDArray, shapes: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return cameras and coefficients of a block, from given coefficients."""
+    fits, first = [], 0
+    for part in block:
+        W, seen = _tracks_of(part)
+        start = initial[first : first + len(W)]
+        if seen is None:
+            fits.append(fit_prepared(part, shapes, 0.0, initial=start))
+        else:
+            tracks = W.swapaxes(1, 2)
+            fits.append(fit_posterior(tracks, shapes, 0.0, weights=seen, initial=start))
+        first += len(W)
+    motion = np.concatenate([fit.motion for fit in fits])
+    return motion, np.concatenate([fit.alpha for fit in fits])
+
+
+def likely_basis(
+    shapes: NDArray, motion: NDArray, alpha: NDArray, stiffness: float
+) -> NDArray:
+    """
+    Return the same shapes in the basis of greatest marginal likelihood.
+
+    Without noise it is free to shift the mean shape, and to mix the basis shapes by any
+    A: alpha becomes ``A^-1 (alpha - mean)``, and the objective changes by
+
+        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + stiffness tr(A^T H A)
+
+    with H the sum over the frames of ``<M B_k, M B_l>``. Where the covariance of the
+    coefficients is the identity and H is diagonal, A is diagonal, too.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras.
+    alpha : ndarray of shape (n_components, n_frames)
+        Coefficients.
+    stiffness : float
+        As in `MarginalLikelihood`.
+
+    Returns
+    -------
+    ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes.
+    """
+    n_frames = motion.shape[2]
+    mean = alpha.mean(axis=1)
+    mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
+    rest = alpha - mean[:, None]
+    covariance = rest @ rest.T / n_frames
+    covariance += (RIDGE * np.trace(covariance) or 1.0) * np.eye(len(mean))
+    basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
+    cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
+    energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
+    price = stiffness * np.maximum(energy, 0.0)
+    scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))
+    basis = scale[:, None, None] * np.tensordot(axes.T, basis, 1)
+    return np.concatenate([mean_shape[None], basis])

@@ -1,0 +1,313 @@
+"""Gauss-Newton steps on the reprojection residual, for tables without noise."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import _gauss_newton as module
+from isa_nrsfm._frame_blocks import MemoryBlocks
+from isa_nrsfm._frame_products import frame_tracks
+from isa_nrsfm._gauss_newton import (
+    FramesAndShapes,
+    complete_frames,
+    compressed,
+    fit_without_noise,
+    frame_tangents,
+    likely_basis,
+    minimise,
+    motion_rows,
+    normal_equations,
+)
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.metrics import affine_shape_error
+
+
+def in_blocks(parts):
+    """Return frames as the joint refinement has them."""
+    lengths = [len(part.weight) for part in parts]
+    return MemoryBlocks([[part] for part in parts], lengths)
+
+
+class Scene(NamedTuple):
+    tracks: NDArray  # (n_frames, n_points, 2), centred
+    shapes: NDArray  # (n_shapes, 3, n_points)
+    motion: NDArray  # (2, 3, n_frames)
+    alpha: NDArray  # (n_components, n_frames)
+
+    def frame_shapes(self, shapes, alpha):
+        """Return the shapes of all frames (n_frames, n_points, 3)."""
+        c = np.vstack([np.ones(alpha.shape[1]), alpha])
+        return np.einsum("kaj,ki->ija", shapes, c)
+
+
+def random_scene(seed=0, n_frames=40, n_points=30, n_components=2, noise=0.0):
+    """Return a table that follows the model, and what made it."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes[1:] *= 0.3
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = rng.normal(size=(2, 3, n_frames))
+    alpha = rng.normal(size=(n_components, n_frames))
+    c = np.vstack([np.ones(n_frames), alpha])
+    tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
+    tracks += noise * rng.normal(size=tracks.shape)
+    return Scene(tracks - tracks.mean(axis=1, keepdims=True), shapes, motion, alpha)
+
+
+def in_row_space(scene, size=0.0, seed=1):
+    """Return tracks in a basis of their row space, and a state some way off."""
+    rng = np.random.default_rng(seed)
+    b = scene.shapes.reshape(-1, scene.shapes.shape[2])
+    rows, V = compressed(scene.tracks.swapaxes(1, 2), b)
+    exact = b @ V, scene.motion.transpose(2, 0, 1), scene.alpha.T
+    moved = (part + size * rng.normal(size=part.shape) for part in exact)
+    return rows, FramesAndShapes(*moved)
+
+
+def images(state):
+    return motion_rows(state.motion, state.alpha) @ state.shapes
+
+
+def square(rows, state):
+    return float(np.sum((rows - images(state)) ** 2))
+
+
+def with_gaps(tracks, share, seed=2):
+    """Return tracks with random points that are missing, and the weights."""
+    weights = 1.0 * (np.random.default_rng(seed).random(tracks.shape[:2]) >= share)
+    return np.where(weights[..., None] > 0, tracks, np.nan), weights
+
+
+class TestEquations:
+    def test_tangents_are_the_derivatives_by_cameras_and_coefficients(self):
+        _, state = in_row_space(random_scene(), size=0.1)
+        tangents = frame_tangents(state)
+        step = 1e-6
+        for column in range(tangents.shape[2]):
+            motion, alpha = state.motion.copy(), state.alpha.copy()
+            if column < 6:
+                motion[:, column // 3, column % 3] += step
+            else:
+                alpha[:, column - 6] += step
+            change = images(FramesAndShapes(state.shapes, motion, alpha))
+            change = (change - images(state)).reshape(len(motion), -1) / step
+            assert_allclose(change, tangents[:, :, column], atol=1e-8)
+
+    def test_they_are_those_of_all_unknowns_with_the_frames_eliminated(self):
+        rows, state = in_row_space(random_scene(n_frames=15), size=0.1)
+        frames = module._Frames.at(rows, state)
+        system = normal_equations(frames, state)
+        X = motion_rows(state.motion, state.alpha)
+        n_directions = rows.shape[2]
+        matrix, right = 0.0, 0.0
+        for x, tangent, rest in zip(
+            X, frame_tangents(state), rows - images(state), strict=True
+        ):
+            by_shapes = np.kron(x, np.eye(n_directions))
+            off = np.eye(len(tangent)) - tangent @ np.linalg.pinv(tangent)
+            matrix = matrix + by_shapes.T @ off @ by_shapes
+            right = right + by_shapes.T @ off @ rest.ravel()
+        scaling = np.kron(np.linalg.inv(system.root), np.eye(n_directions))
+        assert_allclose(system.matrix, scaling.T @ matrix @ scaling, atol=1e-10)
+        assert_allclose(system.slope.ravel(), scaling.T @ right, atol=1e-10)
+
+    @pytest.mark.parametrize("n_components", [1, 2, 4])
+    def test_nothing_but_the_basis_is_free(self, n_components):
+        # A 3x3 affinity and a mixing of all shapes, which share one scale.
+        scene = random_scene(n_components=n_components)
+        rows, state = in_row_space(scene)
+        system = normal_equations(module._Frames.at(rows, state), state)
+        values = np.linalg.eigvalsh(system.matrix)
+        n_free = (n_components + 1) ** 2 + 8
+        assert_allclose(values[:n_free], 0.0, atol=1e-10)
+        assert values[n_free] > 1e-4
+        assert values[-1] < 1 + 1e-10
+
+
+class TestMinimise:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_exact_tables_are_fitted_to_rounding_errors(self, seed):
+        rows, start = in_row_space(random_scene(seed), size=0.05)
+        end = minimise(rows, start)
+        assert square(rows, start) > 1e-4 * np.vdot(rows, rows)
+        assert square(rows, end) < 1e-28 * np.vdot(rows, rows)
+
+    def test_the_first_order_conditions_hold_where_there_is_noise(self):
+        rows, start = in_row_space(random_scene(noise=1e-3), size=0.02)
+        end = minimise(rows, start)
+        frames = module._Frames.at(rows, end)
+        rest = np.sqrt(square(rows, end))
+        along = np.einsum("ipt,ip->it", frames.tangent, frames.rest)
+        assert np.abs(along).max() < 1e-3 * rest
+        assert np.abs(normal_equations(frames, end).slope).max() < 1e-3 * rest
+
+    @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+    def test_it_never_ends_above_the_start(self, size):
+        rows, start = in_row_space(random_scene(noise=0.1), size=size)
+        assert square(rows, minimise(rows, start)) < square(rows, start)
+
+    def test_steps_go_along_with_the_basis(self, monkeypatch):
+        monkeypatch.setattr(module, "MAX_STEPS", 3)
+        rows, start = in_row_space(random_scene(noise=0.01), size=0.1)
+        rng = np.random.default_rng(5)
+        space = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+        mixing = np.eye(2) + 0.3 * rng.normal(size=(2, 2))
+        shift = rng.normal(size=2)
+        b = start.shapes.reshape(3, 3, -1)
+        b = np.concatenate(
+            [[b[0] - np.tensordot(shift, b[1:], 1)], np.tensordot(mixing, b[1:], 1)]
+        )
+        turned = FramesAndShapes(
+            (np.linalg.inv(space) @ b).reshape(9, -1),
+            start.motion @ space,
+            (start.alpha + shift) @ np.linalg.inv(mixing),
+        )
+        assert_allclose(images(turned), images(start), atol=1e-12)
+        expected = images(minimise(rows, start))
+        assert np.abs(expected - images(start)).max() > 0.1
+        assert_allclose(images(minimise(rows, turned)), expected, atol=1e-8)
+
+
+class TestRowSpace:
+    def test_it_holds_all_of_an_exact_table(self):
+        scene = random_scene()
+        W = scene.tracks.swapaxes(1, 2)
+        rng = np.random.default_rng(3)
+        near = scene.shapes + 1e-3 * rng.normal(size=scene.shapes.shape)
+        rows, V = compressed(W, near.reshape(9, -1))
+        assert_allclose(V.T @ V, np.eye(9), atol=1e-12)
+        assert_allclose(rows @ V.T, W, atol=1e-12)
+
+    def test_missing_points_are_found(self):
+        scene = random_scene()
+        tracks, weights = with_gaps(scene.tracks, 0.2)
+        blocks = in_blocks([frame_tracks(tracks, weights)])
+        rng = np.random.default_rng(3)
+        near = scene.shapes + 1e-3 * rng.normal(size=scene.shapes.shape)
+        W, frames = complete_frames(blocks, near.reshape(9, -1), 1000)
+        assert len(frames) > 30
+        assert_allclose(W, scene.tracks.swapaxes(1, 2)[frames], atol=1e-11)
+
+    def test_frames_that_do_not_tell_their_missing_points_are_left_out(self):
+        scene = random_scene()
+        weights = np.ones(scene.tracks.shape[:2])
+        weights[[3, 17], 9:] = 0.0
+        blocks = in_blocks([frame_tracks(scene.tracks, weights)])
+        _, frames = complete_frames(blocks, scene.shapes.reshape(9, -1), 1000)
+        assert_array_equal(frames, np.setdiff1d(np.arange(40), [3, 17]))
+
+    def test_few_frames_are_spread_over_all_blocks(self):
+        scene = random_scene()
+        parts = np.split(scene.tracks, [10, 25])
+        blocks = in_blocks([frame_tracks(part) for part in parts])
+        W, frames = complete_frames(blocks, scene.shapes.reshape(9, -1), 12)
+        assert_array_equal(frames, [0, 4, 9, 10, 14, 17, 20, 24, 25, 29, 32, 35, 39])
+        assert_allclose(W, scene.tracks.swapaxes(1, 2)[frames], atol=1e-13)
+
+    def test_points_of_small_weight_count_as_missing(self):
+        scene = random_scene()
+        weights = np.random.default_rng(4).choice([0.1, 0.6, 1.0], (40, 30))
+        weights[:, :12] = 1.0
+        tracks = np.where(weights[..., None] > 0.5, scene.tracks, 7.0)
+        blocks = in_blocks([frame_tracks(tracks, weights)])
+        W, frames = complete_frames(blocks, scene.shapes.reshape(9, -1), 1000)
+        assert_allclose(W, scene.tracks.swapaxes(1, 2)[frames], atol=1e-10)
+
+
+class TestWholeTable:
+    @pytest.mark.parametrize("gaps", [0.0, 0.2])
+    @pytest.mark.parametrize("n_components", [1, 3])
+    def test_images_of_all_frames_are_exact(self, gaps, n_components):
+        scene = random_scene(n_components=n_components)
+        tracks, weights = with_gaps(scene.tracks, gaps)
+        parts = slice(0, 15), slice(15, 40)
+        blocks = in_blocks(
+            [frame_tracks(tracks[p], weights[p] if gaps else None) for p in parts]
+        )
+        rng = np.random.default_rng(3)
+        near = [
+            part + 0.01 * rng.normal(size=part.shape)
+            for part in (scene.shapes, scene.motion, scene.alpha)
+        ]
+        near[0] -= near[0].mean(axis=2, keepdims=True)
+        copies = [part.copy() for part in near]
+        shapes, motion = fit_without_noise(blocks, *near, 0.0)
+        for part, copy in zip(near, copies, strict=True):
+            assert_array_equal(part, copy)
+        # What the cameras leave open are the coefficients.
+        for camera, frame in zip(motion.transpose(2, 0, 1), scene.tracks, strict=True):
+            seen = (camera @ shapes).reshape(n_components + 1, -1)
+            rest = frame.T.ravel() - seen[0]
+            alpha = np.linalg.lstsq(seen[1:].T, rest, rcond=None)[0]
+            assert_allclose(alpha @ seen[1:], rest, atol=1e-7)
+
+    def test_a_step_that_would_take_too_long_is_not_made(self, monkeypatch):
+        scene = random_scene()
+        monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 8)
+        blocks = in_blocks([frame_tracks(scene.tracks)])
+        assert fit_without_noise(blocks, *scene[1:], 0.0) is None
+        monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 9)
+        assert fit_without_noise(blocks, *scene[1:], 0.0) is not None
+
+    def test_nor_where_no_frame_tells_its_missing_points(self):
+        scene = random_scene()
+        order = np.random.default_rng(4).random(scene.tracks.shape[:2]).argsort(axis=1)
+        weights = 1.0 * (order < 9)
+        blocks = in_blocks([frame_tracks(scene.tracks, weights)])
+        assert fit_without_noise(blocks, *scene[1:], 0.0) is None
+
+    @pytest.mark.parametrize("stiffness", [0.0, 0.5, 300.0])
+    def test_no_other_basis_is_likelier(self, stiffness):
+        scene = random_scene()
+        shapes = likely_basis(*scene[1:], stiffness)
+
+        def objective(shift, mixing):
+            # alpha of these shapes from the true ones: S = B_0 + alpha B.
+            basis = np.tensordot(mixing, shapes[1:], 1).reshape(2, -1)
+            mean = shapes[0] + np.tensordot(shift, shapes[1:], 1)
+            frames = scene.frame_shapes(scene.shapes, scene.alpha).swapaxes(1, 2)
+            alpha = (frames - mean).reshape(40, -1) @ np.linalg.pinv(basis)
+            moved = np.einsum("rai,kaj->ikrj", scene.motion, basis.reshape(2, 3, -1))
+            gram = np.einsum("ikrj,ilrj->ikl", moved, moved)
+            value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
+            return value + stiffness * np.trace(gram, axis1=1, axis2=2).sum()
+
+        least = objective(np.zeros(2), np.eye(2))
+        rng = np.random.default_rng(6)
+        for _ in range(10):
+            step = 0.01 * rng.normal(size=2), np.eye(2) + 0.01 * rng.normal(size=(2, 2))
+            assert objective(*step) > least
+
+    def test_coefficients_that_are_all_zero(self):
+        scene = random_scene()
+        shapes = likely_basis(scene.shapes, scene.motion, 0 * scene.alpha, 0.0)
+        assert_allclose(shapes[0], scene.shapes[0])
+        assert np.isfinite(shapes).all()
+
+
+class TestEstimator:
+    @pytest.mark.parametrize("n_components", [2, 4])
+    def test_few_faces(self, n_components):
+        faces = make_face_tracks(
+            60, n_components=n_components, noise=0.0, random_state=0
+        )
+        model = AffineNRSfM(n_components, random_state=0).fit(faces.data)
+        assert model.inverse_snr_ < 1e-18
+        error = affine_shape_error(faces.shapes, model.reconstruct(faces.data))
+        assert error < 1e-9
+
+    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("missing", [0.0, 0.15])
+    def test_exact_tables_with_and_without_gaps(self, seed, missing):
+        truth = make_nonrigid_tracks(
+            80, 30, 2 + seed, noise=0.0, missing=missing, random_state=seed
+        )
+        model = AffineNRSfM(2 + seed, random_state=0).fit(truth.data)
+        assert model.inverse_snr_ < 1e-18
+        error = affine_shape_error(truth.shapes, model.reconstruct(truth.data))
+        assert error < 1e-9
+        assert_allclose(model.transform(truth.data), model.alpha_, atol=1e-10)
