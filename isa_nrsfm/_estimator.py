@@ -427,7 +427,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             frames = self._refine_jointly(table, outliers, sample, factors, result)
             report("joint refinement, gauge and coefficients")
         else:
-            frames = self._keep(table, sample.W, result)
+            frames = self._keep(source, table, sample.W, result)
             report("gauge and coefficients")
         self._describe(table, frames)
         self._keep_frames(table, frames)
@@ -698,7 +698,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         return np.random.RandomState(seed)
 
-    def _keep(self, table: ScaledTable, W: NDArray, result: PaperResult) -> FrameFit:
+    def _keep(
+        self, source: Table, table: ScaledTable, W: NDArray, result: PaperResult
+    ) -> FrameFit:
         """Set the shapes of the paper's pipeline and return the fit of the frames."""
         dtype = table.dtype
         completed = W.reshape(len(table.sizes), 2, -1).transpose(0, 2, 1)
@@ -713,10 +715,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.mode_covariance_ = self._unit**2 * covariance
         self._converged(result.converged, result.n_iter)
         # The coefficients are those that transform gives, from the stored shapes.
-        frames = RigidFrames(self.mean_shape_, self.basis_)
-        self._model = self._table_model(frames)
-        unit = table.rows.whole().transpose(0, 2, 1)
-        return frames.fit(unit * table.sizes[:, None, None], table.sizes)
+        self._model = self._table_model(RigidFrames(self.mean_shape_, self.basis_))
+        return self._model.decompose(source)
 
     def _refine_jointly(
         self,
@@ -765,7 +765,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         cameras = shown.motion / table.sizes[:, None, None]
         covariance = mode_covariance(cameras, shown.alpha)
         self.mode_covariance_ = self._unit**2 * covariance
-        return shown
+        return shown._replace(translation=shown.translation + table.translation)
 
     def _table_model(self, frames: RigidFrames | PosteriorFrames) -> TableModel:
         """Return the model of tables that belongs to a model of frames."""
@@ -779,10 +779,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         )
 
     def _describe(self, table: ScaledTable, frames: FrameFit) -> None:
-        """Set what is said of the fit of all frames, relative to their centroids."""
+        """Set what is said of the fit of all frames."""
         sizes, dtype = table.sizes, table.dtype
         cameras = frames.motion / sizes[:, None, None]
-        position = frames.translation / sizes[:, None]
+        position = (frames.translation - table.translation) / sizes[:, None]
         shapes = np.concatenate([self.mean_shape_[None], self.basis_])
         self.inverse_snr_ = reprojection_error(
             table.rows, shapes.transpose(0, 2, 1), cameras, position, frames.alpha
@@ -790,13 +790,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         energy = image_energies(cameras, self.basis_, frames.alpha)
         self.energy_share_ = energy / (energy.sum() or 1.0)
         self.reference_motion_ = reference_camera(cameras, sizes).astype(dtype)
-        translation = frames.translation + table.translation
-        self.reference_translation_ = translation.mean(axis=0).astype(dtype)
+        self.reference_translation_ = frames.translation.mean(axis=0).astype(dtype)
 
     def _keep_frames(self, table: ScaledTable, frames: FrameFit) -> None:
         """Set what was found for each frame, in memory or in files, if it is wanted."""
-        translation = frames.translation + table.translation
-        kept = frames._replace(translation=translation).astype(table.dtype)
+        kept = frames.astype(table.dtype)
         if isinstance(self.keep_frames, str | os.PathLike):
             kept = kept.in_files(self.keep_frames)
         if self.keep_frames:

@@ -256,13 +256,14 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
         gram = basis.T @ products
         values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
         before, found = found, float(values[-k:].sum())
-        if found - before <= CONVERGED * max(energy - found, ROUNDING * energy):
+        little = CONVERGED * max(energy - found, ROUNDING * energy)
+        if found - before <= little or basis.shape[1] + width > n_columns:
             break
         last = products[:, -width:]
         for _ in range(2):  # twice is enough
             last = np.linalg.qr(last - basis @ (basis.T @ last))[0]
         basis = np.hstack([basis, last])
-    return basis @ axes[:, -k:]
+    return basis[:, : len(axes)] @ axes[:, -k:]
 
 
 def _squared(block: NDArray, V: NDArray) -> NDArray:

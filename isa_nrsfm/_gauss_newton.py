@@ -235,6 +235,9 @@ def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
     for _ in range(COMPLETION_STEPS):
         rows = np.hstack([V, np.ones((n_points, 1))])
         gram = (seen @ _squares(rows)).reshape(-1, rank + 1, rank + 1)
+        # Where W has a lower rank, a column of V can be anything.
+        size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+        gram += RIDGE * size * np.eye(rank + 1)
         factors = np.linalg.solve(gram, (W @ rows).swapaxes(1, 2)).swapaxes(1, 2)
         model = factors @ rows.T
         previous = square

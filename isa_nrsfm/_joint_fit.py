@@ -54,8 +54,10 @@ TOO_STIFF = 4.0
 STILL_MOVING = 0.5
 # Steps of the fit of frames that then brings the cameras of all frames close.
 ALIGNING_STEPS = 2
-# Complete frames with more points than so many times the rows of all shapes are given
-# by directions, to which so many times at most those of a step in all points are added.
+# Complete frames with more points than that, and than so many times the rows of all
+# shapes, are given by directions. So many times at most the directions of a step in all
+# points are added.
+MANY_POINTS = 200
 WIDE = 8
 WIDENINGS = 20
 # Singular values of shapes below this share of the largest are rounding errors.
@@ -165,7 +167,8 @@ def fit_jointly(
     """
     n_shapes, _, n_points = paper_shapes.shape
     complete = bool((n_seen == n_points).all())
-    wide = complete and loss == "linear" and n_points > WIDE * 3 * n_shapes
+    many = n_points > max(WIDE * 3 * n_shapes, MANY_POINTS)
+    wide = complete and loss == "linear" and many
     if wide:
         frames = JointFrames.along(rows, _directions(factors))
     elif loss == "linear":

@@ -123,7 +123,7 @@ def scaled_table(
     check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
     check_places(report, n_points)
     every = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
-    warn_if_other_layout(blocks.take(every), layout, scale_frames)
+    warn_if_other_layout(blocks.take(every), layout, scale_frames, stacklevel=5)
     size = np.sqrt(report.square / (2 * report.n_seen))
     if robust:
         sizes = blocks.map(partial(_robust_sizes, layout=layout), report.translation)

@@ -310,7 +310,9 @@ def layout_sample(n_frames: int, n_columns: int) -> slice:
     return slice(None, None, max(-(-n_frames // enough), 1))
 
 
-def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None:
+def warn_if_other_layout(
+    X: NDArray, layout: Layout, scale_frames: bool, stacklevel: int = 4
+) -> None:
     """
     Warn where the columns in the other layout are nearer to a rigid object.
 
@@ -325,6 +327,8 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
         What is said to be the order of its columns.
     scale_frames : bool
         Whether frames count alike.
+    stacklevel : int, default=4
+        Where the warning points to: four is the caller of a method that calls this.
 
     Warns
     -----
@@ -348,7 +352,7 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
         warnings.warn(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
             f"what is not rigid has {swapped / given:.2g} times the energy",
-            stacklevel=4,
+            stacklevel=stacklevel,
         )
 
 
