@@ -155,9 +155,7 @@ def test_score_leaves_frames_without_camera_out():
     assert np.isnan(model.score(X))
 
 
-@pytest.mark.parametrize(
-    ("n_components", "seed"), [(1, 0), (2, 1), (3, 2), (4, 3), (5, 4)]
-)
+@pytest.mark.parametrize(("n_components", "seed"), [(1, 0), (3, 2), (5, 4)])
 def test_score_of_new_frames_is_best_at_the_true_number(n_components, seed):
     X = table(n_components, seed)
     search = GridSearchCV(

@@ -61,9 +61,9 @@ EXTRA_CHECKS = (
 
 
 def estimators():
-    """Return the estimators that are checked, with both strategies."""
+    """Return the estimators that are checked: both strategies and refinements."""
     return [
-        AffineNRSfM(n_components=1),
+        AffineNRSfM(n_components=1, refinement="alternating"),
         AffineNRSfM(n_components=2, isa=FastISA(n_init=2)),
     ]
 
