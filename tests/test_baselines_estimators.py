@@ -74,7 +74,8 @@ class TestContract:
         expected_failed_checks=lambda estimator: {
             name: reason
             for name, reason in NARROW_TABLE_CHECKS.items()
-            if name != "check_transformer_n_iter"
+            # The pseudo-inverse method has no steps to count.
+            if name != "check_transformer_n_iter" or hasattr(estimator, "max_iter")
         },
         xfail_strict=True,
     )
