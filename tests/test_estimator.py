@@ -1012,7 +1012,8 @@ def test_pipeline_ends_in_a_classifier():
 
 def test_grid_search_over_own_and_nested_parameters():
     grid = {"n_components": [1, 3], "isa__n_init": [1, 2]}
-    search = GridSearchCV(AffineNRSfM(isa=FastISA(), random_state=0), grid, cv=2)
+    model = AffineNRSfM(isa=FastISA(), refinement="alternating", random_state=0)
+    search = GridSearchCV(model, grid, cv=2)
     search.fit(TABLE)
     scores = search.cv_results_["mean_test_score"]
     assert np.isfinite(scores).all()
