@@ -616,8 +616,8 @@ class TestCompressibleNRSfM:
         truth = 100 * scene.shapes.transpose(0, 2, 1)
         assert np.linalg.norm(shapes - truth) < 0.05 * np.linalg.norm(truth)
 
-    def test_scales_of_frames(self, sparse_table):
-        _, X = sparse_table
+    def test_scales_of_frames(self, small_table):
+        X = small_table
         units = np.random.default_rng(0).uniform(0.1, 10, (len(X), 1))
         settings = {"scale_frames": True, "random_state": 0}
         model = CompressibleNRSfM(4, **settings).fit(X)

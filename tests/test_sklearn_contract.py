@@ -63,8 +63,8 @@ EXTRA_CHECKS = (
 def estimators():
     """Return the estimators that are checked: both strategies and refinements."""
     return [
-        AffineNRSfM(n_components=1, refinement="alternating"),
-        AffineNRSfM(n_components=2, isa=FastISA(n_init=2)),
+        AffineNRSfM(n_components=1),
+        AffineNRSfM(n_components=2, isa=FastISA(n_init=2), refinement="alternating"),
     ]
 
 
@@ -117,7 +117,7 @@ def test_contract_on_landmark_tables(estimator, check, landmark_tables):
 @pytest.mark.filterwarnings("ignore:X has feature names:UserWarning")
 @pytest.mark.parametrize("name", EXTRA_CHECKS)
 def test_extra_checks_on_landmark_tables(name, landmark_tables):
-    # Names, dataframes and parameters have nothing to do with the strategy.
+    # Names, dataframes and parameters have nothing to do with the way of fitting.
     estimator = estimators()[1]
     getattr(estimator_checks, name)(type(estimator).__name__, estimator)
 
