@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from functools import cache
 
 import joblib
 import numpy as np
@@ -51,6 +52,13 @@ def estimator(n_components=K, **params):
     """Return an estimator with few starts."""
     params = {"isa": FastISA(n_init=3), "random_state": 0} | params
     return AffineNRSfM(n_components, **params)
+
+
+@cache
+def fitted_by(strategy, n_components=K):
+    """Return a model of the table by a strategy, to be left as it is."""
+    isa = None if strategy == "pooled" else FastISA(n_init=3)
+    return estimator(n_components, isa=isa).fit(TABLE)
 
 
 def planar(table):
@@ -463,15 +471,13 @@ def test_inverse_transform_takes_the_mean_view_by_default(model):
     assert_allclose(model.transform(table), alpha, atol=model.alpha_std_.max())
 
 
-@pytest.mark.parametrize(
-    "method", ["transform", "decompose", "reconstruct", "reproject"]
-)
-def test_single_precision_is_kept(method):
+def test_single_precision_is_kept():
     table = TABLE.astype(np.float32)
     model = estimator().fit(table)
-    result = getattr(model, method)(table)
-    for array in result if isinstance(result, tuple) else (result,):
-        assert array.dtype == np.float32
+    for method in ("transform", "decompose", "reconstruct", "reproject"):
+        result = getattr(model, method)(table)
+        for array in result if isinstance(result, tuple) else (result,):
+            assert array.dtype == np.float32, method
     assert model.inverse_transform(model.alpha_).dtype == np.float32
     assert model.fit_transform(table).dtype == np.float32
     # Cameras and coefficients are computed in double precision from shapes that were
@@ -523,13 +529,13 @@ TABLE_KINDS = {
 
 @pytest.mark.parametrize("kind", TABLE_KINDS)
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
-def test_results_do_not_depend_on_how_the_table_is_kept(kind, isa, tmp_path):
+@pytest.mark.parametrize("strategy", ["pooled", "fast"])
+def test_results_do_not_depend_on_how_the_table_is_kept(kind, strategy, tmp_path):
     before = TABLE.copy()
     table = TABLE_KINDS[kind](tmp_path)
-    model = estimator(isa=isa).fit(table)
+    reference = fitted_by(strategy)
+    model = clone(reference).fit(table)
     assert_array_equal(TABLE, before)
-    reference = estimator(isa=isa).fit(TABLE)
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
     assert_allclose(model.basis_, reference.basis_, atol=1e-10)
     # New tables may be of another kind than the fitted one, in the same order.
@@ -539,10 +545,10 @@ def test_results_do_not_depend_on_how_the_table_is_kept(kind, isa, tmp_path):
 
 
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
-def test_planar_tables_equal_interleaved_ones(isa):
-    model = estimator(isa=isa, layout="planar").fit(planar(TABLE))
-    reference = estimator(isa=isa).fit(TABLE)
+@pytest.mark.parametrize("strategy", ["pooled", "fast"])
+def test_planar_tables_equal_interleaved_ones(strategy):
+    reference = fitted_by(strategy)
+    model = clone(reference).set_params(layout="planar").fit(planar(TABLE))
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
     assert_allclose(model.basis_, reference.basis_, atol=1e-10)
     assert_allclose(
@@ -637,7 +643,8 @@ def test_smallest_tables_are_fitted_and_smaller_ones_are_not():
         table = rng.normal(size=(n_frames, 2 * n_points))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
-            model = estimator(n_components).fit(table)
+            # Tables of noise alone take many steps that say no more.
+            model = estimator(n_components, max_iter=20).fit(table)
         assert np.isfinite(model.alpha_).all()
         assert model.rank_floor_ < 1e-25
         with pytest.raises(ValueError, match=f"at least {n_points} points"):
@@ -646,10 +653,10 @@ def test_smallest_tables_are_fitted_and_smaller_ones_are_not():
             estimator(n_components).fit(table[1:])
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_k_is_never_changed(seed):
-    faces = make_face_tracks(60, n_components=2, noise=0, random_state=seed)
-    model = estimator(6).fit(faces.data)
+@may_not_converge
+def test_k_is_never_changed():
+    faces = make_face_tracks(60, n_components=2, noise=0, random_state=0)
+    model = estimator(6, max_iter=20).fit(faces.data)
     assert model.n_components == 6
     assert len(model.basis_) == 6
 
@@ -770,7 +777,7 @@ def test_bad_parameters_are_refused(params):
 @pytest.mark.parametrize("n_components", [1, 2, 3])
 def test_too_few_basis_shapes_are_better_than_none(n_components):
     # K is not known: shapes must not be worse for it than the mean shape alone.
-    model = estimator(n_components, isa=None).fit(TABLE)
+    model = fitted_by("pooled", n_components)
     rigid = np.repeat(FACES.shapes.mean(axis=0)[None], N_FRAMES, axis=0)
     error = affine_shape_error(FACES.shapes, model.reconstruct(TABLE))
     assert error < 1.05 * affine_shape_error(FACES.shapes, rigid)
@@ -779,7 +786,7 @@ def test_too_few_basis_shapes_are_better_than_none(n_components):
 @may_not_converge
 @pytest.mark.parametrize("n_components", [1, 2, 3])
 def test_too_few_basis_shapes_do_not_depend_on_rounding(n_components):
-    model = estimator(n_components, isa=None).fit(TABLE)
+    model = fitted_by("pooled", n_components)
     moved = estimator(n_components, isa=None).fit(TABLE + 300.0)
     assert_allclose(moved.alpha_, model.alpha_, atol=1e-5)
 
@@ -787,9 +794,17 @@ def test_too_few_basis_shapes_do_not_depend_on_rounding(n_components):
 # --- parameters ---------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("block_recovery", ["generalized_eigen", "eigen", "irls"])
+@pytest.mark.parametrize(
+    ("block_recovery", "isa"),
+    [
+        ("generalized_eigen", FastISA(n_init=3)),
+        ("generalized_eigen", PooledFastICA(n_init=3)),
+        ("eigen", FastISA(n_init=3)),
+        ("irls", PooledFastICA(n_init=3)),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("refinement", ["joint", "alternating", None])
-@pytest.mark.parametrize("isa", [FastISA(n_init=3), PooledFastICA(n_init=3)], ids=str)
 def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
     block_recovery, refinement, isa
 ):
@@ -823,24 +838,22 @@ def test_robust_losses_need_the_joint_refinement(refinement, loss):
 
 
 def test_stiffness_zero_is_not_raised():
-    assert estimator(stiffness=0).fit(TABLE).stiffness_ == 0
     soft, stiff = (estimator(stiffness=s).fit(TABLE) for s in (0, 1e6))
+    assert soft.stiffness_ == 0
     assert np.linalg.norm(stiff.basis_) < np.linalg.norm(soft.basis_)
     assert stiff.inverse_snr_ > soft.inverse_snr_
 
 
-def test_shapes_of_frames_do_not_depend_on_the_independence():
-    fits = [
-        estimator(independence=name).fit(TABLE)
-        for name in ("shapes", "coefficients", None)
-    ]
-    shapes = fits[0].reconstruct(TABLE)
-    for other in fits[1:]:
-        assert_allclose(other.mean_shape_, fits[0].mean_shape_, atol=1e-9)
+def test_shapes_of_frames_do_not_depend_on_the_independence(model):
+    assert model.independence == "shapes"
+    shapes, score = model.reconstruct(TABLE), model.score(TABLE)
+    for name in ("coefficients", None):
+        other = estimator(independence=name).fit(TABLE)
+        assert_allclose(other.mean_shape_, model.mean_shape_, atol=1e-9)
         assert_allclose(other.reconstruct(TABLE), shapes, atol=1e-8)
-        assert_allclose(other.inverse_snr_, fits[0].inverse_snr_, rtol=1e-9)
-        assert_allclose(other.score(TABLE), fits[0].score(TABLE), rtol=1e-7)
-        assert np.abs(other.alpha_ - fits[0].alpha_).max() > 0.1
+        assert_allclose(other.inverse_snr_, model.inverse_snr_, rtol=1e-9)
+        assert_allclose(other.score(TABLE), score, rtol=1e-7)
+        assert np.abs(other.alpha_ - model.alpha_).max() > 0.1
 
 
 def test_refinement_that_is_cut_short_says_so():
@@ -999,7 +1012,8 @@ def test_pipeline_ends_in_a_classifier():
 
 def test_grid_search_over_own_and_nested_parameters():
     grid = {"n_components": [1, 3], "isa__n_init": [1, 2]}
-    search = GridSearchCV(AffineNRSfM(isa=FastISA(), random_state=0), grid, cv=3)
+    model = AffineNRSfM(isa=FastISA(), refinement="alternating", random_state=0)
+    search = GridSearchCV(model, grid, cv=2)
     search.fit(TABLE)
     scores = search.cv_results_["mean_test_score"]
     assert np.isfinite(scores).all()
@@ -1030,18 +1044,25 @@ COPIES = {
 }
 
 
-@may_not_converge
-@pytest.mark.parametrize("way", COPIES)
-@pytest.mark.parametrize(
-    "params",
-    [
+@pytest.fixture(
+    scope="module",
+    params=[
         {"isa": PooledFastICA(n_init=2)},
         {"isa": FastISA(n_init=2), "refinement": "alternating"},
     ],
     ids=str,
 )
-def test_copies_give_the_same_to_the_bit(way, params, tmp_path):
-    model = estimator(**params).fit(TABLE)
+def copied(request):
+    """Return a model that is copied."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return estimator(**request.param).fit(TABLE)
+
+
+@may_not_converge
+@pytest.mark.parametrize("way", COPIES)
+def test_copies_give_the_same_to_the_bit(way, copied, tmp_path):
+    model = copied
     loaded = COPIES[way](model, tmp_path / "model")
     assert_array_equal(loaded.transform(TABLE), model.transform(TABLE))
     assert_array_equal(loaded.reproject(TABLE), model.reproject(TABLE))

@@ -326,10 +326,11 @@ def test_arguments_are_keywords():
         ("shark_torresani", 2, None, "upper"),
     ],
 )
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_real_tables(load_data, name, n_components, order, origin):
     W = load_data(name)["W2d"]
     W = W[np.isfinite(W).all(axis=(1, 2))][:600]
-    estimator = AffineNRSfM(n_components, random_state=0)
+    estimator = AffineNRSfM(n_components, max_iter=20, random_state=0)
     display = BasisShapeDisplay.from_estimator(estimator.fit(W.reshape(len(W), -1)))
     assert display.origin == origin
     if order is None:
