@@ -763,25 +763,29 @@ def shark(load_data):
     return data["W2d"].reshape(len(truth), -1), truth
 
 
+def by_seeds(X, n_seeds=5, **settings):
+    """Return a fit of each of some seeds."""
+    return [
+        CompressibleNRSfM(1, random_state=seed, **settings).fit(X)
+        for seed in range(n_seeds)
+    ]
+
+
+@pytest.fixture(scope="module")
+def three_atoms(shark):
+    """Return the fits of the shark by three atoms."""
+    return by_seeds(shark[0], n_atoms=3)
+
+
 class TestShark:
     """Shapes of rank two (480 x 91, rank five): no sparse dictionary is unique."""
-
-    def fit(self, X, n_seeds=5, **settings):
-        return [
-            CompressibleNRSfM(1, random_state=seed, **settings).fit(X)
-            for seed in range(n_seeds)
-        ]
-
-    @pytest.fixture(scope="class")
-    def three_atoms(self, shark):
-        return self.fit(shark[0], n_atoms=3)
 
     def test_one_atom_is_the_rigid_factorisation(self, shark):
         X, truth = shark
         W = X.reshape((*truth.shape[:2], 2)).transpose(0, 2, 1).reshape(480, -1)
         W = W - W.mean(axis=1, keepdims=True)
         energy = np.linalg.svd(W, compute_uv=False) ** 2
-        for model in self.fit(X, n_atoms=1, sparsity=1):
+        for model in by_seeds(X, n_atoms=1, sparsity=1):
             floor = energy[3:].sum() / energy.sum()
             assert model.dictionary_residual_ == pytest.approx(floor)
             # With the released code of the publication: 0.0118.
@@ -805,7 +809,7 @@ class TestShark:
         # Any two atoms span the table: without a price every frame is exact, and the
         # blocks are no cameras.
         X, _ = shark
-        without = self.fit(X, n_seeds=3, n_atoms=3, ridge=1e-6)
+        without = by_seeds(X, n_seeds=3, n_atoms=3, ridge=1e-6)
         for model in without:
             assert model.dictionary_residual_ < 1e-6
             assert model.inverse_snr_ > 0.2
