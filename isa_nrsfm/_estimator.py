@@ -54,6 +54,7 @@ from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._robust import LOSSES, gross_outliers
 from isa_nrsfm._sampling import Sample, sample_frames
 from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
+from isa_nrsfm._stored_table import StoredTable
 from isa_nrsfm._table_checks import check_names
 from isa_nrsfm._table_model import TableModel
 from isa_nrsfm._table_sources import (
@@ -256,6 +257,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     frame. The affinity is fixed as said above; angles and proportions in depth are
     not those of the object.
 
+    `fit` and the methods for new tables take tables that are not in memory, too. Of a
+    dask array `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays, and
+    so is what `transform`, `decompose`, `reconstruct` and `reproject` return.
+
     Points that are missing are NaN, in `fit` and everywhere else. A point of which only
     one coordinate is missing counts as missing, with a warning. Rows of which too
     little is seen to determine a camera are refused by `fit` and have NaN elsewhere.
@@ -344,7 +349,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Parameters
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
-            The table, one frame a row, in the order of `layout`.
+            The table, one frame a row, in the order of `layout`. A memory map or a
+            `StoredTable` of `isa_nrsfm.io.open_table` is read block by block, a dask
+            array stays where it is.
         y : None
             Ignored.
 
@@ -360,7 +367,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             frames for `n_components`, a frame whose points are all equal, that shows
             fewer than four points or some on one line only, a point that is seen in too
             few frames, or column names that contradict `layout`; or if `loss` is not
-            linear without the joint refinement.
+            linear without the joint refinement, or either is not the default for a
+            `StoredTable` or a dask array.
         """
         report = StageReport(self.verbose)
         for name in OF_FRAMES:
@@ -370,11 +378,15 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 f"loss={self.loss!r} needs refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
-        source = self._opened(X, reset=True)
         if self.refinement != "joint" or self.loss != "linear":
-            source.need_memory(
-                f"refinement={self.refinement!r} with loss={self.loss!r}"
-            )
+            if is_on_dask(X) or isinstance(X, StoredTable):
+                raise ValueError(
+                    "tables that are not in memory need refinement='joint' and "
+                    f"loss='linear'; got refinement={self.refinement!r} and "
+                    f"loss={self.loss!r}"
+                )
+            X = np.asarray(X) if isinstance(X, np.memmap) else X
+        source = self._opened(X, reset=True)
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
         table = scaled_table(
@@ -715,7 +727,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.mode_covariance_ = self._unit**2 * covariance
         self._converged(result.converged, result.n_iter)
         # The coefficients are those that transform gives, from the stored shapes.
-        self._model = self._table_model(RigidFrames(self.mean_shape_, self.basis_))
+        self._frames: RigidFrames | PosteriorFrames = RigidFrames(
+            self.mean_shape_, self.basis_
+        )
         return self._model.decompose(source)
 
     def _refine_jointly(
@@ -755,7 +769,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         frames = frames._replace(gauge=gauge.frames)
         self.mean_shape_ = gauge.mean_shape.astype(table.dtype)
         self.basis_ = gauge.basis.astype(table.dtype)
-        self._model = self._table_model(frames)
+        self._frames = frames
         self.noise_variance_ = self._unit**2 * fitted.noise_variance
         self.stiffness_ = fitted.stiffness
         self.objective_history_ = fitted.history
@@ -767,10 +781,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.mode_covariance_ = self._unit**2 * covariance
         return shown._replace(translation=shown.translation + table.translation)
 
-    def _table_model(self, frames: RigidFrames | PosteriorFrames) -> TableModel:
-        """Return the model of tables that belongs to a model of frames."""
+    @property
+    def _model(self) -> TableModel:
+        """The model of tables that was fitted."""
         return TableModel(
-            frames,
+            self._frames,
             self.mean_shape_,
             self.basis_,
             self.layout,

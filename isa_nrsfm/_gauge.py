@@ -68,7 +68,8 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     """
     variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
     inside = variance > 1e-18 * variance[-1]
-    scale = np.where(inside, 1.0 / np.sqrt(np.where(inside, variance, 1.0)), 1.0)
+    # Directions in which the shape is flat get the scale of its widest one.
+    scale = 1.0 / np.sqrt(np.where(inside, variance, variance[-1] or 1.0))
     whitening = (axes * scale) @ axes.T
     white_motion = motion @ np.linalg.inv(whitening)
     return canonical_rotation(mean_shape @ whitening, white_motion) @ whitening

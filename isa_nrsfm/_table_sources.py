@@ -44,14 +44,6 @@ class Table(NamedTuple):
     n_columns: int
     dtype: Any
 
-    def need_memory(self, what: str) -> None:
-        """Refuse a table that is not in memory, for what needs it to be."""
-        if not isinstance(self.blocks, MemoryBlocks):
-            raise ValueError(
-                "tables that are read in blocks, or are on dask, need "
-                f"refinement='joint' and loss='linear'; got {what}"
-            )
-
     @classmethod
     def in_memory(
         cls, X: NDArray, n_jobs: int | None = 1, whole: bool = False

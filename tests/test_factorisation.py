@@ -235,8 +235,8 @@ class TestLargeBothWays:
         got = np.sum(leading.singular_values**2)
         assert abs(got - kept) < 1e-6 * whole.rest + 1e-14 * kept
         assert_allclose(leading.rest, whole.rest, rtol=1e-6, atol=1e-14 * kept)
-        for got, expected in zip(leading[:5], whole[:5], strict=True):
-            assert_allclose(got, expected, atol=1e-4 * np.abs(expected).max())
+        assert_allclose(leading.rigid_shape, whole.rigid_shape, atol=1e-6)
+        assert_allclose(leading.singular_values, whole.singular_values, rtol=1e-3)
 
     @pytest.mark.parametrize("block_frames", [1, 7, 60])
     @pytest.mark.parametrize("size", [(60, 70), (40, 25), (60, 8)])

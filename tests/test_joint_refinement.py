@@ -376,7 +376,7 @@ class TestWithoutNoise:
             refined(random_scene(noise=0.0))
 
     def test_tries_again_from_closer_by(self, monkeypatch):
-        likelihood = MarginalLikelihood(random_scene(noise=0.0).tracks, None, 0.0)
+        likelihood = likelihood_of(random_scene(noise=0.0).tracks, None, 0.0)
         noises = []
 
         def fail(blocks, shapes, motion, alpha, stiffness):

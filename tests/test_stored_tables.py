@@ -228,10 +228,15 @@ class TestErrors:
             model.transform(memmap(X[:, :-2], tmp_path))
 
     def test_what_needs_memory(self, tmp_path):
-        stored = memmap(table(), tmp_path)
+        stored = folder(table(), tmp_path, "npy")
         for params in ({"refinement": "alternating"}, {"loss": "huber"}):
-            with pytest.raises(ValueError, match=r"read in blocks.*loss='linear'"):
+            with pytest.raises(ValueError, match=r"not in memory.*loss='linear'"):
                 estimator(**params).fit(stored)
+
+    def test_memory_maps_are_taken_as_arrays_where_that_is_needed(self, tmp_path):
+        X, params = table(), {"refinement": "alternating"}
+        got = estimator(**params).fit(memmap(X, tmp_path))
+        assert_array_equal(got.basis_, estimator(**params).fit(X).basis_)
 
     def test_other_dimensions(self, tmp_path):
         with pytest.raises(ValueError, match="Expected 2D array, got 1D"):

@@ -14,7 +14,6 @@ TRUSTED_TYPES = (
     "isa_nrsfm._frame_fit.PosteriorFrames",
     "isa_nrsfm._frame_fit.RigidFrames",
     "isa_nrsfm._independent_gauge.FrameMap",
-    "isa_nrsfm._table_model.TableModel",
     "isa_nrsfm.isa._density.SqrtDensity",
     "isa_nrsfm.isa._fastisa.FastISA",
     "isa_nrsfm.isa._pooled_fastica.PooledFastICA",
