@@ -5,6 +5,7 @@ functions of a block of frames, and run here: on arrays in memory, in threads, o
 that are read from disk block by block, or on a dask cluster.
 """
 
+import mmap
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -148,6 +149,14 @@ class FrameBlocks(ABC):
         return tuple(array[self.slices[block]] for array in arrays)
 
 
+def release_map(table: Any) -> None:
+    """Let go of the pages of a memory map, which count as memory that is used."""
+    mapped = getattr(table, "_mmap", None)
+    # What was written to a copy of a file in memory is nowhere else.
+    if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
+        mapped.madvise(mmap.MADV_DONTNEED)
+
+
 def _rows(block: NDArray, chosen: NDArray) -> NDArray:
     """Return the chosen frames of a block."""
     return block[chosen]
@@ -242,7 +251,9 @@ class StoredBlocks(FrameBlocks):
         slices = [slice(s, min(s + block_frames, table.shape[0])) for s in starts]
 
         def read(number: int) -> NDArray:
-            return np.asarray(table[slices[number]])
+            rows = np.array(table[slices[number]])
+            release_map(table)
+            return rows
 
         return cls(read, [part.stop - part.start for part in slices])
 

@@ -26,6 +26,7 @@ from isa_nrsfm._frame_posterior import fit_prepared
 from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._joint_frames import JointFrames
 from isa_nrsfm._joint_refinement import (
+    NOISE_FLOOR,
     JointResult,
     JointState,
     refine_joint,
@@ -476,6 +477,7 @@ class _Problem:
         """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
         motion = rigid_cameras(self.W, shapes[0].T)
         noise = FIRST_NOISE * _rigid_noise(self.W, shapes[0])
+        noise = max(noise, NOISE_FLOOR * float(np.vdot(self.W, self.W)) / self.W.size)
         shapes = self.frames.coordinates(shapes)
         return JointState(shapes, motion.transpose(1, 2, 0), noise)
 

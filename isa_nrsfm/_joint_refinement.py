@@ -9,17 +9,21 @@ noise is small enough to tell.
 """
 
 from collections import deque
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._gauss_newton import fit_without_noise
-from isa_nrsfm._marginal_likelihood import MarginalLikelihood, Passed
+from isa_nrsfm._marginal_likelihood import MarginalLikelihood
 from isa_nrsfm._small_matrices import inverse3
 
-# Steps whose curvature is remembered.
+# Steps whose curvature is remembered, of tables with so many frames that these would be
+# more numbers than that at least so many.
 MEMORY = 20
+MEMORY_NUMBERS = 2**25
+LEAST_MEMORY = 3
 # The noise variance is at least this share of the mean square of the tracks: tables
 # without noise are fitted, too.
 NOISE_FLOOR = 1e-11
@@ -111,7 +115,10 @@ def refine_joint(
     floor = NOISE_FLOOR * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
     point = _Point(likelihood, start, floor)
-    memory: deque[tuple[NDArray, NDArray, float]] = deque(maxlen=MEMORY)
+    remembered = min(MEMORY_NUMBERS // (2 * point.vector.size), MEMORY)
+    memory: deque[tuple[NDArray, NDArray, float]] = deque(
+        maxlen=max(remembered, LEAST_MEMORY)
+    )
     history = [point.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
@@ -151,7 +158,7 @@ def refine_joint(
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
         small_steps >= 2 and bool(np.isfinite(point.value)),
-        point.passed.alpha.T,
+        likelihood(*point.state).alpha.T,
     )
 
 
@@ -162,8 +169,9 @@ def _without_noise(
     shapes, motion, _ = point.state
     if not np.isfinite(point.value):
         return None
+    alpha = likelihood(*point.state).alpha
     found = fit_without_noise(
-        likelihood.frames, shapes, motion, point.passed.alpha, likelihood.stiffness
+        likelihood.frames, shapes, motion, alpha, likelihood.stiffness
     )
     if found is None:
         return None
@@ -178,33 +186,44 @@ class _Point:
     """A state with the objective, its gradient and its curvature there."""
 
     def __init__(self, likelihood: MarginalLikelihood, state: JointState, floor: float):
-        self.state = state
+        passed = likelihood(*state)
         self.n_seen = likelihood.n_seen
-        self.passed: Passed = likelihood(*state)
-        self.value = self.passed.value
+        self.value = passed.value
         # A coordinate: what the noise says, or the residual where it says more.
-        self.left = max(state.noise, self.passed.residual / likelihood.n_seen)
+        self.left = max(state.noise, passed.residual / likelihood.n_seen)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
-            self.passed.shape_gradient,
-            self.passed.motion_gradient,
+            passed.shape_gradient,
+            passed.motion_gradient,
             # Noise that is least already does not fall.
-            min(self.passed.noise_gradient, 0.0 if at_floor else np.inf),
+            min(passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
+        self.curvature = passed.shape_curvature, passed.motion_curvature
         self.vector = _stacked(state.shapes, state.motion, np.log(state.noise))
-        self.shape_metric = np.linalg.inv(regular(self.passed.shape_curvature))
-        self.motion_metric = inverse3(self.passed.motion_curvature)
+        first = state.shapes.size  # parts of the vector: the arrays can be large
+        self.state = JointState(
+            self.vector[:first].reshape(state.shapes.shape),
+            self.vector[first:-1].reshape(state.motion.shape),
+            state.noise,
+        )
+
+    @cached_property
+    def metric(self) -> tuple[NDArray, NDArray]:
+        """Inverses of the curvatures by the shapes and by the cameras."""
+        by_shapes, by_motion = self.curvature
+        return np.linalg.inv(regular(by_shapes)), inverse3(by_motion)
 
     def precondition(self, vector: NDArray) -> NDArray:
         """Return a vector times the inverse of the curvature."""
         half = self.state.noise / 2
         shapes, motion, noise = self.split(vector)
+        by_shapes, by_motion = self.metric
         stacked = shapes.reshape(-1, shapes.shape[-1])
-        if len(self.shape_metric) == 1:
-            stacked = self.shape_metric[0] @ stacked
+        if len(by_shapes) == 1:
+            stacked = by_shapes[0] @ stacked
         else:
-            stacked = (self.shape_metric @ stacked.T[:, :, None])[:, :, 0].T
-        motion = sum(motion[:, [b]] * self.motion_metric[b] for b in range(3))
+            stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
+        motion = sum(motion[:, [b]] * by_motion[b] for b in range(3))
         return _stacked(half * stacked, half * motion, noise / self.n_seen)
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
