@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from isa_nrsfm._camera import mean_view
 from isa_nrsfm._factorisation import orientations
 
+# Frames that are taken together where much is computed of each.
+BLOCK_FRAMES = 4096
+
 
 def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
     """
@@ -187,8 +190,13 @@ def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
         the images of Brandt et al. (2018), section 3.3, is for motion that has block
         structure.
     """
-    blocks = np.einsum("ik,irc->irkc", alpha, motion).reshape(2 * len(alpha), -1)
-    return blocks.T @ blocks / len(blocks)
+    total = np.zeros((3 * alpha.shape[1],) * 2)
+    for start in range(0, len(alpha), BLOCK_FRAMES):
+        part = slice(start, start + BLOCK_FRAMES)
+        blocks = np.einsum("ik,irc->irkc", alpha[part], motion[part])
+        blocks = blocks.reshape(-1, len(total))
+        total += blocks.T @ blocks
+    return total / (2 * len(alpha))
 
 
 def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:

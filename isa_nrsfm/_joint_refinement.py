@@ -141,25 +141,33 @@ def refine_joint(
                 small_steps = 2
             memory.clear()
             continue
-        moved = reached.vector - point.vector
-        change = reached.gradient - point.gradient
-        curvature = float(moved @ change)
-        if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
-            memory.append((moved, change, curvature))
+        _remember(memory, point, reached)
         gain = point.value - reached.value
         rounding = ROUNDING * likelihood.square / reached.state.noise
         small = gain < max(tol * likelihood.n_frames, rounding)
         small_steps = small_steps + 1 if small else 0
         point = reached
         history.append(point.value)
+    memory.clear()
     slope = point.gradient @ point.precondition(point.gradient)
     return JointResult(
         point.state,
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
         small_steps >= 2 and bool(np.isfinite(point.value)),
-        likelihood(*point.state).alpha.T,
+        likelihood.coefficients(*point.state),
     )
+
+
+def _remember(
+    memory: deque[tuple[NDArray, NDArray, float]], point: "_Point", reached: "_Point"
+) -> None:
+    """Remember the curvature along a step, if it is positive."""
+    moved = reached.vector - point.vector
+    change = reached.gradient - point.gradient
+    curvature = float(moved @ change)
+    if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
+        memory.append((moved, change, curvature))
 
 
 def _without_noise(
@@ -169,7 +177,7 @@ def _without_noise(
     shapes, motion, _ = point.state
     if not np.isfinite(point.value):
         return None
-    alpha = likelihood(*point.state).alpha
+    alpha = likelihood.coefficients(*point.state).T
     found = fit_without_noise(
         likelihood.frames, shapes, motion, alpha, likelihood.stiffness
     )

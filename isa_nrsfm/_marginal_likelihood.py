@@ -19,6 +19,7 @@ Frames are the last index of all arrays here, and everything is a sum over block
 frames: how they are split makes no difference.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -187,14 +188,7 @@ class MarginalLikelihood:
             The sums over the frames.
         """
         n_shapes = len(shapes)
-        over_block = partial(
-            _pass_over_block,
-            shapes=shapes,
-            gram=shared_gram(shapes),
-            noise=noise,
-            stiffness=self.stiffness,
-            tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
-        )
+        over_block = self._over_block(shapes, noise)
         alpha = np.empty((n_shapes - 1, self.n_frames))
         motion_gradient = np.empty((2, 3, self.n_frames))
         motion_curvature = np.empty((6, self.n_frames))
@@ -219,6 +213,39 @@ class MarginalLikelihood:
             motion_curvature,
             alpha,
             float(residual),
+        )
+
+    def coefficients(self, shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
+        """
+        Return the means of the coefficients alone.
+
+        Parameters
+        ----------
+        shapes, motion, noise
+            As of a call.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_components)
+            The means.
+        """
+        alpha = np.empty((self.n_frames, len(shapes) - 1))
+        passes = self.frames.map(
+            self._over_block(shapes, noise), motion.transpose(2, 0, 1)
+        )
+        for frames, part in zip(self.frames.slices, passes, strict=True):
+            alpha[frames] = part.alpha.T
+        return alpha
+
+    def _over_block(self, shapes: NDArray, noise: float) -> Callable[..., Passed]:
+        """Return what goes over a block, given the cameras of its frames."""
+        return partial(
+            _pass_over_block,
+            shapes=shapes,
+            gram=shared_gram(shapes),
+            noise=noise,
+            stiffness=self.stiffness,
+            tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
         )
 
 

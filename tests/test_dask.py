@@ -94,6 +94,13 @@ class TestThreads:
 
 
 class TestCluster:
+    @pytest.fixture(autouse=True)
+    def sampled(self, monkeypatch):
+        """Take the first steps on few frames, as of large tables."""
+        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._joint_fit.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._sampling.SAMPLE_FRAMES", 40)
+
     def test_fit_is_that_in_memory(self, cluster):
         X = table(0.1)
         model = AffineNRSfM(K, random_state=0).fit(chunked(X))
@@ -118,9 +125,6 @@ class TestCluster:
         assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
 
     def test_nothing_as_large_as_the_table_comes_back(self, cluster, monkeypatch):
-        # But for a table so small that it is taken whole by the first stages.
-        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
-        monkeypatch.setattr("isa_nrsfm._sampling.SAMPLE_FRAMES", 40)
         compute, largest = DaskBlocks.map, []
 
         def measured(self, *args):
