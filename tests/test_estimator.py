@@ -745,7 +745,7 @@ def test_methods_need_a_fitted_model():
         {"n_components": 0},
         {"n_components": 2.0},
         {"isa": "fastisa"},
-        {"isa": object()},
+        {"isa": 3},
         {"block_recovery": "best"},
         {"refinement": "alternate"},
         {"refinement": False},
