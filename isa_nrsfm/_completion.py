@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._sampling import spread
+from isa_nrsfm._sampling import order_by_halves, spread
 from isa_nrsfm._tracks import seen_points
 
 RIGID_RANK = 3
@@ -193,23 +193,17 @@ def _telling_frames(rows: FrameBlocks, n_points: int) -> NDArray:
     They are spread evenly over the shares of the energy that the frames have in x, and
     so are those that are added for points that they hardly show.
     """
-    order = np.argsort(np.concatenate(list(rows.map(_share_of_x))), kind="stable")
+    order = order_by_halves(rows)
     chosen = np.zeros(len(order), dtype=bool)
     chosen[spread(order, MODEL_FRAMES)] = True
     shown = np.zeros(n_points)
     for block in rows.map(_seen_rows, chosen):
         shown += block.sum(axis=0)
     for point in map(int, np.flatnonzero(shown < FEWEST_SHOWN)):
-        seen = np.concatenate(list(rows.map(partial(_sees, point=point))))
+        seen = rows.joined(partial(_sees, point=point))
         showing = order[seen[order]]
         chosen[spread(showing, min(FEWEST_SHOWN, len(showing)))] = True
     return np.flatnonzero(chosen)
-
-
-def _share_of_x(rows: NDArray) -> NDArray:
-    """Return the share of the energy of frames that is in their first row."""
-    energy = np.nansum(rows**2, axis=2)
-    return energy[:, 0] / energy.sum(axis=1)
 
 
 def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:

@@ -45,18 +45,12 @@ class DaskBlocks(FrameBlocks):
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Yield what a function makes of each block, in order."""
         dask = import_optional("dask", extra="dask")
-        with warnings.catch_warnings():
-            # Cameras and coefficients of the frames of a block go with each task.
-            warnings.filterwarnings("ignore", "Sending large graph")
-            found = dask.compute(*self._tasks(function, by_frame))
-        yield from found
+        yield from _sent(dask.compute, self._tasks(function, by_frame))
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return the blocks that a function makes of these."""
         dask = import_optional("dask", extra="dask")
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Sending large graph")
-            blocks = dask.persist(*self._tasks(function, by_frame))
+        blocks = _sent(dask.persist, self._tasks(function, by_frame))
         return type(self)(blocks, self.lengths)
 
     def gather(
@@ -94,3 +88,11 @@ class DaskBlocks(FrameBlocks):
             run(block, *self.parts(by_frame, number))
             for number, block in enumerate(self.blocks)
         ]
+
+
+def _sent(run: Callable[..., Any], tasks: list[Any]) -> Any:
+    """Return what dask makes of tasks, without a word about their size."""
+    with warnings.catch_warnings():
+        # Cameras and coefficients of the frames of a block go with each task.
+        warnings.filterwarnings("ignore", "Sending large graph")
+        return run(*tasks)

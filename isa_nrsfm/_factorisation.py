@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
-from isa_nrsfm._sampling import spread
+from isa_nrsfm._sampling import order_by_halves, spread
 
 # A direction whose singular value is below this share of the first is null, whatever
 # the precision of the table: it has less than 1e-20 of the energy.
@@ -204,14 +204,6 @@ def _energy(block: NDArray) -> float:
     return float(np.vdot(block, block))
 
 
-def _first_half(block: NDArray) -> NDArray:
-    """Return the share of the energy of frames that is in the first half of them."""
-    square = block.reshape(len(block), -1) ** 2
-    energy = square.sum(axis=1)
-    half = square[:, : square.shape[1] // 2].sum(axis=1)
-    return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
-
-
 def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:
     """Return the triangular factor of a tall matrix, or of its product with V."""
     pending: list[NDArray] = []
@@ -244,9 +236,8 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     """
     width = k + OVERSAMPLING
     n_frames = blocks.n_frames
-    # The same frames in whatever order they come.
-    order = np.argsort(np.concatenate(list(blocks.map(_first_half))), kind="stable")
-    sample = _matrix(blocks.take(np.sort(spread(order, min(n_frames, 4 * width)))))
+    some = spread(order_by_halves(blocks), min(n_frames, 4 * width))
+    sample = _matrix(blocks.take(np.sort(some)))
     last = np.linalg.qr(sample.T @ np.linalg.svd(sample @ sample.T)[0][:, :width])[0]
     basis, products = last, np.zeros((n_columns, 0))
     energy = sum(blocks.map(_energy))

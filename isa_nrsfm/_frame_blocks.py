@@ -67,6 +67,10 @@ class FrameBlocks(ABC):
         are computed whenever they are needed.
         """
 
+    def joined(self, function: Callable[..., NDArray], *by_frame: NDArray) -> NDArray:
+        """Return the arrays that a function makes of the blocks as one."""
+        return np.concatenate(list(self.map(function, *by_frame)))
+
     def take(self, frames: NDArray) -> NDArray:
         """
         Return some of the frames, of blocks that are arrays.
@@ -83,7 +87,7 @@ class FrameBlocks(ABC):
         """
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        found = np.concatenate(list(self.map(_rows, chosen)))
+        found = self.joined(_rows, chosen)
         order = np.empty(len(frames), dtype=int)
         order[np.argsort(frames)] = np.arange(len(frames))
         return found[order]
@@ -124,7 +128,7 @@ class FrameBlocks(ABC):
 
     def whole(self) -> NDArray:
         """Return all frames, of blocks that are arrays."""
-        return np.concatenate(list(self.map(_same)))
+        return self.joined(_same)
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
         """
@@ -149,12 +153,14 @@ class FrameBlocks(ABC):
         return tuple(array[self.slices[block]] for array in arrays)
 
 
-def release_map(table: Any) -> None:
-    """Let go of the pages of a memory map, which count as memory that is used."""
+def read_rows(table: Any, rows: slice) -> NDArray:
+    """Return rows of a table; the pages of a memory map do not stay in memory."""
+    found = np.array(table[rows])
     mapped = getattr(table, "_mmap", None)
     # What was written to a copy of a file in memory is nowhere else.
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
+    return found
 
 
 def _rows(block: NDArray, chosen: NDArray) -> NDArray:
@@ -251,9 +257,7 @@ class StoredBlocks(FrameBlocks):
         slices = [slice(s, min(s + block_frames, table.shape[0])) for s in starts]
 
         def read(number: int) -> NDArray:
-            rows = np.array(table[slices[number]])
-            release_map(table)
-            return rows
+            return read_rows(table, slices[number])
 
         return cls(read, [part.stop - part.start for part in slices])
 

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_fit import stacked_motion
 from isa_nrsfm._frame_posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frame_products import FrameTracks
 
@@ -285,9 +286,7 @@ def compressed(W: NDArray, shapes: NDArray) -> tuple[NDArray, NDArray]:
 
 def motion_rows(motion: NDArray, alpha: NDArray) -> NDArray:
     """Return ``X_i = c_i^T (x) M_i`` (n_frames, 2, 3 * n_shapes)."""
-    c = np.hstack([np.ones((len(alpha), 1)), alpha])
-    rows = c[:, None, :, None] * motion[:, :, None]
-    return rows.reshape(len(c), 2, -1)
+    return stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
 
 
 def frame_tangents(state: FramesAndShapes) -> NDArray:

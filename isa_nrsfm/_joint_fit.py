@@ -494,7 +494,7 @@ class _Problem:
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
         aligned = partial(_aligned_cameras, shapes=shapes, noise=state.noise)
-        motion = np.concatenate(list(self.frames.blocks.map(aligned)))
+        motion = self.frames.blocks.joined(aligned)
         return JointState(shapes, motion.transpose(1, 2, 0), state.noise)
 
     @cached_property

@@ -63,7 +63,7 @@ def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sam
     parts: list[NDArray] = []
     if 2 * n_frames * n_points >= SMALL_TABLE and n_frames > SAMPLE_FRAMES:
         energy = partial(rigid_energy, shape=rigid_shape)
-        order = np.argsort(np.concatenate(list(rows.map(energy))), kind="stable")
+        order = np.argsort(rows.joined(energy), kind="stable")
         n = SAMPLE_FRAMES
         while not parts or n < min(n_frames / 2, MOST_SAMPLED):
             parts.append(np.sort(spread(order, n)))
@@ -93,6 +93,31 @@ def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
     flat = rows.reshape(len(rows), -1)
     seen = (rows.reshape(-1, rows.shape[-1]) @ axes).reshape(len(rows), -1)
     return np.maximum(np.vecdot(flat, flat) - np.vecdot(seen, seen), 0.0)
+
+
+def order_by_halves(rows: FrameBlocks) -> NDArray:
+    """
+    Return an order of frames that does not depend on the one in which they come.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of frames (n_frames, ...), NaN where a point is missing.
+
+    Returns
+    -------
+    ndarray of int, shape (n_frames,)
+        Frames by the share of their energy that is in their first half, x for instance.
+    """
+    return np.argsort(rows.joined(_first_half), kind="stable")
+
+
+def _first_half(rows: NDArray) -> NDArray:
+    """Return the share of the energy of frames that is in the first half of them."""
+    square = rows.reshape(len(rows), -1) ** 2
+    energy = np.nansum(square, axis=1)
+    half = np.nansum(square[:, : square.shape[1] // 2], axis=1)
+    return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
 
 
 def spread(order: NDArray, n: int) -> NDArray:

@@ -126,8 +126,8 @@ def scaled_table(
     warn_if_other_layout(blocks.take(every), layout, scale_frames, stacklevel=5)
     size = np.sqrt(report.square / (2 * report.n_seen))
     if robust:
-        sizes = blocks.map(partial(_robust_sizes, layout=layout), report.translation)
-        size = np.concatenate(list(sizes))
+        robust_size = partial(_robust_sizes, layout=layout)
+        size = blocks.joined(robust_size, report.translation)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
     rows = blocks.derive(partial(_unit_rows, layout=layout), report.translation, size)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import release_map
+from isa_nrsfm._frame_blocks import read_rows
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm._stored_table import StoredTable
 
@@ -94,9 +94,7 @@ def _rows_of(array: NDArray) -> Callable[[int, int], NDArray]:
     """Return what reads rows of an array."""
 
     def read(first: int, last: int) -> NDArray:
-        rows = np.array(array[first:last])
-        release_map(array)
-        return rows
+        return read_rows(array, slice(first, last))
 
     return read
 
