@@ -31,7 +31,7 @@ from isa_nrsfm._frame_fit import (
     PosteriorFrames,
     RigidFrames,
     compose,
-    posterior_blocks,
+    fitted_posteriors,
     posterior_moments,
     project,
     reprojection_error,
@@ -69,7 +69,7 @@ from isa_nrsfm.isa import PooledFastICA
 
 # Tolerances where none is given: for each frame, of minus twice the log likelihood, and
 # for the paper's refinement, of the energy that it explains.
-JOINT_TOL, PAPER_TOL = 0.05, 1e-10
+JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 # Runs of FastICA, and steps and tolerance of the paper's refinement, where the result
 # is only a start.
 START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
@@ -162,7 +162,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         The most steps of the refinement.
     tol : float or None, default=None
         The joint refinement has converged when two successive steps each lower minus
-        twice the log likelihood by less than tol for each frame (0.05 by default), and
+        twice the log likelihood by less than tol for each frame (0.025 by default), and
         the alternating one when a step would gain less than this share of the energy
         it explains (1e-10 by default).
     random_state : int, RandomState instance or None, default=None
@@ -762,7 +762,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             self.loss,
             FrameMap.identity(self.n_components),
         )
-        posteriors = posterior_blocks(frames, fitted.frames, table.rows)
+        part = sample.parts[0] if sample.parts else None
+        frames, posteriors = fitted_posteriors(frames, fitted.frames, table.rows, part)
         motion, alpha, covariance = posterior_moments(posteriors)
         self.reliability_ = reliabilities(alpha, covariance)
         gauge = independent_gauge(fitted.shapes, motion, alpha, self.independence)

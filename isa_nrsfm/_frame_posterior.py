@@ -44,7 +44,9 @@ from isa_nrsfm._small_matrices import (
     SMALLEST_PIVOT,
     inverse_factor3,
     invert_positive,
+    packed_rows,
     solve_positive,
+    unpacked,
 )
 
 # Frames in a block: enough to be worth the calls, few enough for the cache. Frames
@@ -57,7 +59,7 @@ WEIGHTED_BLOCK = 512
 RIDGE = 1e-13
 # A frame has converged when a Newton step gains less than this share of its energy;
 # the next one would gain about the square.
-TOLERANCE = 1e-14
+TOLERANCE = 1e-12
 # f may rise by this share of the energy: rounding errors.
 ROUNDING = 1e-14
 MAX_STEPS = 60
@@ -204,6 +206,36 @@ def fit_prepared(
         starts=starts,
         max_steps=max_steps,
     )
+
+
+def approximate_cameras(
+    frames: FrameTracks, shapes: NDArray, noise_variance: float
+) -> NDArray:
+    """
+    Return cameras close to those of `fit_prepared`, by two steps from zero.
+
+    Parameters
+    ----------
+    frames, shapes, noise_variance
+        As of `fit_prepared`; all frames determine a camera.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    """
+    white, space = whitened(np.ascontiguousarray(shapes))
+    prepared = _Prepared(frames)
+    motion = np.empty((len(frames.weight), 2, 3))
+    for block, products in prepared.blocks(white):
+        variance = np.full(len(block), noise_variance)
+        problem = _problem(products, variance, np.zeros((3, 3)), prepared.n_points)
+        state = _evaluate(problem, np.zeros((len(shapes) - 1, len(block))))
+        alpha, _ = solve_positive(state.known, state.slope)
+        step, _ = _newton_step(_evaluate(problem, alpha), np.zeros(len(block)))
+        camera = _eliminated(problem, _with_one(alpha + step))[-1]
+        motion[block] = camera.transpose(2, 1, 0)
+    return motion @ space
 
 
 class _Tracks(NamedTuple):
@@ -438,8 +470,8 @@ class _State(NamedTuple):
     camera: NDArray  # M^T (3, 2, n)
     explained: NDArray  # ||W||^2 - f (n,)
     slope: NDArray  # minus half the gradient (K, n)
-    known: NDArray  # H + s2 I, half the Hessian if the camera is known (K, K, n)
-    schur: NDArray  # half the Hessian (K, K, n)
+    known: NDArray  # H + s2 I, half the Hessian if the camera is known, packed
+    schur: NDArray  # half the Hessian, packed
 
     def take(self, frames: NDArray) -> Self:
         """Return the state of some of the frames."""
@@ -469,7 +501,8 @@ def _write(
         products.centroid - np.einsum("ari,ai->ri", camera, origin)
     ).T
     fits.alpha[frames] = alpha.T
-    fits.covariance[frames] = (problem.ridge * _inverse_schur(state)).transpose(2, 0, 1)
+    covariance = unpacked(problem.ridge * _inverse_schur(state))
+    fits.covariance[frames] = covariance.transpose(2, 0, 1)
     objective = np.maximum(products.energy - state.explained, 0.0)
     priors = problem.ridge * np.einsum("ki,ki->i", alpha, alpha)
     priors += np.einsum("ab,ari,bri->i", prior, camera, camera)
@@ -497,30 +530,42 @@ def _with_one(alpha: NDArray) -> NDArray:
     return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
 
 
+def _eliminated(
+    problem: _Problem, c: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """
+    Return what follows from c when the camera is eliminated.
+
+    That is ``B_k S^T + S B_k^T``, the inverse factor R of ``A = (R^T R)^-1``, ``R Y^T``
+    and the camera ``M^T = A^-1 Y^T``.
+    """
+    T = problem.gram.products(c)
+    A = 0.5 * np.einsum("ki,kabi->abi", c, T)[ROWS, COLUMNS] + problem.precision
+    R = inverse_factor3(A)
+    Y = np.einsum("ki,kari->ari", c, problem.cross)
+    half = np.einsum("abi,bri->ari", R, Y)
+    return T, R, half, np.einsum("bai,bri->ari", R, half)
+
+
 def _evaluate(problem: _Problem, alpha: NDArray) -> _State:
     """Return the objective and its derivatives, as in the head of this module."""
-    P, gram, _, ridge, precision = problem
+    P, ridge = problem.cross, problem.ridge
     c = _with_one(alpha)
-    T = gram.products(c)  # B_k S^T + S B_k^T
-    A = 0.5 * np.einsum("ki,kabi->abi", c, T)[ROWS, COLUMNS] + precision
-    R = inverse_factor3(A)
-    Y = np.einsum("ki,kari->ari", c, P)
-    half = np.einsum("abi,bri->ari", R, Y)
-    camera = np.einsum("bai,bri->ari", R, half)  # M^T = A^-1 Y^T
+    T, R, half, camera = _eliminated(problem, c)
     explained = np.einsum("ari,ari->i", half, half)
     explained -= ridge * np.einsum("ki,ki->i", alpha, alpha)
 
-    H = gram.energies(np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :]))
-    slope = np.einsum("kari,ari->ki", P[1:], camera)
-    slope -= np.einsum("kli,li->ki", H[1:], c) + ridge * alpha
-    known = H[1:, 1:]
-    diagonal = np.arange(len(alpha))
-    known[diagonal, diagonal] += ridge
+    images = np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :])
+    known = problem.gram.energies(images)[len(c) :]
+    for row in packed_rows(known):
+        row[0] += ridge
     F = np.einsum("kabi,bri->kari", T[1:], camera)
     F -= P[1:]
-    F = np.einsum("abi,kbri->kari", R, F)
-    schur = np.einsum("kari,lari->kli", F, F)
-    np.subtract(known, schur, out=schur)
+    slope = 0.5 * np.einsum("kari,ari->ki", P[1:] - F, camera) - ridge * alpha
+    F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(ridge))
+    schur = known.copy()
+    for k, row in enumerate(packed_rows(schur)):
+        row -= np.einsum("lmi,mi->li", F[k:], F[k])
     return _State(alpha, camera, explained, slope, known, schur)
 
 
@@ -584,11 +629,13 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
     saddle-free Newton method of Dauphin et al., "Identifying and attacking the saddle
     point problem in high-dimensional non-convex optimization", 2014).
     """
-    size, axes = np.linalg.eigh(state.known.transpose(2, 0, 1))
+    known, schur = (
+        unpacked(each).transpose(2, 0, 1) for each in (state.known, state.schur)
+    )
+    size, axes = np.linalg.eigh(known)
     size = np.maximum(size, SMALLEST_PIVOT * size[:, -1:])
     whitening = axes / np.sqrt(size)[:, None]
-    schur = whitening.swapaxes(1, 2) @ state.schur.transpose(2, 0, 1) @ whitening
-    curvature, modes = np.linalg.eigh(schur)
+    curvature, modes = np.linalg.eigh(whitening.swapaxes(1, 2) @ schur @ whitening)
     axes = whitening @ modes
     along = np.einsum("nab,an->nb", axes, state.slope)
     along /= np.abs(curvature) + damping[:, None]
@@ -597,7 +644,7 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
 
 def _inverse_schur(state: _State) -> NDArray:
     """
-    Return the inverse of the Schur complement.
+    Return the inverse of the Schur complement, packed.
 
     Where it is not positive definite, which it is wherever a frame determines its
     minimum, as much of ``H + s2 I`` is added as makes it so.

@@ -12,7 +12,14 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, UNPACKED, unpack3
+from isa_nrsfm._small_matrices import (
+    COLUMNS,
+    ROWS,
+    UNPACKED,
+    pair_indices,
+    unpack3,
+    unpacked,
+)
 
 # <S, Q> of packed symmetric matrices counts the entries beside the diagonal twice.
 TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
@@ -23,17 +30,10 @@ FLAT = 1e-10
 LEAST_COVER = 1e-10
 
 
-def shape_pairs(n_shapes: int) -> tuple[NDArray, NDArray]:
-    """Return the indices k <= l of the pairs of shapes, in the order of all packs."""
-    return np.triu_indices(n_shapes)
-
-
 def _pair_index(n_pairs: int) -> tuple[NDArray, NDArray]:
     """Return where each (k, l) is among the pairs, and how often each pair counts."""
-    n_shapes = (int(np.sqrt(8 * n_pairs + 1)) - 1) // 2
-    first, second = shape_pairs(n_shapes)
-    index = np.empty((n_shapes, n_shapes), dtype=np.intp)
-    index[first, second] = index[second, first] = np.arange(n_pairs)
+    index = unpacked(np.arange(n_pairs)).astype(np.intp)
+    first, second = pair_indices(len(index))
     return index, np.where(first == second, 1.0, 2.0)
 
 
@@ -44,7 +44,7 @@ class SharedGram:
     Parameters
     ----------
     pairs : ndarray of shape (n_pairs, 6)
-        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `shape_pairs`: what is not
+        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`: what is not
         symmetric in a G_kl has no part in the fit.
     """
 
@@ -54,7 +54,7 @@ class SharedGram:
         full = pairs[index]  # (n, n, 6)
         self._n_shapes = len(index)
         self._moments = multiplicity * pairs.T
-        self._energies = (full * TWICE).reshape(-1, 6)
+        self._energies = pairs * TWICE
         doubled = 2.0 * full.transpose(0, 2, 1)[:, UNPACKED]  # (n, 3, 3, n)
         self._products = doubled.reshape(-1, self._n_shapes)
 
@@ -81,7 +81,7 @@ class SharedGram:
         Parameters
         ----------
         C : ndarray of shape (n_pairs, n_frames)
-            Symmetric matrices (moments of the coefficients), packed as `shape_pairs`.
+            Symmetric matrices (moments of the coefficients), packed as `pair_indices`.
 
         Returns
         -------
@@ -101,10 +101,10 @@ class SharedGram:
 
         Returns
         -------
-        ndarray of shape (n_shapes, n_shapes, n_frames)
-            ``<M_i B_k, M_i B_l>``.
+        ndarray of shape (n_pairs, n_frames)
+            ``<M_i B_k, M_i B_l>`` for the pairs of `pair_indices`.
         """
-        return (self._energies @ Q).reshape(self._n_shapes, self._n_shapes, -1)
+        return self._energies @ Q
 
     def take(self, frames: NDArray) -> Self:
         """Return the Gram matrix of some of the frames."""
@@ -120,7 +120,7 @@ class FrameGram:
     Parameters
     ----------
     pairs : ndarray of shape (n_pairs, 6, n_frames)
-        ``(G_i,kl + G_i,kl^T) / 2``, packed, for the pairs of `shape_pairs`.
+        ``(G_i,kl + G_i,kl^T) / 2``, packed, for the pairs of `pair_indices`.
     """
 
     def __init__(self, pairs: NDArray) -> None:
@@ -138,8 +138,7 @@ class FrameGram:
 
     def energies(self, Q: NDArray) -> NDArray:
         """Return ``H_kl = <G_kl, Q>``."""
-        packed = np.einsum("pai,ai->pi", self.pairs, TWICE[:, None] * Q)
-        return packed[self._index]
+        return np.einsum("pai,ai->pi", self.pairs, TWICE[:, None] * Q)
 
     def take(self, frames: NDArray) -> "FrameGram":
         """Return the Gram matrices of some of the frames."""
@@ -275,7 +274,7 @@ def shared_gram(shapes: NDArray) -> SharedGram:
     n_shapes, _, n_points = shapes.shape
     rows = shapes.reshape(-1, n_points)
     blocks = (rows @ rows.T).reshape(n_shapes, 3, n_shapes, 3).transpose(0, 2, 1, 3)
-    pairs = blocks[shape_pairs(n_shapes)]
+    pairs = blocks[pair_indices(n_shapes)]
     return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
 
 
@@ -317,7 +316,7 @@ def frame_products(
 
 def _pair_products(rows: NDArray) -> NDArray:
     """Return the symmetric parts of ``x_k x_l^T`` of (n, 3, m) as (n_pairs, 6, m)."""
-    first, second = (rows[index] for index in shape_pairs(len(rows)))
+    first, second = (rows[index] for index in pair_indices(len(rows)))
     products = first[:, ROWS] * second[:, COLUMNS]
     products += first[:, COLUMNS] * second[:, ROWS]
     products *= 0.5

@@ -22,7 +22,7 @@ from isa_nrsfm._camera import rigid_cameras
 from isa_nrsfm._factorisation import Factorisation, orientations
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frame_fit import RigidFrames, compose, project, stacked_motion
-from isa_nrsfm._frame_posterior import fit_prepared
+from isa_nrsfm._frame_posterior import approximate_cameras
 from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._joint_frames import JointFrames
 from isa_nrsfm._joint_refinement import (
@@ -43,8 +43,12 @@ from isa_nrsfm._tracks import seen_points
 STIFFNESS = 300.0
 # Rigid cameras whose anisotropy is below this leave nothing to mend.
 ISOTROPIC = 0.15
-# So many starts are enough for them: the fits have one optimum in practice.
+# So many starts are enough for them: the fits have one optimum in practice. Of frames
+# that are a sample the first one is: what the next ones change is more.
 ISOTROPIC_STARTS = 2
+# The steps on a sample end at this share of what its shapes explain by chance alone, a
+# unit of the objective for each number, if it is above the tolerance.
+BY_CHANCE = 0.03
 # The stiff fit is taken where it brings the anisotropy below this share of it, and
 # where the free fit brings it above this multiple, unless the noise of the stiff fit is
 # so many times that of the free one.
@@ -53,8 +57,6 @@ DRIFTED = 1.5
 TOO_STIFF = 4.0
 # A stiff fit that leaves more than this share of what a rigid one leaves does not move.
 STILL_MOVING = 0.5
-# Steps of the fit of frames that then brings the cameras of all frames close.
-ALIGNING_STEPS = 2
 # Complete frames with more points than that, and than so many times the rows of all
 # shapes, are given by directions. So many times at most the directions of a step in all
 # points are added.
@@ -87,8 +89,8 @@ class JointFit(NamedTuple):
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         B_0, ..., B_K, centred, in coordinates in which alpha is drawn from N(0, I).
-    alpha : ndarray of shape (n_frames, n_components)
-        Means of the coefficients in these coordinates.
+    alpha : ndarray of shape (n_chosen, n_components)
+        Means of the coefficients in these coordinates, of the frames of the sample.
     noise_variance : float
         Variance of the noise of a coordinate, for the degrees of freedom that cameras
         and shapes leave.
@@ -180,8 +182,10 @@ def fit_jointly(
             used &= ~outliers
         weights = None if used.all() else used * 1.0
         frames = JointFrames.of_points(rows, complete, weights)
+    by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
     problems = [
-        _Problem(frames.take(part), sample.W, max_iter, tol) for part in sample.parts
+        _Problem(frames.take(part), sample.W, max_iter, max(tol, by_chance / len(part)))
+        for part in sample.parts
     ]
     problem = _Problem(frames, sample.W, max_iter, tol)
     problems.append(problem)
@@ -189,10 +193,16 @@ def fit_jointly(
     small = sample.W.size < SMALL_TABLE
     starts = _starts(first, factors, paper_shapes, random_state if small else None)
     rigid = _Rigid.of(sample.W, factors)
-    best, price = _best(first, starts, rigid, stiffness)
+    n_isotropic = ISOTROPIC_STARTS if first is problem else 1
+    best, price = _best(first, starts, n_isotropic, rigid, stiffness)
+    free = stiffness is None and price == 0
+    if free and rigid.ratio(best) > DRIFTED:
+        stiff = first.best(starts[:n_isotropic], STIFFNESS)
+        if stiff.state.noise < TOO_STIFF * best.state.noise:
+            best, price = stiff, STIFFNESS
     best = _finished(best, problems, price)
-    if stiffness is None and price == 0 and rigid.ratio(best) > DRIFTED:
-        stiff = first.best(starts[:ISOTROPIC_STARTS], STIFFNESS)
+    if free and price == 0 and rigid.ratio(best) > DRIFTED:
+        stiff = first.best(starts[:n_isotropic], STIFFNESS)
         stiff = _finished(stiff, problems, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
@@ -204,10 +214,13 @@ def fit_jointly(
         best, noise = _reweighted(problem, rows, used, best, loss, price)
         n_fitted = n_shapes - 1
     shapes = problem.frames.points(best.state.shapes)
+    state = best.state._replace(shapes=first.frames.coordinates(shapes))
+    if sample.parts:
+        state = state._replace(motion=state.motion[:, :, sample.parts[0]])
     noise *= _freedom_correction(n_seen, n_points, n_shapes, n_fitted)
     return JointFit(
         shapes - shapes.mean(axis=2, keepdims=True),
-        best.alpha,
+        first.coefficients(state),
         max(noise, ROUNDING**2),
         price,
         best.history,
@@ -291,6 +304,7 @@ def _rigid_noise(W: NDArray, shape: NDArray) -> float:
 def _best(
     problem: "_Problem",
     starts: list[NDArray],
+    n_isotropic: int,
     rigid: _Rigid,
     stiffness: float | None,
 ) -> tuple[JointResult, float]:
@@ -305,7 +319,7 @@ def _best(
         ):
             return stiff, STIFFNESS
         return problem.best(starts, 0.0), 0.0
-    return problem.best(starts[:ISOTROPIC_STARTS], 0.0), 0.0
+    return problem.best(starts[:n_isotropic], 0.0), 0.0
 
 
 def _finished(
@@ -316,8 +330,7 @@ def _finished(
         state = result.state
         if problem is not problems[0]:
             state = problem.aligned(state)
-        last = problem is problems[-1]
-        tol = problem.final_tol if last else problem.tol
+        tol = problem.final_tol if problem is problems[-1] else problem.tol
         result = problem.refined(state, stiffness, tol)
     return result
 
@@ -360,7 +373,7 @@ def _reweighted(
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
         model = project(
-            compose(stacked[0], stacked[1:], result.alpha),
+            compose(stacked[0], stacked[1:], problem.coefficients(result.state)),
             motion.transpose(2, 0, 1),
             np.zeros(2),
         )
@@ -506,6 +519,10 @@ class _Problem:
         """Return the objective."""
         return MarginalLikelihood(self.frames.blocks, stiffness, self.totals)
 
+    def coefficients(self, state: JointState) -> NDArray:
+        """Return the means of the coefficients (n_frames, n_components)."""
+        return self.likelihood(0.0).coefficients(*state)
+
     def likelier(self, *starts: NDArray) -> NDArray:
         """Return the shapes that are more likely to start with."""
         likelihood = self.likelihood(0.0)
@@ -529,7 +546,4 @@ def _aligned_cameras(
     block: list[FrameTracks], shapes: NDArray, noise: float
 ) -> NDArray:
     """Return cameras (n_frames, 2, 3) close to the best for given shapes."""
-    fits = [
-        fit_prepared(part, shapes, noise, max_steps=ALIGNING_STEPS) for part in block
-    ]
-    return np.concatenate([fit.motion for fit in fits])
+    return np.concatenate([approximate_cameras(part, shapes, noise) for part in block])

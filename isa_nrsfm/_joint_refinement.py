@@ -78,15 +78,12 @@ class JointResult(NamedTuple):
         still possible, under the root.
     converged : bool
         Whether it stopped by itself.
-    alpha : ndarray of shape (n_frames, n_components)
-        Means of the coefficients at the end.
     """
 
     state: JointState
     history: NDArray
     gradient_norm: float
     converged: bool
-    alpha: NDArray
 
 
 def refine_joint(
@@ -155,7 +152,6 @@ def refine_joint(
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
         small_steps >= 2 and bool(np.isfinite(point.value)),
-        likelihood.coefficients(*point.state),
     )
 
 

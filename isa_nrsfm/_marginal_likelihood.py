@@ -32,13 +32,20 @@ from isa_nrsfm._frame_products import (
     SharedGram,
     frame_products,
     frame_tracks,
-    shape_pairs,
     shared_gram,
 )
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, invert_positive, unpack3
+from isa_nrsfm._small_matrices import (
+    COLUMNS,
+    ROWS,
+    packed_rows,
+    pair_indices,
+    sweep,
+    unpack3,
+    unpacked,
+)
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
-BLOCK_FRAMES = 1024
+BLOCK_FRAMES = 2048
 # With noise below this share of the mean square of the tracks the equations of the
 # coefficients are solved once more for what the first solution leaves.
 TINY_NOISE = 1e-7
@@ -92,7 +99,7 @@ def prepared_frames(
         Tracks; NaN where a point is missing.
     weights : ndarray of shape (n_frames, n_points) or None
         Weights of the points, zero for those that are missing; None for ones.
-    block_frames : int, default=1024
+    block_frames : int, default=2048
         Frames of a block.
 
     Returns
@@ -302,13 +309,12 @@ def _pass_over_block(
     tiny_noise: bool,
 ) -> Passed:
     """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
-    pairs = shape_pairs(len(shapes))
     motion, start, parts = motion.transpose(1, 2, 0), 0, []
     for frames in block:
         end = start + len(frames.weight)
         part = motion[:, :, start:end]
         parts.append(
-            _pass_over(frames, shapes, gram, pairs, part, noise, stiffness, tiny_noise)
+            _pass_over(frames, shapes, gram, part, noise, stiffness, tiny_noise)
         )
         start = end
     if len(parts) == 1:
@@ -331,7 +337,6 @@ def _pass_over(
     block: FrameTracks,
     shapes: NDArray,
     gram: SharedGram,
-    pairs: tuple[NDArray, NDArray],
     motion: NDArray,
     noise: float,
     stiffness: float,
@@ -344,59 +349,58 @@ def _pass_over(
     the curvature is packed: (n_pairs, 6, n_points or 1).
     """
     n_shapes, _, n_points = shapes.shape
-    n_frames = len(block.weight)
     products = frame_products(block, shapes, gram)
     flat_tracks = block.weighted.reshape(n_points, -1)
     cameras = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])  # M^T M
     H = products.gram.energies(cameras)
     seen = np.einsum("kari,rai->ki", products.cross, motion)
 
-    # The posterior of the coefficients of each frame.
-    diagonal = np.arange(n_shapes - 1)
-    moving = H[1:, 1:][diagonal, diagonal].sum()
-    Q = H[1:, 1:].copy()
-    Q[diagonal, diagonal] += noise
-    Q, logdet, _ = invert_positive(Q)
-    along = seen[1:] - H[1:, 0]
-    alpha = np.einsum("kli,li->ki", Q, along)
-    explained = np.einsum("ki,ki->i", alpha, along)
-    if tiny_noise:
+    # The posterior of the coefficients of each frame: rest is min_alpha.
+    first, second = pair_indices(n_shapes)
+    diagonal = (first == second) & (first > 0)
+    moving = H[diagonal].sum()
+    H[diagonal] += noise
+    H[0] += block.energy - 2 * seen[0]
+    H[1:n_shapes] = seen[1:] - H[1:n_shapes]
+    equations = H.copy() if tiny_noise else None
+    logdet, _ = sweep(H, 1)
+    rest, alpha, Q = H[0], H[1:n_shapes], H[n_shapes:]  # Q is minus the inverse
+    if equations is not None:
         # Divided by so little, what rounding leaves of the equations counts.
-        left = along - np.einsum("kli,li->ki", H[1:, 1:], alpha) - noise * alpha
-        alpha += np.einsum("kli,li->ki", Q, left)
-        explained += np.einsum("ki,ki->i", alpha, left)
-    rest = block.energy - 2 * seen[0] + H[0, 0] - explained  # with s2 |alpha|^2
-    rest = np.maximum(rest, 0.0)  # less is rounding errors
-    value = np.sum(rest / noise + logdet - len(diagonal) * np.log(noise))
+        left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
+        alpha -= _product(Q, left)
+        rest -= np.einsum("ki,ki->i", alpha, left)
+    rest = np.maximum(rest, 0.0)  # with s2 |alpha|^2; less is rounding errors
+    value = np.sum(rest / noise + logdet - len(alpha) * np.log(noise))
     residual = rest.sum() - noise * np.sum(alpha**2)
-    spread = noise * (alpha.size - noise * Q[diagonal, diagonal].sum())
+    spread = noise * (alpha.size + noise * H[diagonal].sum())
 
     # Second moments of c, with what the stiffness adds to them.
-    c = np.concatenate([np.ones((1, n_frames)), alpha])
-    first, second = pairs
-    packed = c[first] * c[second]
-    Q[diagonal, diagonal] += stiffness
-    packed[first > 0] += noise * Q[first[first > 0] - 1, second[first > 0] - 1]
+    c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
+    packed = H
+    packed *= -noise
+    packed[:n_shapes] = 0.0
+    for k, row in enumerate(packed_rows(packed)):
+        row += c[k] * c[k:]
+    packed[diagonal] += noise * stiffness
     motion_curvature = products.gram.moments(packed)
     A = unpack3(motion_curvature)
     motion_gradient = np.einsum("rbi,bai->rai", motion, A)
     motion_gradient -= np.einsum("ki,kari->rai", c, products.cross)
     X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
-    shape_gradient = -X @ flat_tracks.T
+    shape_gradient = X @ flat_tracks.T
     if block.weights is None:
         shape_curvature = (packed @ cameras.T)[:, :, None]
     else:
-        moments = (packed[:, None] * cameras).reshape(-1, n_frames)
+        moments = (packed[:, None] * cameras).reshape(6 * len(packed), -1)
         shape_curvature = (moments @ block.weights.T).reshape(-1, 6, n_points)
         # The position of a frame follows the weighted means of its points.
-        E = np.empty((n_shapes, n_shapes, n_frames))
-        E[first, second] = E[second, first] = packed
-        mixed = np.einsum("kli,lbi->kbi", E, products.shape_centroid)
+        mixed = np.einsum("kli,lbi->kbi", unpacked(packed), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
-        shape_gradient -= means.reshape(-1, n_frames) @ block.weights.T
+        shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
     return Passed(
         float(value + stiffness * moving),
-        (2 / noise) * shape_gradient.reshape(shapes.shape),
+        (-2 / noise) * shape_gradient.reshape(shapes.shape),
         (2 / noise) * motion_gradient,
         -float(residual + spread) / noise,
         shape_curvature,
@@ -406,10 +410,12 @@ def _pass_over(
     )
 
 
+def _product(packed: NDArray, vectors: NDArray) -> NDArray:
+    """Return the products of packed symmetric matrices with vectors (k, n)."""
+    return np.einsum("kli,li->ki", unpacked(packed), vectors)
+
+
 def kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
     """Return (n, 3 n_shapes, 3 n_shapes) of packed pairs of shapes and of axes."""
-    first, second = shape_pairs(n_shapes)
-    rows = np.empty((n_shapes, n_shapes, *packed.shape[1:]))
-    rows[first, second] = rows[second, first] = packed
     size = 3 * n_shapes
-    return unpack3(rows).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)
+    return unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)

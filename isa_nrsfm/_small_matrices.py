@@ -1,14 +1,19 @@
 """Algebra of many small symmetric matrices, the index of the matrix last.
 
 With the index last each operation is one pass over long rows of numbers, which for
-matrices of one to fifteen rows is faster than a call of LAPACK for each. None of the
-functions divides by zero: a pivot that is not positive is left out, as said at each.
+matrices of one to fifteen rows is faster than a call of LAPACK for each. Symmetric
+matrices are packed: of each row the part from the diagonal on, one row after the other.
+None of the functions divides by zero: a pivot that is not positive is left out, as said
+at each.
 """
+
+import math
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Symmetric 3x3 matrices are packed as xx, yy, zz, xy, xz, yz.
+# Symmetric 3x3 matrices, of space, are packed as xx, yy, zz, xy, xz, yz.
 ROWS = (0, 1, 2, 0, 0, 1)
 COLUMNS = (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -77,14 +82,39 @@ def inverse3(packed: NDArray) -> NDArray:
     return np.einsum("can,cbn->abn", R, R)
 
 
+def pair_indices(k: int) -> tuple[NDArray, NDArray]:
+    """Return row and column of the entries of packed symmetric k x k matrices."""
+    return np.triu_indices(k)
+
+
+def packed_rows(packed: NDArray) -> list[NDArray]:
+    """Return views of the rows of packed matrices, each from the diagonal on."""
+    starts = np.cumsum([0, *range(_size(packed), 0, -1)])
+    return [packed[start:end] for start, end in pairwise(starts)]
+
+
+def unpacked(packed: NDArray) -> NDArray:
+    """Return packed symmetric matrices (n_pairs, ...) as (k, k, ...)."""
+    k = _size(packed)
+    first, second = pair_indices(k)
+    full = np.empty((k, k, *packed.shape[1:]))
+    full[first, second] = full[second, first] = packed
+    return full
+
+
+def _size(packed: NDArray) -> int:
+    """Return the number of rows of packed matrices."""
+    return (math.isqrt(8 * len(packed) + 1) - 1) // 2
+
+
 def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     """
     Solve symmetric positive definite systems of equations.
 
     Parameters
     ----------
-    A : ndarray of shape (k, k, n)
-        Symmetric matrices.
+    A : ndarray of shape (k * (k + 1) / 2, n)
+        Symmetric matrices, packed.
     b : ndarray of shape (k, n)
         Right sides.
 
@@ -96,26 +126,26 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
-    k, _, n = A.shape
+    k, n = b.shape
     if n <= FEW:
-        x = _solve_by_lapack(A, b)
+        x = _solve_by_lapack(unpacked(A), b)
         if x is not None:
             return x, np.ones(n, dtype=bool)
-    # Rows of A below the diagonal are never read: by symmetry they are the columns.
-    work = np.empty((k, k + 1, n))
-    work[:, :k] = A
-    work[:, k] = b
+    # The right side is the last entry of each row.
+    rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
+    diagonal = [row[0].copy() for row in rows]
     positive = np.ones(n, dtype=bool)
-    for i in range(k):
-        inverse = _inverse_pivot(work[i, i], A[i, i], positive)
-        rest = work[i, i + 1 :]
-        scaled = rest * inverse
-        work[i + 1 :, i + 1 :] -= rest[:-1, None] * scaled
-        work[i, i + 1 :] = scaled
-    x = work[:, k]
-    for i in range(k - 2, -1, -1):
-        x[i] -= np.einsum("jn,jn->n", work[i, i + 1 : k], x[i + 1 :])
-    return np.ascontiguousarray(x), positive
+    room = np.empty((k, n))
+    for i, row in enumerate(rows):
+        scaled = row[1:] * _inverse_pivot(row[0], diagonal[i], positive)
+        for j in range(i + 1, k):
+            part = np.multiply(scaled[j - i - 1 :], row[j - i], out=room[: k + 1 - j])
+            rows[j] -= part
+        row[1:] = scaled
+    x = np.empty((k, n))
+    for i in range(k - 1, -1, -1):
+        x[i] = rows[i][-1] - np.einsum("jn,jn->n", rows[i][1:-1], x[i + 1 :])
+    return x, positive
 
 
 def _solve_by_lapack(A: NDArray, b: NDArray) -> NDArray | None:
@@ -138,40 +168,75 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
     Parameters
     ----------
-    A : ndarray of shape (k, k, n)
-        Symmetric matrices.
+    A : ndarray of shape (k * (k + 1) / 2, n)
+        Symmetric matrices, packed.
 
     Returns
     -------
-    inverse : ndarray of shape (k, k, n)
-        Inverses, by Gauss-Jordan elimination. A coordinate whose pivot is not
-        positive has a row and a column of zeros, so that the result is finite for
-        any matrix.
+    inverse : ndarray of shape (k * (k + 1) / 2, n)
+        Inverses, packed. A coordinate whose pivot is not positive has a row and a
+        column of zeros, so that the result is finite for any matrix.
     log_determinant : ndarray of shape (n,)
         Sum of the logarithms of the positive pivots.
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
-    k, _, n = A.shape
     work = A.copy()
-    log_determinant = np.zeros(n)
+    log_determinant, positive = sweep(work)
+    return np.negative(work, out=work), log_determinant, positive
+
+
+def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
+    """
+    Sweep rows of symmetric matrices, in place.
+
+    For ``[[C, G^T], [G, A]]``, with A the rows from the first to sweep on, that leaves
+    ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
+    SWEEP operator", The American Statistician 33, 1979).
+
+    Parameters
+    ----------
+    packed : ndarray of shape (n_pairs, n)
+        Symmetric matrices, packed, A positive definite.
+    first : int, default=0
+        The first row that is swept. All after it are, too.
+
+    Returns
+    -------
+    log_determinant : ndarray of shape (n,)
+        Sum of the logarithms of the positive pivots, ``log det A``.
+    positive : ndarray of bool, shape (n,)
+        Whether all pivots are positive. Where one is not, its row and its column are
+        zero in the end.
+    """
+    rows = packed_rows(packed)
+    k, n = len(rows), packed.shape[1]
+    diagonal = [row[0].copy() for row in rows]
+    inverses = np.empty((k - first, n))
     positive = np.ones(n, dtype=bool)
-    for i in range(k):
-        inverse = _inverse_pivot(work[i, i], A[i, i], positive)
-        log_determinant -= np.log(inverse, where=inverse > 0, out=np.zeros(n))
-        row = work[i] * inverse
-        row[i] = inverse
-        column = work[:, i].copy()
-        column[i] = 0.0
-        work[:, i] = 0.0
-        work -= column[:, None] * row
-        work[i] = row
-    # Rounding errors differ on the two sides of the diagonal.
-    return 0.5 * (work + work.swapaxes(0, 1)), log_determinant, positive
+    column, scaled, room = np.empty((3, k, n))
+    for i in range(first, k):
+        inverse = _inverse_pivot(rows[i][0], diagonal[i], positive)
+        inverses[i - first] = inverse
+        for j in range(i):
+            column[j] = rows[j][i - j]
+        column[i:] = rows[i]
+        np.multiply(column, inverse, out=scaled)
+        for j in range(k):
+            if j != i:
+                rows[j] -= np.multiply(scaled[j:], column[j], out=room[: k - j])
+        for j in range(i):
+            rows[j][i - j] = scaled[j]
+        rows[i][1:] = scaled[i + 1 :]
+        np.negative(inverse, out=rows[i][0])
+    logarithms = np.log(inverses, where=inverses > 0, out=np.zeros_like(inverses))
+    return -logarithms.sum(axis=0), positive
 
 
 def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
     """Return the inverse pivots, zero for those left out, and mark these."""
     kept = pivot > SMALLEST_PIVOT * diagonal
+    if kept.all():
+        return 1.0 / pivot
     positive &= kept
     return kept / np.where(kept, pivot, 1.0)

@@ -15,7 +15,7 @@ from isa_nrsfm._stored_table import StoredTable
 
 # Numbers and frames of a block of a table in memory: it stays in the cache.
 BLOCK_NUMBERS = 2**20
-BLOCK_FRAMES = 1024
+BLOCK_FRAMES = 2048
 # Numbers that are in memory, at most, for each number of a block that is read.
 COPIES = 8
 MEGABYTE = 2**20

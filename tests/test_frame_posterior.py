@@ -9,6 +9,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm import _frame_posterior as module
 from isa_nrsfm._frame_posterior import fit_posterior, spread_starts
 from isa_nrsfm._frame_products import frame_products, frame_tracks, whitened
+from isa_nrsfm._small_matrices import unpacked
 
 NOISE = 0.02
 
@@ -132,7 +133,7 @@ class TestOptimum:
                 slope = (above.explained - below.explained) / (4 * h)
                 assert_allclose(state.slope[k], slope, rtol=1e-6, atol=1e-7)
                 bend = (below.slope - above.slope) / (2 * h)
-                assert_allclose(state.schur[:, k], bend, rtol=1e-6, atol=1e-6)
+                assert_allclose(unpacked(state.schur)[:, k], bend, rtol=1e-6, atol=1e-6)
 
     def test_no_worse_than_alternation(self):
         tracks, shapes, _ = random_scene(0)
@@ -517,7 +518,7 @@ class TestStarts:
             state = module._evaluate(problem, found)
             assert (state.explained >= before - 1e-12 * problem.energy).all()
             assert there.mean() > 0.995
-            assert (np.linalg.eigvalsh(state.schur.T)[there] > 0).all()
+            assert (np.linalg.eigvalsh(unpacked(state.schur).T)[there] > 0).all()
             step, _ = module.solve_positive(state.schur, state.slope)
             assert np.abs(step[:, there]).max() < 1e-7
 

@@ -10,10 +10,9 @@ from isa_nrsfm._frame_products import (
     determines_camera,
     frame_products,
     frame_tracks,
-    shape_pairs,
     whitened,
 )
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, unpack3
+from isa_nrsfm._small_matrices import COLUMNS, ROWS, pair_indices, unpack3, unpacked
 
 
 def random_problem(seed, n_frames=6, n_points=11, n_components=2):
@@ -38,7 +37,7 @@ class TestProducts:
     def test_by_definition(self):
         tracks, shapes, weights = random_problem(0)
         products = frame_products(frame_tracks(tracks, weights), shapes)
-        first, second = shape_pairs(3)
+        first, second = pair_indices(3)
         for i, w in enumerate(weights):
             mean = w @ tracks[i] / w.sum()
             moved = tracks[i] - mean
@@ -137,20 +136,20 @@ class TestGram:
         C = np.random.default_rng(0).normal(size=(3, 3, 6))
         C += C.swapaxes(0, 1)
         expected = np.einsum("kli,klabi->abi", C, G)
-        assert_allclose(unpack3(gram.moments(C[shape_pairs(3)])), expected, atol=1e-12)
+        assert_allclose(unpack3(gram.moments(C[pair_indices(3)])), expected, atol=1e-12)
 
     def test_energies(self, weighted):
         gram, G = self.gram(weighted)
         M = np.random.default_rng(0).normal(size=(2, 3, 6))
         Q = np.einsum("rai,rbi->abi", M, M)
         expected = np.einsum("klabi,abi->kli", G, Q)
-        assert_allclose(gram.energies(Q[ROWS, COLUMNS]), expected, atol=1e-12)
+        assert_allclose(unpacked(gram.energies(Q[ROWS, COLUMNS])), expected, atol=1e-12)
 
     def test_moments_are_the_shapes(self, weighted):
         # c c^T gives S S^T, which is also half the sum of c_k times the products.
         gram, _ = self.gram(weighted)
         c = np.random.default_rng(0).normal(size=(3, 6))
-        first, second = shape_pairs(3)
+        first, second = pair_indices(3)
         half = 0.5 * np.einsum("ki,kabi->abi", c, gram.products(c))
         assert_allclose(unpack3(gram.moments(c[first] * c[second])), half, atol=1e-12)
 

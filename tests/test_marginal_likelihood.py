@@ -297,8 +297,8 @@ class TestBlocks:
 
     def test_default_size_is_passed(self):
         # More frames than a block has: the cameras are dealt out in the right order.
-        scene = random_scene("complete", n_frames=2100, n_points=4, n_components=1)
-        whole = scene.at(STIFFNESS, block_frames=2100)
+        scene = random_scene("complete", n_frames=4100, n_points=4, n_components=1)
+        whole = scene.at(STIFFNESS, block_frames=4100)
         assert len(likelihood_of(scene.tracks, None, 0.0).frames.lengths) == 3
         assert_same(scene.at(STIFFNESS), whole)
 

@@ -11,8 +11,12 @@ from isa_nrsfm._small_matrices import (
     inverse3,
     inverse_factor3,
     invert_positive,
+    packed_rows,
+    pair_indices,
     solve_positive,
+    sweep,
     unpack3,
+    unpacked,
 )
 
 # One number of matrices for each of the two ways to solve, by LAPACK and by passes.
@@ -26,6 +30,11 @@ def positive_matrices(seed, k, n, condition=1e3):
     values = condition ** -np.linspace(0, 1, k) * rng.uniform(0.5, 2, (n, 1))
     A = np.moveaxis((Q * values[:, None]) @ Q.swapaxes(1, 2), 0, -1)
     return 0.5 * (A + A.swapaxes(0, 1))
+
+
+def packed(A):
+    """Return symmetric matrices (k, k, n) packed."""
+    return A[pair_indices(len(A))]
 
 
 def last_to_first(matrices):
@@ -81,7 +90,7 @@ class TestPositiveDefinite:
     def test_solution(self, k, n):
         A = positive_matrices(k, k, n)
         b = np.random.default_rng(0).normal(size=(k, n))
-        x, positive = solve_positive(A, b)
+        x, positive = solve_positive(packed(A), b)
         expected = np.linalg.solve(last_to_first(A), b.T[..., None])[..., 0].T
         assert_allclose(x, expected, rtol=1e-10, atol=1e-11 * np.abs(x).max())
         assert positive.all()
@@ -89,10 +98,9 @@ class TestPositiveDefinite:
     @pytest.mark.parametrize("k", range(1, 16))
     def test_inverse_and_determinant(self, k, n):
         A = positive_matrices(k, k, n)
-        inverse, log_determinant, positive = invert_positive(A)
+        inverse, log_determinant, positive = invert_positive(packed(A))
         expected = np.linalg.inv(last_to_first(A))
-        assert_allclose(last_to_first(inverse), expected, atol=1e-9)
-        assert_array_equal(inverse, inverse.swapaxes(0, 1))
+        assert_allclose(last_to_first(unpacked(inverse)), expected, atol=1e-9)
         assert_allclose(log_determinant, np.linalg.slogdet(last_to_first(A))[1])
         assert positive.all()
 
@@ -102,12 +110,12 @@ class TestPositiveDefinite:
         A = positive_matrices(k, k, n) - 0.05 * rng.random(n) * np.eye(k)[..., None]
         b = rng.normal(size=(k, n))
         expected = np.linalg.eigvalsh(last_to_first(A))[:, 0] > 0
-        x, positive = solve_positive(A, b)
+        x, positive = solve_positive(packed(A), b)
         assert not expected.all()
         assert_array_equal(positive, expected)
-        assert_array_equal(invert_positive(A)[2], expected)
+        assert_array_equal(invert_positive(packed(A))[2], expected)
         assert np.isfinite(x).all()
-        assert np.isfinite(invert_positive(A)[0]).all()
+        assert np.isfinite(invert_positive(packed(A))[0]).all()
         # The others are solved all the same.
         right = np.einsum("kln,ln->kn", A, x)
         assert_allclose(right[:, positive], b[:, positive], atol=1e-6)
@@ -116,49 +124,89 @@ class TestPositiveDefinite:
         A, b = positive_matrices(0, 4, n), np.ones((4, n))
         A[2] = A[:, 2] = 0.0
         kept = [0, 1, 3]
-        x, positive = solve_positive(A, b)
-        inverse, log_determinant, _ = invert_positive(A)
-        expected = invert_positive(A[kept][:, kept])
+        x, positive = solve_positive(packed(A), b)
+        inverse, log_determinant, _ = invert_positive(packed(A))
+        expected = invert_positive(packed(A[kept][:, kept]))
         assert not positive.any()
         assert_array_equal(x[2], 0)
+        inverse = unpacked(inverse)
         assert_array_equal(inverse[2], 0)
-        assert_allclose(inverse[kept][:, kept], expected[0], rtol=1e-10)
-        assert_allclose(x[kept], expected[0].sum(axis=1), rtol=1e-8)
+        assert_allclose(packed(inverse[kept][:, kept]), expected[0], rtol=1e-10)
+        assert_allclose(x[kept], inverse[kept].sum(axis=1), rtol=1e-8)
         assert_allclose(log_determinant, expected[1])
 
     def test_equal_coordinates(self, n):
         # The matrix is singular; whatever rounding makes of it the result is finite.
         A = positive_matrices(0, 4, n)[[0, 1, 2, 3, 1]][:, [0, 1, 2, 3, 1]]
         b = np.ones((5, n))
-        x, positive = solve_positive(A, b)
+        x, positive = solve_positive(packed(A), b)
         assert not positive.any()
         assert np.abs(x).max() < 1e5
-        assert np.abs(invert_positive(A)[0]).max() < 1e5
+        assert np.abs(invert_positive(packed(A))[0]).max() < 1e5
 
     def test_arguments_are_left_alone(self, n):
         A, b = positive_matrices(0, 4, n), np.ones((4, n))
-        before = A.copy()
-        solve_positive(A, b)
-        invert_positive(A)
-        assert_array_equal(A, before)
+        matrices = packed(A)
+        solve_positive(matrices, b)
+        invert_positive(matrices)
+        assert_array_equal(matrices, packed(A))
         assert_array_equal(b, 1)
+
+
+class TestPacking:
+    def test_unpacked_is_the_matrix(self):
+        A = positive_matrices(0, 5, 3)
+        assert_array_equal(unpacked(packed(A)), A)
+
+    def test_rows_are_views_from_the_diagonal_on(self):
+        A = positive_matrices(0, 5, 3)
+        matrices = packed(A)
+        for k, row in enumerate(packed_rows(matrices)):
+            assert_array_equal(row, A[k, k:])
+            assert row.base is matrices
+
+
+class TestSweep:
+    @pytest.mark.parametrize("first", [0, 1, 3, 5])
+    def test_identity(self, first):
+        A = positive_matrices(0, 5, 7)
+        swept = packed(A)
+        log_determinant, positive = sweep(swept, first)
+        swept = last_to_first(unpacked(swept))
+        C, G, B = A[:first, :first], A[first:, :first], A[first:, first:]
+        inverse = np.linalg.inv(last_to_first(B))
+        G = last_to_first(G)
+        assert_allclose(swept[:, first:, first:], -inverse, rtol=1e-9)
+        assert_allclose(swept[:, first:, :first], inverse @ G, rtol=1e-9, atol=1e-12)
+        rest = last_to_first(C) - G.swapaxes(1, 2) @ inverse @ G
+        assert_allclose(swept[:, :first, :first], rest, rtol=1e-9, atol=1e-12)
+        assert_allclose(log_determinant, np.linalg.slogdet(last_to_first(B))[1])
+        assert positive.all()
+
+    def test_a_row_without_a_positive_pivot_is_zero_in_the_end(self):
+        A = positive_matrices(0, 5, 7)
+        A[3] = A[:, 3] = 0.0
+        swept = packed(A)
+        _, positive = sweep(swept, 1)
+        assert not positive.any()
+        assert_array_equal(unpacked(swept)[3], 0)
 
 
 def test_both_ways_agree():
     A = positive_matrices(0, 6, FEW + 50)
     b = np.random.default_rng(0).normal(size=(6, FEW + 50))
-    many = solve_positive(A, b)[0]
+    many = solve_positive(packed(A), b)[0]
     for i in range(0, FEW + 50, 10):
-        alone = solve_positive(A[..., i : i + 1], b[:, i : i + 1])[0]
+        alone = solve_positive(packed(A[..., i : i + 1]), b[:, i : i + 1])[0]
         assert_allclose(alone[:, 0], many[:, i], rtol=1e-10)
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 4), (0, 200), (3, 0)])
 def test_nothing_to_solve(k, n):
     A = np.ones((k, k, n))
-    x, positive = solve_positive(A, np.ones((k, n)))
-    inverse, log_determinant, _ = invert_positive(A)
+    x, positive = solve_positive(packed(A), np.ones((k, n)))
+    inverse, log_determinant, _ = invert_positive(packed(A))
     assert x.shape == (k, n)
     assert positive.all()
-    assert inverse.shape == (k, k, n)
+    assert unpacked(inverse).shape == (k, k, n)
     assert_array_equal(log_determinant, np.zeros(n))
