@@ -13,6 +13,7 @@ from scipy.linalg import null_space
 
 from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._sampling import order_by_halves, spread
+from isa_nrsfm._tracks import energies
 
 # A direction whose singular value is below this share of the first is null, whatever
 # the precision of the table: it has less than 1e-20 of the energy.
@@ -201,7 +202,7 @@ def _matrix(block: NDArray) -> NDArray:
 
 def _energy(block: NDArray) -> float:
     """Return the sum of the squares of a block."""
-    return float(np.vdot(block, block))
+    return float(energies(block).sum())
 
 
 def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:
@@ -237,7 +238,7 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     width = k + OVERSAMPLING
     n_frames = blocks.n_frames
     some = spread(order_by_halves(blocks), min(n_frames, 4 * width))
-    sample = _matrix(blocks.take(np.sort(some)))
+    sample = _matrix(blocks.take(np.sort(some))).astype(np.float64)
     last = np.linalg.qr(sample.T @ np.linalg.svd(sample @ sample.T)[0][:, :width])[0]
     basis, products = last, np.zeros((n_columns, 0))
     energy = sum(blocks.map(_energy))
@@ -260,7 +261,7 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
 def _squared(block: NDArray, V: NDArray) -> NDArray:
     """Return the product of a block's transpose, the block and V."""
     matrix = _matrix(block)
-    return matrix.T @ (matrix @ V)
+    return (matrix.T @ (matrix @ V.astype(matrix.dtype))).astype(np.float64)
 
 
 def orientations(rows: NDArray) -> NDArray:

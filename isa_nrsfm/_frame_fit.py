@@ -20,7 +20,7 @@ from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm._joint_frames import JointFrames
 from isa_nrsfm._robust import distant_points, robust_weights
-from isa_nrsfm._tracks import measurement_matrix, seen_points
+from isa_nrsfm._tracks import energies, measurement_matrix, seen_points
 
 if TYPE_CHECKING:
     import os
@@ -134,10 +134,30 @@ class RigidFrames(NamedTuple):
         """Return the fit of complete frames."""
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
+        motion, alpha = self.of_rows(W)
+        return motion, translation, alpha
+
+    def of_rows(self, W: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return cameras and coefficients of complete frames.
+
+        Parameters
+        ----------
+        W : ndarray of shape (2 * n_frames, n_points)
+            Measurement matrix, rows centred, or its products and those of the shapes
+            with orthonormal directions that the shapes are made of.
+
+        Returns
+        -------
+        motion : ndarray of shape (n_frames, 2, 3)
+            Cameras.
+        alpha : ndarray of shape (n_frames, n_components)
+            Coefficients.
+        """
         motion = rigid_cameras(W, self.mean_shape)
         n_components, n_points, _ = self.basis.shape
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
-        P = (W @ stacked).reshape(len(tracks), 2, n_components, 3)
+        P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
         along = np.einsum("irkc,irc->ik", P, motion)
         # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
         R = np.linalg.qr(self.basis, mode="r")
@@ -145,8 +165,7 @@ class RigidFrames(NamedTuple):
         energy = np.einsum("ikrd,ikrd->ik", images, images)
         largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
         visible = energy > UNSEEN * largest
-        alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
-        return motion, translation, alpha
+        return motion, np.divide(along, energy, where=visible, out=np.zeros_like(along))
 
     def _together(
         self, points: NDArray, seen: NDArray
@@ -421,8 +440,8 @@ def reprojection_error(
         ``||W - What||_F^2 / ||W||_F^2`` over the points that are seen.
     """
     stacked = shapes.reshape(-1, shapes.shape[2])
-    energies = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
-    noise, signal = np.sum(list(energies), axis=0)
+    found = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
+    noise, signal = np.sum(list(found), axis=0)
     return float(noise / signal)
 
 
@@ -438,7 +457,7 @@ def _energies(
 
 def _energy(rows: NDArray) -> float:
     """Return the sum of the squares of numbers, of those that are not NaN."""
-    energy = float(np.vdot(rows, rows))
+    energy = float(energies(rows).sum())
     return float(np.nansum(rows**2)) if np.isnan(energy) else energy
 
 

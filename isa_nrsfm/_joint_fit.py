@@ -182,17 +182,18 @@ def fit_jointly(
             used &= ~outliers
         weights = None if used.all() else used * 1.0
         frames = JointFrames.of_points(rows, complete, weights)
+    chosen = _SampleRows.of(sample.W, frames)
     by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
     problems = [
-        _Problem(frames.take(part), sample.W, max_iter, max(tol, by_chance / len(part)))
+        _Problem(frames.take(part), chosen, max_iter, max(tol, by_chance / len(part)))
         for part in sample.parts
     ]
-    problem = _Problem(frames, sample.W, max_iter, tol)
+    problem = _Problem(frames, chosen, max_iter, tol)
     problems.append(problem)
     first = problems[0]
     small = sample.W.size < SMALL_TABLE
     starts = _starts(first, factors, paper_shapes, random_state if small else None)
-    rigid = _Rigid.of(sample.W, factors)
+    rigid = _Rigid.of(chosen, frames.coordinates(factors.rigid_shape), factors)
     n_isotropic = ISOTROPIC_STARTS if first is problem else 1
     best, price = _best(first, starts, n_isotropic, rigid, stiffness)
     free = stiffness is None and price == 0
@@ -284,10 +285,10 @@ class _Rigid(NamedTuple):
     noise: float  # what it leaves, a coordinate
 
     @classmethod
-    def of(cls, W: NDArray, factors: Factorisation) -> Self:
-        """Return the cameras' anisotropy, and what the rigid shape leaves of W."""
+    def of(cls, rows: "_SampleRows", shape: NDArray, factors: Factorisation) -> Self:
+        """Return the cameras' anisotropy, and what the rigid shape leaves of rows."""
         cameras = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
-        return cls(cameras, _rigid_noise(W, factors.rigid_shape))
+        return cls(cameras, rows.rigid_noise(shape))
 
     def ratio(self, result: JointResult) -> float:
         """Return the anisotropy of a refinement's cameras relative to these."""
@@ -295,10 +296,28 @@ class _Rigid(NamedTuple):
         return cameras / self.anisotropy if self.anisotropy > 0 else 1.0
 
 
-def _rigid_noise(W: NDArray, shape: NDArray) -> float:
-    """Return the mean square that a rigid shape leaves of a measurement matrix."""
-    rows = W.reshape(len(W) // 2, 2, -1)
-    return float(rigid_energy(rows, shape).sum()) / W.size
+class _SampleRows(NamedTuple):
+    """The measurement matrix of a sample, in the coordinates of the frames."""
+
+    W: NDArray
+    energy: float  # of all points
+    n_numbers: int
+
+    @classmethod
+    def of(cls, W: NDArray, frames: JointFrames) -> Self:
+        """Return the rows of a measurement matrix (2 * n_frames, n_points)."""
+        return cls(frames.coordinates(W), float(np.vdot(W, W)), W.size)
+
+    @property
+    def least_noise(self) -> float:
+        """The least noise variance, a share of the mean square."""
+        return NOISE_FLOOR * self.energy / self.n_numbers
+
+    def rigid_noise(self, shape: NDArray) -> float:
+        """Return the mean square that a rigid shape, in coordinates, leaves."""
+        rows = self.W.reshape(len(self.W) // 2, 2, -1)
+        outside = max(self.energy - float(np.vdot(rows, rows)), 0.0)
+        return (outside + float(rigid_energy(rows, shape).sum())) / self.n_numbers
 
 
 def _best(
@@ -473,8 +492,10 @@ def lifted_shapes(factors: Factorisation, directions: NDArray) -> NDArray:
 class _Problem:
     """The joint refinement of some frames, from given shapes."""
 
-    def __init__(self, frames: JointFrames, W: NDArray, max_iter: int, tol: float):
-        self.frames, self.W = frames, W
+    def __init__(
+        self, frames: JointFrames, rows: _SampleRows, max_iter: int, tol: float
+    ):
+        self.frames, self.rows = frames, rows
         self.max_iter, self.tol = max_iter, tol
 
     @property
@@ -484,21 +505,20 @@ class _Problem:
 
     def of(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
-        return type(self)(frames, self.W, self.max_iter, self.tol)
+        return type(self)(frames, self.rows, self.max_iter, self.tol)
 
     def start(self, shapes: NDArray) -> JointState:
         """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
-        motion = rigid_cameras(self.W, shapes[0].T)
-        noise = FIRST_NOISE * _rigid_noise(self.W, shapes[0])
-        noise = max(noise, NOISE_FLOOR * float(np.vdot(self.W, self.W)) / self.W.size)
         shapes = self.frames.coordinates(shapes)
+        motion = rigid_cameras(self.rows.W, shapes[0].T)
+        noise = FIRST_NOISE * self.rows.rigid_noise(shapes[0])
+        noise = max(noise, self.rows.least_noise)
         return JointState(shapes, motion.transpose(1, 2, 0), noise)
 
     def scaled(self, shapes: NDArray) -> NDArray:
         """Return shapes whose coefficients, with rigid cameras, have unit variance."""
-        frames = RigidFrames(shapes[0].T, shapes[1:].transpose(0, 2, 1))
-        tracks = self.W.reshape(len(self.W) // 2, 2, -1).transpose(0, 2, 1)
-        size = frames.fit(tracks, np.ones(len(tracks))).alpha.std(axis=0)
+        known = self.frames.coordinates(shapes).transpose(0, 2, 1)
+        size = RigidFrames(known[0], known[1:]).of_rows(self.rows.W)[1].std(axis=0)
         return np.concatenate([shapes[:1], size[:, None, None] * shapes[1:]])
 
     def aligned(self, state: JointState) -> JointState:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._frame_products import FrameTracks, joined_frames
 from isa_nrsfm._marginal_likelihood import BLOCK_FRAMES, prepared_frames
-from isa_nrsfm._tracks import seen_points
+from isa_nrsfm._tracks import energies, seen_points
 
 
 class JointFrames(NamedTuple):
@@ -122,7 +122,7 @@ def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
         None,
         np.zeros((2, n_frames)),
         np.full(n_frames, float(n_points)),
-        np.vecdot(rows, rows).sum(axis=1),
+        energies(rows),
     )
     starts = range(0, n_frames, BLOCK_FRAMES)
     return [frames.take(slice(start, start + BLOCK_FRAMES)) for start in starts]

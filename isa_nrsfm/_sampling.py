@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._tracks import energies
 
 # With more frames than that the first steps are made on so many of them, the next ones
 # on so many times more, up to about so many, and the last ones on all.
@@ -69,7 +70,8 @@ def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sam
             parts.append(np.sort(spread(order, n)))
             n *= GROWTH
     W = rows.take(parts[0]) if parts else rows.whole()
-    return Sample(W.reshape(-1, n_points), parts)
+    W = W.reshape(-1, n_points).astype(np.float64, copy=False)
+    return Sample(W, parts)
 
 
 def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
@@ -114,9 +116,10 @@ def order_by_halves(rows: FrameBlocks) -> NDArray:
 
 def _first_half(rows: NDArray) -> NDArray:
     """Return the share of the energy of frames that is in the first half of them."""
-    square = rows.reshape(len(rows), -1) ** 2
-    energy = np.nansum(square, axis=1)
-    half = np.nansum(square[:, : square.shape[1] // 2], axis=1)
+    flat = rows.reshape(len(rows), -1)
+    if np.isnan(flat.sum()):
+        flat = np.nan_to_num(flat)
+    energy, half = energies(flat), energies(flat[:, : flat.shape[1] // 2])
     return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
 
 

@@ -30,6 +30,9 @@ from isa_nrsfm._tracks import (
     table_to_tracks,
 )
 
+# Tables with fewer points have no large products.
+MANY_POINTS = 200
+
 
 class ScaledTable(NamedTuple):
     """
@@ -39,7 +42,8 @@ class ScaledTable(NamedTuple):
     ----------
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), x above y, centred over the points
-        that are seen and divided by their sizes; NaN where a point is not seen.
+        that are seen and divided by their sizes; NaN where a point is not seen. Single
+        precision where the table is large, complete and in single precision.
     sizes : ndarray of shape (n_frames,)
         What the frames were divided by.
     translation : ndarray of shape (n_frames, 2)
@@ -130,7 +134,13 @@ def scaled_table(
         size = blocks.joined(robust_size, report.translation)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
-    rows = blocks.derive(partial(_unit_rows, layout=layout), report.translation, size)
+    # The products of large tables are as precise as these are given.
+    single = dtype == np.float32 and n_points >= MANY_POINTS and not robust
+    single = single and bool((report.n_seen == n_points).all())
+    unit_rows = partial(
+        _unit_rows, layout=layout, dtype=np.float32 if single else np.float64
+    )
+    rows = blocks.derive(unit_rows, report.translation, size)
     precision = relative_precision(report, dtype, size)
     return ScaledTable(
         rows, size, report.translation, report.n_seen, n_points, precision, dtype
@@ -152,14 +162,14 @@ def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArra
 
 
 def _unit_rows(
-    rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout
+    rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout, dtype: Any
 ) -> NDArray:
     """Return frames, (n_frames, 2, n_points), centred and of size one."""
     tracks, _ = without_half_points(table_to_tracks(rows, layout))
     centred = np.array(tracks.transpose(0, 2, 1), dtype=np.float64, order="C")
     centred -= translation[:, :, None]
     centred /= sizes[:, None, None]
-    return centred
+    return centred.astype(dtype, copy=False)
 
 
 def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:

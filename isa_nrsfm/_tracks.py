@@ -328,6 +328,12 @@ def _zero_where_unseen(tracks: NDArray, seen: NDArray) -> NDArray:
     return np.where(seen[..., None], tracks, tracks.dtype.type(0))
 
 
+def energies(rows: NDArray) -> NDArray[np.float64]:
+    """Return the sums of the squares of arrays (n_frames, ...), in double precision."""
+    flat = rows.reshape(len(rows), -1).astype(np.float64, copy=False)
+    return np.vecdot(flat, flat)
+
+
 def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Return centred tracks, zero where not seen, centroids and the mask of seen."""
     # The same memory order, so that sums are the same to the last bit.

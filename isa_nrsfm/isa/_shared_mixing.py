@@ -15,6 +15,7 @@ from scipy.special import gammaln
 from sklearn.utils.parallel import _threadpool_controller_decorator
 
 from isa_nrsfm._factorisation import orientations
+from isa_nrsfm._sampling import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
 
 # A direction whose singular value is below this share of the first is null.
@@ -36,6 +37,8 @@ FIXED_POINT_STEPS = 8
 SAME_BASIN = 0.97
 # Starts from which the likelihood is maximised, those likeliest at their basin.
 N_FINALISTS = 2
+# With more samples than the one number so many of them lead near the maximum.
+MANY_SAMPLES, FIRST_SAMPLES = 3000, 1500
 TURNS = 10  # between mixing and densities
 SCALE_STEPS = 5
 NEWTON_STEPS = 100
@@ -108,12 +111,15 @@ def shared_mixing(
         return np.eye(n_signals)
     Z = np.tensordot(whitening, signals, 1)
 
-    basins = _distinct(_fixed_point(_starts(Z, n_starts, random_state), Z))
+    some = _some_samples(Z)
+    basins = _distinct(_fixed_point(_starts(some, n_starts, random_state), some))
     if len(basins) > N_FINALISTS:
-        likeliest = np.argsort([-_fit_densities(W, Z).total for W in basins])
+        likeliest = np.argsort([-_fit_densities(W, some).total for W in basins])
         basins = [basins[b] for b in likeliest[:N_FINALISTS]]
-    optima = [_maximise(W, Z) for W in basins]
+    optima = [_maximise(W, some) for W in basins]
     W, fit = max(optima, key=lambda optimum: optimum[1].total)
+    if some is not Z:
+        W, fit = _maximise(W, Z)
 
     Y = np.tensordot(W, Z, 1).reshape(len(W), -1)
     scale = np.sqrt(np.mean(Y**2, axis=1))
@@ -178,6 +184,18 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     if rank == 0:
         return np.empty((0, len(rows))), np.eye(len(rows))
     return (U[:, :rank] / S[:rank]).T, U[:, rank:].T / S[0]
+
+
+def _some_samples(Z: NDArray) -> NDArray:
+    """
+    Return samples that are spread from the smallest to the largest, if there are many.
+
+    They are the same in whatever order and basis Z (n_signals, n_samples, size) came.
+    """
+    if Z.shape[1] <= MANY_SAMPLES:
+        return Z
+    order = np.argsort(np.einsum("kjc,kjc->j", Z, Z), kind="stable")
+    return np.ascontiguousarray(Z[:, spread(order, FIRST_SAMPLES)])
 
 
 def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
@@ -374,13 +392,14 @@ def _relative_derivatives(
     to ``H_ka,ak`` (Ablin, Cardoso and Gramfort 2018, here for vectors).
     """
     n_signals, n_samples, size = Y.shape
+    Y = np.ascontiguousarray(Y.transpose(0, 2, 1))  # long rows are fast
     flat = Y.reshape(n_signals, -1)
-    gradient = 2.0 / n_samples * (g[..., None] * Y).reshape(n_signals, -1) @ flat.T
+    gradient = 2.0 / n_samples * (g[:, None] * Y).reshape(n_signals, -1) @ flat.T
     gradient += size * np.eye(n_signals)
     hessian = np.zeros((n_signals,) * 4)
     for k in range(n_signals):
-        products = np.einsum("ajc,jc->aj", Y, Y[k])
-        weighted = (g[k, :, None] * Y).reshape(n_signals, -1)
+        products = np.einsum("acj,cj->aj", Y, Y[k])
+        weighted = (g[k] * Y).reshape(n_signals, -1)
         hessian[k, :, k] = 2.0 * weighted @ flat.T
         hessian[k, :, k] += 4.0 * (dg[k] * products) @ products.T
     hessian /= n_samples
