@@ -262,8 +262,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     so is what `transform`, `decompose`, `reconstruct` and `reproject` return.
 
     Points that are missing are NaN, in `fit` and everywhere else. A point of which only
-    one coordinate is missing counts as missing, with a warning. Rows of which too
-    little is seen to determine a camera are refused by `fit` and have NaN elsewhere.
+    one coordinate is missing counts as missing, with a warning. Rows that show no point
+    at all are left out of the fit, with a warning, and have NaN in `alpha_` and the
+    other attributes of frames. Rows of which something is seen, but too little to
+    determine a camera, are refused by `fit` and have NaN elsewhere.
 
     References
     ----------
@@ -365,10 +367,17 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ValueError
             If X has an odd number of columns, infinite values, too few points or
             frames for `n_components`, a frame whose points are all equal, that shows
-            fewer than four points or some on one line only, a point that is seen in too
+            one to three points or some on one line only, a point that is seen in too
             few frames, or column names that contradict `layout`; or if `loss` is not
             linear without the joint refinement, or either is not the default for a
             `StoredTable` or a dask array.
+
+        Warns
+        -----
+        UserWarning
+            If rows show no point and are left out, if points lack one coordinate, if
+            the other layout explains the table much better, or if a refinement has not
+            converged.
         """
         report = StageReport(self.verbose)
         for name in OF_FRAMES:
@@ -439,10 +448,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             frames = self._refine_jointly(table, outliers, sample, factors, result)
             report("joint refinement, gauge and coefficients")
         else:
-            frames = self._keep(source, table, sample.W, result)
+            frames = self._keep(table, sample.W, result)
             report("gauge and coefficients")
         self._describe(table, frames)
-        self._keep_frames(table, frames)
+        self._keep_frames(source, table, frames)
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -666,11 +675,13 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 f"got refinement={self.refinement!r}"
             )
         self._need_frames("diagnostics")
+        fitted = np.isfinite(self._frame_sizes)
+        motion = np.asarray(self.motion_)[fitted]
         return diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
-            np.asarray(self.motion_) / self._frame_sizes[:, None, None],
-            np.asarray(self.alpha_, dtype=np.float64),
+            motion / self._frame_sizes[fitted, None, None],
+            np.asarray(self.alpha_, dtype=np.float64)[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
         )
@@ -710,9 +721,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         return np.random.RandomState(seed)
 
-    def _keep(
-        self, source: Table, table: ScaledTable, W: NDArray, result: PaperResult
-    ) -> FrameFit:
+    def _keep(self, table: ScaledTable, W: NDArray, result: PaperResult) -> FrameFit:
         """Set the shapes of the paper's pipeline and return the fit of the frames."""
         dtype = table.dtype
         completed = W.reshape(len(table.sizes), 2, -1).transpose(0, 2, 1)
@@ -730,7 +739,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self._frames: RigidFrames | PosteriorFrames = RigidFrames(
             self.mean_shape_, self.basis_
         )
-        return self._model.decompose(source)
+        return self._model.decompose(table.source)
 
     def _refine_jointly(
         self,
@@ -807,14 +816,14 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.reference_motion_ = reference_camera(cameras, sizes).astype(dtype)
         self.reference_translation_ = frames.translation.mean(axis=0).astype(dtype)
 
-    def _keep_frames(self, table: ScaledTable, frames: FrameFit) -> None:
+    def _keep_frames(self, source: Table, table: ScaledTable, frames: FrameFit) -> None:
         """Set what was found for each frame, in memory or in files, if it is wanted."""
-        kept = frames.astype(table.dtype)
+        kept = FrameFit(*map(table.of_all_rows, frames.astype(table.dtype)))
         if isinstance(self.keep_frames, str | os.PathLike):
             kept = kept.in_files(self.keep_frames)
         if self.keep_frames:
-            self._frame_sizes = table.sizes
-            kept = FrameFit(*map(table.rows.spread, kept))
+            self._frame_sizes = table.of_all_rows(table.sizes)
+            kept = FrameFit(*map(source.blocks.spread, kept))
             self.motion_, self.translation_, self.alpha_, deviation = kept
             if self.refinement == "joint":
                 self.alpha_std_ = deviation
