@@ -1,7 +1,6 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
 import os
-import time
 import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Self
@@ -21,6 +20,7 @@ from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._camera import reference_camera
 from isa_nrsfm._completion import complete_rows
 from isa_nrsfm._deformation_metric import deformation_metric
@@ -77,6 +77,16 @@ START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 N_STARTS = 8
 # What a fit may keep of the frames.
 OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+# Stages of a fit, the joint refinement only where it is wanted.
+JOINT_STAGE = "joint refinement"
+STAGES = (
+    "table",
+    "factorisation",
+    "independent subspaces",
+    "block structure and refinement",
+    JOINT_STAGE,
+    "gauge and coefficients",
+)
 
 
 class Decomposition(NamedTuple):
@@ -98,7 +108,12 @@ class Decomposition(NamedTuple):
     alpha: NDArray
 
 
-class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
+class AffineNRSfM(
+    CallbackSupportMixin,
+    ClassNamePrefixFeaturesOutMixin,
+    TransformerMixin,
+    BaseEstimator,
+):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -180,7 +195,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Number of threads that work on the frames, and of joblib workers for strategies
         that use them. The result does not depend on it.
     verbose : int, default=0
-        Above zero, print a line for each stage.
+        Above zero, print a line for each stage. With scikit-learn 1.9 and later the fit
+        tells its callbacks of stages and steps, too: ``set_callbacks(ProgressBar())``.
 
     Attributes
     ----------
@@ -379,7 +395,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             the other layout explains the table much better, or if a refinement has not
             converged.
         """
-        report = StageReport(self.verbose)
+        joint = self.refinement == "joint"
+        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
+        progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
         for name in OF_FRAMES:
             self.__dict__.pop(name, None)
         if self.refinement != "joint" and self.loss != "linear":
@@ -415,9 +433,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             complete = complete and not outliers.any()
         if not complete:
             used = complete_rows(used, n_points, self.n_components)
-        report("table")
+        progress("table")
 
-        joint = self.refinement == "joint"
         shape = 2 * len(sizes), n_points
         triplets = block_triplets(used, shape, 3 * self.n_components + 3)
         if joint:
@@ -425,7 +442,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         else:
             sample = Sample(used.whole().reshape(shape), [])
         factors = factorise(sample.W, self.n_components, table.precision, triplets)
-        report("factorisation")
+        progress("factorisation")
         self.isa_ = self._strategy()
         with warnings.catch_warnings():
             if joint and self.isa is None:
@@ -439,19 +456,21 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 refinement="alternating" if joint else self.refinement,
                 max_iter=START_STEPS if joint else self.max_iter,
                 tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
-                report=report,
+                report=progress,
             )
         self.singular_values_ = self._unit * triplets.values
         self.rank_floor_ = triplets.rest_share
         self._n_features_out = self.n_components
         if joint:
-            frames = self._refine_jointly(table, outliers, sample, factors, result)
-            report("joint refinement, gauge and coefficients")
+            frames = self._refine_jointly(
+                table, outliers, sample, factors, result, progress
+            )
         else:
             frames = self._keep(table, sample.W, result)
-            report("gauge and coefficients")
         self._describe(table, frames)
         self._keep_frames(source, table, frames)
+        progress("gauge and coefficients")
+        progress.end()
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -748,6 +767,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         sample: Sample,
         factors: Factorisation,
         result: PaperResult,
+        progress: FitProgress,
     ) -> FrameFit:
         """Set the shapes of the joint refinement and return the fit of the frames."""
         shapes = np.concatenate([result.mean_shape[None], result.basis])
@@ -763,7 +783,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             random_state=self._random_state(),
             max_iter=self.max_iter,
             tol=JOINT_TOL if self.tol is None else self.tol,
+            on_step=progress.step,
         )
+        progress(JOINT_STAGE)
         frames = PosteriorFrames(
             fitted.shapes,
             fitted.noise_variance,
@@ -874,18 +896,3 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
-
-
-class StageReport:
-    """Prints a line with the seconds of each stage, where it is wanted."""
-
-    def __init__(self, verbose: int):
-        self.verbose = verbose
-        self.since = time.perf_counter()
-
-    def __call__(self, stage: str) -> None:
-        """Report that a stage has ended."""
-        now = time.perf_counter()
-        if self.verbose:
-            print(f"[AffineNRSfM] {stage}: {now - self.since:.2f} s", flush=True)
-        self.since = now

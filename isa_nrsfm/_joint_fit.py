@@ -11,6 +11,7 @@ first, and taken if it brings them nearer. Otherwise the free fit is taken, unle
 cameras are much farther from orthographic ones than those of the rigid fit.
 """
 
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import NamedTuple, Self
 
@@ -129,6 +130,7 @@ def fit_jointly(
     random_state: np.random.RandomState,
     max_iter: int,
     tol: float,
+    on_step: Callable[[], None] | None = None,
 ) -> JointFit:
     """
     Start and run the joint refinement.
@@ -158,7 +160,7 @@ def fit_jointly(
         Draws the additional starts of small tables.
     max_iter : int
         The most steps.
-    tol : float
+    tol, on_step
         As in `refine_joint`.
 
     Returns
@@ -181,9 +183,10 @@ def fit_jointly(
         weights = None if used.all() else used * 1.0
         frames = JointFrames.of_points(rows, complete, weights)
     problems = [
-        _Problem(frames.take(part), sample.W, max_iter, tol) for part in sample.parts
+        _Problem(frames.take(part), sample.W, max_iter, tol, on_step)
+        for part in sample.parts
     ]
-    problem = _Problem(frames, sample.W, max_iter, tol)
+    problem = _Problem(frames, sample.W, max_iter, tol, on_step)
     problems.append(problem)
     first = problems[0]
     small = sample.W.size < SMALL_TABLE
@@ -460,9 +463,16 @@ def lifted_shapes(factors: Factorisation, directions: NDArray) -> NDArray:
 class _Problem:
     """The joint refinement of some frames, from given shapes."""
 
-    def __init__(self, frames: JointFrames, W: NDArray, max_iter: int, tol: float):
+    def __init__(
+        self,
+        frames: JointFrames,
+        W: NDArray,
+        max_iter: int,
+        tol: float,
+        on_step: Callable[[], None] | None = None,
+    ):
         self.frames, self.W = frames, W
-        self.max_iter, self.tol = max_iter, tol
+        self.max_iter, self.tol, self.on_step = max_iter, tol, on_step
 
     @property
     def final_tol(self) -> float:
@@ -471,7 +481,7 @@ class _Problem:
 
     def of(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
-        return type(self)(frames, self.W, self.max_iter, self.tol)
+        return type(self)(frames, self.W, self.max_iter, self.tol, self.on_step)
 
     def start(self, shapes: NDArray) -> JointState:
         """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
@@ -521,7 +531,11 @@ class _Problem:
     def refined(self, state: JointState, stiffness: float, tol: float) -> JointResult:
         """Return the joint refinement of a state."""
         return refine_joint(
-            self.likelihood(stiffness), state, max_iter=self.max_iter, tol=tol
+            self.likelihood(stiffness),
+            state,
+            max_iter=self.max_iter,
+            tol=tol,
+            on_step=self.on_step,
         )
 
 
