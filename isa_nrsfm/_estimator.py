@@ -15,7 +15,7 @@ from sklearn.base import (
     clone,
 )
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_array, check_random_state
+from sklearn.utils import check_array, check_random_state, estimator_html_repr
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
@@ -55,6 +55,7 @@ from isa_nrsfm._robust import LOSSES, gross_outliers
 from isa_nrsfm._sampling import Sample, sample_frames
 from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._stored_table import StoredTable
+from isa_nrsfm._summary import summary_html
 from isa_nrsfm._table_checks import check_names
 from isa_nrsfm._table_model import TableModel
 from isa_nrsfm._table_sources import (
@@ -711,6 +712,11 @@ class AffineNRSfM(
         tags.transformer_tags.preserves_dtype = ["float64", "float32"]
         tags.input_tags.allow_nan = True
         return tags
+
+    def _html_repr(self) -> str:
+        """Return what a notebook shows: scikit-learn's picture, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with what it leaves open filled in."""
