@@ -11,7 +11,6 @@ from sklearn.base import (
     BaseEstimator,
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
-    _fit_context,
     clone,
 )
 from sklearn.exceptions import ConvergenceWarning
@@ -51,6 +50,7 @@ from isa_nrsfm._independent_gauge import (
 from isa_nrsfm._joint_fit import fit_jointly
 from isa_nrsfm._metric_refinement import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
+from isa_nrsfm._parameter_checks import fit_context
 from isa_nrsfm._robust import LOSSES, gross_outliers
 from isa_nrsfm._sampling import Sample, sample_frames
 from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
@@ -304,6 +304,29 @@ class AffineNRSfM(
     (5, 4)
     """
 
+    mean_shape_: NDArray
+    basis_: NDArray
+    alpha_: NDArray
+    alpha_std_: NDArray
+    motion_: NDArray
+    translation_: NDArray
+    inverse_snr_: float
+    rank_floor_: float
+    noise_variance_: float
+    stiffness_: float
+    reliability_: NDArray
+    objective_history_: NDArray
+    gradient_norm_: float
+    energy_share_: NDArray
+    mode_covariance_: NDArray
+    singular_values_: NDArray
+    reference_motion_: NDArray
+    reference_translation_: NDArray
+    isa_: Any
+    n_iter_: int
+    n_features_in_: int
+    feature_names_in_: NDArray
+
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [Interval(Integral, 1, None, closed="left")],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
@@ -360,7 +383,7 @@ class AffineNRSfM(
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(nested=True)
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.
