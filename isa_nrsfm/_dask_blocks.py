@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_blocks import FrameBlocks, kept_rows
 from isa_nrsfm._optional import import_optional
 
 
@@ -37,10 +37,13 @@ class DaskBlocks(FrameBlocks):
         if np.isnan(table.shape[0]):
             table = table.compute_chunk_sizes()
         table = table.rechunk({1: -1})
-        lengths = table.chunks[0]
-        blocks = table.to_delayed().ravel()
-        kept = [number for number, length in enumerate(lengths) if length]
-        return cls([blocks[k] for k in kept], [lengths[k] for k in kept])
+        return cls._filled(table.to_delayed().ravel(), table.chunks[0])
+
+    @classmethod
+    def _filled(cls, blocks: Sequence[Any], lengths: Sequence[int]) -> Self:
+        """Return those blocks that have frames."""
+        filled = [number for number, length in enumerate(lengths) if length]
+        return cls([blocks[k] for k in filled], [lengths[k] for k in filled])
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Yield what a function makes of each block, in order."""
@@ -52,6 +55,11 @@ class DaskBlocks(FrameBlocks):
         dask = import_optional("dask", extra="dask")
         blocks = _sent(dask.persist, self._tasks(function, by_frame))
         return type(self)(blocks, self.lengths)
+
+    def kept(self, frames: NDArray) -> Self:
+        """Return only some of the frames, of blocks that are arrays."""
+        lengths = [int(frames[rows].sum()) for rows in self.slices]
+        return self._filled(self.derive(kept_rows, frames).blocks, lengths)
 
     def gather(
         self,

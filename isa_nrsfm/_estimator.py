@@ -1,7 +1,6 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
 import os
-import time
 import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Self
@@ -12,15 +11,15 @@ from sklearn.base import (
     BaseEstimator,
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
-    _fit_context,
     clone,
 )
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_array, check_random_state
+from sklearn.utils import check_array, check_random_state, estimator_html_repr
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._camera import reference_camera
 from isa_nrsfm._completion import complete_rows
 from isa_nrsfm._deformation_metric import deformation_metric
@@ -51,10 +50,12 @@ from isa_nrsfm._independent_gauge import (
 from isa_nrsfm._joint_fit import fit_jointly
 from isa_nrsfm._metric_refinement import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
+from isa_nrsfm._parameter_checks import fit_context
 from isa_nrsfm._robust import LOSSES, gross_outliers
 from isa_nrsfm._sampling import Sample, sample_frames
 from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._stored_table import StoredTable
+from isa_nrsfm._summary import summary_html
 from isa_nrsfm._table_checks import check_names
 from isa_nrsfm._table_model import TableModel
 from isa_nrsfm._table_sources import (
@@ -75,8 +76,25 @@ JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
-# What a fit may keep of the frames.
+# What a fit may keep of the frames, and what only the joint refinement tells.
 OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+OF_JOINT_FIT = (
+    "noise_variance_",
+    "stiffness_",
+    "reliability_",
+    "objective_history_",
+    "gradient_norm_",
+)
+# Stages of a fit, the joint refinement only where it is wanted.
+JOINT_STAGE = "joint refinement"
+STAGES = (
+    "table",
+    "factorisation",
+    "independent subspaces",
+    "block structure and refinement",
+    JOINT_STAGE,
+    "gauge and coefficients",
+)
 
 
 class Decomposition(NamedTuple):
@@ -98,7 +116,12 @@ class Decomposition(NamedTuple):
     alpha: NDArray
 
 
-class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
+class AffineNRSfM(
+    CallbackSupportMixin,
+    ClassNamePrefixFeaturesOutMixin,
+    TransformerMixin,
+    BaseEstimator,
+):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -180,7 +203,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         Number of threads that work on the frames, and of joblib workers for strategies
         that use them. The result does not depend on it.
     verbose : int, default=0
-        Above zero, print a line for each stage.
+        Above zero, print a line for each stage. With scikit-learn 1.9 and later the fit
+        tells its callbacks of stages and steps, too: ``set_callbacks(ProgressBar())``.
 
     Attributes
     ----------
@@ -262,8 +286,10 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     so is what `transform`, `decompose`, `reconstruct` and `reproject` return.
 
     Points that are missing are NaN, in `fit` and everywhere else. A point of which only
-    one coordinate is missing counts as missing, with a warning. Rows of which too
-    little is seen to determine a camera are refused by `fit` and have NaN elsewhere.
+    one coordinate is missing counts as missing, with a warning. Rows that show no point
+    at all are left out of the fit, with a warning, and have NaN in `alpha_` and the
+    other attributes of frames. Rows of which something is seen, but too little to
+    determine a camera, are refused by `fit` and have NaN elsewhere.
 
     References
     ----------
@@ -284,6 +310,29 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
     >>> model.transform(faces.data[:5]).shape
     (5, 4)
     """
+
+    mean_shape_: NDArray
+    basis_: NDArray
+    alpha_: NDArray
+    alpha_std_: NDArray
+    motion_: NDArray
+    translation_: NDArray
+    inverse_snr_: float
+    rank_floor_: float
+    noise_variance_: float
+    stiffness_: float
+    reliability_: NDArray
+    objective_history_: NDArray
+    gradient_norm_: float
+    energy_share_: NDArray
+    mode_covariance_: NDArray
+    singular_values_: NDArray
+    reference_motion_: NDArray
+    reference_translation_: NDArray
+    isa_: Any
+    n_iter_: int
+    n_features_in_: int
+    feature_names_in_: NDArray
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [Interval(Integral, 1, None, closed="left")],
@@ -341,7 +390,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(nested=True)
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.
@@ -365,13 +414,22 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         ValueError
             If X has an odd number of columns, infinite values, too few points or
             frames for `n_components`, a frame whose points are all equal, that shows
-            fewer than four points or some on one line only, a point that is seen in too
+            one to three points or some on one line only, a point that is seen in too
             few frames, or column names that contradict `layout`; or if `loss` is not
             linear without the joint refinement, or either is not the default for a
             `StoredTable` or a dask array.
+
+        Warns
+        -----
+        UserWarning
+            If rows show no point and are left out, if points lack one coordinate, if
+            the other layout explains the table much better, or if a refinement has not
+            converged.
         """
-        report = StageReport(self.verbose)
-        for name in OF_FRAMES:
+        joint = self.refinement == "joint"
+        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
+        progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+        for name in (*OF_FRAMES, *OF_JOINT_FIT):
             self.__dict__.pop(name, None)
         if self.refinement != "joint" and self.loss != "linear":
             raise ValueError(
@@ -406,9 +464,8 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             complete = complete and not outliers.any()
         if not complete:
             used = complete_rows(used, n_points, self.n_components)
-        report("table")
+        progress("table")
 
-        joint = self.refinement == "joint"
         shape = 2 * len(sizes), n_points
         triplets = block_triplets(used, shape, 3 * self.n_components + 3)
         if joint:
@@ -416,7 +473,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         else:
             sample = Sample(used.whole().reshape(shape), [])
         factors = factorise(sample.W, self.n_components, table.precision, triplets)
-        report("factorisation")
+        progress("factorisation")
         self.isa_ = self._strategy()
         with warnings.catch_warnings():
             if joint and self.isa is None:
@@ -430,19 +487,21 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 refinement="alternating" if joint else self.refinement,
                 max_iter=START_STEPS if joint else self.max_iter,
                 tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
-                report=report,
+                report=progress,
             )
         self.singular_values_ = self._unit * triplets.values
         self.rank_floor_ = triplets.rest_share
         self._n_features_out = self.n_components
         if joint:
-            frames = self._refine_jointly(table, outliers, sample, factors, result)
-            report("joint refinement, gauge and coefficients")
+            frames = self._refine_jointly(
+                table, outliers, sample, factors, result, progress
+            )
         else:
-            frames = self._keep(source, table, sample.W, result)
-            report("gauge and coefficients")
+            frames = self._keep(table, sample.W, result)
         self._describe(table, frames)
-        self._keep_frames(table, frames)
+        self._keep_frames(source, table, frames)
+        progress("gauge and coefficients")
+        progress.end()
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -666,11 +725,13 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
                 f"got refinement={self.refinement!r}"
             )
         self._need_frames("diagnostics")
+        fitted = np.isfinite(self._frame_sizes)
+        motion = np.asarray(self.motion_)[fitted]
         return diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
-            np.asarray(self.motion_) / self._frame_sizes[:, None, None],
-            np.asarray(self.alpha_, dtype=np.float64),
+            motion / self._frame_sizes[fitted, None, None],
+            np.asarray(self.alpha_, dtype=np.float64)[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
         )
@@ -681,6 +742,11 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         tags.transformer_tags.preserves_dtype = ["float64", "float32"]
         tags.input_tags.allow_nan = True
         return tags
+
+    def _html_repr(self) -> str:
+        """Return what a notebook shows: scikit-learn's picture, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with what it leaves open filled in."""
@@ -710,9 +776,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         return np.random.RandomState(seed)
 
-    def _keep(
-        self, source: Table, table: ScaledTable, W: NDArray, result: PaperResult
-    ) -> FrameFit:
+    def _keep(self, table: ScaledTable, W: NDArray, result: PaperResult) -> FrameFit:
         """Set the shapes of the paper's pipeline and return the fit of the frames."""
         dtype = table.dtype
         completed = W.reshape(len(table.sizes), 2, -1).transpose(0, 2, 1)
@@ -730,7 +794,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self._frames: RigidFrames | PosteriorFrames = RigidFrames(
             self.mean_shape_, self.basis_
         )
-        return self._model.decompose(source)
+        return self._model.decompose(table.source)
 
     def _refine_jointly(
         self,
@@ -739,6 +803,7 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         sample: Sample,
         factors: Factorisation,
         result: PaperResult,
+        progress: FitProgress,
     ) -> FrameFit:
         """Set the shapes of the joint refinement and return the fit of the frames."""
         shapes = np.concatenate([result.mean_shape[None], result.basis])
@@ -754,7 +819,9 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
             random_state=self._random_state(),
             max_iter=self.max_iter,
             tol=JOINT_TOL if self.tol is None else self.tol,
+            on_step=progress.step,
         )
+        progress(JOINT_STAGE)
         frames = PosteriorFrames(
             fitted.shapes,
             fitted.noise_variance,
@@ -808,14 +875,14 @@ class AffineNRSfM(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimat
         self.reference_motion_ = reference_camera(cameras, sizes).astype(dtype)
         self.reference_translation_ = frames.translation.mean(axis=0).astype(dtype)
 
-    def _keep_frames(self, table: ScaledTable, frames: FrameFit) -> None:
+    def _keep_frames(self, source: Table, table: ScaledTable, frames: FrameFit) -> None:
         """Set what was found for each frame, in memory or in files, if it is wanted."""
-        kept = frames.astype(table.dtype)
+        kept = FrameFit(*map(table.of_all_rows, frames.astype(table.dtype)))
         if isinstance(self.keep_frames, str | os.PathLike):
             kept = kept.in_files(self.keep_frames)
         if self.keep_frames:
-            self._frame_sizes = table.sizes
-            kept = FrameFit(*map(table.rows.spread, kept))
+            self._frame_sizes = table.of_all_rows(table.sizes)
+            kept = FrameFit(*map(source.blocks.spread, kept))
             self.motion_, self.translation_, self.alpha_, deviation = kept
             if self.refinement == "joint":
                 self.alpha_std_ = deviation
@@ -866,18 +933,3 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
-
-
-class StageReport:
-    """Prints a line with the seconds of each stage, where it is wanted."""
-
-    def __init__(self, verbose: int):
-        self.verbose = verbose
-        self.since = time.perf_counter()
-
-    def __call__(self, stage: str) -> None:
-        """Report that a stage has ended."""
-        now = time.perf_counter()
-        if self.verbose:
-            print(f"[AffineNRSfM] {stage}: {now - self.since:.2f} s", flush=True)
-        self.since = now

@@ -148,7 +148,7 @@ def leading_triplets(W: NDArray, k: int) -> Triplets:
     Triplets
         As of `block_triplets`.
     """
-    return block_triplets(MemoryBlocks([W], [len(W)]), W.shape, k)
+    return block_triplets(MemoryBlocks([W], [len(W)]), (len(W), W.shape[1]), k)
 
 
 def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Triplets:

@@ -9,6 +9,7 @@ import mmap
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -67,6 +68,22 @@ class FrameBlocks(ABC):
         are computed whenever they are needed.
         """
 
+    @abstractmethod
+    def kept(self, frames: NDArray) -> Self:
+        """
+        Return only some of the frames, of blocks that are arrays.
+
+        Parameters
+        ----------
+        frames : ndarray of bool, shape (n_frames,)
+            Which ones, at least one.
+
+        Returns
+        -------
+        FrameBlocks
+            The blocks that a table of these frames alone would have.
+        """
+
     def joined(self, function: Callable[..., NDArray], *by_frame: NDArray) -> NDArray:
         """Return the arrays that a function makes of the blocks as one."""
         return np.concatenate(list(self.map(function, *by_frame)))
@@ -87,7 +104,7 @@ class FrameBlocks(ABC):
         """
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        found = self.joined(_rows, chosen)
+        found = self.joined(kept_rows, chosen)
         order = np.empty(len(frames), dtype=int)
         order[np.argsort(frames)] = np.arange(len(frames))
         return found[order]
@@ -153,6 +170,11 @@ class FrameBlocks(ABC):
         return tuple(array[self.slices[block]] for array in arrays)
 
 
+def kept_rows(block: NDArray, kept: NDArray) -> NDArray:
+    """Return the frames of a block that are kept."""
+    return block[kept]
+
+
 def read_rows(table: Any, rows: slice) -> NDArray:
     """Return rows of a table; the pages of a memory map do not stay in memory."""
     found = np.array(table[rows])
@@ -161,11 +183,6 @@ def read_rows(table: Any, rows: slice) -> NDArray:
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
     return found
-
-
-def _rows(block: NDArray, chosen: NDArray) -> NDArray:
-    """Return the chosen frames of a block."""
-    return block[chosen]
 
 
 def _same(block: Any) -> Any:
@@ -219,6 +236,11 @@ class MemoryBlocks(FrameBlocks):
         blocks = list(self.map(function, *by_frame))
         return type(self)(blocks, self.lengths, self.n_threads)
 
+    def kept(self, frames: NDArray) -> Self:
+        """Return only some of the frames, of blocks that are arrays."""
+        array = self.joined(kept_rows, frames)
+        return self.of(array, max(self.lengths), self.n_threads)
+
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
         """Return blocks of at most so many frames, made of as many as can be."""
         groups: list[list[int]] = []
@@ -241,35 +263,49 @@ class StoredBlocks(FrameBlocks):
     Parameters
     ----------
     read : callable
-        Returns a block, given its number.
+        Returns a block, given the slice of its frames.
     lengths : sequence of int
         How many frames each block has.
     """
 
-    def __init__(self, read: Callable[[int], Any], lengths: Sequence[int]):
+    def __init__(self, read: Callable[[slice], Any], lengths: Sequence[int]):
         super().__init__(lengths)
         self.read = read
 
     @classmethod
     def of(cls, table: Any, block_frames: int) -> Self:
         """Return what can be sliced along its frames in blocks of so many."""
-        starts = range(0, table.shape[0], block_frames)
-        slices = [slice(s, min(s + block_frames, table.shape[0])) for s in starts]
-
-        def read(number: int) -> NDArray:
-            return read_rows(table, slices[number])
-
-        return cls(read, [part.stop - part.start for part in slices])
+        read = partial(read_rows, table)
+        return cls(read, _block_lengths(table.shape[0], block_frames))
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Yield what a function makes of each block, in order."""
-        for number in range(len(self.lengths)):
-            yield function(self.read(number), *self.parts(by_frame, number))
+        for number, rows in enumerate(self.slices):
+            yield function(self.read(rows), *self.parts(by_frame, number))
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return the blocks that a function makes of these when they are read."""
 
-        def read(number: int) -> Any:
-            return function(self.read(number), *self.parts(by_frame, number))
+        def read(rows: slice) -> Any:
+            return function(self.read(rows), *(array[rows] for array in by_frame))
 
         return type(self)(read, self.lengths)
+
+    def kept(self, frames: NDArray) -> Self:
+        """Return only some of the frames, of blocks that are arrays."""
+        numbers, length = np.flatnonzero(frames), max(self.lengths)
+
+        def read(rows: slice) -> NDArray:
+            first, last = numbers[rows][[0, -1]]
+            # Never more at once than a block, however many frames are left out.
+            starts = range(int(first), int(last) + 1, length)
+            parts = [slice(s, min(s + length, int(last) + 1)) for s in starts]
+            return np.concatenate([self.read(part)[frames[part]] for part in parts])
+
+        return type(self)(read, _block_lengths(len(numbers), length))
+
+
+def _block_lengths(n_frames: int, block_frames: int) -> list[int]:
+    """Return the lengths of blocks of so many frames, the last one having the rest."""
+    starts = range(0, n_frames, block_frames)
+    return [min(block_frames, n_frames - start) for start in starts]

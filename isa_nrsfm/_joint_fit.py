@@ -11,6 +11,7 @@ first, and taken if it brings them nearer. Otherwise the free fit is taken, unle
 cameras are much farther from orthographic ones than those of the rigid fit.
 """
 
+from collections.abc import Callable
 from functools import cached_property, partial
 from typing import NamedTuple, Self
 
@@ -131,6 +132,7 @@ def fit_jointly(
     random_state: np.random.RandomState,
     max_iter: int,
     tol: float,
+    on_step: Callable[[], None] | None = None,
 ) -> JointFit:
     """
     Start and run the joint refinement.
@@ -160,7 +162,7 @@ def fit_jointly(
         Draws the additional starts of small tables.
     max_iter : int
         The most steps.
-    tol : float
+    tol, on_step
         As in `refine_joint`.
 
     Returns
@@ -185,10 +187,16 @@ def fit_jointly(
     chosen = _SampleRows.of(sample.W, frames)
     by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
     problems = [
-        _Problem(frames.take(part), chosen, max_iter, max(tol, by_chance / len(part)))
+        _Problem(
+            frames.take(part),
+            chosen,
+            max_iter,
+            max(tol, by_chance / len(part)),
+            on_step,
+        )
         for part in sample.parts
     ]
-    problem = _Problem(frames, chosen, max_iter, tol)
+    problem = _Problem(frames, chosen, max_iter, tol, on_step)
     problems.append(problem)
     first = problems[0]
     small = sample.W.size < SMALL_TABLE
@@ -493,10 +501,15 @@ class _Problem:
     """The joint refinement of some frames, from given shapes."""
 
     def __init__(
-        self, frames: JointFrames, rows: _SampleRows, max_iter: int, tol: float
+        self,
+        frames: JointFrames,
+        rows: _SampleRows,
+        max_iter: int,
+        tol: float,
+        on_step: Callable[[], None] | None,
     ):
         self.frames, self.rows = frames, rows
-        self.max_iter, self.tol = max_iter, tol
+        self.max_iter, self.tol, self.on_step = max_iter, tol, on_step
 
     @property
     def final_tol(self) -> float:
@@ -505,7 +518,7 @@ class _Problem:
 
     def of(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
-        return type(self)(frames, self.rows, self.max_iter, self.tol)
+        return type(self)(frames, self.rows, self.max_iter, self.tol, self.on_step)
 
     def start(self, shapes: NDArray) -> JointState:
         """Return shapes with the cameras of a rigid fit, and part of what it leaves."""
@@ -558,7 +571,11 @@ class _Problem:
     def refined(self, state: JointState, stiffness: float, tol: float) -> JointResult:
         """Return the joint refinement of a state."""
         return refine_joint(
-            self.likelihood(stiffness), state, max_iter=self.max_iter, tol=tol
+            self.likelihood(stiffness),
+            state,
+            max_iter=self.max_iter,
+            tol=tol,
+            on_step=self.on_step,
         )
 
 

@@ -9,6 +9,7 @@ noise is small enough to tell.
 """
 
 from collections import deque
+from collections.abc import Callable
 from functools import cached_property
 from typing import NamedTuple
 
@@ -87,7 +88,12 @@ class JointResult(NamedTuple):
 
 
 def refine_joint(
-    likelihood: MarginalLikelihood, start: JointState, *, max_iter: int, tol: float
+    likelihood: MarginalLikelihood,
+    start: JointState,
+    *,
+    max_iter: int,
+    tol: float,
+    on_step: Callable[[], None] | None = None,
 ) -> JointResult:
     """
     Minimise the objective of `MarginalLikelihood`.
@@ -103,6 +109,8 @@ def refine_joint(
     tol : float
         It has converged when two steps one after the other each lower the objective,
         minus twice the log likelihood, by less than tol for each frame.
+    on_step : callable, optional
+        Called before each step.
 
     Returns
     -------
@@ -119,6 +127,8 @@ def refine_joint(
     history = [point.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     while len(history) <= max_iter and small_steps < 2:
+        if on_step is not None:
+            on_step()
         if point.left < exact:
             reached = _without_noise(likelihood, point, floor)
             # Once is enough. Where it leads nowhere it may from closer by.

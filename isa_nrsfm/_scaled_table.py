@@ -1,5 +1,6 @@
 """A table made ready for the fit: checked, each frame centred and of size one."""
 
+import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -40,6 +41,10 @@ class ScaledTable(NamedTuple):
 
     Attributes
     ----------
+    shown : ndarray of bool, shape (n_rows,)
+        Which rows of the table show any point: they are the frames.
+    source : Table
+        These rows as they came.
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), x above y, centred over the points
         that are seen and divided by their sizes; NaN where a point is not seen. Single
@@ -58,6 +63,8 @@ class ScaledTable(NamedTuple):
         Type of the numbers of the table as it came.
     """
 
+    shown: NDArray
+    source: Table
     rows: FrameBlocks
     sizes: NDArray
     translation: NDArray
@@ -70,6 +77,14 @@ class ScaledTable(NamedTuple):
     def complete(self) -> bool:
         """Whether all points are seen."""
         return bool((self.n_seen == self.n_points).all())
+
+    def of_all_rows(self, values: NDArray) -> NDArray:
+        """Return an array with a row for each frame with NaN for the other rows."""
+        if self.shown.all():
+            return values
+        every = np.full((len(self.shown), *values.shape[1:]), np.nan, values.dtype)
+        every[self.shown] = values
+        return every
 
 
 def scaled_table(
@@ -112,20 +127,26 @@ def scaled_table(
     Warns
     -----
     UserWarning
-        If points have only one coordinate, or if the columns seem to be in another
-        order.
+        If points have only one coordinate, if rows without any point are left out, or
+        if the columns seem to be in another order.
     """
     blocks, n_columns, dtype = table
-    n_frames, n_points = blocks.n_frames, n_columns // 2
+    n_points = n_columns // 2
     refuse_odd(n_columns)
-    check_size(n_frames, n_points, n_components)
+    check_size(blocks.n_frames, n_points, n_components)
     found = list(blocks.map(partial(_examine, layout=layout)))
     frames, points, half = zip(*found, strict=True)
     HalfPoints.merged(half, blocks.lengths).warn(layout, names, stacklevel=4)
     report = FrameReport(*map(np.concatenate, zip(*frames, strict=True)))
     check_frames(report, n_points)
+    shown = report.n_seen > 0
+    if not shown.all():
+        _warn_of_empty(shown)
+        check_size(int(shown.sum()), n_points, n_components)
+        blocks, report = blocks.kept(shown), report.of_frames(shown)
     check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
     check_places(report, n_points)
+    n_frames = blocks.n_frames
     every = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
     warn_if_other_layout(blocks.take(every), layout, scale_frames, stacklevel=5)
     size = np.sqrt(report.square / (2 * report.n_seen))
@@ -143,7 +164,27 @@ def scaled_table(
     rows = blocks.derive(unit_rows, report.translation, size)
     precision = relative_precision(report, dtype, size)
     return ScaledTable(
-        rows, size, report.translation, report.n_seen, n_points, precision, dtype
+        shown,
+        table._replace(blocks=blocks),
+        rows,
+        size,
+        report.translation,
+        report.n_seen,
+        n_points,
+        precision,
+        dtype,
+    )
+
+
+def _warn_of_empty(shown: NDArray) -> None:
+    """Warn of rows that show no point, or refuse a table without any."""
+    if not shown.any():
+        raise ValueError(f"X shows no point: all of its {len(shown)} row(s) are NaN")
+    empty = ~shown
+    warnings.warn(
+        f"{empty.sum()} of {len(empty)} row(s) show no point and are left out of the "
+        f"fit, the first is row {empty.argmax()}",
+        stacklevel=5,
     )
 
 

@@ -5,7 +5,7 @@ A *table* has one row a frame and two columns a point, shape ``(n_frames,
 that is not seen in a frame is NaN.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,10 @@ class FrameReport(NamedTuple):
     n_seen: NDArray
     in_one_place: NDArray
     on_line: NDArray
+
+    def of_frames(self, frames: NDArray) -> Self:
+        """Return the report of some frames."""
+        return type(self)(*(part[frames] for part in self))
 
 
 def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
@@ -271,10 +275,10 @@ def check_frames(report: FrameReport, n_points: int) -> None:
     ValueError
         If a frame shows fewer than four points, or has missing points and shows the
         others on one line (see `usable_frames`). Those with all points in one place
-        are left to `check_places`.
+        are left to `check_places`, those without any point are not looked at.
     """
     n_seen, n_frames = report.n_seen, len(report.n_seen)
-    few = (n_seen < FEWEST_POINTS) & (n_seen < n_points)
+    few = (n_seen > 0) & (n_seen < FEWEST_POINTS) & (n_seen < n_points)
     if few.any():
         row = few.argmax()
         raise ValueError(

@@ -56,6 +56,20 @@ class TestThreads:
         model = AffineNRSfM(K, random_state=0).fit(chunked(X, columns=16))
         assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
 
+    def test_rows_that_show_nothing_are_left_out(self):
+        X = table()
+        empty = np.arange(300) % 5 == 2
+        empty[70:220] = True  # a whole chunk
+        expected = AffineNRSfM(K, random_state=0).fit(X[~empty])
+        X[empty] = np.nan
+        with pytest.warns(UserWarning, match=rf"{empty.sum()} of 300 row\(s\)"):
+            model = AffineNRSfM(K, random_state=0).fit(chunked(X))
+        assert model.alpha_.chunks[0] == (70, 150, 80)
+        found = np.asarray(model.alpha_)
+        assert np.isnan(found[empty]).all()
+        assert_allclose(found[~empty], expected.alpha_, rtol=0, atol=1e-8)
+        assert_allclose(model.basis_, expected.basis_, rtol=0, atol=1e-8)
+
     def test_results_are_dask_arrays(self):
         X = table()
         model = AffineNRSfM(K, random_state=0).fit(chunked(X))

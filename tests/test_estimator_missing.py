@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._estimator import OF_FRAMES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -70,6 +72,62 @@ def gross_scene(seed, size=0.0):
     return made, X, fitted, error(fitted, X, made.shapes)
 
 
+# --- rows that show nothing ---------------------------------------------------------
+
+EMPTY = np.isin(np.arange(90), [0, 17, 18, 60, 89])
+
+
+def with_empty_rows(table):
+    """Return a table with rows of NaN."""
+    return np.where(EMPTY[:, None], np.nan, table)
+
+
+def fitted_with_empty_rows(**params):
+    """Return the model of a table with rows of NaN, which are warned of."""
+    message = r"5 of 90 row\(s\) .* first is row 0"
+    with pytest.warns(UserWarning, match=message) as found:
+        fitted = estimator(**params).fit(with_empty_rows(HOLED.data))
+    assert found[0].filename == __file__
+    return fitted
+
+
+@pytest.mark.parametrize("params", VARIANTS[:2] + VARIANTS[3:4], ids=str)
+def test_rows_that_show_nothing_are_left_out_of_the_fit(params):
+    fitted = fitted_with_empty_rows(**params)
+    expected = estimator(**params).fit(HOLED.data[~EMPTY])
+    for name in OF_FRAMES if "alpha_std_" in vars(expected) else OF_FRAMES[:3]:
+        assert np.isnan(getattr(fitted, name)[EMPTY]).all()
+        assert_array_equal(getattr(fitted, name)[~EMPTY], getattr(expected, name))
+    for name in ("mean_shape_", "basis_", "mode_covariance_", "singular_values_"):
+        assert_array_equal(getattr(fitted, name), getattr(expected, name))
+    assert fitted.inverse_snr_ == expected.inverse_snr_
+
+
+def test_methods_make_nothing_of_rows_that_show_nothing():
+    fitted = fitted_with_empty_rows()
+    expected = estimator().fit(HOLED.data[~EMPTY])
+    table = with_empty_rows(HOLED.data)
+    assert fitted.score(table) == expected.score(HOLED.data[~EMPTY])
+    for found, wanted in zip(fitted.diagnostics(), expected.diagnostics(), strict=True):
+        assert_array_equal(found, wanted)
+    shapes = fitted.reconstruct(table, camera="weak_perspective")
+    wanted = expected.reconstruct(HOLED.data[~EMPTY], camera="weak_perspective")
+    assert_array_equal(shapes[~EMPTY], wanted)
+    assert np.isnan(shapes[EMPTY]).all()
+    assert_array_equal(fitted.transform(table), fitted.alpha_)
+
+
+def test_rows_that_show_nothing_in_a_search():
+    table = with_empty_rows(COMPLETE.data)
+    search = GridSearchCV(estimator(refinement=None), {"n_components": [1, K]}, cv=2)
+    with pytest.warns(UserWarning, match="show no point"):
+        search.fit(table)
+    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
+    with pytest.warns(UserWarning, match="show no point"):
+        found = search.best_estimator_.fit_transform(table)
+    assert_array_equal(found, search.best_estimator_.alpha_)
+
+
 # --- errors -------------------------------------------------------------------------
 
 
@@ -90,15 +148,11 @@ BAD = {
         without(ALL_FRAMES[4:], [11, 12]),
         r"at least 5 frames; 2 of 30 point\(s\) .* point 11, seen in 4",
     ),
-    "frames without points": (
-        without([3, 8], ALL_POINTS),
-        r"at least 4 points .*; 2 of 90 frame\(s\) .* row 3 with 0 point\(s\)",
-    ),
     "a frame with too few points": (
         without([5], ALL_POINTS[3:]),
         r"at least 4 points .*; 1 of 90 frame\(s\) .* row 5 with 3 point\(s\)",
     ),
-    "nothing": (without(ALL_FRAMES, ALL_POINTS), "at least 4 points"),
+    "nothing": (without(ALL_FRAMES, ALL_POINTS), r"no point: all of its 90 row\(s\)"),
 }
 
 
@@ -108,6 +162,23 @@ def test_tables_that_show_too_little_are_refused(name, refinement):
     table, message = BAD[name]
     with pytest.raises(ValueError, match=message):
         estimator(refinement=refinement).fit(table)
+
+
+def test_rows_are_counted_from_the_first_one_where_some_show_nothing():
+    tracks = COMPLETE.tracks.copy()
+    tracks[[1, 2]] = np.nan
+    tracks[5, 3:] = np.nan
+    with pytest.raises(ValueError, match="the first is row 5 with 3 point"):
+        estimator().fit(tracks.reshape(90, -1))
+
+
+def test_rows_that_show_nothing_are_no_frames():
+    few = r"at least 7 frames \(rows\), X has n_samples=6"
+    with (
+        pytest.raises(ValueError, match=few),
+        pytest.warns(UserWarning, match="84 of 90"),
+    ):
+        estimator().fit(without(ALL_FRAMES[6:], ALL_POINTS))
 
 
 def test_groups_of_points_that_are_never_seen_together_are_refused():

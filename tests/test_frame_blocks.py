@@ -51,6 +51,18 @@ class TestBlocks:
         order = np.random.default_rng(1).permutation(N_FRAMES)[:9]
         assert_array_equal(blocks_of(kind, array, length).take(order), array[order])
 
+    def test_kept_frames_are_in_the_blocks_of_a_table_of_them(
+        self, kind, array, length
+    ):
+        frames = np.isin(np.arange(N_FRAMES), [0, 1, 6, 7, 8, 18, 19, 22])
+        kept = blocks_of(kind, array, length).kept(frames)
+        alone = blocks_of(kind, array[frames], length)
+        assert kept.lengths == alone.lengths
+        assert_array_equal(kept.whole(), array[frames])
+        factors = np.arange(8)
+        derived = kept.derive(scaled, factors)
+        assert_array_equal(derived.whole(), array[frames] * factors[:, None])
+
     def test_gather_concatenates_each_of_several_results(self, kind, array, length):
         blocks = blocks_of(kind, array, length)
         first, second = blocks.gather(lambda b: (b, b[:, 0]), ((4,), ()), float)
@@ -74,6 +86,19 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     kept = MemoryBlocks.of(array, 10).derive(recorded)
     kept.whole()
     assert calls == [10, 10, 3]
+
+
+def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
+    calls = []
+
+    def recorded(block):
+        calls.append(len(block))
+        return block
+
+    stored = StoredBlocks.of(array, 4).derive(recorded)
+    frames = np.isin(np.arange(N_FRAMES), [0, 22])
+    assert_array_equal(stored.kept(frames).whole(), array[frames])
+    assert max(calls) == 4
 
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])

@@ -74,6 +74,24 @@ def assert_same_model(got, expected):
 
 
 class TestFit:
+    def test_rows_that_show_nothing_are_left_out(self, sampled, tmp_path):
+        X = table(0.1)
+        empty = np.arange(len(X)) % 7 == 3
+        empty[40:100] = True
+        expected = estimator(working_memory=0.02, keep_frames=tmp_path / "expected")
+        expected.fit(memmap(X[~empty], tmp_path))
+        X[empty] = np.nan
+        model = estimator(working_memory=0.02, keep_frames=tmp_path / "found")
+        with pytest.warns(UserWarning, match=rf"{empty.sum()} of 150 row\(s\)"):
+            model.fit(memmap(X, tmp_path))
+        for name in OF_SHAPES:
+            assert_array_equal(getattr(model, name), getattr(expected, name))
+        for name in OF_FRAMES:
+            found = getattr(model, name)
+            assert isinstance(found, np.memmap)
+            assert np.isnan(found[empty]).all()
+            assert_array_equal(found[~empty], getattr(expected, name))
+
     @pytest.mark.parametrize("missing", [0.0, 0.1])
     def test_block_size_makes_no_difference(self, sampled, tmp_path, missing):
         X = table(missing)

@@ -15,7 +15,6 @@ from sklearn.base import (
     BaseEstimator,
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
-    _fit_context,
 )
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -23,6 +22,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._estimator import Decomposition
 from isa_nrsfm._frame_fit import compose, project
 from isa_nrsfm._gauge import canonical_rotation
+from isa_nrsfm._parameter_checks import fit_context
 from isa_nrsfm._table_checks import check_names, check_size, warn_if_other_layout
 from isa_nrsfm._tracks import (
     LAYOUTS,
@@ -69,6 +69,17 @@ class ShapeSequenceNRSfM(
         the signs are those with which the shapes resemble each other.
     """
 
+    mean_shape_: NDArray
+    basis_: NDArray
+    shapes_: NDArray
+    alpha_: NDArray
+    motion_: NDArray
+    translation_: NDArray
+    inverse_snr_: float
+    noise_variance_: float
+    n_features_in_: int
+    feature_names_in_: NDArray
+
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [Interval(Integral, 1, None, closed="left")],
         "layout": [StrOptions(set(LAYOUTS))],
@@ -102,7 +113,7 @@ class ShapeSequenceNRSfM(
             chosen afterwards.
         """
 
-    @_fit_context(prefer_skip_nested_validation=True)
+    @fit_context(nested=False)
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.

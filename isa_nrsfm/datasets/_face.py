@@ -7,8 +7,9 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions, validate_params
+from sklearn.utils._param_validation import Interval, StrOptions
 
+from isa_nrsfm._parameter_checks import checked_parameters
 from isa_nrsfm._tracks import LAYOUTS, Layout
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,
@@ -33,7 +34,7 @@ SCALES = (1.0, 4.0)
 CENTRES = ((320.0, 240.0), (960.0, 720.0))
 
 
-@validate_params(
+@checked_parameters(
     {
         "n_frames": [Interval(Integral, 2, None, closed="left")],
         "n_components": [Interval(Integral, 0, len(COMPONENT_NAMES), closed="both")],
@@ -42,8 +43,7 @@ CENTRES = ((320.0, 240.0), (960.0, 720.0))
         "missing": [Interval(Real, 0, 1, closed="left")],
         "layout": [StrOptions(set(LAYOUTS))],
         "random_state": ["random_state"],
-    },
-    prefer_skip_nested_validation=True,
+    }
 )
 def make_face_tracks(
     n_frames: int = 400,

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
-from sklearn.utils._param_validation import validate_params
 
 from isa_nrsfm._optional import import_optional
+from isa_nrsfm._parameter_checks import checked_parameters
 from isa_nrsfm._tracks import table_to_tracks
 from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
 
@@ -50,15 +50,14 @@ Recognition Association of South Africa, 2010. http://www.milbo.org/muct
 """
 
 
-@validate_params(
+@checked_parameters(
     {
         "data_home": [str, os.PathLike, None],
         "download_if_missing": ["boolean"],
         "mirrored": ["boolean"],
         "return_X_y": ["boolean"],
         "as_frame": ["boolean"],
-    },
-    prefer_skip_nested_validation=True,
+    }
 )
 def fetch_muct(
     *,
@@ -67,7 +66,7 @@ def fetch_muct(
     mirrored: bool = False,
     return_X_y: bool = False,
     as_frame: bool = False,
-) -> Bunch | tuple[Any, Any]:
+) -> Any:
     """
     Load the landmarks of the faces of MUCT; download them if necessary.
 

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 from sklearn.utils import Bunch, check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions, validate_params
+from sklearn.utils._param_validation import Interval, StrOptions
 
+from isa_nrsfm._parameter_checks import checked_parameters
 from isa_nrsfm._tracks import LAYOUTS, Layout
 from isa_nrsfm.datasets._scene import (
     CAMERAS,
@@ -28,7 +29,7 @@ EXTENT = (1.0, 0.8, 0.6)
 SCALES = (2 / 3, 3 / 2)
 
 
-@validate_params(
+@checked_parameters(
     {
         "n_frames": [Interval(Integral, 2, None, closed="left")],
         "n_points": [Interval(Integral, 4, None, closed="left")],
@@ -41,8 +42,7 @@ SCALES = (2 / 3, 3 / 2)
         "missing": [Interval(Real, 0, 1, closed="left")],
         "layout": [StrOptions(set(LAYOUTS))],
         "random_state": ["random_state"],
-    },
-    prefer_skip_nested_validation=True,
+    }
 )
 def make_nonrigid_tracks(
     n_frames: int = 300,

@@ -4,8 +4,8 @@ import os
 
 from scipy.io import loadmat
 from sklearn.utils import Bunch
-from sklearn.utils._param_validation import validate_params
 
+from isa_nrsfm._parameter_checks import checked_parameters
 from isa_nrsfm._tracks import tracks_to_table
 from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
 
@@ -37,12 +37,11 @@ Intelligence 30 (2008), 878-892.
 """
 
 
-@validate_params(
+@checked_parameters(
     {
         "data_home": [str, os.PathLike, None],
         "download_if_missing": ["boolean"],
-    },
-    prefer_skip_nested_validation=True,
+    }
 )
 def fetch_shark(
     *, data_home: DataHome = None, download_if_missing: bool = True

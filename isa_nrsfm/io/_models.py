@@ -6,6 +6,7 @@ from pathlib import Path
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._callbacks import without_callbacks
 from isa_nrsfm._optional import import_optional
 
 #: The types beside those that skops trusts by itself that a model file may contain.
@@ -65,7 +66,7 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     skops_io = import_optional("skops.io", extra="share")
     _check_class(estimator, "estimator")
     check_is_fitted(estimator)
-    contents = skops_io.dumps(estimator)
+    contents = skops_io.dumps(without_callbacks(estimator))
     _refuse_untrusted(skops_io.get_untrusted_types(data=contents), "the estimator")
     Path(path).write_bytes(contents)
 

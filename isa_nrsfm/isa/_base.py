@@ -27,6 +27,12 @@ class BaseSubspaceAnalysis(
 ):
     """Whitening, validation and projection; a strategy adds `_unmix`."""
 
+    components_: NDArray
+    mean_: NDArray
+    n_iter_: int
+    n_features_in_: int
+    feature_names_in_: NDArray
+
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "subspace_size": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],

@@ -218,7 +218,7 @@ class BasisShapeDisplay:
         """
         check_is_fitted(estimator, "mean_shape_")
         view = viewing_transform(estimator.motion_, estimator.reference_motion_)
-        deviation = estimator.alpha_.std(axis=0)[:, None, None]
+        deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
             basis=deviation * (estimator.basis_ @ view.T),

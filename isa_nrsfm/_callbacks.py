@@ -1,0 +1,112 @@
+"""How a fit tells of its progress: lines on the terminal, scikit-learn's callbacks.
+
+Callbacks are new in scikit-learn 1.9, and experimental there. All that is known of them
+is in this module; with older versions nobody is told but the terminal.
+"""
+
+import copy
+import time
+from collections.abc import Sequence
+from typing import Any, Self
+
+try:
+    from sklearn.callback import CallbackSupportMixin as CallbackSupportMixin
+except ImportError:
+
+    class CallbackSupportMixin:  # type: ignore[no-redef]
+        """Estimators take no callbacks."""
+
+        def _init_callback_context(self, **_: Any) -> "_NoContext":
+            """Return the context of a fit."""
+            return _NoContext()
+
+
+class _NoContext:
+    """A task of which nobody is told."""
+
+    def subcontext(self, **_: Any) -> Self:
+        """Return the context of a part of the task."""
+        return self
+
+    def call_on_fit_task_begin(self, **_: Any) -> Self:
+        """Tell that the task begins."""
+        return self
+
+    def call_on_fit_task_end(self, **_: Any) -> bool:
+        """Tell that the task has ended."""
+        return False
+
+
+def without_callbacks(estimator: Any) -> Any:
+    """Return a copy of an estimator that nobody is told of."""
+    copied = copy.copy(estimator)
+    vars(copied).pop("_skl_callbacks", None)
+    return copied
+
+
+class FitProgress:
+    """
+    Tells of the stages of a fit, and of the steps of one of them.
+
+    The fit is a task whose subtasks are the stages; the steps of a stage are subtasks
+    of that. A line is printed for each stage that has ended, where it is wanted.
+
+    Parameters
+    ----------
+    estimator : object
+        The estimator, with `CallbackSupportMixin`. Where its `verbose` is above zero
+        lines are printed.
+    stages : sequence of str
+        The names of the stages, in order.
+    stepwise : str
+        The stage with steps; how many is not known before.
+    **data : object
+        X and y of the fit, for the callbacks.
+    """
+
+    def __init__(
+        self, estimator: Any, stages: Sequence[str], *, stepwise: str, **data: Any
+    ):
+        self.about = {"estimator": estimator, **data}
+        self.left = list(stages)
+        self.stepwise = stepwise
+        self.stage: Any = None
+        self.last_step: Any = None
+        self.fit = estimator._init_callback_context(max_subtasks=len(self.left))
+        self.fit.call_on_fit_task_begin(**self.about)
+        self._begin()
+
+    def __call__(self, stage: str) -> None:
+        """Tell that a stage has ended, and that the next one begins."""
+        now = time.perf_counter()
+        if self.about["estimator"].verbose:
+            name = type(self.about["estimator"]).__name__
+            print(f"[{name}] {stage}: {now - self.since:.2f} s", flush=True)
+        self._end_step()
+        self.stage.call_on_fit_task_end(**self.about)
+        self.left.remove(stage)
+        if self.left:
+            self._begin()
+
+    def step(self) -> None:
+        """Tell that a step of the stage begins, and that the one before has ended."""
+        self._end_step()
+        self.last_step = self.stage.subcontext(task_name="step")
+        self.last_step.call_on_fit_task_begin(**self.about)
+
+    def end(self) -> None:
+        """Tell that the fit has ended: the estimator is fitted."""
+        self.fit.call_on_fit_task_end(**self.about, reconstruction_attributes={})
+
+    def _begin(self) -> None:
+        """Tell that the next stage begins."""
+        n_steps = None if self.left[0] == self.stepwise else 0
+        self.since = time.perf_counter()
+        self.last_step = None
+        self.stage = self.fit.subcontext(task_name=self.left[0], max_subtasks=n_steps)
+        self.stage.call_on_fit_task_begin(**self.about)
+
+    def _end_step(self) -> None:
+        """Tell that the step has ended, if there is one."""
+        if self.last_step is not None:
+            self.last_step.call_on_fit_task_end(**self.about)

@@ -1,0 +1,67 @@
+"""What a notebook shows of a fitted model, below scikit-learn's own picture of it."""
+
+import html
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+
+# Basis shapes whose energy is listed, at most.
+MOST_LISTED = 12
+
+
+def summary_html(model: Any) -> str:
+    """
+    Return what is to be said first of a fitted model.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        The fitted estimator.
+
+    Returns
+    -------
+    str
+        A table in HTML.
+    """
+    rows = "".join(
+        f'<tr><th scope="row" style="text-align: left">{html.escape(name)}</th>'
+        f'<td style="text-align: left">{html.escape(value)}</td></tr>'
+        for name, value in _lines(model).items()
+    )
+    return f'<table class="isa-nrsfm-summary"><tbody>{rows}</tbody></table>'
+
+
+def _lines(model: Any) -> dict[str, str]:
+    """Return names and values."""
+    n_components, n_points, _ = model.basis_.shape
+    lines = {"Shapes": f"{n_components} basis shapes of {n_points} points"}
+    if hasattr(model, "motion_"):
+        fitted = np.isfinite(model._frame_sizes)
+        without = f", {(~fitted).sum()} rows without points" * (not fitted.all())
+        lines["Frames"] = f"{fitted.sum()}{without}"
+    floor = _percent(model.rank_floor_)
+    lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"
+    if hasattr(model, "noise_variance_"):
+        noise = math.sqrt(model.noise_variance_)
+        lines["Noise"] = (
+            f"{_percent(noise)} of a frame's size"
+            if model.scale_frames
+            else f"{noise:.3g} in the units of the table"
+        )
+    shares = [_percent(share) for share in model.energy_share_]
+    more = ["..."] * (len(shares) > MOST_LISTED)
+    lines["Energy of each"] = ", ".join(shares[:MOST_LISTED] + more)
+    if "Noise" in lines and "Frames" in lines:
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            model.diagnostics()
+        said = [str(warning.message) for warning in found]
+        lines["Diagnostics"] = "; ".join(said) or "no warning"
+    return lines
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent."""
+    return f"{100 * share:.3g} %"

@@ -1,0 +1,54 @@
+"""A script that uses the package, for mypy: it is checked strictly, and never run."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
+from isa_nrsfm.baselines import BlockMatrixNRSfM
+from isa_nrsfm.calibration import canonical_pose, deformation_metric, euclidean_frames
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.io import landmark_table, load_model, open_table, save_model
+from isa_nrsfm.metrics import affine_shape_error, inverse_snr
+from isa_nrsfm.plotting import BasisShapeDisplay
+
+Floats = NDArray[np.float64]
+
+
+def fitted(table: Floats, n_components: int = 4) -> AffineNRSfM:
+    isa = FastISA(n_init=2) if n_components > 2 else PooledFastICA()
+    return AffineNRSfM(n_components, isa=isa, random_state=0).fit(table)
+
+
+def of_methods(model: AffineNRSfM, table: Floats, folder: Path) -> Floats:
+    found: Decomposition = model.decompose(table)
+    image: Floats = model.inverse_transform(found.alpha, found.motion)
+    save_model(model, folder / "model.skops")
+    loaded: AffineNRSfM = load_model(folder / "model.skops")
+    reliable: bool = bool((loaded.diagnostics().reliability > 0.5).all())
+    score: float = model.score(table)
+    error: float = inverse_snr(table, model.reproject(table)) if reliable else score
+    return image * error
+
+
+def of_attributes(model: AffineNRSfM) -> Floats:
+    metric = deformation_metric(model.motion_, model.alpha_)
+    shapes = model.mean_shape_, model.basis_
+    frames = euclidean_frames(metric, model.motion_, model.alpha_, *shapes)
+    upright: Floats = canonical_pose(frames.shapes.mean(axis=0), scheme="ibug-68").shape
+    return upright * model.noise_variance_ * model.n_iter_
+
+
+def main(folder: Path) -> float:
+    faces = make_face_tracks(n_frames=100, random_state=0)
+    points, _ = landmark_table(pd.read_csv(folder / "faces.csv"))
+    model = fitted(faces.data).fit(points)
+    fitted(make_nonrigid_tracks(60, 20, 2).data).fit(open_table(folder / "faces.npy"))
+    of_methods(model, faces.data, folder)
+    of_attributes(model)
+    alpha: Floats = BlockMatrixNRSfM(n_components=2).fit_transform(faces.data)
+    BasisShapeDisplay.from_estimator(model).plot()
+    error: float = affine_shape_error(faces.shapes, model.reconstruct(faces.data))
+    return error + float(alpha.sum())
