@@ -1095,3 +1095,13 @@ def test_output_in_dataframes(library, frame):
 def test_names_of_the_output(model):
     names = ["affinenrsfm0", "affinenrsfm1", "affinenrsfm2"]
     assert model.get_feature_names_out().tolist() == names
+
+
+def test_another_refinement_leaves_nothing_of_the_joint_one():
+    model = AffineNRSfM(1, random_state=0).fit(TABLE)
+    assert model.noise_variance_ > 0
+    model.set_params(refinement="alternating").fit(TABLE)
+    with pytest.raises(AttributeError):
+        model.noise_variance_
+    with pytest.raises(ValueError, match="joint"):
+        model.diagnostics()
