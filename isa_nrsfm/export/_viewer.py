@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import _safe_indexing
+from sklearn.utils.validation import _num_samples
 
 from isa_nrsfm.export._drawing import Links, choose_links, edges_of
 from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
@@ -63,12 +65,13 @@ def write_viewer(
         The file, with the suffix ``.html``. An existing file is replaced.
     X : array-like of shape (n_rows, 2 * n_points), default=None
         The table whose frames are shown; by default the one that the model was fitted
-        to.
+        to. The page calls frames by their number, from 0, or by the index of a pandas
+        DataFrame.
     labels : array-like of shape (n_rows,), default=None
         Labels of the rows of the table, text or numbers, at most 30 different ones.
         Frames have colours by them. None and NaN are rows without a label.
     n_frames : int, default=1000
-        The page has no more frames than this, evenly spread over the rows.
+        The page has no more frames than this, of rows evenly spread over the table.
     edges : "auto", None or array-like, default="auto"
         Pairs of points to be joined, of shape (n_edges, 2), or triangles (n_triangles,
         3), whose sides are drawn. "auto" joins 68 points that look like a face in the
@@ -114,31 +117,36 @@ def write_viewer(
     _check_n_frames(n_frames)
     space = upright_space(model, camera, origin, mirrored)
     components = names_of_components(names, len(model.basis_))
-    motion, alpha = model.motion_, model.alpha_
-    if X is not None:
-        motion, _, alpha = model.decompose(X)
-    codes, categories = _codes(labels, len(alpha))
-    usable = np.flatnonzero(np.isfinite(alpha).all(axis=1))
-    shown = usable[_evenly_spread(len(usable), n_frames)]
+    n_rows = len(model.alpha_) if X is None else _num_samples(X)
+    codes, categories = _codes(labels, n_rows)
+    rows = _evenly_spread(n_rows, n_frames)
+    if X is None:
+        motion, alpha = model.motion_[rows], model.alpha_[rows]
+    elif len(rows):
+        motion, _, alpha = model.decompose(_safe_indexing(X, rows))
+    else:
+        motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
+    seen = np.isfinite(alpha).all(axis=1)
+    rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
 
     mean, basis = upright_basis(space, model)
     links = choose_links(edges, mean)
     centre = mean.mean(axis=0)
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
-    rotations = _rotations(space, model, motion[shown], alpha[shown])
+    rotations = _rotations(space, model, motion, alpha)
     content = {
         "about": ABOUT[space.metric is not None]
         + " The mirror image in depth fits the images as well.",
         "points": list(names_of_points(model)),
         "components": components,
         "categories": categories,
-        "rows": shown.tolist(),
-        "labels": codes[shown].tolist() if categories else [],
-        "count": _count(len(shown), len(usable), len(alpha)),
+        "rows": _row_names(X, rows),
+        "labels": codes[rows].tolist() if categories else [],
+        "count": _count(n_rows, len(seen), len(rows)),
         "shapes": _encoded(shapes, "<f4"),
         "edges": _encoded(edges_of(links), "<u4"),
-        "alpha": _encoded(alpha[shown], "<f4"),
+        "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
     }
     Path(path).write_text(_page(content), encoding="utf-8", newline="\n")
@@ -186,14 +194,20 @@ def _check_n_frames(n_frames: Any) -> None:
         )
 
 
-def _count(n_shown: int, n_usable: int, n_rows: int) -> str:
+def _row_names(X: Any, rows: NDArray[np.intp]) -> list[str]:
+    """Return what rows of a table are called: the index of a DataFrame or numbers."""
+    names = X.index[rows] if hasattr(X, "iloc") else rows
+    return [str(name) for name in names]
+
+
+def _count(n_rows: int, n_chosen: int, n_shown: int) -> str:
     """Say how many frames the page has."""
-    parts = []
-    if n_shown < n_usable:
-        parts.append(f"{n_shown} of {n_usable} frames, evenly spread")
-    if n_usable < n_rows:
-        parts.append(f"{n_rows - n_usable} of {n_rows} rows show too few points")
-    return "; ".join(parts) + "." if parts else f"{n_rows} frames."
+    text = f"{n_chosen} of {n_rows} rows, evenly spread"
+    if n_chosen == n_rows:
+        text = f"{n_rows} rows"
+    if n_shown < n_chosen:
+        text += f"; {n_chosen - n_shown} of them show too few points"
+    return text + "."
 
 
 def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:

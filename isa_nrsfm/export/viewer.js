@@ -16,7 +16,7 @@
   const SWING = { amplitude: 2, seconds: 3 };
   const EYE = 6; // distance of the viewer, in radii of the mean shape
   const LEVELS = 12; // of depth, far ones drawn first and paler
-  const N_COLOURS = 6; // of the page; more labels go round the circle of hues
+  const N_COLOURS = 8; // of the page; more labels go round the circle of hues
 
   const state = {
     weights: new Float32Array(nWeights),
@@ -60,8 +60,10 @@
     const pose = posed
       ? poses.subarray(9 * state.frame, 9 * state.frame + 9)
       : [1, 0, 0, 0, 1, 0, 0, 0, 1];
-    const depth = byId("mirror").checked ? -1 : 1;
-    return product(product(state.turn, [1, 0, 0, 0, 1, 0, 0, 0, depth]), pose);
+    // Half a turn about the axis to the right, and the mirror image in depth.
+    const over = byId("over").checked ? -1 : 1;
+    const depth = byId("mirror").checked ? -over : over;
+    return product(product(state.turn, [1, 0, 0, 0, over, 0, 0, 0, depth]), pose);
   }
 
   // Positions x, y on the canvas and depth, nearer ones larger, of all points.
@@ -104,7 +106,7 @@
 
   function labelColour(code) {
     if (model.categories.length <= N_COLOURS) return colour(`--label-${code}`);
-    return `hsl(${(137.5 * code) % 360} 65% 50%)`;
+    return `hsl(${(137.5 * code) % 360} 65% 55%)`;
   }
 
   function cleared(canvas) {
@@ -375,7 +377,7 @@
     actions[event.key]();
   });
   byId("front").addEventListener("click", frontView);
-  for (const id of ["ghost", "mirror", "pose", "across", "upwards"])
+  for (const id of ["ghost", "mirror", "over", "pose", "across", "upwards"])
     byId(id).addEventListener("change", redraw);
 
   function nameNearest(x, y) {
