@@ -124,8 +124,9 @@ def point_distribution_model(
     Notes
     -----
     The modes are principal axes, not the independent basis shapes: uncorrelated,
-    orthogonal, and sorted by variance. Shapes that are aligned are those of
-    generalised Procrustes analysis [1]_.
+    orthogonal, and sorted by variance. Shapes are aligned as in generalised Procrustes
+    analysis [1]_, with scales that bring them to the tangent space of the mean: their
+    differences from it are orthogonal to it.
 
     References
     ----------
@@ -332,22 +333,20 @@ def _number_of_modes(n_modes: Any, n_components: int, variances: NDArray) -> int
 
 
 def _aligned(shapes: NDArray) -> NDArray:
-    """Return centred shapes aligned to their mean by rotations and scales."""
+    """Return centred shapes turned to their mean, and scaled to its tangent space."""
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
-    energies = np.sum(shapes**2, axis=(1, 2))
     mean = shapes.mean(axis=0)
-    size = np.linalg.norm(mean)
     aligned = shapes
     for _ in range(MAX_ROUNDS):
         left, stretch, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
         turned = np.linalg.det(left @ right)
         left[:, :, 2] *= turned[:, None]
         stretch[:, 2] *= turned
-        scales = stretch.sum(axis=1) / energies
+        # <aligned shape, mean> = <mean, mean>
+        scales = np.sum(mean**2) / stretch.sum(axis=1)
         aligned = scales[:, None, None] * (shapes @ (left @ right))
         previous, mean = mean, aligned.mean(axis=0)
-        mean *= size / np.linalg.norm(mean)
-        if np.linalg.norm(mean - previous) <= SETTLED * size:
+        if np.linalg.norm(mean - previous) <= SETTLED * np.linalg.norm(mean):
             break
     return aligned
 
