@@ -24,6 +24,7 @@ from isa_nrsfm.export._upright import (
     upright_basis,
     upright_space,
 )
+from isa_nrsfm.plotting._axes import is_dense
 from isa_nrsfm.plotting._edges import Origin
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
@@ -79,7 +80,8 @@ def write_glb(
         What is drawn beside the points: integers of shape (n_edges, 2), pairs of points
         to be joined; or (n_triangles, 3), the triangles of a surface, counter-clockwise
         as seen from outside; or None for nothing. "auto" makes a surface of the
-        Delaunay triangles of the front view.
+        Delaunay triangles of the front view. More than 400 points of a surface are not
+        drawn as points.
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -134,6 +136,9 @@ def write_glb(
 
     file = Binary()
     primitives = _primitives(file, mean, basis, links)
+    used = sorted({part["material"] for part in primitives})
+    for part in primitives:
+        part["material"] = used.index(part["material"])
     mesh = {
         "name": "mean shape",
         "primitives": primitives,
@@ -161,7 +166,7 @@ def write_glb(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "shape", "mesh": 0}],
         "meshes": [mesh],
-        "materials": MATERIALS[: 1 + max(part["material"] for part in primitives)],
+        "materials": MATERIALS[: 1 + max(p["material"] for p in primitives)],
         "animations": [animation],
     }
     Path(path).write_bytes(file.with_document(document))
@@ -255,7 +260,7 @@ def _padded(content: bytes, filler: bytes) -> bytes:
 def _primitives(
     file: Binary, mean: NDArray, basis: NDArray, links: NDArray | None
 ) -> list[dict[str, Any]]:
-    """Return the points and what joins them, with their morph targets."""
+    """Return the points, unless there are many on a surface, and what joins them."""
     position = file.add(mean, VERTICES, bounds=True)
     drifts = [file.add(drift, VERTICES, bounds=True) for drift in basis]
     bare: dict[str, Any] = {
@@ -282,7 +287,7 @@ def _primitives(
         "mode": TRIANGLES,
         "indices": indices,
     }
-    return [surface, *primitives]
+    return [surface] if is_dense(mean) else [surface, *primitives]
 
 
 def _swings(n_components: int) -> tuple[NDArray, NDArray]:

@@ -131,7 +131,7 @@
       const [a, b] = [3 * edges[e], 3 * edges[e + 1]];
       levels[level((seen[a + 2] + seen[b + 2]) / 2)].edges.push([a, b]);
     }
-    const usual = nPoints <= 100 ? 3.2 : nPoints <= 400 ? 2.2 : 1.1;
+    const usual = nPoints <= 100 ? 3.2 : nPoints <= 400 ? 2.2 : 0.9;
     const radius = (edges.length ? 0.75 : 1) * usual * Math.sqrt(state.zoom);
     pen.strokeStyle = pen.fillStyle = ink;
     pen.lineWidth = nPoints <= 400 ? 1.6 : 0.7;
@@ -145,8 +145,12 @@
       pen.stroke();
       pen.beginPath();
       for (const i of content.points) {
-        pen.moveTo(seen[i] + radius, seen[i + 1]);
-        pen.arc(seen[i], seen[i + 1], radius, 0, 7);
+        const [x, y] = [seen[i], seen[i + 1]];
+        if (nPoints > 400) pen.rect(x - radius, y - radius, 2 * radius, 2 * radius);
+        else {
+          pen.moveTo(x + radius, y);
+          pen.arc(x, y, radius, 0, 7);
+        }
       }
       pen.fill();
     });
