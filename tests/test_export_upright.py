@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 from export_models import aligned, blob_model, face_model, faces
 from numpy.testing import assert_allclose
+from sklearn.decomposition import PCA
+from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frame_fit import compose, project
@@ -104,6 +106,10 @@ def test_affine_shapes_are_an_affinity_of_the_model():
 
 def test_what_is_refused():
     model = blob_model()
+    with pytest.raises(ValueError, match="model should be an AffineNRSfM; got PCA"):
+        space_of(PCA())
+    with pytest.raises(NotFittedError):
+        space_of(AffineNRSfM())
     with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
         space_of(model, camera="orthographic")
     with pytest.raises(ValueError, match="origin must be"):

@@ -10,6 +10,7 @@ from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._landmark_names import point_names
+from isa_nrsfm.io._models import _check_class
 
 SUFFIXES = (".npz", ".mat")
 
@@ -71,10 +72,16 @@ def shape_arrays(model: Any) -> ShapeArrays:
     ShapeArrays
         Named tuple of arrays: the attributes of the model and names.
 
+    Raises
+    ------
+    ValueError
+        If the model is no AffineNRSfM.
+
     See Also
     --------
     write_shapes : Write them to a file.
     """
+    _check_class(model, "model")
     check_is_fitted(model)
     n_components = len(model.basis_)
     kept = hasattr(model, "alpha_")
