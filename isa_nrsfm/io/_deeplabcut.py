@@ -1,0 +1,212 @@
+"""Read the csv and h5 files of DeepLabCut, which Lightning Pose writes, too."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
+from isa_nrsfm.io._landmarks import (
+    Landmarks,
+    assemble,
+    each_individual,
+    name_individuals,
+)
+from isa_nrsfm.io._separated_values import header_rows, read_columns
+
+_LEVELS = ["scorer", "bodyparts", "coords"]
+_LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
+_KEY = "df_with_missing"
+# The individual to which points belong that are not of an animal.
+_UNIQUE = "single"
+
+
+class _Table(NamedTuple):
+    """Values (n_frames, n_columns), their columns by the levels, labels of the rows."""
+
+    values: NDArray[np.float64]
+    columns: list[tuple[str, ...]]
+    labels: list[Any]
+
+
+def is_deeplabcut(path: Path) -> bool:
+    """Tell whether the header, or the group of an h5 file, is DeepLabCut's."""
+    if path.suffix.lower() == ".csv":
+        return _levels_of(header_rows(path, 4)) is not None
+    return is_hdf5(path) and _KEY in root_groups(path)
+
+
+def read_deeplabcut(path: Path) -> Landmarks:
+    """
+    Read a csv or h5 file of DeepLabCut or Lightning Pose.
+
+    The columns have the levels ``scorer``, ``individuals`` (only with several animals),
+    ``bodyparts`` and ``coords``, which are ``x``, ``y`` and, but for labels made by
+    hand, ``likelihood``. The index has the number of the frame or the path of the
+    image. The individual "single", to which DeepLabCut gives points that belong to no
+    animal, is left out with a warning where there are others.
+    """
+    pd = import_optional("pandas", extra="io")
+    table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+    scorers = {column[0] for column in table.columns}
+    if len(scorers) > 1:
+        raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
+    places = _places(table.columns)
+    bodyparts = _common_bodyparts(places)
+    individuals = list(places)
+    where = np.array([[places[i][b] for b in bodyparts] for i in individuals])
+    # A column of NaN stands for likelihoods that are not there.
+    values = np.column_stack([table.values, np.full(len(table.values), np.nan)])
+    found = values[:, where]
+    confidence = found[..., 2] if (where[..., 2] >= 0).any() else None
+    rows = each_individual(found[..., :2], confidence)
+    frames = _index_columns(table.labels)
+    frames = {name: [column[i] for i in rows.frame] for name, column in frames.items()}
+    if len(table.columns[0]) == len(_LEVELS_OF_MANY):
+        frames["individual"] = name_individuals(rows.individual, individuals)
+    return assemble(
+        rows.tracks,
+        bodyparts,
+        pd.DataFrame(frames),
+        format="deeplabcut",
+        confidence=rows.confidence,
+    )
+
+
+def _read_csv(path: Path) -> _Table:
+    """Read a csv file, whose first lines are the levels of the columns."""
+    header = header_rows(path, 4)
+    levels = _levels_of(header)
+    if levels is None:
+        raise ValueError(
+            "its first lines do not begin with scorer, bodyparts, coords or with "
+            "scorer, individuals, bodyparts, coords"
+        )
+    header = header[: len(levels)]
+    if len({len(row) for row in header}) > 1:
+        raise ValueError("its first lines are not of the same length")
+    # Labels made by hand have the path of the image in up to three columns.
+    n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
+    columns = list(zip(*(row[n_index:] for row in header), strict=True))
+    names = [str(i) for i in range(len(header[0]))]
+    frame = read_columns(
+        path,
+        numbers=names[n_index:],
+        text=names[:n_index],
+        n_header=len(levels),
+        names=names,
+    )
+    index = ["/".join(cells) for cells in frame[names[:n_index]].fillna("").to_numpy()]
+    return _Table(frame[names[n_index:]].to_numpy(dtype=np.float64), columns, index)
+
+
+def _read_h5(path: Path) -> _Table:
+    """Read the table that pandas has stored in an h5 file."""
+    pd = import_optional("pandas", extra="io")
+    import_optional("tables", extra="h5")
+    try:
+        frame = pd.read_hdf(path, key=_KEY)
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # PyTables, HDF5 and pickle have errors of many kinds
+        raise ValueError(f"pandas cannot read {_KEY!r} in it: {error}") from error
+    n_levels = getattr(getattr(frame, "columns", None), "nlevels", 0)
+    if n_levels not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
+        raise ValueError(
+            f"the columns should have the levels {', '.join(_LEVELS_OF_MANY)}; got "
+            f"{n_levels} levels"
+        )
+    try:
+        values = frame.to_numpy(dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"its columns do not hold numbers: {error}") from error
+    columns = [tuple(map(str, column)) for column in frame.columns]
+    index = [
+        "/".join(map(str, label)) if isinstance(label, tuple) else label
+        for label in frame.index
+    ]
+    return _Table(values, columns, index)
+
+
+def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
+    """Return the levels that the first lines of a csv file name, or None."""
+    first = [row[0].strip().lower() if row else "" for row in header]
+    for levels in (_LEVELS, _LEVELS_OF_MANY):
+        if first[: len(levels)] == levels:
+            return levels
+    return None
+
+
+def _places(
+    columns: Sequence[tuple[str, ...]],
+) -> dict[str, dict[str, tuple[int, int, int]]]:
+    """Return the numbers of the x, y and likelihood columns of each point.
+
+    The number is -1 where there is no likelihood. Other columns are left aside.
+    """
+    numbers: dict[str, dict[str, dict[str, int]]] = {}
+    for number, column in enumerate(columns):
+        *individual, bodypart, coord = column[1:]
+        of_point = numbers.setdefault("".join(individual), {}).setdefault(bodypart, {})
+        if coord == "z":
+            raise ValueError(
+                f"{bodypart!r} has a z: these are points in space, not in an image"
+            )
+        if coord in of_point:
+            raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
+        of_point[coord] = number
+    found = {
+        individual: {
+            bodypart: (of_point["x"], of_point["y"], of_point.get("likelihood", -1))
+            for bodypart, of_point in points.items()
+            if {"x", "y"}.issubset(of_point)
+        }
+        for individual, points in numbers.items()
+    }
+    half = next(
+        (
+            bodypart
+            for points in numbers.values()
+            for bodypart, of_point in points.items()
+            if len({"x", "y"}.intersection(of_point)) == 1
+        ),
+        None,
+    )
+    if half is not None:
+        raise ValueError(f"{half!r} has only one of x and y")
+    found = {individual: points for individual, points in found.items() if points}
+    if not found:
+        raise ValueError("it has no columns x and y")
+    return found
+
+
+def _common_bodyparts(places: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the bodyparts that all individuals have; leave unique ones out."""
+    if len(places) > 1 and _UNIQUE in places:
+        others = next(points for name, points in places.items() if name != _UNIQUE)
+        if set(places[_UNIQUE]) != set(others):
+            warnings.warn(
+                f"the points {', '.join(places[_UNIQUE])} belong to no animal "
+                f"(individual {_UNIQUE!r}) and are left out",
+                stacklevel=2,
+            )
+            del places[_UNIQUE]
+    first, points = next(iter(places.items()))
+    for name, other in places.items():
+        if set(other) != set(points):
+            raise ValueError(
+                f"the individuals {first!r} and {name!r} have different bodyparts"
+            )
+    return list(points)
+
+
+def _index_columns(index: list[Any]) -> dict[str, list[Any]]:
+    """Name the index: numbers of frames, or paths of images."""
+    try:
+        return {"frame": [int(label) for label in index]}
+    except (TypeError, ValueError):
+        return {"image": [str(label) for label in index]}
