@@ -129,7 +129,8 @@ def assemble(
         points=pd.DataFrame(
             tracks.reshape(n_frames, 2 * n_points), columns=list(columns)
         ),
-        frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0),
+        # The copy is in one piece, so that further columns can be added quickly.
+        frames=frames.set_axis(pd.RangeIndex(n_frames), axis=0).copy(),
         confidence=None
         if confidence is None
         else pd.DataFrame(confidence, columns=list(point_names)),
