@@ -160,7 +160,14 @@ def write_deeplabcut(path, frame, *, how="table"):
 
 
 def write_sleap(
-    path, tracks, *, order="txnf", named=True, scores=None, names=("a", "b")
+    path,
+    tracks,
+    *,
+    order="txnf",
+    named=True,
+    scores=None,
+    names=("a", "b"),
+    nodes=BODYPARTS,
 ):
     """Write an analysis file; tracks (frame, track, node, xy), order of the axes.
 
@@ -183,7 +190,6 @@ def write_sleap(
         put("instance_scores", scores.mean(axis=2), "ft")
         occupied = ~np.isnan(tracks).all(axis=(2, 3))
         file["track_occupancy"] = occupied.astype(np.uint8)
-        nodes = BODYPARTS[: tracks.shape[2]]
         file["node_names"] = np.array([name.encode() for name in nodes])
         file["track_names"] = np.array([name.encode() for name in names])
         file["provenance"] = "{}"

@@ -166,6 +166,9 @@ def test_openface_without_landmarks_is_refused(tmp_path):
     table.to_csv(path, index=False)
     with pytest.raises(ValueError, match="success must hold 0 and 1 only"):
         read_landmarks(path)
+    table.drop(columns="success").to_csv(path, index=False)
+    with pytest.raises(ValueError, match="it has no column success"):
+        read_landmarks(path, "openface")
 
 
 @pytest.mark.parametrize("detector", ["Detector", "MPDetector"])

@@ -1,6 +1,7 @@
 """Read the csv tables of OpenFace, py-feat and MediaPipe's face mesh."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,30 +55,29 @@ def read_openface(path: Path) -> Landmarks:
         raise ValueError(
             "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
         )
+    of_image = names[:1] == ["face"]
+    scores = ["confidence"] if of_image else ["confidence", "success"]
+    _need(names, scores)
     found = find_landmark_columns(names, "x_#,y_#")
-    given = [name for name in ("confidence", "success") if name in names]
     table = read_columns(
         path,
         leave_out=_OPENFACE_NOT_READ,
-        numbers=[*found.interleaved, *given],
+        numbers=[*found.interleaved, *scores],
     )
     failed = None
-    if "success" in given:
+    if not of_image:
         success = table["success"].to_numpy()
         if not np.isin(success, (0, 1)).all():
             raise ValueError("the column success must hold 0 and 1 only")
         failed = success == 0
         table["success"] = table["success"].astype(int)
-    confidence = None
-    if "confidence" in given:
-        confidence = _of_all_points(table["confidence"], found)
     return assemble(
         _tracks(table, found),
         found.points,
         table.drop(columns=found.interleaved),
         format="openface",
         columns=found.interleaved,
-        confidence=confidence,
+        confidence=_of_all_points(table["confidence"], found),
         failed=failed,
     )
 
@@ -97,6 +97,7 @@ def read_pyfeat(path: Path) -> Landmarks:
     x_1, ...``. ``FaceScore`` is the confidence of the face detector.
     """
     names = _stripped_header(path)
+    _need(names, _PYFEAT_BOX)
     found = find_landmark_columns(names, "x_#,y_#")
     scored = ["FaceScore"] if "FaceScore" in names else []
     table = read_columns(
@@ -187,6 +188,13 @@ def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
             f"got {image_size!r}"
         )
     return width, height
+
+
+def _need(names: list[str], needed: Iterable[str]) -> None:
+    """Raise if one of the columns that are needed is not there."""
+    absent = [name for name in needed if name not in names]
+    if absent:
+        raise ValueError(f"it has no column {', '.join(absent)}")
 
 
 def _stripped_header(path: Path) -> list[str]:
