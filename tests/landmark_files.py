@@ -196,6 +196,20 @@ def write_sleap(
     return path
 
 
+def write_sleap_csv(path, tracks, scores, *, names=("a", "b"), nodes=BODYPARTS):
+    """Write an analysis table, with a row for each track that a frame shows."""
+    rows = []
+    for frame, track in np.argwhere(~np.isnan(tracks).all(axis=(2, 3))):
+        row = {"track": names[track], "frame_idx": frame, "instance.score": 0.5}
+        for j, node in enumerate(nodes):
+            x, y = tracks[frame, track, j]
+            score = scores[frame, track, j]
+            row |= {f"{node}.score": score, f"{node}.x": x, f"{node}.y": y}
+        rows.append(row)
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
 def coco_annotations(tracks, *, names=BODYPARTS, image=None):
     """Return annotations of one person an image; missing points have zeros."""
     seen = ~np.isnan(tracks).any(axis=2)

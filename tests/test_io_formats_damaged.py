@@ -76,9 +76,9 @@ def test_truncated_files_are_refused(format, tmp_path):
 @pytest.mark.filterwarnings("default")
 def test_damaged_files_are_read_or_refused(format, tmp_path):
     path = WRITERS[format](tmp_path)
-    for part in with_other_bytes(path.read_bytes(), 24):
+    for part in with_other_bytes(path.read_bytes(), 16):
         read_or_refuse(path, part, format)
-        read_or_refuse(path, part, "auto")
+    read_or_refuse(path, part, "auto")
 
 
 @pytest.mark.parametrize("format", BINARY_WRITERS)
@@ -90,7 +90,7 @@ def test_damaged_hdf5_files_are_read_or_refused(format, tmp_path):
         assert read_or_refuse(path, part, format) is None
     for part in with_other_bytes(content, 24):
         read_or_refuse(path, part, format)
-        read_or_refuse(path, part, "auto")
+    read_or_refuse(path, part, "auto")
 
 
 @pytest.mark.parametrize("wrong", FORMATS)

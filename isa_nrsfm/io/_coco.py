@@ -115,8 +115,9 @@ def _annotations(content: Any, category: str | None) -> _Instances:
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        if _key(entry.get("category_id")) in chosen and "keypoints" in entry:
-            entries.append({**entry, "category": chosen[_key(entry["category_id"])]})
+        of = entry.get("category_id")
+        if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
+            entries.append({**entry, "category": chosen[of]})
             shown.add(where)
     order = {image: i for i, image in enumerate(images)}
     entries.sort(key=lambda entry: order[entry["image_id"]])
@@ -127,7 +128,7 @@ def _annotations(content: Any, category: str | None) -> _Instances:
 
 def _chosen_categories(
     categories: list[dict[str, Any]], name: str | None
-) -> tuple[dict[str, str], tuple[str, ...]]:
+) -> tuple[dict[int | str, str], tuple[str, ...]]:
     """Return names of the categories to read by id, and their common keypoints."""
     with_points = [entry for entry in categories if entry.get("keypoints")]
     names = [str(entry.get("name")) for entry in with_points]
@@ -148,7 +149,9 @@ def _chosen_categories(
                 f"the categories {', '.join(names)} have different keypoints: choose "
                 "one with category"
             )
-    chosen = {_key(entry.get("id")): str(entry.get("name")) for entry in with_points}
+        if not isinstance(entry.get("id"), int | str):
+            raise ValueError("each of the categories needs an id")
+    chosen = {entry["id"]: str(entry.get("name")) for entry in with_points}
     return chosen, tuple(with_points[0]["keypoints"])
 
 
@@ -203,8 +206,3 @@ def _refuse_non_objects(entries: list[Any], what: str) -> None:
     """Raise if a list has something else than objects."""
     if not all(isinstance(entry, dict) for entry in entries):
         raise ValueError(f"all {what} must be objects")
-
-
-def _key(identifier: Any) -> str:
-    """Return an identifier as something that can be looked up."""
-    return json.dumps(identifier)

@@ -134,6 +134,8 @@ def read_mesh_table(
     columns ``image_width`` and ``image_height``. Coordinates in pixels are taken as
     they are.
     """
+    if image_size is not None:
+        image_size = _checked_size(image_size)
     names = _stripped_header(path)
     found = find_landmark_columns(names)
     sizes = [name for name in _IMAGE_SIZE_COLUMNS if name in names]
@@ -146,8 +148,6 @@ def read_mesh_table(
     )
     tracks = _tracks(table, found)
     of_table = len(sizes) == 2
-    if image_size is not None:
-        image_size = _checked_size(image_size)
     known = np.abs(tracks[~np.isnan(tracks)])
     if known.size and np.median(known) <= _LARGEST_SHARE:
         if image_size is None and not of_table:

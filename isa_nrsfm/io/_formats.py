@@ -345,8 +345,9 @@ _ALL = (
     LandmarkFormat(
         "sleap",
         "SLEAP analysis",
-        "the datasets tracks, node_names and track_names",
-        (".h5", ".hdf5"),
+        "the datasets tracks, node_names and track_names, or the columns track, "
+        "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
+        (".h5", ".hdf5", ".csv"),
         is_sleap,
         read_sleap,
     ),

@@ -125,10 +125,10 @@ def read_columns(
     except (UnicodeDecodeError, pd.errors.ParserError) as error:
         raise ValueError(f"it is not a table of separated values: {error}") from error
     types = pd.api.types
+    found = dict(frame.dtypes)
     for name in numbers:
-        column = frame[name]
-        if not types.is_numeric_dtype(column) or types.is_bool_dtype(column):
-            raise ValueError(_first_bad_cell(column))
+        if not types.is_numeric_dtype(found[name]) or types.is_bool_dtype(found[name]):
+            raise ValueError(_first_bad_cell(frame[name]))
     return frame
 
 

@@ -1,4 +1,4 @@
-"""Read the analysis files of SLEAP."""
+"""Read the analysis files of SLEAP, h5 and csv."""
 
 import json
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._landmark_names import find_landmark_columns
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
 from isa_nrsfm.io._landmarks import (
@@ -15,28 +16,62 @@ from isa_nrsfm.io._landmarks import (
     each_individual,
     name_individuals,
 )
+from isa_nrsfm.io._separated_values import header_names, read_columns
 
 _DIMS = ("frame", "track", "node", "xy")
 # Where the file does not say: SLEAP's own order, and that of its older files
 # for Python. They differ where there are more than two points.
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
+_CSV_COLUMNS = ["track", "frame_idx", "instance.score"]
 _NEEDED = frozenset({"tracks", "node_names", "track_names"})
 
 
 def is_sleap(path: Path) -> bool:
-    """Tell whether an h5 file has the datasets of an analysis file."""
+    """Tell whether an h5 file has the datasets, or a csv file the header, of SLEAP."""
+    if path.suffix.lower() == ".csv":
+        return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
     return is_hdf5(path) and _NEEDED <= root_groups(path)
 
 
 def read_sleap(path: Path) -> Landmarks:
     """
-    Read an analysis h5 file of SLEAP, or of sleap-io and movement.
+    Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
 
-    ``tracks`` has the points, in the order of axes that its attribute ``dims`` tells,
-    and otherwise (track, xy, node, frame), as SLEAP writes it; ``point_scores`` has
-    their confidences, ``instance_scores`` those of the instances. Frames are counted
-    from 0.
+    In an h5 file, ``tracks`` has the points, in the order of axes that its attribute
+    ``dims`` tells, and otherwise (track, xy, node, frame), as SLEAP writes it;
+    ``point_scores`` has their confidences, ``instance_scores`` those of the instances.
+    A csv file has a row for each instance, ``track, frame_idx, instance.score`` and
+    ``x``, ``y`` and ``score`` of each node. Frames are counted from 0.
     """
+    return _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+
+
+def _read_csv(path: Path) -> Landmarks:
+    """Read a csv file, which has no rows for frames without instances."""
+    if not is_sleap(path):
+        raise ValueError(f"its first columns are not {', '.join(_CSV_COLUMNS)}")
+    names = header_names(path)
+    found = find_landmark_columns(names, "*.x,*.y")
+    nodes = [name.removesuffix(".x") for name in found.x]
+    scores = [f"{node}.score" for node in nodes]
+    if not set(scores).issubset(names):
+        raise ValueError("not all of its points have a score")
+    table = read_columns(
+        path,
+        numbers=[*found.interleaved, *scores, "frame_idx", "instance.score"],
+        text=("track",),
+    )
+    return assemble(
+        table[found.interleaved].to_numpy(np.float64).reshape(len(table), -1, 2),
+        nodes,
+        table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
+        format="sleap",
+        confidence=table[scores].to_numpy(np.float64),
+    )
+
+
+def _read_h5(path: Path) -> Landmarks:
+    """Read an h5 file."""
     pd = import_optional("pandas", extra="io")
     h5py = import_optional("h5py", extra="h5")
     try:
