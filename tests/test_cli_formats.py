@@ -140,7 +140,7 @@ def test_files_are_fitted_and_transformed(write, run, tracks, lost, tmp_path):
     ]
     if name == "openface":
         assert " 1 left out: tracking failed" in out
-        assert " 1 left out: all points missing" in out
+        assert " 1 left out: all points missing or unsure" in out
     elif len(missing):
         assert " 1 left out: tracking failed" in out
 

@@ -310,6 +310,15 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
         read_landmarks(tmp_path / "a.csv", min_confidence=0.5)
 
 
+@pytest.mark.parametrize("name", ["a.csv", "a.h5"])
+def test_further_columns_of_lightning_pose_are_left_aside(name, tmp_path):
+    frame = FRAME.copy()
+    frame[("DLC_resnet50_mice", "set", "")] = "train"
+    path = files.write_deeplabcut(tmp_path / name, frame)
+    landmarks = read_landmarks(path, min_confidence=0.5)
+    np.testing.assert_allclose(tracks_of(landmarks), TRACKS)
+
+
 def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
     both = pd.concat(
         [
@@ -333,8 +342,8 @@ def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
     ("change", "message"),
     [
         ({"y": "z"}, "'snout' has a z"),
-        ({"y": "b"}, "'snout' has only one of x and y"),
-        ({"y": "b", "x": "a"}, "no columns x and y"),
+        ({"y": "b"}, "'snout' has no x or no y"),
+        ({"y": "b", "x": "a", "likelihood": "c"}, "no columns x and y"),
         ({"y": "x"}, "more than one column 'x' of 'snout'"),
     ],
 )

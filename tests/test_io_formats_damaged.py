@@ -88,6 +88,9 @@ def test_damaged_hdf5_files_are_read_or_refused(format, tmp_path):
     content = path.read_bytes()
     for part in truncated(content, 20)[:-1]:
         assert read_or_refuse(path, part, format) is None
+    path.write_bytes(content[:-100])
+    with pytest.raises(ValueError, match=r"a\.h5 is a damaged HDF5 file"):
+        read_landmarks(path)
     for part in with_other_bytes(content, 24):
         read_or_refuse(path, part, format)
     read_or_refuse(path, part, "auto")

@@ -91,7 +91,7 @@ def choose_frames(
     left_out += [
         LeftOut(reason, rows[which], skipped=False)
         for reason, which in _reasons(
-            tracks, usable, usable & False if failed is None else failed[rows]
+            tracks, usable, None if failed is None else failed[rows]
         )
     ]
     if not zeros_missing:
@@ -113,16 +113,21 @@ def choose_frames(
 def _reasons(
     tracks: NDArray[np.float64],
     usable: NDArray[np.bool_],
-    failed: NDArray[np.bool_],
+    failed: NDArray[np.bool_] | None,
 ) -> list[tuple[str, NDArray[np.bool_]]]:
     """Tell in which frames what is the matter, each with one reason."""
     report = report_frames(tracks)
     n_seen = report.n_seen
     few = n_seen < FEWEST_POINTS
     in_one_place = report.in_one_place & ~few
+    none: list[tuple[str, NDArray[np.bool_]]] = [("all points missing", n_seen == 0)]
+    if failed is not None:
+        none = [
+            ("tracking failed", failed),
+            ("all points missing or unsure", (n_seen == 0) & ~failed),
+        ]
     return [
-        ("tracking failed", failed),
-        ("all points missing", (n_seen == 0) & ~failed),
+        *none,
         (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
         ("all points in one place", in_one_place),
         ("points on one line, others missing", ~usable & ~few & ~in_one_place),

@@ -20,6 +20,8 @@ from isa_nrsfm.io._separated_values import header_rows, read_columns
 
 _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
+# Lightning Pose adds columns of other names, such as set.
+_COORDS = ("x", "y", "z", "likelihood")
 _KEY = "df_with_missing"
 # The individual to which points belong that are not of an animal.
 _UNIQUE = "single"
@@ -91,17 +93,24 @@ def _read_csv(path: Path) -> _Table:
         raise ValueError("its first lines are not of the same length")
     # Labels made by hand have the path of the image in up to three columns.
     n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
-    columns = list(zip(*(row[n_index:] for row in header), strict=True))
-    names = [str(i) for i in range(len(header[0]))]
+    columns = list(zip(*header, strict=True))
+    numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
+    index = list(range(n_index))
+    names = [str(i) for i in range(len(columns))]
     frame = read_columns(
         path,
-        numbers=names[n_index:],
-        text=names[:n_index],
+        leave_out=set(names).difference(str(i) for i in (*index, *numbers)),
+        numbers=[str(i) for i in numbers],
+        text=[str(i) for i in index],
         n_header=len(levels),
         names=names,
     )
-    index = ["/".join(cells) for cells in frame[names[:n_index]].fillna("").to_numpy()]
-    return _Table(frame[names[n_index:]].to_numpy(dtype=np.float64), columns, index)
+    cells = frame.iloc[:, :n_index].fillna("").to_numpy()
+    return _Table(
+        frame.iloc[:, n_index:].to_numpy(dtype=np.float64),
+        [columns[i] for i in numbers],
+        ["/".join(row) for row in cells],
+    )
 
 
 def _read_h5(path: Path) -> _Table:
@@ -110,8 +119,6 @@ def _read_h5(path: Path) -> _Table:
     import_optional("tables", extra="h5")
     try:
         frame = pd.read_hdf(path, key=_KEY)
-    except FileNotFoundError:
-        raise
     except Exception as error:  # PyTables, HDF5 and pickle have errors of many kinds
         raise ValueError(f"pandas cannot read {_KEY!r} in it: {error}") from error
     n_levels = getattr(getattr(frame, "columns", None), "nlevels", 0)
@@ -120,6 +127,7 @@ def _read_h5(path: Path) -> _Table:
             f"the columns should have the levels {', '.join(_LEVELS_OF_MANY)}; got "
             f"{n_levels} levels"
         )
+    frame = frame.loc[:, frame.columns.get_level_values(-1).isin(_COORDS)]
     try:
         values = frame.to_numpy(dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -146,7 +154,7 @@ def _places(
 ) -> dict[str, dict[str, tuple[int, int, int]]]:
     """Return the numbers of the x, y and likelihood columns of each point.
 
-    The number is -1 where there is no likelihood. Other columns are left aside.
+    The number is -1 where there is no likelihood.
     """
     numbers: dict[str, dict[str, dict[str, int]]] = {}
     for number, column in enumerate(columns):
@@ -159,28 +167,19 @@ def _places(
         if coord in of_point:
             raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
         of_point[coord] = number
-    found = {
-        individual: {
-            bodypart: (of_point["x"], of_point["y"], of_point.get("likelihood", -1))
-            for bodypart, of_point in points.items()
-            if {"x", "y"}.issubset(of_point)
-        }
-        for individual, points in numbers.items()
-    }
-    half = next(
-        (
-            bodypart
-            for points in numbers.values()
-            for bodypart, of_point in points.items()
-            if len({"x", "y"}.intersection(of_point)) == 1
-        ),
-        None,
-    )
-    if half is not None:
-        raise ValueError(f"{half!r} has only one of x and y")
-    found = {individual: points for individual, points in found.items() if points}
-    if not found:
+    if not numbers:
         raise ValueError("it has no columns x and y")
+    found: dict[str, dict[str, tuple[int, int, int]]] = {}
+    for name, points in numbers.items():
+        found[name] = {}
+        for bodypart, of_point in points.items():
+            if not {"x", "y"}.issubset(of_point):
+                raise ValueError(f"{bodypart!r} has no x or no y")
+            found[name][bodypart] = (
+                of_point["x"],
+                of_point["y"],
+                of_point.get("likelihood", -1),
+            )
     return found
 
 

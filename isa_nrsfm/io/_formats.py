@@ -78,6 +78,8 @@ class LandmarkFormat:
 
         Raises
         ------
+        ValueError
+            If it is an HDF5 file that is damaged.
         OSError
             If the file cannot be opened.
         """

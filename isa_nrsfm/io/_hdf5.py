@@ -14,10 +14,10 @@ def is_hdf5(path: Path) -> bool:
 
 
 def root_groups(path: Path) -> set[str]:
-    """Return the names at the root of an HDF5 file; none where it is damaged."""
+    """Return the names at the root of an HDF5 file, or raise where it is damaged."""
     h5py = import_optional("h5py", extra="h5")
     try:
         with h5py.File(path, "r") as file:
             return set(file)
-    except (OSError, RuntimeError, ValueError):
-        return set()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{path} is a damaged HDF5 file: {error}") from error

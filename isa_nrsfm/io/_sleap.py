@@ -85,8 +85,6 @@ def _read_h5(path: Path) -> Landmarks:
             tracks = _ordered(stored, dims, _DIMS)
             scores = _scores(file, "point_scores", dims, tracks.shape[:3])
             of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
-    except FileNotFoundError:
-        raise
     except ValueError:
         raise
     except Exception as error:  # h5py has errors of many kinds for damaged files
