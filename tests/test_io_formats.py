@@ -116,6 +116,11 @@ def test_openface_keeps_what_it_says_of_frames(tmp_path):
     path = files.write_openface(
         tmp_path / "a.csv", TRACKS, success=success, confidence=confidence
     )
+    lines = path.read_text().splitlines()
+    for number, text in ((TRACKS[1, 2, 0], "inf"), (TRACKS[1, 3, 0], "-nan(ind)")):
+        assert f",{number}," in lines[2]
+        lines[2] = lines[2].replace(f",{number},", f",{text},")
+    path.write_text("\n".join(lines) + "\n")
     landmarks = read_landmarks(path)
     np.testing.assert_array_equal(landmarks.failed, success == 0)
     points = tracks_of(landmarks)

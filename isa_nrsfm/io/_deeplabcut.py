@@ -118,7 +118,8 @@ def _read_h5(path: Path) -> _Table:
     pd = import_optional("pandas", extra="io")
     import_optional("tables", extra="h5")
     try:
-        frame = pd.read_hdf(path, key=_KEY)
+        with pd.HDFStore(path, mode="r") as store:
+            frame = store.get(_KEY)
     except Exception as error:  # PyTables, HDF5 and pickle have errors of many kinds
         raise ValueError(f"pandas cannot read {_KEY!r} in it: {error}") from error
     n_levels = getattr(getattr(frame, "columns", None), "nlevels", 0)

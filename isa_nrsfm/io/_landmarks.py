@@ -111,6 +111,10 @@ def assemble(
         raise ValueError("there are no frames in it")
     if columns is None:
         columns = [f"{name}_{axis}" for name in point_names for axis in "xy"]
+    lost = np.asarray(np.isnan(tracks).all(axis=(1, 2)))
+    if failed is not None:
+        lost |= failed
+        tracks = np.where(lost[:, None, None], np.nan, tracks)
     infinite = np.isinf(tracks)
     if infinite.any():
         frame, point, axis = (int(i) for i in np.argwhere(infinite)[0])
@@ -121,10 +125,6 @@ def assemble(
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"two columns are called {twice!r}")
-    lost = np.asarray(np.isnan(tracks).all(axis=(1, 2)))
-    if failed is not None:
-        lost |= failed
-        tracks = np.where(lost[:, None, None], np.nan, tracks)
     return Landmarks(
         points=pd.DataFrame(
             tracks.reshape(n_frames, 2 * n_points), columns=list(columns)
