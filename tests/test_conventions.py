@@ -25,7 +25,6 @@ OPTIONAL = [
     "pooch",
     "pyarrow",
     "skops",
-    "tables",
 ]
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [

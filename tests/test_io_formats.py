@@ -315,6 +315,16 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
         read_landmarks(tmp_path / "a.csv", min_confidence=0.5)
 
 
+def test_h5_files_run_no_code(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_deeplabcut(tmp_path / "a.h5", FRAME)
+    with h5py.File(path, "a") as file:
+        call = b"cbuiltins\nexec\n(Vraise SystemExit\ntR."
+        file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(call)
+    with pytest.raises(ValueError, match=r"builtins\.exec is not allowed"):
+        read_landmarks(path)
+
+
 @pytest.mark.parametrize("name", ["a.csv", "a.h5"])
 def test_further_columns_of_lightning_pose_are_left_aside(name, tmp_path):
     frame = FRAME.copy()
@@ -707,6 +717,11 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
     assert list(landmarks.frames["individual"][:2]) == ["id_0", "id_1"]
     np.testing.assert_allclose(landmarks.frames["time"][:3], [0, 0, 1 / 30])
     assert landmarks.confidence.iloc[0, 1] == pytest.approx(2 / 191)
+    swapped = movement_dataset(plural, order)
+    swapped["position"].coords["space"].values = np.array(["y", "x"])
+    np.testing.assert_array_equal(
+        tracks_of(from_movement(swapped))[..., ::-1], tracks_of(landmarks)
+    )
     one = from_movement(movement_dataset(plural, order), individual="id_1")
     np.testing.assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
     assert list(np.flatnonzero(one.failed)) == [3]

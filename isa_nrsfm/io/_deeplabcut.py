@@ -3,10 +3,9 @@
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
@@ -17,6 +16,7 @@ from isa_nrsfm.io._landmarks import (
     name_individuals,
 )
 from isa_nrsfm.io._separated_values import header_rows, read_columns
+from isa_nrsfm.io._stored_frames import StoredFrame, read_stored_frame
 
 _LEVELS = ["scorer", "bodyparts", "coords"]
 _LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
@@ -25,14 +25,6 @@ _COORDS = ("x", "y", "z", "likelihood")
 _KEY = "df_with_missing"
 # The individual to which points belong that are not of an animal.
 _UNIQUE = "single"
-
-
-class _Table(NamedTuple):
-    """Values (n_frames, n_columns), their columns by the levels, labels of the rows."""
-
-    values: NDArray[np.float64]
-    columns: list[tuple[str, ...]]
-    labels: list[Any]
 
 
 def is_deeplabcut(path: Path) -> bool:
@@ -79,7 +71,7 @@ def read_deeplabcut(path: Path) -> Landmarks:
     )
 
 
-def _read_csv(path: Path) -> _Table:
+def _read_csv(path: Path) -> StoredFrame:
     """Read a csv file, whose first lines are the levels of the columns."""
     header = header_rows(path, 4)
     levels = _levels_of(header)
@@ -106,39 +98,22 @@ def _read_csv(path: Path) -> _Table:
         names=names,
     )
     cells = frame.iloc[:, :n_index].fillna("").to_numpy()
-    return _Table(
+    return StoredFrame(
         frame.iloc[:, n_index:].to_numpy(dtype=np.float64),
         [columns[i] for i in numbers],
         ["/".join(row) for row in cells],
     )
 
 
-def _read_h5(path: Path) -> _Table:
+def _read_h5(path: Path) -> StoredFrame:
     """Read the table that pandas has stored in an h5 file."""
-    pd = import_optional("pandas", extra="io")
-    import_optional("tables", extra="h5")
-    try:
-        with pd.HDFStore(path, mode="r") as store:
-            frame = store.get(_KEY)
-    except Exception as error:  # PyTables, HDF5 and pickle have errors of many kinds
-        raise ValueError(f"pandas cannot read {_KEY!r} in it: {error}") from error
-    n_levels = getattr(getattr(frame, "columns", None), "nlevels", 0)
-    if n_levels not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
-        raise ValueError(
-            f"the columns should have the levels {', '.join(_LEVELS_OF_MANY)}; got "
-            f"{n_levels} levels"
-        )
-    frame = frame.loc[:, frame.columns.get_level_values(-1).isin(_COORDS)]
-    try:
-        values = frame.to_numpy(dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"its columns do not hold numbers: {error}") from error
-    columns = [tuple(map(str, column)) for column in frame.columns]
-    index = [
-        "/".join(map(str, label)) if isinstance(label, tuple) else label
-        for label in frame.index
-    ]
-    return _Table(values, columns, index)
+    values, columns, labels = read_stored_frame(path, _KEY)
+    numbers = [i for i, column in enumerate(columns) if column[-1] in _COORDS]
+    columns = [columns[i] for i in numbers]
+    for column in columns:
+        if len(column) not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
+            raise ValueError(f"its columns have {len(column)} levels")
+    return StoredFrame(values[:, numbers], columns, labels)
 
 
 def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
