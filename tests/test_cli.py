@@ -544,7 +544,8 @@ def test_bad_tables_are_refused_in_one_line(fails, run, table, faces, tmp_path):
     absent = tmp_path / "absent.csv"
     assert f"{absent}: No such file" in fails("fit", absent, *folder)
     (tmp_path / "folder.csv").mkdir()
-    assert "Is a directory" in fails("fit", tmp_path / "folder.csv", *folder)
+    message = fails("fit", tmp_path / "folder.csv", *folder)
+    assert "folder.csv is of no known format. Expected pts" in message
     (tmp_path / "ragged.csv").write_text("x0,y0\n1\n")
     assert "line 2" in fails("fit", tmp_path / "ragged.csv", *folder)
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")

@@ -17,7 +17,15 @@ import isa_nrsfm
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks"]
-OPTIONAL = ["matplotlib", "pandas", "polars", "pooch", "pyarrow", "skops"]
+OPTIONAL = [
+    "h5py",
+    "matplotlib",
+    "pandas",
+    "polars",
+    "pooch",
+    "pyarrow",
+    "skops",
+]
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [
     "isa_nrsfm",

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._frame_fit import FrameFit
@@ -41,7 +42,14 @@ from isa_nrsfm.cli._report import (
     table_report,
     versions,
 )
-from isa_nrsfm.io import load_model, read_table, write_table
+from isa_nrsfm.io import (
+    FORMATS,
+    find_format,
+    load_model,
+    read_landmarks,
+    read_table,
+    write_table,
+)
 from isa_nrsfm.io._tables import table_suffix
 
 if TYPE_CHECKING:
@@ -117,7 +125,7 @@ def fit_table(
     report = {
         "command": "fit",
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "table": table_report(args.table, frames),
+        "table": table_report(args.table, args.format, frames),
         **({} if choice is None else {"choice": choice}),
         "model": model,
         **{name: compute(estimator, X) for name, compute in extra.items()},
@@ -156,7 +164,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
 
-    table = table_report(args.table, frames)
+    table = table_report(args.table, args.format, frames)
     title = f"{n_components} coefficients of {n_frames} frames"
     sections = {
         "Table": table_lines(table, unusable="without coefficients"),
@@ -169,28 +177,80 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
 
 def _read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
-    table = read_table(args.table)
-    columns = (
-        find_landmark_columns(table.columns, args.columns)
-        if estimator is None
-        else _columns_of_model(estimator, table, args.columns)
-    )
-    return choose_frames(
+    args.format = _format(args)
+    table, chosen, failed = _read(args)
+    if estimator is not None:
+        columns = _columns_of_model(estimator, table, chosen)
+    else:
+        columns = chosen or find_landmark_columns(table.columns)
+    frames = choose_frames(
         table,
         columns,
         rules=args.skip_rows,
         zeros_missing=args.zeros_missing,
+        failed=failed,
     )
+    # A format says itself which of its columns are landmarks.
+    return frames if failed is None else frames._replace(not_used={})
+
+
+def _format(args: Namespace) -> str:
+    """Return the format of the table, and refuse options of another one."""
+    found = args.format
+    if found == "auto":
+        found = "table" if args.columns is not None else find_format(args.table)
+    if args.columns is not None and found != "table":
+        raise ValueError(f"--columns is for --format table; got --format {found}")
+    if args.image_size is not None and "image_size" not in FORMATS[found].options:
+        raise ValueError(
+            f"--image-size is for --format mediapipe; {args.table} is of format {found}"
+        )
+    if args.min_confidence is not None and found == "table":
+        raise ValueError(
+            f"--min-confidence: {args.table} is of format table, which has no "
+            "confidences"
+        )
+    return found
+
+
+def _read(
+    args: Namespace,
+) -> "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None]":
+    """Return the table, its landmark columns and its failed rows, where known."""
+    if args.format == "table":
+        table = read_table(args.table)
+        if args.columns is None:
+            return table, None, None
+        return table, find_landmark_columns(table.columns, args.columns), None
+    pd = import_optional("pandas", extra="io")
+    options = {} if args.image_size is None else {"image_size": args.image_size}
+    found = read_landmarks(
+        args.table, args.format, min_confidence=args.min_confidence, **options
+    )
+    table = pd.concat([found.frames, found.points], axis=1)
+    names = tuple(found.points)
+    columns = LandmarkColumns(
+        pattern=f"those of {args.format}",
+        points=found.point_names,
+        x=names[::2],
+        y=names[1::2],
+        z=(),
+        gaps=(),
+    )
+    return table, columns, found.failed
 
 
 def _columns_of_model(
-    estimator: AffineNRSfM, table: "pd.DataFrame", columns: str | None
+    estimator: AffineNRSfM, table: "pd.DataFrame", chosen: LandmarkColumns | None
 ) -> LandmarkColumns:
-    """Return the columns of the points that a model was fitted to."""
+    """Return the columns of the points that a model was fitted to.
+
+    ``chosen`` are the landmarks of the table where more than their names tells them.
+    """
     fitted = getattr(estimator, "feature_names_in_", None)
     n_points = len(estimator.mean_shape_)
     if fitted is None:
-        found = find_landmark_columns(table.columns, columns)
+        found = chosen or find_landmark_columns(table.columns)
         if len(found.points) != n_points:
             raise ValueError(
                 f"the model has {n_points} points, the table has {len(found.points)} "
@@ -203,18 +263,18 @@ def _columns_of_model(
     x, y = tracks if estimator.layout == "planar" else tracks.T
     wanted = {*x, *y}
     in_table = {str(name).strip(): name for name in table.columns}
-    # Columns that are coordinates or, where they are named, the chosen ones.
+    # Columns that are coordinates or, where there are such, the chosen ones.
     candidates = (
         [name for name in table.columns if parse_coordinate(name) is not None]
-        if columns is None
-        else find_landmark_columns(table.columns, columns).interleaved
+        if chosen is None
+        else chosen.interleaved
     )
     coordinates = {str(name).strip(): name for name in candidates}
-    present = in_table if columns is None else coordinates
+    present = in_table if chosen is None else coordinates
     absent = [name for point in zip(x, y, strict=True) for name in point]
     absent = [name for name in absent if name not in present]
     surplus = [name for name in coordinates if name not in wanted]
-    if absent or (surplus and columns is not None):
+    if absent or (surplus and chosen is not None):
         differences = [
             f"{len(names)} columns are only in the {where} ({_shortened(names)})"
             for names, where in ((absent, "model"), (surplus, "table"))

@@ -29,7 +29,15 @@ _OPTIONS = {
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
 }
-_TABLE_OPTIONS = ("columns", "skip_rows", "zeros_missing", "label")
+_TABLE_OPTIONS = (
+    "format",
+    "columns",
+    "skip_rows",
+    "zeros_missing",
+    "min_confidence",
+    "image_size",
+    "label",
+)
 
 
 def run_export(args: Namespace) -> str:
@@ -101,7 +109,7 @@ def _options(args: Namespace, content: str) -> dict[str, Any]:
             )
     if args.table is None:
         for name in _TABLE_OPTIONS:
-            if getattr(args, name):
+            if getattr(args, name) not in (None, [], False, "auto"):
                 raise ValueError(f"--{name.replace('_', '-')} needs a TABLE")
     return {name: given[name] for name in given if name not in ("table", "label")}
 
@@ -111,7 +119,7 @@ def _table_options(
 ) -> dict[str, Any]:
     """Read the table that the viewer shows, and its labels."""
     frames = _read_frames(args, estimator)
-    report = table_report(args.table, frames)
+    report = table_report(args.table, args.format, frames)
     sections["Table"] = table_lines(report, unusable="not shown")
     options = {"X": _as_fitted(estimator, frames.points[frames.usable])}
     if args.label is not None:

@@ -56,8 +56,12 @@ def choose_frames(
     *,
     rules: Sequence[RowRule],
     zeros_missing: bool,
+    failed: NDArray[np.bool_] | None = None,
 ) -> Frames:
-    """Apply the rules for rows, take the landmarks, and look for unusable frames."""
+    """Apply the rules for rows, take the landmarks, and look for unusable frames.
+
+    ``failed`` tells in which rows of the table tracking failed, where that is known.
+    """
     pd = import_optional("pandas", extra="io")
     kept = np.ones(len(table), dtype=bool)
     left_out = []
@@ -86,7 +90,9 @@ def choose_frames(
     usable = usable_frames(tracks)
     left_out += [
         LeftOut(reason, rows[which], skipped=False)
-        for reason, which in _reasons(tracks, usable)
+        for reason, which in _reasons(
+            tracks, usable, None if failed is None else failed[rows]
+        )
     ]
     if not zeros_missing:
         _warn_of_zeros(tracks[usable])
@@ -105,15 +111,23 @@ def choose_frames(
 
 
 def _reasons(
-    tracks: NDArray[np.float64], usable: NDArray[np.bool_]
+    tracks: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    failed: NDArray[np.bool_] | None,
 ) -> list[tuple[str, NDArray[np.bool_]]]:
     """Tell in which frames what is the matter, each with one reason."""
     report = report_frames(tracks)
     n_seen = report.n_seen
     few = n_seen < FEWEST_POINTS
     in_one_place = report.in_one_place & ~few
+    none: list[tuple[str, NDArray[np.bool_]]] = [("all points missing", n_seen == 0)]
+    if failed is not None:
+        none = [
+            ("tracking failed", failed),
+            ("all points missing or unsure", (n_seen == 0) & ~failed),
+        ]
     return [
-        ("all points missing", n_seen == 0),
+        *none,
         (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
         ("all points in one place", in_one_place),
         ("points on one line, others missing", ~usable & ~few & ~in_one_place),

@@ -9,6 +9,7 @@ from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._independent_gauge import INDEPENDENCE
 from isa_nrsfm._robust import LOSSES
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
+from isa_nrsfm.io import FORMATS
 
 PROGRAM = "isa-nrsfm"
 # A range of more numbers of basis shapes is a mistake.
@@ -30,7 +31,9 @@ examples:
       the shapes for other programs
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
-such as x0, y0 or nose_x, nose_y; all other columns are kept beside the results."""
+such as x0, y0 or nose_x, nose_y; all other columns are kept beside the results. Files
+of OpenFace, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO, WFLW, and folders of .pts
+files, are recognised, too."""
 
 _FIT_EXAMPLES = """\
 examples:
@@ -38,8 +41,8 @@ examples:
   isa-nrsfm fit faces.csv --n-components 1-12 --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
-  isa-nrsfm fit openface.csv --columns 'x_#,y_#' --skip-rows 'success=^0' \\
-      --n-components 5 --output results
+  isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
+  isa-nrsfm fit 300W/01_Indoor --n-components 5 --output results
 
 Cells of missing points are empty. Rows that show too few points for a fit are counted
 and get empty coefficients. Files of an earlier run in the output folder are
@@ -148,8 +151,17 @@ def _add_table_options(
         metavar="TABLE",
         type=_path,
         nargs=None if required else "?",
-        help="a .csv, .tsv or .parquet file"
-        + ("" if required else " with the frames that the viewer shows"),
+        help="a .csv, .tsv or .parquet file, or a file or folder of another format"
+        + ("" if required else ", with the frames that the viewer shows"),
+    )
+    group.add_argument(
+        "--format",
+        choices=["auto", *FORMATS],
+        default="auto",
+        metavar="FORMAT",
+        help="what has written the table: "
+        f"{', '.join(name for name in FORMATS if name != 'table')}, or table for any "
+        "with named columns (default: auto, the one whose files begin like this one)",
     )
     group.add_argument(
         "--columns",
@@ -171,6 +183,20 @@ def _add_table_options(
         "--zeros-missing",
         action="store_true",
         help="points at exactly (0, 0) are missing",
+    )
+    group.add_argument(
+        "--min-confidence",
+        metavar="NUMBER",
+        type=float,
+        help="points with a lower confidence are missing, in the scale of the program "
+        "that has written the table",
+    )
+    group.add_argument(
+        "--image-size",
+        metavar="WIDTHxHEIGHT",
+        type=_image_size,
+        help="size of the images in pixels, such as 1920x1080, for the coordinates of "
+        "MediaPipe, which are shares of it",
     )
 
 
@@ -285,6 +311,16 @@ def _path(text: str) -> str:
     if not text.strip():
         raise argparse.ArgumentTypeError("expected a path; got an empty text")
     return text
+
+
+def _image_size(text: str) -> tuple[int, int]:
+    """Read WIDTHxHEIGHT."""
+    match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
+    if match is None:
+        raise argparse.ArgumentTypeError(
+            f"expected WIDTHxHEIGHT, such as 1920x1080; got {text!r}"
+        )
+    return int(match[1]), int(match[2])
 
 
 def _row_rule(text: str) -> RowRule:

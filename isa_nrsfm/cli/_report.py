@@ -13,6 +13,7 @@ from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
+from isa_nrsfm.io import FORMATS
 from isa_nrsfm.metrics import inverse_snr
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
@@ -20,10 +21,11 @@ _LABEL_WIDTH = 11
 _MOST_ROWS = 10
 
 
-def table_report(path: str, frames: Frames) -> dict[str, Any]:
+def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
     """Describe the table and which of its rows and columns are used."""
     return {
         "path": str(Path(path).resolve()),
+        "format": format,
         "n_rows": frames.n_rows,
         "n_frames": int(np.count_nonzero(frames.usable)),
         "n_points": len(frames.columns.points),
@@ -161,8 +163,9 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
 def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
     """Say which rows and columns of a table are used, and what becomes of the rest."""
     first, last = table["first_columns"], table["last_columns"]
+    format = table["format"]
     lines = [
-        table["path"],
+        table["path"] + ("" if format == "table" else f" ({FORMATS[format].title})"),
         f"{table['n_points']} points in the columns {', '.join(first)}, ..., "
         + ", ".join(last),
     ]

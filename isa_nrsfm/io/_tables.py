@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _SEPARATORS = {".csv": ",", ".tsv": "\t"}
+TABLE_SUFFIXES = (*_SEPARATORS, ".parquet")
 _MISSING = ("", "na", "nan", "n/a", "null", "none")
 
 
@@ -191,7 +192,7 @@ def landmark_table(
 def table_suffix(path: "str | os.PathLike[str]") -> str:
     """Return the suffix of a table's file, or raise if it is none of a table."""
     suffix = Path(path).suffix
-    if suffix.lower() not in (*_SEPARATORS, ".parquet"):
+    if suffix.lower() not in TABLE_SUFFIXES:
         raise ValueError(
             f"{path}: a table is a .csv, .tsv or .parquet file; got {suffix!r}"
         )

@@ -1,0 +1,172 @@
+"""Read annotations of face images: iBUG .pts files and the lists of WFLW."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
+from isa_nrsfm.io._separated_values import first_lines
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_PTS = re.compile(
+    r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
+    r"\{(?P<points>[^{}]*)\}\s*"
+)
+_N_WFLW = 98
+_WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
+_WFLW_ATTRIBUTES = (
+    "pose",
+    "expression",
+    "illumination",
+    "make_up",
+    "occlusion",
+    "blur",
+)
+# Points and the image, without and with the box and the attributes.
+_WFLW_LENGTHS = (
+    2 * _N_WFLW + 1,
+    2 * _N_WFLW + len(_WFLW_BOX) + len(_WFLW_ATTRIBUTES) + 1,
+)
+
+
+def is_pts(path: Path) -> bool:
+    """Tell whether a file begins as .pts files do, or a folder has such files."""
+    if path.is_dir():
+        return any(_is_pts_name(file) for file in path.iterdir())
+    return "".join(first_lines(path, 1)).lstrip().startswith("version")
+
+
+def read_pts(path: Path) -> Landmarks:
+    """
+    Read a .pts file, or all of a folder in the order of their names.
+
+    A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
+    braces, a line ``x y`` for each point. Other files of the folder, such as the
+    images, and folders in it do not count. Coordinates are as they are written; iBUG
+    counts pixels from 1.
+    """
+    pd = import_optional("pandas", extra="io")
+    files = [path]
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if _is_pts_name(file))
+        if not files:
+            raise ValueError("there are no .pts files in the folder")
+    tracks = []
+    for file in files:
+        try:
+            tracks.append(_points_of(file.read_bytes().decode("utf-8-sig")))
+        except ValueError as error:
+            raise ValueError(f"{file.name}: {error}") from error
+        if len(tracks[-1]) != len(tracks[0]):
+            raise ValueError(
+                f"{files[0].name} has {len(tracks[0])} points, {file.name} has "
+                f"{len(tracks[-1])}: all files must have the same number"
+            )
+    return _numbered(
+        np.stack(tracks), pd.DataFrame({"file": [file.name for file in files]}), "pts"
+    )
+
+
+def is_wflw(path: Path) -> bool:
+    """Tell whether the first line has the fields of a WFLW list."""
+    fields = "".join(first_lines(path, 1)).split()
+    if len(fields) not in _WFLW_LENGTHS:
+        return False
+    try:
+        _floats(fields[: 2 * _N_WFLW])
+    except ValueError:
+        return False
+    return True
+
+
+def read_wflw(path: Path) -> Landmarks:
+    """
+    Read a list of WFLW, with a line for each face.
+
+    A line has 196 coordinates, x and y in turn, the box of the face (``x_min y_min
+    x_max y_max``), six attributes that are 0 or 1 (pose, expression, illumination,
+    make-up, occlusion, blur) and the name of the image. Lists without box and
+    attributes are read, too.
+    """
+    pd = import_optional("pandas", extra="io")
+    rows, images = [], []
+    n_fields = None
+    with path.open(encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, start=1):
+            fields = line.split()
+            if not fields:
+                continue
+            n_fields = n_fields or len(fields)
+            if len(fields) not in _WFLW_LENGTHS or len(fields) != n_fields:
+                raise ValueError(
+                    f"line {number} has {len(fields)} fields; all must have "
+                    f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
+                )
+            try:
+                rows.append(_floats(fields[:-1]))
+            except ValueError as error:
+                raise ValueError(f"line {number}: {error}") from error
+            images.append(fields[-1])
+    if not rows:
+        raise ValueError("there are no lines in it")
+    values = np.stack(rows)
+    frames = pd.DataFrame({"image": images})
+    points, rest = values[:, : 2 * _N_WFLW], values[:, 2 * _N_WFLW :]
+    if n_fields == _WFLW_LENGTHS[1]:
+        box, attributes = rest[:, : len(_WFLW_BOX)], rest[:, len(_WFLW_BOX) :]
+        if not np.isin(attributes, (0, 1)).all():
+            raise ValueError("the six attributes before the image must be 0 or 1")
+        frames[list(_WFLW_BOX)] = box
+        frames[list(_WFLW_ATTRIBUTES)] = attributes.astype(int)
+    return _numbered(points.reshape(-1, _N_WFLW, 2), frames, "wflw")
+
+
+def _is_pts_name(file: Path) -> bool:
+    """Tell whether a file in a folder is one of points; hidden ones are not."""
+    return file.suffix.lower() == ".pts" and not file.name.startswith(".")
+
+
+def _points_of(text: str) -> NDArray[np.float64]:
+    """Return the points (n_points, 2) that a .pts file holds."""
+    match = _PTS.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            "expected 'version: 1', 'n_points: N' and N lines 'x y' between braces; "
+            f"got {text[:40]!r}"
+        )
+    coordinates = _floats(match["points"].split())
+    n_points = int(match["n_points"])
+    if len(coordinates) != 2 * n_points or n_points == 0:
+        raise ValueError(
+            f"n_points is {n_points}, but there are {len(coordinates)} coordinates"
+        )
+    return coordinates.reshape(n_points, 2)
+
+
+def _floats(fields: list[str]) -> NDArray[np.float64]:
+    """Return the numbers that fields hold."""
+    # Python reads 1_0 as a number.
+    bad = next((field for field in fields if "_" in field), None)
+    if bad is not None:
+        raise ValueError(f"a coordinate should be a number; got {bad!r}")
+    return np.array(fields, dtype=np.float64)
+
+
+def _numbered(
+    tracks: NDArray[np.float64], frames: "pd.DataFrame", format: str
+) -> Landmarks:
+    """Return landmarks whose points have numbers only."""
+    n_points = tracks.shape[1]
+    return assemble(
+        tracks,
+        [str(j) for j in range(n_points)],
+        frames,
+        format=format,
+        columns=numbered_columns(n_points),
+    )

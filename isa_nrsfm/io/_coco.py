@@ -1,0 +1,208 @@
+"""Read the keypoints of COCO json files."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
+
+# What is said of an instance, beside its image and its points.
+_OF_INSTANCE = ("id", "score", "iscrowd", "area")
+_OF_IMAGE = ("file_name", "width", "height")
+
+
+class _Instances(NamedTuple):
+    """Objects with keypoints (n_instances, n_points, 3), and images without any."""
+
+    entries: list[dict[str, Any]]
+    values: NDArray[np.float64]
+    point_names: tuple[str, ...] | None
+    images: dict[Any, dict[str, Any]]
+    empty_images: list[Any]
+
+
+def is_coco(path: Path) -> bool:
+    """Tell whether a file begins as a json object or list."""
+    with path.open("rb") as file:
+        return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
+
+
+def read_coco(path: Path, category: str | None = None) -> Landmarks:
+    """
+    Read keypoints of COCO, annotations or results of a detector.
+
+    Annotations are an object with ``images``, ``annotations`` and ``categories``; the
+    third number of a keypoint is 0 where it is not labelled, 1 where it is hidden and 2
+    where it is visible. Results are a list of objects with ``image_id``,
+    ``category_id``, ``keypoints`` and ``score``; the third number is a confidence. Each
+    instance has a row, and each image without any has one without points. Of several
+    categories with different keypoints, ``category`` names the one to read.
+    """
+    pd = import_optional("pandas", extra="io")
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            content = json.load(file)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"it is not json: {error}") from error
+    if isinstance(content, list):
+        if category is not None:
+            raise ValueError("results of a detector do not name their categories")
+        found = _results(content)
+    else:
+        found = _annotations(content, category)
+    third = found.values[:, :, 2]
+    tracks = found.values[:, :, :2].copy()
+    # Detectors that find no point write zeros, as annotators do.
+    unseen = third == 0 if found.point_names else (found.values == 0).all(axis=2)
+    tracks[unseen] = np.nan
+    n_empty = len(found.empty_images)
+    tracks = np.concatenate([tracks, np.full((n_empty, *tracks.shape[1:]), np.nan)])
+    confidence = None
+    if found.point_names is None:
+        confidence = third
+    n_points = tracks.shape[1]
+    return assemble(
+        tracks,
+        found.point_names or [str(j) for j in range(n_points)],
+        pd.DataFrame(_descriptions(found)),
+        format="coco",
+        columns=None if found.point_names else numbered_columns(n_points),
+        confidence=confidence,
+    )
+
+
+def _results(entries: list[Any]) -> _Instances:
+    """Return what a list of results holds."""
+    _refuse_non_objects(entries, "results")
+    categories = {json.dumps(entry.get("category_id")) for entry in entries}
+    if len(categories) > 1:
+        raise ValueError(
+            "the results are of more than one category_id: "
+            f"{', '.join(sorted(categories))}"
+        )
+    return _Instances(entries, _keypoints(entries, "result"), None, {}, [])
+
+
+def _annotations(content: Any, category: str | None) -> _Instances:
+    """Return what an object with annotations holds."""
+    if not isinstance(content, dict) or not all(
+        isinstance(content.get(part), list)
+        for part in ("images", "annotations", "categories")
+    ):
+        raise ValueError(
+            "expected an object with the lists images, annotations and categories, or "
+            "a list of results"
+        )
+    for part in ("images", "annotations", "categories"):
+        _refuse_non_objects(content[part], part)
+    chosen, point_names = _chosen_categories(content["categories"], category)
+    images = {}
+    for image in content["images"]:
+        if not isinstance(image.get("id"), int | str):
+            raise ValueError("each of the images needs an id")
+        images[image["id"]] = image
+    entries = []
+    shown = set()
+    for entry in content["annotations"]:
+        where = entry.get("image_id")
+        if not isinstance(where, int | str) or where not in images:
+            raise ValueError(
+                f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
+                "among the images"
+            )
+        of = entry.get("category_id")
+        if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
+            entries.append({**entry, "category": chosen[of]})
+            shown.add(where)
+    order = {image: i for i, image in enumerate(images)}
+    entries.sort(key=lambda entry: order[entry["image_id"]])
+    values = _keypoints(entries, "annotation", len(point_names))
+    empty = [image for image in images if image not in shown]
+    return _Instances(entries, values, point_names, images, empty)
+
+
+def _chosen_categories(
+    categories: list[dict[str, Any]], name: str | None
+) -> tuple[dict[int | str, str], tuple[str, ...]]:
+    """Return names of the categories to read by id, and their common keypoints."""
+    with_points = [entry for entry in categories if entry.get("keypoints")]
+    names = [str(entry.get("name")) for entry in with_points]
+    if name is not None:
+        with_points = [e for e in with_points if str(e.get("name")) == name]
+    if not with_points:
+        raise ValueError(
+            "no category has keypoints"
+            if not names
+            else f"no category {name!r} has keypoints; there are {', '.join(names)}"
+        )
+    for entry in with_points:
+        points = entry["keypoints"]
+        if not isinstance(points, list) or not all(isinstance(p, str) for p in points):
+            raise ValueError("the keypoints of a category must be a list of names")
+        if points != with_points[0]["keypoints"]:
+            raise ValueError(
+                f"the categories {', '.join(names)} have different keypoints: choose "
+                "one with category"
+            )
+        if not isinstance(entry.get("id"), int | str):
+            raise ValueError("each of the categories needs an id")
+    chosen = {entry["id"]: str(entry.get("name")) for entry in with_points}
+    return chosen, tuple(with_points[0]["keypoints"])
+
+
+def _keypoints(
+    entries: Sequence[dict[str, Any]], what: str, n_points: int | None = None
+) -> NDArray[np.float64]:
+    """Return the keypoints of instances, (n_instances, n_points, 3)."""
+    for number, entry in enumerate(entries):
+        numbers = entry.get("keypoints")
+        if not isinstance(numbers, list) or not all(
+            type(value) in (int, float) for value in numbers
+        ):
+            raise ValueError(
+                f"{what} {number} (counted from 0) should have keypoints, a list of "
+                f"numbers; got {str(numbers)[:40]}"
+            )
+        if n_points is None:
+            n_points = len(numbers) // 3
+        if len(numbers) != 3 * n_points or n_points == 0:
+            raise ValueError(
+                f"{what} {number} (counted from 0) should have {n_points} keypoints of "
+                f"3 numbers; got {len(numbers)} numbers"
+            )
+    try:
+        values = np.array([entry["keypoints"] for entry in entries], dtype=np.float64)
+    except OverflowError as error:
+        raise ValueError(f"a coordinate is too large: {error}") from error
+    return values.reshape(len(entries), n_points or 0, 3)
+
+
+def _descriptions(found: _Instances) -> dict[str, list[Any]]:
+    """Return what is known of each row: image, instance and its scores."""
+    rows = [
+        *found.entries,
+        *({"image_id": image} for image in found.empty_images),
+    ]
+    of_image = [found.images.get(row.get("image_id"), {}) for row in rows]
+    columns = {"image_id": [row.get("image_id") for row in rows]}
+    columns |= {
+        name: [image.get(name) for image in of_image]
+        for name in _OF_IMAGE
+        if any(name in image for image in of_image)
+    }
+    return columns | {
+        "annotation_id" if name == "id" else name: [row.get(name) for row in rows]
+        for name in (*_OF_INSTANCE, "category")
+        if any(name in row for row in found.entries)
+    }
+
+
+def _refuse_non_objects(entries: list[Any], what: str) -> None:
+    """Raise if a list has something else than objects."""
+    if not all(isinstance(entry, dict) for entry in entries):
+        raise ValueError(f"all {what} must be objects")

@@ -1,0 +1,187 @@
+"""Read the csv and h5 files of DeepLabCut, which Lightning Pose writes, too."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
+from isa_nrsfm.io._landmarks import (
+    Landmarks,
+    assemble,
+    each_individual,
+    name_individuals,
+)
+from isa_nrsfm.io._separated_values import header_rows, read_columns
+from isa_nrsfm.io._stored_frames import StoredFrame, read_stored_frame
+
+_LEVELS = ["scorer", "bodyparts", "coords"]
+_LEVELS_OF_MANY = ["scorer", "individuals", "bodyparts", "coords"]
+# Lightning Pose adds columns of other names, such as set.
+_COORDS = ("x", "y", "z", "likelihood")
+_KEY = "df_with_missing"
+# The individual to which points belong that are not of an animal.
+_UNIQUE = "single"
+
+
+def is_deeplabcut(path: Path) -> bool:
+    """Tell whether the header, or the group of an h5 file, is DeepLabCut's."""
+    if path.suffix.lower() == ".csv":
+        return _levels_of(header_rows(path, 4)) is not None
+    return is_hdf5(path) and _KEY in root_groups(path)
+
+
+def read_deeplabcut(path: Path) -> Landmarks:
+    """
+    Read a csv or h5 file of DeepLabCut or Lightning Pose.
+
+    The columns have the levels ``scorer``, ``individuals`` (only with several animals),
+    ``bodyparts`` and ``coords``, which are ``x``, ``y`` and, but for labels made by
+    hand, ``likelihood``. The index has the number of the frame or the path of the
+    image. The individual "single", to which DeepLabCut gives points that belong to no
+    animal, is left out with a warning where there are others.
+    """
+    pd = import_optional("pandas", extra="io")
+    table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+    scorers = {column[0] for column in table.columns}
+    if len(scorers) > 1:
+        raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
+    places = _places(table.columns)
+    bodyparts = _common_bodyparts(places)
+    individuals = list(places)
+    where = np.array([[places[i][b] for b in bodyparts] for i in individuals])
+    # A column of NaN stands for likelihoods that are not there.
+    values = np.column_stack([table.values, np.full(len(table.values), np.nan)])
+    found = values[:, where]
+    confidence = found[..., 2] if (where[..., 2] >= 0).any() else None
+    rows = each_individual(found[..., :2], confidence)
+    frames = _index_columns(table.labels)
+    frames = {name: [column[i] for i in rows.frame] for name, column in frames.items()}
+    if len(table.columns[0]) == len(_LEVELS_OF_MANY):
+        frames["individual"] = name_individuals(rows.individual, individuals)
+    return assemble(
+        rows.tracks,
+        bodyparts,
+        pd.DataFrame(frames),
+        format="deeplabcut",
+        confidence=rows.confidence,
+    )
+
+
+def _read_csv(path: Path) -> StoredFrame:
+    """Read a csv file, whose first lines are the levels of the columns."""
+    header = header_rows(path, 4)
+    levels = _levels_of(header)
+    if levels is None:
+        raise ValueError(
+            "its first lines do not begin with scorer, bodyparts, coords or with "
+            "scorer, individuals, bodyparts, coords"
+        )
+    header = header[: len(levels)]
+    if len({len(row) for row in header}) > 1:
+        raise ValueError("its first lines are not of the same length")
+    # Labels made by hand have the path of the image in up to three columns.
+    n_index = next(i for i, name in enumerate([*header[-1][1:], "x"], 1) if name)
+    columns = list(zip(*header, strict=True))
+    numbers = [i for i in range(n_index, len(columns)) if columns[i][-1] in _COORDS]
+    index = list(range(n_index))
+    names = [str(i) for i in range(len(columns))]
+    frame = read_columns(
+        path,
+        leave_out=set(names).difference(str(i) for i in (*index, *numbers)),
+        numbers=[str(i) for i in numbers],
+        text=[str(i) for i in index],
+        n_header=len(levels),
+        names=names,
+    )
+    cells = frame.iloc[:, :n_index].fillna("").to_numpy()
+    return StoredFrame(
+        frame.iloc[:, n_index:].to_numpy(dtype=np.float64),
+        [columns[i] for i in numbers],
+        ["/".join(row) for row in cells],
+    )
+
+
+def _read_h5(path: Path) -> StoredFrame:
+    """Read the table that pandas has stored in an h5 file."""
+    values, columns, labels = read_stored_frame(path, _KEY)
+    numbers = [i for i, column in enumerate(columns) if column[-1] in _COORDS]
+    columns = [columns[i] for i in numbers]
+    for column in columns:
+        if len(column) not in (len(_LEVELS), len(_LEVELS_OF_MANY)):
+            raise ValueError(f"its columns have {len(column)} levels")
+    return StoredFrame(values[:, numbers], columns, labels)
+
+
+def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
+    """Return the levels that the first lines of a csv file name, or None."""
+    first = [row[0].strip().lower() if row else "" for row in header]
+    for levels in (_LEVELS, _LEVELS_OF_MANY):
+        if first[: len(levels)] == levels:
+            return levels
+    return None
+
+
+def _places(
+    columns: Sequence[tuple[str, ...]],
+) -> dict[str, dict[str, tuple[int, int, int]]]:
+    """Return the numbers of the x, y and likelihood columns of each point.
+
+    The number is -1 where there is no likelihood.
+    """
+    numbers: dict[str, dict[str, dict[str, int]]] = {}
+    for number, column in enumerate(columns):
+        *individual, bodypart, coord = column[1:]
+        of_point = numbers.setdefault("".join(individual), {}).setdefault(bodypart, {})
+        if coord == "z":
+            raise ValueError(
+                f"{bodypart!r} has a z: these are points in space, not in an image"
+            )
+        if coord in of_point:
+            raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
+        of_point[coord] = number
+    if not numbers:
+        raise ValueError("it has no columns x and y")
+    found: dict[str, dict[str, tuple[int, int, int]]] = {}
+    for name, points in numbers.items():
+        found[name] = {}
+        for bodypart, of_point in points.items():
+            if not {"x", "y"}.issubset(of_point):
+                raise ValueError(f"{bodypart!r} has no x or no y")
+            found[name][bodypart] = (
+                of_point["x"],
+                of_point["y"],
+                of_point.get("likelihood", -1),
+            )
+    return found
+
+
+def _common_bodyparts(places: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the bodyparts that all individuals have; leave unique ones out."""
+    if len(places) > 1 and _UNIQUE in places:
+        others = next(points for name, points in places.items() if name != _UNIQUE)
+        if set(places[_UNIQUE]) != set(others):
+            warnings.warn(
+                f"the points {', '.join(places[_UNIQUE])} belong to no animal "
+                f"(individual {_UNIQUE!r}) and are left out",
+                stacklevel=2,
+            )
+            del places[_UNIQUE]
+    first, points = next(iter(places.items()))
+    for name, other in places.items():
+        if set(other) != set(points):
+            raise ValueError(
+                f"the individuals {first!r} and {name!r} have different bodyparts"
+            )
+    return list(points)
+
+
+def _index_columns(index: list[Any]) -> dict[str, list[Any]]:
+    """Name the index: numbers of frames, or paths of images."""
+    try:
+        return {"frame": [int(label) for label in index]}
+    except (TypeError, ValueError):
+        return {"image": [str(label) for label in index]}

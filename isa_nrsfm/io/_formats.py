@@ -1,0 +1,378 @@
+"""The formats of landmark files, and reading them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from isa_nrsfm._landmark_names import point_names
+from isa_nrsfm.io._annotation_files import is_pts, is_wflw, read_pts, read_wflw
+from isa_nrsfm.io._coco import is_coco, read_coco
+from isa_nrsfm.io._deeplabcut import is_deeplabcut, read_deeplabcut
+from isa_nrsfm.io._face_tables import (
+    is_mesh_table,
+    is_openface,
+    is_pyfeat,
+    read_mesh_table,
+    read_openface,
+    read_pyfeat,
+)
+from isa_nrsfm.io._landmarks import Landmarks, assemble, drop_unsure_points
+from isa_nrsfm.io._sleap import is_sleap, read_sleap
+from isa_nrsfm.io._tables import TABLE_SUFFIXES, landmark_table, read_table
+
+if TYPE_CHECKING:
+    import os
+
+# Stands for a folder where others have the suffix of a file.
+_FOLDER = "/"
+_TABLE = "table"
+
+
+@dataclass(frozen=True)
+class LandmarkFormat:
+    """
+    A format of landmark files.
+
+    Parameters
+    ----------
+    name : str
+        The name to give to `read_landmarks`.
+    title : str
+        Which program or data set it belongs to.
+    expected : str
+        What such a file must have.
+    suffixes : tuple of str
+        Suffixes of its files in lower case; "/" for a folder of files.
+    recognise : callable
+        Tells from the beginning of a file whether it is of the format.
+    parse : callable
+        Reads a file and returns its `Landmarks`, or raises a ValueError that says what
+        is wrong.
+    options : tuple of str
+        Names of the options that `read` takes.
+    """
+
+    name: str
+    title: str
+    expected: str
+    suffixes: tuple[str, ...]
+    recognise: Callable[[Path], bool] = field(repr=False)
+    parse: Callable[..., Landmarks] = field(repr=False)
+    options: tuple[str, ...] = ()
+
+    def matches(self, path: "str | os.PathLike[str]") -> bool:
+        """
+        Tell whether a file looks like one of this format, from its beginning.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file or folder.
+
+        Returns
+        -------
+        bool
+            Whether suffix and beginning are those of the format.
+
+        Raises
+        ------
+        ValueError
+            If it is an HDF5 file that is damaged.
+        OSError
+            If the file cannot be opened.
+        """
+        path = Path(path)
+        return _suffix(path) in self.suffixes and self.recognise(path)
+
+    def read(self, path: "str | os.PathLike[str]", **options: Any) -> Landmarks:
+        """
+        Read a file of this format.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file or folder.
+        **options : dict
+            Those of the format's `options`.
+
+        Returns
+        -------
+        Landmarks
+            The landmarks.
+
+        Raises
+        ------
+        ValueError
+            If the file is not of the format, or the format has no such option. The
+            message has the path and what was expected.
+        OSError
+            If the file cannot be opened.
+        """
+        path = Path(path)
+        unknown = set(options).difference(self.options)
+        if unknown:
+            raise ValueError(
+                f"the format {self.name} has no option {', '.join(sorted(unknown))}; "
+                + (f"it has {', '.join(self.options)}" if self.options else "")
+            )
+        _check_exists(path)
+        if _suffix(path) not in self.suffixes:
+            raise ValueError(
+                f"{path} cannot be read as {self.name} ({self.title}): expected "
+                f"{self.expected}, in {_listed(self.suffixes)}"
+            )
+        try:
+            return self.parse(path, **options)
+        except ValueError as error:
+            raise ValueError(
+                f"{path} cannot be read as {self.name} ({self.title}): {error}. "
+                f"Expected {self.expected}"
+            ) from error
+
+
+def read_landmarks(
+    path: "str | os.PathLike[str]",
+    format: str = "auto",
+    *,
+    min_confidence: float | None = None,
+    **options: Any,
+) -> Landmarks:
+    r"""
+    Read landmarks from a file of one of several formats.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file, or a folder of ``.pts`` files.
+    format : str, default="auto"
+        The format, one of `FORMATS`. With "auto", it is the one whose files begin like
+        this one, which must be a single one. Files of separated values that no other
+        format claims are of format "table".
+    min_confidence : float, optional
+        Points with a lower confidence become NaN, where the format has confidences.
+    **options : dict
+        Options of the format: ``image_size`` (width, height) of "mediapipe", in
+        pixels, for coordinates in shares of the image's size; ``category`` of "coco",
+        the name of the category to read; ``columns`` and ``missing`` of "table", as in
+        `landmark_table`.
+
+    Returns
+    -------
+    Landmarks
+        The landmarks, with what is known of each frame. A frame in which tracking
+        failed is a row of NaN.
+
+    Raises
+    ------
+    ValueError
+        If the file is not of the format, if not exactly one format matches, or if an
+        option or the threshold does not apply. The message has the path and what was
+        expected.
+    OSError
+        If the file cannot be opened.
+
+    See Also
+    --------
+    from_mediapipe : Landmarks from results of MediaPipe.
+    from_movement : Landmarks from datasets of movement.
+    read_table : All columns of a table.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from isa_nrsfm.io import read_landmarks
+    >>> with TemporaryDirectory() as folder:
+    ...     for name, shift in (("a", 0), ("b", 5)):
+    ...         lines = [f"{j + shift} {j * j}" for j in range(3)]
+    ...         head = ["version: 1", "n_points: 3", "{"]
+    ...         path = Path(folder, f"{name}.pts")
+    ...         _ = path.write_text("\n".join([*head, *lines, "}"]))
+    ...     landmarks = read_landmarks(folder)
+    >>> landmarks.format
+    'pts'
+    >>> landmarks.points
+       x_0  y_0  x_1  y_1  x_2  y_2
+    0  0.0  0.0  1.0  1.0  2.0  4.0
+    1  5.0  0.0  6.0  1.0  7.0  4.0
+    >>> list(landmarks.frames["file"])
+    ['a.pts', 'b.pts']
+    """
+    if format != "auto" and format not in FORMATS:
+        raise ValueError(
+            f"format must be auto or one of {', '.join(FORMATS)}; got {format!r}"
+        )
+    name = find_format(path) if format == "auto" else format
+    landmarks = FORMATS[name].read(path, **options)
+    if min_confidence is None:
+        return landmarks
+    try:
+        return drop_unsure_points(landmarks, min_confidence)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def find_format(path: "str | os.PathLike[str]") -> str:
+    """
+    Find the one format that a file is of.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file or folder.
+
+    Returns
+    -------
+    str
+        The name of the format. It is "table" where no other format with files of this
+        suffix matches.
+
+    Raises
+    ------
+    ValueError
+        If no format matches, or more than one.
+    OSError
+        If the file cannot be opened.
+    """
+    path = Path(path)
+    _check_exists(path)
+    possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
+    matching = [
+        found.name for found in possible if found.name != _TABLE and found.matches(path)
+    ]
+    if len(matching) > 1:
+        raise ValueError(
+            f"{path} matches more than one format: {', '.join(matching)}. Choose with "
+            "format (command line: --format)"
+        )
+    if matching:
+        return matching[0]
+    if any(found.name == _TABLE for found in possible):
+        return _TABLE
+    raise ValueError(
+        f"{path} is of no known format. Expected "
+        + "; ".join(
+            f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
+            for found in possible or FORMATS.values()
+        )
+    )
+
+
+def _read_named_columns(
+    path: Path, columns: str | None = None, missing: Any = None
+) -> Landmarks:
+    """Read a table whose landmark columns are recognised by their names."""
+    points, other = landmark_table(read_table(path), columns=columns, missing=missing)
+    return assemble(
+        points.to_numpy().reshape(len(points), -1, 2),
+        point_names(points.columns[::2]),
+        other,
+        format=_TABLE,
+        columns=list(points.columns),
+    )
+
+
+def _suffix(path: Path) -> str:
+    """Return the suffix of a file in lower case, or what stands for a folder."""
+    return _FOLDER if path.is_dir() else path.suffix.lower()
+
+
+def _check_exists(path: Path) -> None:
+    """Raise the error of opening a file where there is none."""
+    if not path.is_dir():
+        with path.open("rb"):
+            pass
+
+
+def _listed(suffixes: tuple[str, ...]) -> str:
+    """Say which files have these suffixes."""
+    words = ["a folder" if suffix == _FOLDER else suffix for suffix in suffixes]
+    return " or ".join(words)
+
+
+_ALL = (
+    LandmarkFormat(
+        "openface",
+        "OpenFace",
+        "the columns frame, timestamp, confidence, success (face, confidence for an "
+        "image), x_0, ... and y_0, ...",
+        (".csv",),
+        is_openface,
+        read_openface,
+    ),
+    LandmarkFormat(
+        "pyfeat",
+        "py-feat",
+        "the columns FaceRectX, FaceRectY, FaceRectWidth, FaceRectHeight, x_0, ... and "
+        "y_0, ...",
+        (".csv",),
+        is_pyfeat,
+        read_pyfeat,
+    ),
+    LandmarkFormat(
+        "mediapipe",
+        "MediaPipe",
+        "named columns x and y of each point (468 or 478, where it is recognised)",
+        (".csv",),
+        is_mesh_table,
+        read_mesh_table,
+        ("image_size",),
+    ),
+    LandmarkFormat(
+        "pts",
+        "iBUG, 300-W",
+        "'version: 1', 'n_points: N' and N lines 'x y' between braces",
+        (".pts", _FOLDER),
+        is_pts,
+        read_pts,
+    ),
+    LandmarkFormat(
+        "wflw",
+        "WFLW lists",
+        "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
+        (".txt",),
+        is_wflw,
+        read_wflw,
+    ),
+    LandmarkFormat(
+        "deeplabcut",
+        "DeepLabCut, Lightning Pose",
+        "columns of the levels scorer, (individuals,) bodyparts, coords",
+        (".csv", ".h5", ".hdf5"),
+        is_deeplabcut,
+        read_deeplabcut,
+    ),
+    LandmarkFormat(
+        "sleap",
+        "SLEAP analysis",
+        "the datasets tracks, node_names and track_names, or the columns track, "
+        "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
+        (".h5", ".hdf5", ".csv"),
+        is_sleap,
+        read_sleap,
+    ),
+    LandmarkFormat(
+        "coco",
+        "COCO keypoints",
+        "images, annotations and categories with keypoints, or a list of results",
+        (".json",),
+        is_coco,
+        read_coco,
+        ("category",),
+    ),
+    LandmarkFormat(
+        _TABLE,
+        "a table with named columns",
+        "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
+        TABLE_SUFFIXES,
+        lambda path: True,
+        _read_named_columns,
+        ("columns", "missing"),
+    ),
+)
+
+FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
+    {found.name: found for found in _ALL}
+)

@@ -1,0 +1,251 @@
+"""Take landmarks out of the objects of other libraries."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._landmarks import (
+    Landmarks,
+    assemble,
+    each_individual,
+    name_individuals,
+    numbered_columns,
+)
+
+_MEDIAPIPE_PARTS = ("face_landmarks", "hand_landmarks", "pose_landmarks")
+# movement named the axes keypoints and individuals in its earlier versions.
+_MOVEMENT_DIMS = {"keypoints": "keypoint", "individuals": "individual"}
+
+
+def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
+    """
+    Take the landmarks out of results of MediaPipe's face, hand or pose landmarker.
+
+    Parameters
+    ----------
+    results : iterable of FaceLandmarkerResult
+        The results of one image each; HandLandmarkerResult and PoseLandmarkerResult
+        will do as well. Any objects with a list ``face_landmarks``, ``hand_landmarks``
+        or ``pose_landmarks`` that has, for each face, a list of objects with ``x`` and
+        ``y`` are taken.
+    image_sizes : array-like of shape (2,) or (n_results, 2)
+        Width and height of all images, or of each, in pixels. MediaPipe gives x in
+        shares of the width and y in shares of the height.
+
+    Returns
+    -------
+    Landmarks
+        The points in pixels, a row for each face (hand, pose), in the order of the
+        results. `frames` has the number of the result and that of the face in it. A
+        result without a face has one row without points. Poses have their visibility
+        as confidence.
+
+    Raises
+    ------
+    ValueError
+        If an object is not such a result, if faces have different numbers of points,
+        or if the sizes are not those of the images.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> from isa_nrsfm.io import from_mediapipe
+    >>> face = [SimpleNamespace(x=0.25, y=0.5), SimpleNamespace(x=0.5, y=0.75)]
+    >>> results = [SimpleNamespace(face_landmarks=[face]),
+    ...            SimpleNamespace(face_landmarks=[])]
+    >>> landmarks = from_mediapipe(results, image_sizes=(640, 480))
+    >>> landmarks.points
+         x_0    y_0    x_1    y_1
+    0  160.0  240.0  320.0  360.0
+    1    NaN    NaN    NaN    NaN
+    >>> landmarks.failed
+    array([False,  True])
+    """
+    pd = import_optional("pandas", extra="io")
+    results = list(results)
+    parts = {part for result in results for part in _parts(result)}
+    if len(parts) > 1:
+        raise ValueError(f"the results are of more than one kind: {sorted(parts)}")
+    sizes = _image_sizes(image_sizes, len(results))
+    tracks, visibility, frame, individual = [], [], [], []
+    for number, result in enumerate(results):
+        found = getattr(result, *parts)
+        for i, landmarks in enumerate(found):
+            points = _shares(landmarks, f"result {number} (counted from 0)")
+            tracks.append(points * sizes[number])
+            visibility.append([getattr(p, "visibility", None) for p in landmarks])
+            frame.append(number)
+            individual.append(i)
+            if len(points) != len(tracks[0]):
+                raise ValueError(
+                    f"the first result has {len(tracks[0])} points, result {number} "
+                    f"(counted from 0) has {len(points)}"
+                )
+        if not found:
+            frame.append(number)
+            individual.append(-1)
+    if not tracks:
+        raise ValueError(f"none of the {len(results)} results has any landmarks")
+    n_points = len(tracks[0])
+    missing = np.array(individual) < 0
+    values = np.full((len(frame), n_points, 2), np.nan)
+    values[~missing] = tracks
+    confidence = None
+    # Faces and hands have no visibility, though some versions say it is zero.
+    if parts == {"pose_landmarks"} and None not in visibility[0]:
+        confidence = np.full(values.shape[:2], np.nan)
+        confidence[~missing] = np.array(visibility, dtype=np.float64)
+    return assemble(
+        values,
+        [str(j) for j in range(n_points)],
+        pd.DataFrame(
+            {
+                "frame": frame,
+                "individual": pd.array(
+                    [None if i < 0 else i for i in individual], dtype="Int64"
+                ),
+            }
+        ),
+        format="mediapipe",
+        columns=numbered_columns(n_points),
+        confidence=confidence,
+    )
+
+
+def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
+    """
+    Take the landmarks out of a dataset of poses of the package movement.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        The poses: ``position`` (time, space, keypoint, individual) and, optionally,
+        ``confidence`` without space. The axes may have any order, and keypoint and
+        individual may be named in the plural, as earlier versions do.
+    individual : str, optional
+        The individual to take. By default all.
+
+    Returns
+    -------
+    Landmarks
+        The points, a row for each individual that a frame shows. `frames` has the
+        number of the frame, its time and the individual. A frame in which nobody is
+        seen has one row without points.
+
+    Raises
+    ------
+    ValueError
+        If the dataset has not these axes, is of points in space, or has no such
+        individual.
+
+    Examples
+    --------
+    >>> from movement import sample_data           # doctest: +SKIP
+    >>> from isa_nrsfm.io import from_movement
+    >>> dataset = sample_data.fetch_dataset(       # doctest: +SKIP
+    ...     "SLEAP_three-mice_Aeon_proofread.analysis.h5")
+    >>> from_movement(dataset).points              # doctest: +SKIP
+    """
+    pd = import_optional("pandas", extra="io")
+    axes = ("time", "individual", "keypoint", "space")
+    position = _by_axes(dataset, "position", axes)
+    space = _names(position, "space")
+    if sorted(space) != ["x", "y"]:
+        raise ValueError(
+            "the positions must be in an image, with space x and y; got "
+            f"{', '.join(space)}"
+        )
+    confidence = None
+    if "confidence" in dataset:
+        found = _by_axes(dataset, "confidence", axes[:3])
+        confidence = np.asarray(found.values, dtype=np.float64)
+    tracks = np.asarray(position.values, dtype=np.float64)
+    tracks = tracks[..., [space.index("x"), space.index("y")]]
+    names = _names(position, "individual")
+    if individual is not None:
+        if individual not in names:
+            raise ValueError(
+                f"there is no individual {individual!r}; there are {', '.join(names)}"
+            )
+        chosen = [names.index(individual)]
+        tracks, names = tracks[:, chosen], [individual]
+        confidence = None if confidence is None else confidence[:, chosen]
+    rows = each_individual(tracks, confidence)
+    return assemble(
+        rows.tracks,
+        _names(position, "keypoint"),
+        pd.DataFrame(
+            {
+                "frame": rows.frame,
+                "time": np.asarray(position.coords["time"].values)[rows.frame],
+                "individual": name_individuals(rows.individual, names),
+            }
+        ),
+        format="movement",
+        confidence=rows.confidence,
+    )
+
+
+def _parts(result: Any) -> list[str]:
+    """Return which lists of landmarks a result has."""
+    parts = [part for part in _MEDIAPIPE_PARTS if hasattr(result, part)]
+    if not parts:
+        raise ValueError(
+            "a result of MediaPipe should have face_landmarks, hand_landmarks or "
+            f"pose_landmarks; got {type(result).__name__}"
+        )
+    return parts
+
+
+def _image_sizes(image_sizes: ArrayLike, n_results: int) -> NDArray[np.float64]:
+    """Return the width and the height of each image."""
+    sizes = np.asarray(image_sizes, dtype=np.float64)
+    if sizes.shape not in ((2,), (n_results, 2)) or not (
+        np.isfinite(sizes).all() and (sizes > 0).all()
+    ):
+        raise ValueError(
+            "image_sizes must be a width and a height in pixels, for all images or for "
+            f"each of the {n_results}; got an array of shape {sizes.shape}"
+            + (f" with {sizes.min():g}" if sizes.size else "")
+        )
+    return np.broadcast_to(sizes, (n_results, 2))
+
+
+def _shares(landmarks: Sequence[Any], where: str) -> NDArray[np.float64]:
+    """Return x and y of landmarks, (n_points, 2)."""
+    try:
+        return np.array([(point.x, point.y) for point in landmarks], dtype=np.float64)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{where} should have a list of objects with numbers x and y for each "
+            f"face: {error}"
+        ) from error
+
+
+def _by_axes(dataset: Any, name: str, wanted: tuple[str, ...]) -> Any:
+    """Return a variable of a dataset with its axes in the order that is wanted."""
+    try:
+        variable = dataset[name]
+        dims = tuple(variable.dims)
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"a dataset of movement should have {name}; got {type(dataset).__name__}"
+        ) from error
+    singular = [_MOVEMENT_DIMS.get(dim, dim) for dim in dims]
+    if sorted(singular) != sorted(wanted):
+        raise ValueError(
+            f"{name} should have the axes {', '.join(wanted)}; got {', '.join(dims)}"
+        )
+    return variable.transpose(*(dims[singular.index(dim)] for dim in wanted))
+
+
+def _names(variable: Any, axis: str) -> list[str]:
+    """Return the names along an axis."""
+    plural = {new: old for old, new in _MOVEMENT_DIMS.items()}
+    dim = axis if axis in variable.dims else plural.get(axis, axis)
+    if dim not in variable.coords:
+        raise ValueError(f"the axis {dim} of the dataset has no names")
+    return [str(name) for name in variable.coords[dim].values]

@@ -1,0 +1,180 @@
+"""Read the analysis files of SLEAP, h5 and csv."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._landmark_names import find_landmark_columns
+from isa_nrsfm._optional import import_optional
+from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
+from isa_nrsfm.io._landmarks import (
+    Landmarks,
+    assemble,
+    each_individual,
+    name_individuals,
+)
+from isa_nrsfm.io._separated_values import header_names, read_columns
+
+_DIMS = ("frame", "track", "node", "xy")
+# Where the file does not say: SLEAP's own order, and that of its older files
+# for Python. They differ where there are more than two points.
+_ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
+_CSV_COLUMNS = ["track", "frame_idx", "instance.score"]
+_NEEDED = frozenset({"tracks", "node_names", "track_names"})
+
+
+def is_sleap(path: Path) -> bool:
+    """Tell whether an h5 file has the datasets, or a csv file the header, of SLEAP."""
+    if path.suffix.lower() == ".csv":
+        return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
+    return is_hdf5(path) and _NEEDED <= root_groups(path)
+
+
+def read_sleap(path: Path) -> Landmarks:
+    """
+    Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
+
+    In an h5 file, ``tracks`` has the points, in the order of axes that its attribute
+    ``dims`` tells, and otherwise (track, xy, node, frame), as SLEAP writes it;
+    ``point_scores`` has their confidences, ``instance_scores`` those of the instances.
+    A csv file has a row for each instance, ``track, frame_idx, instance.score`` and
+    ``x``, ``y`` and ``score`` of each node. Frames are counted from 0.
+    """
+    return _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+
+
+def _read_csv(path: Path) -> Landmarks:
+    """Read a csv file, which has no rows for frames without instances."""
+    if not is_sleap(path):
+        raise ValueError(f"its first columns are not {', '.join(_CSV_COLUMNS)}")
+    names = header_names(path)
+    found = find_landmark_columns(names, "*.x,*.y")
+    nodes = [name.removesuffix(".x") for name in found.x]
+    scores = [f"{node}.score" for node in nodes]
+    if not set(scores).issubset(names):
+        raise ValueError("not all of its points have a score")
+    table = read_columns(
+        path,
+        numbers=[*found.interleaved, *scores, "frame_idx", "instance.score"],
+        text=("track",),
+    )
+    return assemble(
+        table[found.interleaved].to_numpy(np.float64).reshape(len(table), -1, 2),
+        nodes,
+        table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
+        format="sleap",
+        confidence=table[scores].to_numpy(np.float64),
+    )
+
+
+def _read_h5(path: Path) -> Landmarks:
+    """Read an h5 file."""
+    pd = import_optional("pandas", extra="io")
+    h5py = import_optional("h5py", extra="h5")
+    try:
+        with h5py.File(path, "r") as file:
+            absent = _NEEDED.difference(file)
+            if absent:
+                raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
+            nodes = _texts(file["node_names"])
+            names = _texts(file["track_names"])
+            stored, dims = _stored(file["tracks"], len(nodes))
+            tracks = _ordered(stored, dims, _DIMS)
+            scores = _scores(file, "point_scores", dims, tracks.shape[:3])
+            of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
+    except ValueError:
+        raise
+    except Exception as error:  # h5py has errors of many kinds for damaged files
+        raise ValueError(f"h5py cannot read it: {error}") from error
+    rows = each_individual(tracks, scores)
+    frames: dict[str, Any] = {"frame": rows.frame}
+    if names:
+        if len(names) != tracks.shape[1]:
+            raise ValueError(
+                f"tracks holds {tracks.shape[1]} tracks, track_names {len(names)}"
+            )
+        frames["individual"] = name_individuals(rows.individual, names)
+    elif tracks.shape[1] > 1:
+        frames["individual"] = name_individuals(rows.individual, range(tracks.shape[1]))
+    if of_instances is not None and not np.isnan(of_instances).all():
+        score = of_instances[rows.frame, np.maximum(rows.individual, 0)]
+        frames["instance_score"] = np.where(rows.individual < 0, np.nan, score)
+    return assemble(
+        rows.tracks,
+        nodes,
+        pd.DataFrame(frames),
+        format="sleap",
+        confidence=rows.confidence,
+    )
+
+
+def _stored(dataset: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
+    """Return the points as they are stored, and the names of their axes."""
+    dims = _named_dims(dataset)
+    if dims is not None and sorted(dims) != sorted(_DIMS):
+        raise ValueError(
+            f"the axes of tracks should be {', '.join(_DIMS)} in some order; got "
+            f"{', '.join(dims)}"
+        )
+    orders = _ORDERS if dims is None else (dims,)
+    for order in orders:
+        lengths = dict(zip(order, dataset.shape, strict=False))
+        if (
+            len(dataset.shape) == len(_DIMS)
+            and lengths["xy"] == 2
+            and lengths["node"] == n_nodes
+        ):
+            return np.asarray(dataset[()], dtype=np.float64), order
+    raise ValueError(
+        f"tracks should have the axes {', '.join(orders[0])}, with 2 and {n_nodes} for "
+        f"xy and node; got the shape {dataset.shape}"
+    )
+
+
+def _named_dims(dataset: Any) -> tuple[str, ...] | None:
+    """Return the names of the axes that a dataset tells, or None."""
+    if "dims" not in dataset.attrs:
+        return None
+    named = json.loads(dataset.attrs["dims"])
+    if not isinstance(named, list) or not all(isinstance(dim, str) for dim in named):
+        raise ValueError(f"its attribute dims should be a list of names; got {named}")
+    return tuple(named)
+
+
+def _ordered(
+    stored: NDArray, dims: tuple[str, ...], wanted: tuple[str, ...]
+) -> NDArray[np.float64]:
+    """Return an array with its axes in the order that is wanted."""
+    return stored.transpose([dims.index(dim) for dim in wanted])
+
+
+def _scores(
+    file: Any, name: str, dims_of_tracks: tuple[str, ...], shape: tuple[int, ...]
+) -> NDArray[np.float64] | None:
+    """Return scores by frame, track and, of points, node; None where there are none."""
+    if name not in file:
+        return None
+    dataset = file[name]
+    wanted = _DIMS[: len(shape)]
+    dims = _named_dims(dataset) or tuple(d for d in dims_of_tracks if d in wanted)
+    if sorted(dims) == sorted(wanted) and len(dataset.shape) == len(shape):
+        scores = _ordered(np.asarray(dataset[()], dtype=np.float64), dims, wanted)
+        if scores.shape == shape:
+            return scores
+    raise ValueError(
+        f"{name} should have the axes {', '.join(dims)} of tracks; got the shape "
+        f"{dataset.shape}"
+    )
+
+
+def _texts(dataset: Any) -> list[str]:
+    """Return the texts that a dataset holds."""
+    if dataset.shape == (0,):
+        return []
+    return [
+        text.decode() if isinstance(text, bytes) else str(text)
+        for text in np.ravel(dataset[()])
+    ]

@@ -1,0 +1,246 @@
+"""Write landmark files as the programs do to which their formats belong."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+IMAGE_SIZE = (640, 480)
+BODYPARTS = ["snout", "ear_L", "ear_R", "neck", "hip", "tail_1", "tail_2", "tail_3"]
+
+
+def scene(n_frames=12, n_points=8, seed=0):
+    """Return points (n_frames, n_points, 2) in an image, with one decimal."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(5, 470, (n_frames, n_points, 2)).round(1)
+
+
+def planar(tracks):
+    """Return the table with all x before all y."""
+    return tracks.swapaxes(1, 2).reshape(len(tracks), -1)
+
+
+def openface_names(n_points=68, *, video=True, face_id=True):
+    """Return the columns that OpenFace 2 writes when asked for all of them."""
+    names = ["face", "confidence"]
+    if video:
+        names = ["frame", "face_id", "timestamp", "confidence", "success"]
+        names = names if face_id else [n for n in names if n != "face_id"]
+    names += [f"gaze_{eye}_{axis}" for eye in (0, 1) for axis in "xyz"]
+    names += ["gaze_angle_x", "gaze_angle_y"]
+    names += [f"eye_lmk_{axis}_{j}" for axis in "xyXYZ" for j in range(56)]
+    names += [f"pose_{kind}{axis}" for kind in "TR" for axis in "xyz"]
+    names += [f"{axis}_{j}" for axis in "xyXYZ" for j in range(n_points)]
+    names += ["p_scale", "p_rx", "p_ry", "p_rz", "p_tx", "p_ty"]
+    names += [f"p_{j}" for j in range(34)]
+    units = (1, 2, 4, 5, 6, 7, 9, 10, 12, 14, 15, 17, 20, 23, 25, 26, 45)
+    names += [f"AU{unit:02d}_r" for unit in units]
+    return names + [f"AU{unit:02d}_c" for unit in sorted((*units, 28))]
+
+
+def write_openface(
+    path, tracks, *, success=None, confidence=0.98, video=True, separator=","
+):
+    """Write the csv file of FeatureExtraction, or of FaceLandmarkImg."""
+    n_frames, n_points, _ = tracks.shape
+    success = np.ones(n_frames, dtype=int) if success is None else success
+    names = openface_names(n_points, video=video, face_id=separator == ",")
+    first = [f"x_{j}" for j in range(n_points)] + [f"y_{j}" for j in range(n_points)]
+    place = names.index("x_0")
+    assert names[place : place + 2 * n_points] == first
+    confidence = np.broadcast_to(confidence, n_frames)
+    lines = [separator.join(names)]
+    for i, row in enumerate(planar(tracks)):
+        head = [str(i), f"{confidence[i]:.3f}"]
+        if video:
+            head = [
+                str(i + 1),
+                f"{i / 30:.3f}",
+                f"{confidence[i]:.2f}",
+                str(success[i]),
+            ]
+            if separator == ",":
+                head.insert(1, "0")
+        before = [f"{0.1 * (i + k):.1f}" for k in range(place - len(head))]
+        after = ["-7.5"] * (len(names) - place - 2 * n_points)
+        lines.append(",".join([*head, *before, *(f"{v:.1f}" for v in row), *after]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_pyfeat(path, tracks, *, detector="Detector"):
+    """Write a table as Fex.to_csv does."""
+    n_frames, n_points, _ = tracks.shape
+    seen = ~np.isnan(tracks).all(axis=(1, 2))
+    columns = {"frame": np.arange(n_frames)} if detector != "Detectorv2" else {}
+    for name in ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight"):
+        columns[name] = np.where(seen, 100.25, np.nan)
+    columns["FaceScore"] = np.where(seen, np.linspace(0.5, 1, n_frames), np.nan)
+    if detector == "MPDetector":
+        for j in range(n_points):
+            columns |= {f"{a}_{j}": tracks[:, j, k] for k, a in enumerate("xy")}
+            columns[f"z_{j}"] = np.where(seen, -3.5, np.nan)
+    else:
+        for k, axis in enumerate("xy"):
+            columns |= {f"{axis}_{j}": tracks[:, j, k] for j in range(n_points)}
+    columns["AU01"] = np.linspace(0, 1, n_frames)
+    if detector == "Detectorv2":
+        columns |= {f"Identity_{j}": np.zeros(n_frames) for j in range(1, 513)}
+        for axis in "xyz":
+            columns |= {f"mesh_{axis}_{j}": np.full(n_frames, 9.0) for j in range(478)}
+    columns["input"] = ["video, first.mp4"] * n_frames
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+def write_mesh(path, tracks, *, shares=True, sizes=False):
+    """Write the points of MediaPipe's face mesh with names such as x_0, y_0, z_0."""
+    values = tracks / IMAGE_SIZE if shares else tracks
+    columns = {"code": [f"{i:03d}" for i in range(len(tracks))]}
+    if sizes:
+        columns |= {"image_width": IMAGE_SIZE[0], "image_height": IMAGE_SIZE[1]}
+    for j in range(tracks.shape[1]):
+        columns |= {f"x_{j}": values[:, j, 0], f"y_{j}": values[:, j, 1]}
+        columns[f"z_{j}"] = np.full(len(tracks), -0.01)
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+def write_pts(folder, tracks):
+    """Write a .pts file for each image, with the images beside them."""
+    folder.mkdir(exist_ok=True)
+    for i, points in enumerate(tracks):
+        lines = [f"{x:.6f} {y:.6f}" for x, y in points]
+        head = ["version: 1", f"n_points:  {len(points)}", "{"]
+        text = "\n".join([*head, *lines, "}"]) + "\n"
+        (folder / f"image_{i:03d}.pts").write_text(text)
+        (folder / f"image_{i:03d}.png").write_bytes(b"\x89PNG")
+    return folder
+
+
+def write_wflw(path, tracks, *, rest=True):
+    """Write a list of WFLW; it has 98 points."""
+    lines = []
+    for i, points in enumerate(tracks):
+        fields = [f"{v:.6f}" for v in points.ravel()]
+        if rest:
+            fields += ["10", "20", "210", "220", *"010010"]
+        lines.append(" ".join([*fields, f"37--Soccer/37_Soccer_{i}.jpg"]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals=()):
+    """Return a table as DeepLabCut has it; tracks may have an axis of individuals."""
+    tracks = tracks.reshape(len(tracks), -1, len(bodyparts), 2)
+    shape = (*tracks.shape[:3], 1)
+    coords = ["x", "y", "likelihood"]
+    values = [tracks, np.broadcast_to(np.reshape(likelihood, (-1, 1, 1, 1)), shape)]
+    if likelihood is None:
+        values, coords = [tracks], ["x", "y"]
+    levels = [["DLC_resnet50_mice"], list(individuals), list(bodyparts), coords]
+    names = ["scorer", "individuals", "bodyparts", "coords"]
+    if not individuals:
+        del levels[1], names[1]
+    return pd.DataFrame(
+        np.concatenate(values, axis=3).reshape(len(tracks), -1),
+        columns=pd.MultiIndex.from_product(levels, names=names),
+    )
+
+
+def write_deeplabcut(path, frame, *, how="table"):
+    """Write what deeplabcut_frame has returned, as csv or h5."""
+    if path.suffix == ".csv":
+        frame.to_csv(path)
+    else:
+        pytest.importorskip("tables", reason="needs the extra h5")
+        frame.to_hdf(path, key="df_with_missing", format=how, mode="w")
+    return path
+
+
+def write_sleap(
+    path,
+    tracks,
+    *,
+    order="txnf",
+    named=True,
+    scores=None,
+    names=("a", "b"),
+    nodes=BODYPARTS,
+):
+    """Write an analysis file; tracks (frame, track, node, xy), order of the axes.
+
+    The letters of the order are f, t, n and x; named tells whether the file says it.
+    """
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    words = {"f": "frame", "t": "track", "n": "node", "x": "xy"}
+    scores = np.full(tracks.shape[:3], 0.5) if scores is None else scores
+    with h5py.File(path, "w") as file:
+
+        def put(name, values, own_order):
+            wanted = [letter for letter in order if letter in own_order]
+            axes = [own_order.index(letter) for letter in wanted]
+            data = file.create_dataset(name, data=values.transpose(axes))
+            if named:
+                data.attrs["dims"] = json.dumps([words[letter] for letter in wanted])
+
+        put("tracks", tracks, "ftnx")
+        put("point_scores", scores, "ftn")
+        put("instance_scores", scores.mean(axis=2), "ft")
+        occupied = ~np.isnan(tracks).all(axis=(2, 3))
+        file["track_occupancy"] = occupied.astype(np.uint8)
+        file["node_names"] = np.array([name.encode() for name in nodes])
+        file["track_names"] = np.array([name.encode() for name in names])
+        file["provenance"] = "{}"
+    return path
+
+
+def write_sleap_csv(path, tracks, scores, *, names=("a", "b"), nodes=BODYPARTS):
+    """Write an analysis table, with a row for each track that a frame shows."""
+    rows = []
+    for frame, track in np.argwhere(~np.isnan(tracks).all(axis=(2, 3))):
+        row = {"track": names[track], "frame_idx": frame, "instance.score": 0.5}
+        for j, node in enumerate(nodes):
+            x, y = tracks[frame, track, j]
+            score = scores[frame, track, j]
+            row |= {f"{node}.score": score, f"{node}.x": x, f"{node}.y": y}
+        rows.append(row)
+    pd.DataFrame(rows).to_csv(path, index=False)
+    return path
+
+
+def coco_annotations(tracks, *, names=BODYPARTS, image=None):
+    """Return annotations of one person an image; missing points have zeros."""
+    seen = ~np.isnan(tracks).any(axis=2)
+    values = np.concatenate([np.nan_to_num(tracks), 2 * seen[..., None]], axis=2)
+    image = range(1, len(tracks) + 1) if image is None else image
+    images = sorted(set(image))
+    return {
+        "info": {"description": "people"},
+        "images": [
+            {"id": i, "file_name": f"{i:012d}.jpg", "width": 640, "height": 480}
+            for i in images
+        ],
+        "annotations": [
+            {
+                "id": 100 + i,
+                "image_id": of,
+                "category_id": 1,
+                "keypoints": [float(v) for v in row.ravel()],
+                "num_keypoints": int(seen[i].sum()),
+                "iscrowd": 0,
+                "area": 1.5,
+            }
+            for i, (of, row) in enumerate(zip(image, values, strict=True))
+        ],
+        "categories": [
+            {"id": 1, "name": "person", "keypoints": list(names), "skeleton": []}
+        ],
+    }
+
+
+def write_json(path, content):
+    """Write json."""
+    path.write_text(json.dumps(content))
+    return path

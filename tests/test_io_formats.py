@@ -1,0 +1,741 @@
+"""Files of other programs, read back as these have written them."""
+
+from types import SimpleNamespace
+
+import landmark_files as files
+import numpy as np
+import pandas as pd
+import pytest
+
+from isa_nrsfm.io import (
+    FORMATS,
+    Landmarks,
+    find_format,
+    from_mediapipe,
+    from_movement,
+    read_landmarks,
+)
+
+TRACKS = files.scene()
+MESH = files.scene(n_frames=4, n_points=478)
+WFLW = files.scene(n_frames=4, n_points=98)
+FRAME = files.deeplabcut_frame(TRACKS)
+
+# Each writes a file that a single individual fills, and returns its path.
+WRITERS = {
+    "openface": lambda d: files.write_openface(d / "a.csv", TRACKS),
+    "openface-1": lambda d: files.write_openface(d / "a.csv", TRACKS, separator=", "),
+    "openface-image": lambda d: files.write_openface(d / "a.csv", TRACKS, video=False),
+    "pyfeat": lambda d: files.write_pyfeat(d / "a.csv", TRACKS),
+    "pyfeat-v2": lambda d: files.write_pyfeat(
+        d / "a.csv", TRACKS, detector="Detectorv2"
+    ),
+    "pyfeat-mp": lambda d: files.write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
+    "mediapipe-pixels": lambda d: files.write_mesh(d / "a.csv", MESH, shares=False),
+    "mediapipe-sizes": lambda d: files.write_mesh(d / "a.csv", MESH, sizes=True),
+    "pts": lambda d: files.write_pts(d / "a", TRACKS),
+    "pts-file": lambda d: files.write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
+    "wflw": lambda d: files.write_wflw(d / "a.txt", WFLW),
+    "wflw-test": lambda d: files.write_wflw(d / "a.txt", WFLW, rest=False),
+    "deeplabcut": lambda d: files.write_deeplabcut(d / "a.csv", FRAME),
+    "deeplabcut-table": lambda d: files.write_deeplabcut(d / "a.h5", FRAME),
+    "deeplabcut-fixed": lambda d: files.write_deeplabcut(
+        d / "a.h5", FRAME, how="fixed"
+    ),
+    "sleap": lambda d: files.write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
+    "coco": lambda d: files.write_json(d / "a.json", files.coco_annotations(TRACKS)),
+    "coco-results": lambda d: files.write_json(
+        d / "a.json",
+        [
+            {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
+            for i, row in enumerate(np.dstack([TRACKS, np.full((12, 8), 0.7)]))
+        ],
+    ),
+    "table": lambda d: files.write_mesh(d / "a.csv", TRACKS, shares=False),
+}
+EXPECTED = {"pyfeat-mp": MESH, "pts-file": TRACKS[:1]} | dict.fromkeys(
+    ["mediapipe-pixels", "mediapipe-sizes"], MESH
+)
+EXPECTED |= dict.fromkeys(["wflw", "wflw-test"], WFLW)
+
+
+def tracks_of(landmarks):
+    """Return the points (n_frames, n_points, 2), after a look at the whole object."""
+    assert isinstance(landmarks, Landmarks)
+    points, frames = landmarks.points, landmarks.frames
+    n_frames, n_points = len(points), len(landmarks.point_names)
+    assert points.shape == (n_frames, 2 * n_points)
+    assert (points.dtypes == np.float64).all()
+    assert len(set(points.columns) | set(frames.columns)) == 2 * n_points + len(
+        frames.columns
+    )
+    assert len(set(landmarks.point_names)) == n_points
+    for table in (points, frames, landmarks.confidence):
+        if table is not None:
+            pd.testing.assert_index_equal(
+                table.index, pd.RangeIndex(n_frames), exact=True
+            )
+    if landmarks.confidence is not None:
+        assert tuple(landmarks.confidence) == landmarks.point_names
+    assert landmarks.failed.dtype == bool
+    assert points[landmarks.failed].isna().all(axis=None)
+    return points.to_numpy().reshape(n_frames, n_points, 2)
+
+
+def individuals_of(landmarks):
+    """Return the names of the individuals, None in rows that show nobody."""
+    column = landmarks.frames["individual"]
+    return [None if pd.isna(name) else name for name in column]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_files_read_back_as_they_were_written(name, tmp_path):
+    path = WRITERS[name](tmp_path)
+    format = name.partition("-")[0]
+    assert find_format(path) == format
+    landmarks = read_landmarks(path)
+    assert landmarks.format == format
+    np.testing.assert_allclose(
+        tracks_of(landmarks), EXPECTED.get(name, TRACKS), rtol=1e-12
+    )
+    assert not landmarks.failed.any()
+    again = FORMATS[format].read(path)
+    pd.testing.assert_frame_equal(again.points, landmarks.points)
+
+
+def test_every_format_is_written_here():
+    assert {name.partition("-")[0] for name in WRITERS} == set(FORMATS)
+    assert all(name == found.name for name, found in FORMATS.items())
+    with pytest.raises(TypeError):
+        FORMATS["new"] = FORMATS["table"]
+
+
+def test_openface_keeps_what_it_says_of_frames(tmp_path):
+    success = np.array([1, 0, *[1] * 10])
+    confidence = np.linspace(0, 1, 12).round(2)
+    path = files.write_openface(
+        tmp_path / "a.csv", TRACKS, success=success, confidence=confidence
+    )
+    lines = path.read_text().splitlines()
+    for number, text in ((TRACKS[1, 2, 0], "inf"), (TRACKS[1, 3, 0], "-nan(ind)")):
+        assert f",{number}," in lines[2]
+        lines[2] = lines[2].replace(f",{number},", f",{text},")
+    path.write_text("\n".join(lines) + "\n")
+    landmarks = read_landmarks(path)
+    np.testing.assert_array_equal(landmarks.failed, success == 0)
+    points = tracks_of(landmarks)
+    assert np.isnan(points[1]).all()
+    np.testing.assert_array_equal(points[2:], TRACKS[2:])
+    frames = landmarks.frames
+    assert list(frames)[:6] == [
+        "frame",
+        "face_id",
+        "timestamp",
+        "confidence",
+        "success",
+        "gaze_0_x",
+    ]
+    assert {"AU01_r", "pose_Rx", "p_0"} <= set(frames)
+    assert not {"X_0", "eye_lmk_x_0", "eye_lmk_X_0"} & set(frames)
+    assert list(frames["frame"]) == list(range(1, 13))
+    assert frames["frame"].dtype == frames["success"].dtype == np.int64
+    np.testing.assert_array_equal(
+        landmarks.confidence, np.tile(confidence[:, None], (1, 8))
+    )
+    sure = read_landmarks(path, min_confidence=confidence[4])
+    np.testing.assert_array_equal(
+        np.isnan(tracks_of(sure)).all(axis=(1, 2)), confidence < confidence[4]
+    )
+    np.testing.assert_array_equal(sure.failed, landmarks.failed)
+
+
+def test_several_faces_in_a_frame_keep_their_rows(tmp_path):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    table = pd.read_csv(path)
+    table["frame"], table["face_id"] = np.arange(12) // 2, np.arange(12) % 2
+    table.to_csv(path, index=False)
+    landmarks = read_landmarks(path)
+    np.testing.assert_array_equal(tracks_of(landmarks), TRACKS)
+    assert list(landmarks.frames["face_id"]) == [0, 1] * 6
+
+
+def test_openface_without_landmarks_is_refused(tmp_path):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    table = pd.read_csv(path)
+    table[["frame", "timestamp", "confidence", "success", "AU01_r"]].to_csv(
+        path, index=False
+    )
+    with pytest.raises(ValueError, match=r"a\.csv cannot .* openface .*-2Dfp"):
+        read_landmarks(path)
+    table["success"] = 2
+    table.to_csv(path, index=False)
+    with pytest.raises(ValueError, match="success must hold 0 and 1 only"):
+        read_landmarks(path)
+    table.drop(columns="success").to_csv(path, index=False)
+    with pytest.raises(ValueError, match="it has no column success"):
+        read_landmarks(path, "openface")
+
+
+@pytest.mark.parametrize("detector", ["Detector", "MPDetector"])
+def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
+    tracks = TRACKS.copy()
+    tracks[3] = np.nan
+    path = files.write_pyfeat(tmp_path / "a.csv", tracks, detector=detector)
+    landmarks = read_landmarks(path)
+    np.testing.assert_allclose(tracks_of(landmarks), tracks)
+    assert list(np.flatnonzero(landmarks.failed)) == [3]
+    assert list(landmarks.frames["input"]) == ["video, first.mp4"] * 12
+    assert "z_0" not in landmarks.frames
+    sure = read_landmarks(path, min_confidence=0.75)
+    assert np.isnan(tracks_of(sure)).all(axis=(1, 2)).sum() == 6
+
+
+def test_shares_of_the_image_become_pixels(tmp_path):
+    path = files.write_mesh(tmp_path / "a.csv", MESH)
+    with pytest.raises(ValueError, match=r"shares of the image's width.*--image-size"):
+        read_landmarks(path)
+    landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
+    np.testing.assert_allclose(tracks_of(landmarks), MESH)
+    assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
+    for size in (640, (640, 0), (640, 480, 3), ("a", "b"), (np.nan, 480)):
+        with pytest.raises(ValueError, match="image_size must be a width and a height"):
+            read_landmarks(path, image_size=size)
+    pixels = files.write_mesh(tmp_path / "b.csv", MESH, shares=False)
+    with pytest.raises(ValueError, match="these are in pixels"):
+        read_landmarks(pixels, image_size=files.IMAGE_SIZE)
+
+
+def test_hands_are_read_as_mediapipe_when_named(tmp_path):
+    hands = files.scene(n_points=21)
+    path = files.write_mesh(tmp_path / "a.csv", hands)
+    assert find_format(path) == "table"
+    landmarks = read_landmarks(path, "mediapipe", image_size=(640, 480))
+    np.testing.assert_allclose(tracks_of(landmarks), hands)
+
+
+def test_pts_files_are_read_in_the_order_of_names(tmp_path):
+    folder = files.write_pts(tmp_path / "faces", TRACKS)
+    (folder / "image_000.pts").rename(folder / "last.PTS")
+    (folder / "._image_001.pts").write_text("not one")
+    (folder / "inner").mkdir()
+    landmarks = read_landmarks(folder)
+    np.testing.assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
+    assert list(landmarks.frames["file"][-2:]) == ["image_011.pts", "last.PTS"]
+    assert landmarks.confidence is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("version: 1\nn_points: 9\n{\n1 2\n}", "n_points is 9, but .* 2 coordinates"),
+        ("version: 1\nn_points: 0\n{\n}", "n_points is 0"),
+        ("version: 1\nn_points: 1\n{\n1 2\n", "expected 'version: 1'.*got 'version"),
+        ("1 2\n3 4\n", "expected 'version: 1'"),
+        ("version: 1\nn_points: 1\n{\n1 b\n}", "'b'"),
+        ("version: 1\nn_points: 1\n{\n1 1_0\n}", "got '1_0'"),
+        ("version: 1\nn_points: 1\n{\n1 inf\n}", "y_0 is infinite in row 0"),
+        ("version: 1\nn_points: 2\n{\n1 2\n3 4\n}", "a.pts has 8 points, b.pts has 2"),
+    ],
+)
+def test_bad_pts_files_are_named(text, message, tmp_path):
+    folder = files.write_pts(tmp_path / "faces", TRACKS[:1])
+    (folder / "image_000.pts").rename(folder / "a.pts")
+    if "a.pts" not in message:
+        (folder / "a.pts").unlink()
+    (folder / "b.pts").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_landmarks(folder)
+    assert str(folder) in str(caught.value)
+
+
+def test_wflw_keeps_boxes_and_attributes(tmp_path):
+    landmarks = read_landmarks(files.write_wflw(tmp_path / "list.txt", WFLW))
+    frames = landmarks.frames
+    assert list(frames["image"]) == [f"37--Soccer/37_Soccer_{i}.jpg" for i in range(4)]
+    assert list(frames.iloc[0, 1:5]) == [10, 20, 210, 220]
+    assert list(frames.columns[5:]) == [
+        "pose",
+        "expression",
+        "illumination",
+        "make_up",
+        "occlusion",
+        "blur",
+    ]
+    assert list(frames.iloc[0, 5:]) == [0, 1, 0, 0, 1, 0]
+
+
+def test_deeplabcut_finds_each_animal(tmp_path):
+    pair = np.stack([TRACKS, TRACKS + 100], axis=1)
+    pair[2, 0] = np.nan
+    pair[5] = np.nan
+    frame = files.deeplabcut_frame(
+        pair, np.linspace(0, 1, 12), individuals=["mouse 1", "mouse 2"]
+    )
+    landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", frame))
+    frames = landmarks.frames
+    expected = [(i, f"mouse {k}") for i in range(12) for k in (1, 2)]
+    expected.remove((2, "mouse 1"))
+    expected.remove((5, "mouse 2"))
+    expected[expected.index((5, "mouse 1"))] = (5, None)
+    names = individuals_of(landmarks)
+    assert list(zip(frames["frame"], names, strict=True)) == expected
+    rows = pair[
+        [i for i, _ in expected], [int(name == "mouse 2") for _, name in expected]
+    ]
+    np.testing.assert_allclose(tracks_of(landmarks), rows)
+    assert list(np.flatnonzero(landmarks.failed)) == [expected.index((5, None))]
+    assert landmarks.point_names == tuple(files.BODYPARTS)
+    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+    np.testing.assert_allclose(
+        landmarks.confidence["snout"], np.linspace(0, 1, 12)[frames["frame"]]
+    )
+
+
+def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
+    frame = files.deeplabcut_frame(TRACKS, None)
+    names = [f"img{i:03d}.png" for i in range(12)]
+    frame.iloc[3, :2] = np.nan
+    expected = TRACKS.copy()
+    expected[3, 0] = np.nan
+    for index in (
+        pd.Index([f"labeled-data/reach/{name}" for name in names]),
+        pd.MultiIndex.from_product([["labeled-data"], ["reach"], names]),
+    ):
+        frame.index = index
+        landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", frame))
+        np.testing.assert_allclose(tracks_of(landmarks), expected)
+        assert landmarks.confidence is None
+        assert list(landmarks.frames) == ["image"]
+        assert landmarks.frames["image"][0] == "labeled-data/reach/img000.png"
+        h5 = files.write_deeplabcut(tmp_path / "a.h5", frame, how="fixed")
+        pd.testing.assert_frame_equal(
+            read_landmarks(h5).frames, landmarks.frames, check_dtype=False
+        )
+    with pytest.raises(ValueError, match="no confidences"):
+        read_landmarks(tmp_path / "a.csv", min_confidence=0.5)
+
+
+def test_h5_files_run_no_code(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_deeplabcut(tmp_path / "a.h5", FRAME)
+    with h5py.File(path, "a") as file:
+        call = b"cbuiltins\nexec\n(Vraise SystemExit\ntR."
+        file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(call)
+    with pytest.raises(ValueError, match=r"builtins\.exec is not allowed"):
+        read_landmarks(path)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.h5"])
+def test_further_columns_of_lightning_pose_are_left_aside(name, tmp_path):
+    frame = FRAME.copy()
+    frame[("DLC_resnet50_mice", "set", "")] = "train"
+    path = files.write_deeplabcut(tmp_path / name, frame)
+    landmarks = read_landmarks(path, min_confidence=0.5)
+    np.testing.assert_allclose(tracks_of(landmarks), TRACKS)
+
+
+def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
+    both = pd.concat(
+        [
+            files.deeplabcut_frame(TRACKS, individuals=["mouse"]),
+            files.deeplabcut_frame(
+                TRACKS[:, :1], bodyparts=["corner"], individuals=["single"]
+            ),
+        ],
+        axis=1,
+    )
+    path = files.write_deeplabcut(tmp_path / "a.csv", both)
+    with pytest.warns(UserWarning, match="points corner belong to no animal"):
+        landmarks = read_landmarks(path)
+    np.testing.assert_allclose(tracks_of(landmarks), TRACKS)
+    files.write_deeplabcut(path, both.rename(columns={"single": "mouse 2"}))
+    with pytest.raises(ValueError, match="'mouse' and 'mouse 2' have different"):
+        read_landmarks(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"y": "z"}, "'snout' has a z"),
+        ({"y": "b"}, "'snout' has no x or no y"),
+        ({"y": "b", "x": "a", "likelihood": "c"}, "no columns x and y"),
+        ({"y": "x"}, "more than one column 'x' of 'snout'"),
+    ],
+)
+def test_bad_deeplabcut_columns_are_named(change, message, tmp_path):
+    path = files.write_deeplabcut(tmp_path / "a.csv", FRAME.rename(columns=change))
+    with pytest.raises(ValueError, match=message):
+        read_landmarks(path)
+
+
+@pytest.mark.parametrize(
+    ("order", "named"),
+    [("txnf", True), ("ftnx", True), ("nfxt", True), ("txnf", False), ("fnxt", False)],
+    ids=str,
+)
+def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
+    pair = np.stack([TRACKS, TRACKS + 100], axis=1)
+    pair[4] = np.nan
+    pair[6, 1] = np.nan
+    scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
+    path = files.write_sleap(
+        tmp_path / "a.analysis.h5", pair, order=order, named=named, scores=scores
+    )
+    landmarks = read_landmarks(path)
+    expected = [(i, k) for i in range(12) for k in (0, 1)]
+    expected.remove((6, 1))
+    expected.remove((4, 1))
+    frame, track = map(list, zip(*expected, strict=True))
+    np.testing.assert_array_equal(tracks_of(landmarks), pair[frame, track])
+    np.testing.assert_array_equal(landmarks.confidence, scores[frame, track])
+    names = [("a", "b")[k] for k in track]
+    names[expected.index((4, 0))] = None
+    assert individuals_of(landmarks) == names
+    assert list(landmarks.frames["frame"]) == frame
+    known = [name is not None for name in names]
+    np.testing.assert_allclose(
+        landmarks.frames["instance_score"][known],
+        scores.mean(axis=2)[frame, track][known],
+    )
+    sure = read_landmarks(path, min_confidence=0.5)
+    np.testing.assert_array_equal(
+        np.isnan(tracks_of(sure)[..., 0]),
+        np.isnan(pair[frame, track][..., 0]) | (scores[frame, track] < 0.5),
+    )
+
+
+def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
+    pair = np.stack([TRACKS, TRACKS + 100], axis=1)
+    pair[4] = np.nan
+    pair[5, 1, 3] = np.nan
+    scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
+    path = files.write_sleap_csv(tmp_path / "a.csv", pair, scores)
+    assert find_format(path) == "sleap"
+    landmarks = read_landmarks(path, min_confidence=0.2)
+    shown = np.delete(np.arange(12), 4)
+    expected = np.where(scores[..., None] < 0.2, np.nan, pair)[shown]
+    np.testing.assert_array_equal(tracks_of(landmarks), expected.reshape(22, 8, 2))
+    assert individuals_of(landmarks) == ["a", "b"] * 11
+    assert list(landmarks.frames["frame"]) == list(np.repeat(shown, 2))
+    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+
+
+def test_points_without_a_confidence_are_kept(tmp_path):
+    scores = np.full((12, 1, 8), np.nan)
+    scores[0] = 0.1
+    path = files.write_sleap(
+        tmp_path / "a.h5", TRACKS[:, None], scores=scores, names=()
+    )
+    landmarks = read_landmarks(path, min_confidence=0.5)
+    assert "individual" not in landmarks.frames
+    np.testing.assert_array_equal(
+        np.isnan(tracks_of(landmarks)).all(axis=(1, 2)), np.arange(12) == 0
+    )
+    assert not landmarks.failed.any()
+
+
+def test_sleap_files_that_contradict_themselves_are_refused(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], names=["a", "b"])
+    with pytest.raises(ValueError, match="holds 1 tracks, track_names 2"):
+        read_landmarks(path)
+    with h5py.File(path, "a") as file:
+        del file["node_names"]
+        file["node_names"] = np.array([b"snout"])
+    with pytest.raises(ValueError, match="with 2 and 1 for xy and node; got the shape"):
+        read_landmarks(path)
+
+
+def test_coco_has_a_row_for_each_person(tmp_path):
+    tracks = TRACKS.copy()
+    tracks[1, 2] = np.nan
+    tracks[3] = np.nan
+    content = files.coco_annotations(tracks, image=[7, 3, 3, 5] + [9] * 8)
+    content["images"].append({"id": 11, "file_name": "empty.jpg"})
+    content["annotations"].append({"id": 1, "image_id": 7, "category_id": 1})
+    landmarks = read_landmarks(files.write_json(tmp_path / "a.json", content))
+    frames = landmarks.frames
+    # In the order of the images 3, 5, 7 and 9, and last the image without anybody.
+    order = [1, 2, 3, 0, *range(4, 12)]
+    np.testing.assert_array_equal(tracks_of(landmarks)[:-1], tracks[order])
+    assert list(frames["image_id"]) == [3, 3, 5, 7, *[9] * 8, 11]
+    assert list(frames["annotation_id"][:-1]) == [100 + i for i in order]
+    assert list(frames["file_name"][[0, 12]]) == ["000000000003.jpg", "empty.jpg"]
+    assert list(np.flatnonzero(landmarks.failed)) == [2, 12]
+    assert landmarks.confidence is None
+    assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
+
+
+def test_coco_categories_are_not_mixed(tmp_path):
+    content = files.coco_annotations(TRACKS)
+    hand = {"id": 2, "name": "hand", "keypoints": ["wrist", "thumb"]}
+    content["categories"].append(hand)
+    content["annotations"].append(
+        {"id": 5, "image_id": 2, "category_id": 2, "keypoints": [1, 2, 2, 3, 4, 1]}
+    )
+    path = files.write_json(tmp_path / "a.json", content)
+    with pytest.raises(ValueError, match="person, hand have different keypoints"):
+        read_landmarks(path)
+    people = read_landmarks(path, category="person")
+    np.testing.assert_array_equal(tracks_of(people), TRACKS)
+    hands = read_landmarks(path, category="hand")
+    assert hands.failed.sum() == 11
+    np.testing.assert_array_equal(tracks_of(hands)[0], [[1, 2], [3, 4]])
+    with pytest.raises(ValueError, match=r"no category 'cat'.* there are person, hand"):
+        read_landmarks(path, category="cat")
+
+
+def test_coco_results_have_confidences(tmp_path):
+    rows = np.dstack([TRACKS, np.linspace(0, 1, 96).reshape(12, 8)])
+    rows[0, 0] = 0
+    content = [
+        {"image_id": f"{i}.jpg", "category_id": 1, "keypoints": row, "score": 0.5}
+        for i, row in enumerate(rows.reshape(12, -1).tolist())
+    ]
+    path = files.write_json(tmp_path / "a.json", content)
+    landmarks = read_landmarks(path)
+    expected = TRACKS.copy()
+    expected[0, 0] = np.nan
+    np.testing.assert_array_equal(tracks_of(landmarks), expected)
+    np.testing.assert_array_equal(landmarks.confidence, rows[..., 2])
+    assert list(landmarks.frames["image_id"])[:2] == ["0.jpg", "1.jpg"]
+    assert list(landmarks.points)[:2] == ["x_0", "y_0"]
+    content[3]["category_id"] = 2
+    with pytest.raises(ValueError, match="more than one category_id: 1, 2"):
+        read_landmarks(files.write_json(path, content))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({}, "expected an object with the lists images"),
+        (3, "expected an object"),
+        ([3], "all results must be objects"),
+        ([], "no frames"),
+        ([{"keypoints": [1, 2]}], "0 keypoints of 3 numbers; got 2"),
+        ([{"keypoints": [1, 2, True]}], "a list of numbers; got"),
+        ([{"keypoints": [1, 2, "3"]}], "a list of numbers; got"),
+        ([{"keypoints": [1, 2, 10**400]}], "too large"),
+        ([{"keypoints": [1] * 6}, {"keypoints": [1] * 9}], "2 keypoints .* got 9"),
+        (
+            {"images": [], "annotations": [{"image_id": 1}], "categories": [{}]},
+            "no category has keypoints",
+        ),
+        (
+            files.coco_annotations(TRACKS) | {"images": [{"id": 1}]},
+            "annotation 101 is of image 2, which is not among",
+        ),
+        (files.coco_annotations(TRACKS) | {"images": [{}]}, "images needs an id"),
+    ],
+)
+def test_json_that_is_not_coco_is_refused(content, message, tmp_path):
+    path = files.write_json(tmp_path / "a.json", content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_landmarks(path, "coco")
+    assert f"{path} cannot be read as coco" in str(caught.value)
+    assert "Expected images, annotations" in str(caught.value)
+
+
+def test_tables_keep_options_of_their_own(tmp_path):
+    path = tmp_path / "a.tsv"
+    names = [f"{axis}{j}" for axis in "ab" for j in range(8)]
+    table = pd.DataFrame(files.planar(TRACKS), columns=names)
+    table.iloc[2, [3, 11]] = 0
+    table.insert(0, "id", [f"{i:03d}" for i in range(12)])
+    table.to_csv(path, sep="\t", index=False)
+    landmarks = read_landmarks(path, columns="a#,b#", missing="zeros")
+    expected = TRACKS.copy()
+    expected[2, 3] = np.nan
+    np.testing.assert_array_equal(tracks_of(landmarks), expected)
+    assert list(landmarks.frames["id"])[:2] == ["000", "001"]
+    with pytest.raises(ValueError, match=r"a\.tsv cannot be read as table"):
+        read_landmarks(path)
+
+
+def test_only_one_matching_format_is_picked(tmp_path):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    box = [f"FaceRect{side}" for side in ("X", "Y", "Width", "Height")]
+    pd.read_csv(path).copy().assign(**dict.fromkeys(box, 1.0)).to_csv(path, index=False)
+    with pytest.raises(ValueError, match="more than one format: openface, pyfeat"):
+        read_landmarks(path)
+    assert read_landmarks(path, "openface").format == "openface"
+
+
+def test_unknown_files_are_told_what_was_expected(tmp_path):
+    path = tmp_path / "a.slp"
+    with pytest.raises(FileNotFoundError):
+        read_landmarks(path)
+    path.write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"a\.slp is of no known format.*sleap: the"):
+        read_landmarks(path)
+    with pytest.raises(ValueError, match=r"expected the datasets"):
+        read_landmarks(path, "sleap")
+    for name in ("a.txt", "a.json", "a.h5"):
+        (tmp_path / name).write_text("1 2 3\n")
+        with pytest.raises(ValueError, match=r"no known format\. Expected"):
+            read_landmarks(tmp_path / name)
+    with pytest.raises(ValueError, match=r"no known format\. Expected pts"):
+        read_landmarks(tmp_path)
+    with pytest.raises(ValueError, match=r"no \.pts files in the folder"):
+        read_landmarks(tmp_path, "pts")
+    with pytest.raises(ValueError, match=r"auto or one of openface, .* got 'dlc'"):
+        read_landmarks(path, "dlc")
+
+
+def test_options_of_other_formats_are_refused(tmp_path):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    with pytest.raises(ValueError, match="openface has no option columns"):
+        read_landmarks(path, columns="x_#,y_#")
+    for threshold in (np.nan, "0.5", True, np.inf):
+        with pytest.raises(ValueError, match="min_confidence must be a finite number"):
+            read_landmarks(path, min_confidence=threshold)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text[:-40], "line 13 has .* values, but .* truncated"),
+        (lambda text: text.replace("\n2,0,", "\n2,0,,"), "line 3 has 415 values"),
+        (lambda text: text.replace("face_id", "frame"), "two columns .* 'frame'"),
+        (lambda text: text.replace(",y_3,", ",why,"), "'x_3' has no partner"),
+        (lambda text: text.partition("\n")[0], "a header but no rows"),
+        (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",?,", 1), "'x_2'.*'\\?'"),
+        (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",inf,", 1), "infinite"),
+        (lambda text: text.replace("0.98", "0.9\xe9"), "'confidence'.*in row 0"),
+    ],
+    ids=["truncated", "long", "twice", "unpaired", "empty", "text", "inf", "letter"],
+)
+def test_damaged_tables_are_refused(damage, message, tmp_path):
+    path = files.write_openface(tmp_path / "a.csv", TRACKS)
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(ValueError, match=message) as caught:
+        read_landmarks(path, "openface")
+    assert str(path) in str(caught.value)
+
+
+def landmarker_result(part, faces, **extra):
+    """Return what MediaPipe's landmarkers return."""
+    points = [
+        [SimpleNamespace(x=x, y=y, z=0.0, **extra) for x, y in face] for face in faces
+    ]
+    return SimpleNamespace(**{part: points})
+
+
+@pytest.mark.parametrize("part", ["face_landmarks", "hand_landmarks", "pose_landmarks"])
+def test_mediapipe_results_become_pixels(part):
+    sizes = np.array([(640, 480), (1920, 1080), (100, 200)])
+    shares = TRACKS[:3] / 500
+    results = [
+        landmarker_result(part, shares[:2], visibility=0.25),
+        landmarker_result(part, [], visibility=0.25),
+        landmarker_result(part, shares[2:], visibility=0.75),
+    ]
+    landmarks = from_mediapipe(iter(results), sizes)
+    np.testing.assert_allclose(
+        tracks_of(landmarks)[[0, 1, 3]], shares * sizes[[0, 0, 2], None]
+    )
+    assert list(landmarks.failed) == [False, False, True, False]
+    assert list(landmarks.frames["frame"]) == [0, 0, 1, 2]
+    assert list(landmarks.frames["individual"].isna()) == [False, False, True, False]
+    if part == "pose_landmarks":
+        assert list(landmarks.confidence["0"].dropna()) == [0.25, 0.25, 0.75]
+    else:
+        assert landmarks.confidence is None
+
+
+def test_bad_mediapipe_results_are_refused():
+    face = landmarker_result("face_landmarks", TRACKS[:1])
+    with pytest.raises(ValueError, match=r"should have face_landmarks.*got int"):
+        from_mediapipe([3], (640, 480))
+    with pytest.raises(ValueError, match="more than one kind"):
+        from_mediapipe(
+            [face, landmarker_result("hand_landmarks", TRACKS[:1])], (640, 480)
+        )
+    with pytest.raises(ValueError, match=r"has 8 points, result 1 .* has 2"):
+        from_mediapipe(
+            [face, landmarker_result("face_landmarks", TRACKS[:1, :2])], (640, 480)
+        )
+    for sizes in (640, [(640, 480)] * 2, (640, -1), (np.nan, 480)):
+        with pytest.raises(ValueError, match="image_sizes must be"):
+            from_mediapipe([face], sizes)
+    with pytest.raises(ValueError, match="none of the 0 results"):
+        from_mediapipe([], (640, 480))
+    with pytest.raises(ValueError, match="numbers x and y"):
+        from_mediapipe([SimpleNamespace(face_landmarks=[[1, 2]])], (640, 480))
+
+
+class Variable:
+    """As much of an array with named axes as from_movement uses."""
+
+    def __init__(self, values, dims, coords):
+        self.values, self.dims = np.asarray(values), tuple(dims)
+        self.coords = {
+            name: SimpleNamespace(values=np.asarray(coords[name]))
+            for name in dims
+            if name in coords
+        }
+
+    def transpose(self, *dims):
+        axes = [self.dims.index(dim) for dim in dims]
+        coords = {name: coord.values for name, coord in self.coords.items()}
+        return Variable(self.values.transpose(axes), dims, coords)
+
+
+def movement_dataset(plural, order=(0, 1, 2, 3)):
+    """Return a dataset of two mice, as movement names it now and did before."""
+    keypoint, individual = (
+        ("keypoints", "individuals")
+        if plural
+        else (
+            "keypoint",
+            "individual",
+        )
+    )
+    dims = ["time", "space", keypoint, individual]
+    coords = {
+        "time": np.arange(12) / 30,
+        "space": ["x", "y"],
+        keypoint: files.BODYPARTS,
+        individual: ["id_0", "id_1"],
+    }
+    pair = np.stack([TRACKS, TRACKS + 100], axis=3).transpose(0, 2, 1, 3)
+    pair[3, :, :, 1] = np.nan
+    position = pair.transpose(order)
+    confidence = np.linspace(0, 1, 192).reshape(12, 8, 2)
+    return {
+        "position": Variable(position, [dims[i] for i in order], coords),
+        "confidence": Variable(confidence, [dims[0], *dims[2:]], coords),
+    }
+
+
+@pytest.mark.parametrize("plural", [True, False])
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 0, 2, 1)], ids=str)
+def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
+    landmarks = from_movement(movement_dataset(plural, order))
+    rows = np.stack([TRACKS, TRACKS + 100], axis=1).reshape(24, 8, 2)
+    np.testing.assert_allclose(tracks_of(landmarks), np.delete(rows, 7, axis=0))
+    assert list(landmarks.frames["individual"][:2]) == ["id_0", "id_1"]
+    np.testing.assert_allclose(landmarks.frames["time"][:3], [0, 0, 1 / 30])
+    assert landmarks.confidence.iloc[0, 1] == pytest.approx(2 / 191)
+    swapped = movement_dataset(plural, order)
+    swapped["position"].coords["space"].values = np.array(["y", "x"])
+    np.testing.assert_array_equal(
+        tracks_of(from_movement(swapped))[..., ::-1], tracks_of(landmarks)
+    )
+    one = from_movement(movement_dataset(plural, order), individual="id_1")
+    np.testing.assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
+    assert list(np.flatnonzero(one.failed)) == [3]
+
+
+def test_other_datasets_are_refused():
+    dataset = movement_dataset(plural=False)
+    with pytest.raises(ValueError, match="no individual 'x'; there are id_0, id_1"):
+        from_movement(dataset, individual="x")
+    with pytest.raises(ValueError, match="should have position; got dict"):
+        from_movement({})
+    flat = Variable(np.zeros((2, 3)), ["time", "space"], {})
+    with pytest.raises(ValueError, match=r"should have the axes .* got time, space"):
+        from_movement({"position": flat})
+    dataset["position"].coords["space"].values = np.array(["x", "z"])
+    with pytest.raises(ValueError, match="with space x and y; got x, z"):
+        from_movement(dataset)
