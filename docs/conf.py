@@ -6,6 +6,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import importlib
+from pkgutil import iter_modules
 
 from sphinx_gallery.sorting import ExplicitOrder
 
@@ -36,11 +37,13 @@ nitpick_ignore_regex = [
     ("py:obj", r"[^.]+"),
     ("py:obj", r"AffineNRSfM\.\w+_"),  # attributes stand on the page of the class
 ]
-MODULES = ["baselines", "calibration", "datasets", "io", "isa", "metrics", "plotting"]
+MODULES = [m.name for m in iter_modules(isa_nrsfm.__path__) if m.name[0] != "_"]
 
 numpydoc_show_class_members = False
 autodoc_typehints = "none"
 autosummary_generate = True
+autosummary_imported_members = True
+autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 
 myst_heading_anchors = 3

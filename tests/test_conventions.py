@@ -16,7 +16,7 @@ import isa_nrsfm
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
-FOLDERS = ["isa_nrsfm", "tests", "benchmarks"]
+FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]
 OPTIONAL = ["matplotlib", "pandas", "polars", "pooch", "pyarrow", "skops"]
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [

@@ -2,12 +2,14 @@
 
 import re
 from pathlib import Path
+from pkgutil import iter_modules
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.io import savemat
 
+import isa_nrsfm
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -15,9 +17,14 @@ PAGES = ["README.md", "docs/getting_started.md", "docs/migration.md"]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
+def text(page):
+    """Return the text of a page."""
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
 def blocks(page):
     """Return the Python code of a page, block by block."""
-    return BLOCK.findall((ROOT / page).read_text(encoding="utf-8"))
+    return BLOCK.findall(text(page))
 
 
 @pytest.fixture
@@ -57,6 +64,19 @@ def run(page):
     for code in blocks(page):
         exec(compile(code, page, "exec"), names)
     return names
+
+
+def test_links_of_the_readme_lead_somewhere():
+    links = re.findall(r"\]\((?!https?:)([^)#]+)\)", text("README.md"))
+    assert len(links) > 10
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_the_api_page_lists_all_public_modules():
+    modules = {m.name for m in iter_modules(isa_nrsfm.__path__)}
+    public = {name for name in modules - {"cli"} if not name.startswith("_")}
+    listed = re.findall(r"^   isa_nrsfm\.(\w+)$", text("docs/api.rst"), re.MULTILINE)
+    assert public == set(listed)
 
 
 @pytest.mark.parametrize("page", PAGES)

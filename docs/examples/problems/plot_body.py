@@ -96,7 +96,7 @@ def turned_onto(target, shape):
 across, up = axes_of_view
 depth = 3 - across - up
 _, axes = plt.subplots(2, 3, figsize=(7, 6.5), layout="constrained")
-for i, pair in zip(n_frames * np.array([1, 3, 5]) // 6, axes.T, strict=True):
+for i, pair in zip(n_frames * np.array([6, 18, 43]) // 100, axes.T, strict=True):
     body = truth[i] - truth[i].mean(axis=0)
     for shape, colour in ((body, "0.75"), (turned_onto(body, shapes[i]), "tab:red")):
         for axis, horizontal in zip(pair, (across, depth), strict=True):
