@@ -11,6 +11,7 @@ that they were not fitted to.
 """
 
 import warnings
+from textwrap import fill
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -56,8 +57,9 @@ print("held-out errors, %:", -100 * search.cv_results_["mean_test_score"].round(
 # -----------
 #
 # `AffineNRSfM.diagnostics` tells how far the table determines a fit, and warns where it
-# does not. With five basis shapes, two directions of the coefficients are noise: their
-# reliability, the share of their variance that is not uncertainty, is low.
+# does not. With five basis shapes, two directions of the coefficients may well be
+# noise: their reliability, the share of their variance that is not uncertainty, is
+# below 0.8.
 
 for k in (3, 5):
     with warnings.catch_warnings(record=True) as told:
@@ -65,7 +67,7 @@ for k in (3, 5):
         diagnostics = models[k].diagnostics()
     print(f"K={k}: reliability {diagnostics.reliability.round(2)}")
     for warning in told:
-        print(f"     {warning.message}")
+        print(fill(str(warning.message), 80))
 
 # %%
 # The other figures of the named tuple:
@@ -73,8 +75,8 @@ for k in (3, 5):
 # - ``camera_singular_values``: how much the images show of each direction of space. A
 #   last value near zero says that all frames see the object from one side: depth is
 #   hardly determined.
-# - ``deformation_amplitude``: deformation relative to the mean shape. Above some 0.3,
-#   affine cameras take part of it for motion of their own.
+# - ``deformation_amplitude``: deformation relative to the mean shape. The larger it is,
+#   the more of it affine cameras can take for motion of their own.
 # - ``effective_frames``: how many frames speak for each basis shape. One of a few
 #   frames may be an outlier, such as a single bad detection.
 # - ``weak_deviations``: standard deviations of those parts of the basis shapes that

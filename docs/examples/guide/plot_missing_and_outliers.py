@@ -80,7 +80,6 @@ for loss in ("linear", "huber", "cauchy"):
 # The points that do not fit stand out: the distance from the reprojection finds them.
 
 distance = np.linalg.norm(model.reproject(X).reshape(tracks.shape) - tracks, axis=-1)
-moved = np.linalg.norm(tracks - faces.tracks, axis=-1)
 _, axis = plt.subplots(figsize=(6, 3), layout="constrained")
 bins = np.geomspace(0.03, 1000, 60)
 axis.hist(distance[~wrong], bins, color="0.6", label="good points")

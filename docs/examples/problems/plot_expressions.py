@@ -86,8 +86,9 @@ for n_components in (K, 3 * K + 3):
     print(f"PCA with {n_components} components: accuracy {accuracy.mean():.1%}")
 
 # %%
-# Many components of PCA let the classifier undo the mixing of pose and expression, as far
-# as the poses of the table go: :ref:`sphx_glr_gallery_guide_plot_pca_and_fastica.py`.
+# Many components of PCA let the classifier undo the mixing of pose and expression, as
+# far as the poses of the table go:
+# :ref:`sphx_glr_gallery_guide_plot_pca_and_fastica.py`.
 #
 # Which are confused? Rows that no fit has seen, fold by fold.
 
