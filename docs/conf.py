@@ -36,6 +36,7 @@ default_role = "py:obj"
 nitpick_ignore_regex = [
     ("py:obj", r"[^.]+"),
     ("py:obj", r"AffineNRSfM\.\w+_"),  # attributes stand on the page of the class
+    ("py:obj", r".*\.[A-Z_]+"),  # constants have no page
 ]
 MODULES = [m.name for m in iter_modules(isa_nrsfm.__path__) if m.name[0] != "_"]
 
