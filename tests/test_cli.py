@@ -25,7 +25,14 @@ from isa_nrsfm.metrics import inverse_snr
 N_FRAMES, N_COMPONENTS = 60, 2
 QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
 PROGRAM = str(Path(sys.executable).with_name("isa-nrsfm"))
-FIT_FILES = {"alpha.csv", "cameras.csv", "shapes.npz", "model.skops", "report.json"}
+FIT_FILES = {
+    "alpha.csv",
+    "cameras.csv",
+    "shapes.npz",
+    "viewer.html",
+    "model.skops",
+    "report.json",
+}
 FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -25,6 +25,7 @@ PUBLIC_MODULES = [
     "isa_nrsfm.calibration",
     "isa_nrsfm.cli",
     "isa_nrsfm.datasets",
+    "isa_nrsfm.export",
     "isa_nrsfm.io",
     "isa_nrsfm.isa",
     "isa_nrsfm.metrics",

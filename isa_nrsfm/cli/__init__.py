@@ -1,4 +1,4 @@
-"""The command line ``isa-nrsfm`` with its commands fit, transform and demo."""
+"""The command line ``isa-nrsfm`` with its commands fit, transform, export and demo."""
 
 from isa_nrsfm.cli._main import main
 

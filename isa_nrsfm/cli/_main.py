@@ -63,6 +63,10 @@ def _run(args: Namespace, warned: list[str]) -> str:
         from isa_nrsfm.cli._demo import run_demo
 
         return run_demo(args, warned)
+    if args.command == "export":
+        from isa_nrsfm.cli._export import run_export
+
+        return run_export(args)
     from isa_nrsfm.cli._commands import run_fit, run_transform
 
     return (run_fit if args.command == "fit" else run_transform)(args, warned)

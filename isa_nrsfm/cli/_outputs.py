@@ -13,6 +13,8 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm._optional import import_optional
 from isa_nrsfm.cli._frames import Frames
+from isa_nrsfm.export import write_shapes, write_viewer
+from isa_nrsfm.export._shape_arrays import names_of_components
 from isa_nrsfm.io import save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
 
@@ -32,22 +34,23 @@ TABLES = {
     "inverse_snr is the energy of the reprojection error relative to the frame's",
 }
 ARRAYS = {
-    "shapes.npz": "mean_shape, basis, point_names, component_names; the shape of a "
-    "frame is mean_shape + sum_k alpha_k basis[k]",
+    "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
+    "a frame is mean_shape + sum_k alpha_k basis[k]",
 }
+PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
 MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
 
 
 def component_names(n_components: int) -> list[str]:
     """Name the coefficients, counted from 1: number 0 is the mean shape."""
-    return [f"alpha_{k + 1}" for k in range(n_components)]
+    return names_of_components(None, n_components)
 
 
 def prepare_folder(
     folder: Path, inputs: Iterable[str], *, figures: bool
 ) -> dict[str, str]:
     """Create the output folder, check that it can be written, and list its files."""
-    files = MODEL | TABLES | ARRAYS | (FIGURES if figures else {})
+    files = MODEL | TABLES | ARRAYS | PAGE | (FIGURES if figures else {})
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass
@@ -103,7 +106,7 @@ def write_results(
     *,
     std: bool,
 ) -> None:
-    """Write model, coefficients, cameras and shapes.
+    """Write model, coefficients, cameras, shapes and the viewer.
 
     The tables have a row for each frame, empty for those that could not be fitted.
     """
@@ -124,16 +127,18 @@ def write_results(
     cameras.insert(0, "row", cameras.index)
     write_table(cameras, folder / "cameras.csv")
 
-    np.savez(
-        folder / "shapes.npz",
-        mean_shape=estimator.mean_shape_,
-        basis=estimator.basis_,
-        point_names=np.array(frames.columns.points, dtype=str),
-        component_names=np.array(component_names(len(estimator.basis_)), dtype=str),
-        reference_motion=estimator.reference_motion_,
-        reference_translation=estimator.reference_translation_,
-    )
+    write_shapes(estimator, folder / "shapes.npz")
+    _write_page(folder / "viewer.html", estimator, X)
     save_model(estimator, folder / "model.skops")
+
+
+def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
+    """Write the viewer, with affine shapes where the cameras tell no others."""
+    try:
+        write_viewer(estimator, path, X=X)
+    except ValueError as error:
+        warnings.warn(f"{path.name} has affine shapes: {error}", stacklevel=2)
+        write_viewer(estimator, path, X=X, camera=None)
 
 
 def alpha_table(fit: FrameFit, frames: Frames, *, std: bool) -> "pd.DataFrame":

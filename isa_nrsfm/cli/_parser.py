@@ -8,6 +8,7 @@ from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._independent_gauge import INDEPENDENCE
 from isa_nrsfm._robust import LOSSES
+from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
 
 PROGRAM = "isa-nrsfm"
 # A range of more numbers of basis shapes is a mistake.
@@ -25,6 +26,8 @@ examples:
       fit a table and write coefficients, shapes, cameras, figures and the model
   isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
       coefficients of new frames
+  isa-nrsfm export results/model.skops --output faces.glb
+      the shapes for other programs
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
 such as x0, y0 or nose_x, nose_y; all other columns are kept beside the results."""
@@ -104,6 +107,15 @@ def build_parser() -> argparse.ArgumentParser:
     )
     _add_std_option(transform)
 
+    export = commands.add_parser(
+        "export", help="shape models, animated 3D, a viewer", **_manners(*EXPORT_HELP)
+    )
+    export.add_argument(
+        "model", metavar="MODEL", type=_path, help="model.skops, written by fit"
+    )
+    add_export_options(export, _path)
+    _add_table_options(export, required=False)
+
     demo = commands.add_parser(
         "demo",
         help="fit an artificial table of faces",
@@ -126,11 +138,18 @@ def _manners(description: str, epilog: str) -> dict[str, Any]:
     }
 
 
-def _add_table_options(parser: argparse.ArgumentParser) -> None:
+def _add_table_options(
+    parser: argparse.ArgumentParser, *, required: bool = True
+) -> None:
     """Add the options that say what a table's rows and columns mean."""
     group = parser.add_argument_group("table")
     group.add_argument(
-        "table", metavar="TABLE", type=_path, help="a .csv, .tsv or .parquet file"
+        "table",
+        metavar="TABLE",
+        type=_path,
+        nargs=None if required else "?",
+        help="a .csv, .tsv or .parquet file"
+        + ("" if required else " with the frames that the viewer shows"),
     )
     group.add_argument(
         "--columns",

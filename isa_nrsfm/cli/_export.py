@@ -1,0 +1,149 @@
+"""The command export, from options to the text of its report."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.cli._commands import _as_fitted, _read_frames
+from isa_nrsfm.cli._export_options import SUFFIXES
+from isa_nrsfm.cli._outputs import refuse_overwriting
+from isa_nrsfm.cli._report import lay_out, table_lines, table_report
+from isa_nrsfm.export import (
+    point_distribution_model,
+    write_glb,
+    write_pdm,
+    write_shapes,
+    write_viewer,
+)
+from isa_nrsfm.export._shape_arrays import names_of_points
+from isa_nrsfm.io import load_model
+
+# The options that each content has.
+_POSE = ("camera", "origin", "mirrored")
+_OPTIONS = {
+    "viewer": ("edges", "names", "label", "n_frames", "table", *_POSE),
+    "glb": ("edges", "names", *_POSE),
+    "pdm": ("n_modes", *_POSE),
+    "shapes": (),
+}
+_TABLE_OPTIONS = ("columns", "skip_rows", "zeros_missing", "label")
+
+
+def run_export(args: Namespace) -> str:
+    """Write what is asked for, and return the report."""
+    output = Path(args.output)
+    content = _content(output, args.content)
+    options = _options(args, content)
+    estimator = load_model(args.model)
+    for source in filter(None, (args.model, args.table, options.get("edges"))):
+        if source != "none":
+            refuse_overwriting(source, [output])
+    sections = {"Model": [args.model]}
+    if args.table is not None:
+        options |= _table_options(args, estimator, sections)
+    if "edges" in options:
+        options["edges"] = _edges(options["edges"], estimator)
+    if options.get("camera") == "none":
+        options["camera"] = None
+
+    lines = [str(output)]
+    if content == "viewer":
+        write_viewer(estimator, output, **options)
+    elif content == "glb":
+        write_glb(estimator, output, **options)
+    elif content == "pdm":
+        pdm = point_distribution_model(estimator, **options)
+        write_pdm(pdm, output)
+        lines.append(f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points")
+    else:
+        write_shapes(estimator, output)
+    lines.append(f"{output.stat().st_size} bytes")
+    return lay_out(sections | {"Output": lines})
+
+
+def _content(output: Path, content: str | None) -> str:
+    """Return what is to be written, and check that the suffix fits."""
+    suffix = output.suffix.lower()
+    if content is None:
+        found = [name for name, suffixes in SUFFIXES.items() if suffix in suffixes]
+        if not found:
+            known = ", ".join(s for suffixes in SUFFIXES.values() for s in suffixes)
+            raise ValueError(
+                f"--output: expected a file with one of the suffixes {known}; got "
+                f"{output}"
+            )
+        return found[0]
+    suffixes = SUFFIXES[content]
+    if content == "pdm":
+        suffixes += SUFFIXES["shapes"]
+    if suffix not in suffixes:
+        raise ValueError(
+            f"--content {content} is written to files {', '.join(suffixes)}; got "
+            f"{output}"
+        )
+    return content
+
+
+def _options(args: Namespace, content: str) -> dict[str, Any]:
+    """Return the options that are given, all of which the content must have."""
+    names = {name for own in _OPTIONS.values() for name in own}
+    given = {name: value for name, value in vars(args).items() if name in names}
+    given = {name: value for name, value in given.items() if value is not None}
+    for name in given:
+        if name not in _OPTIONS[content]:
+            having = [kind for kind, own in _OPTIONS.items() if name in own]
+            option = "TABLE" if name == "table" else f"--{name.replace('_', '-')}"
+            raise ValueError(
+                f"{option} is for {' and '.join(having)}; {args.output} is {content}"
+            )
+    if args.table is None:
+        for name in _TABLE_OPTIONS:
+            if getattr(args, name):
+                raise ValueError(f"--{name.replace('_', '-')} needs a TABLE")
+    return {name: given[name] for name in given if name not in ("table", "label")}
+
+
+def _table_options(
+    args: Namespace, estimator: AffineNRSfM, sections: dict[str, list[str]]
+) -> dict[str, Any]:
+    """Read the table that the viewer shows, and its labels."""
+    frames = _read_frames(args, estimator)
+    report = table_report(args.table, frames)
+    sections["Table"] = table_lines(report, unusable="not shown")
+    options = {"X": _as_fitted(estimator, frames.points[frames.usable])}
+    if args.label is not None:
+        other = {str(name).strip(): name for name in frames.other.columns}
+        if args.label not in other:
+            raise ValueError(
+                f"--label: the table has no column {args.label!r} beside its "
+                f"landmarks; it has {', '.join(other) or 'none'}"
+            )
+        options["labels"] = frames.other.loc[frames.usable, other[args.label]]
+    return options
+
+
+def _edges(path: str, estimator: AffineNRSfM) -> Any:
+    """Read which points are joined."""
+    if path == "none":
+        return None
+    numbers = {name: j for j, name in enumerate(names_of_points(estimator))}
+    edges: list[list[int]] = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines()):
+        names = [name.strip() for name in line.split(",")]
+        if not line.strip():
+            continue
+        unknown = [name for name in names if name not in numbers]
+        size = len(edges[0]) if edges else len(names)
+        if unknown or len(names) != size or size not in (2, 3):
+            raise ValueError(
+                f"{path}, line {number + 1}: expected the names of two or three points "
+                f"with commas between them, such as {', '.join([*numbers][:2])}; got "
+                f"{line!r}"
+            )
+        edges.append([numbers[name] for name in names])
+    if not edges:
+        raise ValueError(f"{path} has no edges; for points alone say --edges none")
+    return np.array(edges)

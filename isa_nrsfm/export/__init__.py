@@ -1,0 +1,28 @@
+"""Fitted models as files for other programs.
+
+Shape models for MATLAB, OpenFace and own code, animated shapes for programs that show
+glTF, and a page for a browser that lets anybody look at them. Shapes are Euclidean ones
+as far as the cameras tell them (`isa_nrsfm.calibration`), upright and frontal.
+"""
+
+from isa_nrsfm.export._gltf import write_glb
+from isa_nrsfm.export._point_distribution import (
+    PointDistributionModel,
+    point_distribution_model,
+    read_pdm,
+    write_pdm,
+)
+from isa_nrsfm.export._shape_arrays import ShapeArrays, shape_arrays, write_shapes
+from isa_nrsfm.export._viewer import write_viewer
+
+__all__ = [
+    "PointDistributionModel",
+    "ShapeArrays",
+    "point_distribution_model",
+    "read_pdm",
+    "shape_arrays",
+    "write_glb",
+    "write_pdm",
+    "write_shapes",
+    "write_viewer",
+]

@@ -1,0 +1,301 @@
+"""Basis shapes as morph targets of a glTF 2.0 file."""
+
+import json
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm import __version__
+from isa_nrsfm.export._drawing import (
+    Links,
+    choose_links,
+    frontal_triangles,
+    vertex_normals,
+)
+from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
+from isa_nrsfm.export._upright import (
+    UPSIDE_DOWN,
+    Camera,
+    upright_basis,
+    upright_space,
+)
+from isa_nrsfm.plotting._axes import is_dense
+from isa_nrsfm.plotting._edges import Origin
+
+# Numbers of the specification: types of components, uses of bytes, kinds of primitives.
+FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
+VERTICES, INDICES = 34962, 34963
+POINTS, LINES, TRIANGLES = 0, 1, 4
+# The largest index that shorts can hold; one more means something else.
+LARGEST_SHORT = 65534
+# The animation: standard deviations, seconds for a basis shape, keys for one swing.
+AMPLITUDE, SECONDS, KEYS = 2.0, 2.0, 17
+# Matt materials, seen from both sides: that of points and edges, and that of surfaces.
+PLAIN, SURFACE = 0, 1
+MATERIALS = [
+    {
+        "name": name,
+        "doubleSided": True,
+        "pbrMetallicRoughness": {
+            "baseColorFactor": [*colour, 1.0],
+            "metallicFactor": 0.0,
+            "roughnessFactor": 0.8,
+        },
+    }
+    for name, colour in (
+        ("points and edges", (0.05, 0.12, 0.25)),
+        ("surface", (0.80, 0.66, 0.55)),
+    )
+]
+
+
+def write_glb(
+    model: Any,
+    path: str | os.PathLike[str],
+    *,
+    edges: Links = "auto",
+    names: Sequence[str] | None = None,
+    camera: Camera = "weak_perspective",
+    origin: Origin = "auto",
+    mirrored: bool = False,
+) -> None:
+    """
+    Write the mean shape with the basis shapes as morph targets to a glTF 2.0 file.
+
+    The weight of a morph target is the coefficient: with the weights ``alpha_[i]`` the
+    shape is that of frame i. An animation swings them one after the other.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    path : str or path-like
+        The file, with the suffix ``.glb``. An existing file is replaced.
+    edges : "auto", None or array-like, default="auto"
+        What is drawn beside the points: integers of shape (n_edges, 2), pairs of points
+        to be joined; or (n_triangles, 3), the triangles of a surface, counter-clockwise
+        as seen from outside; or None for nothing. "auto" makes a surface of the
+        Delaunay triangles of the front view. More than 400 points of a surface are not
+        drawn as points.
+    names : sequence of str of length n_components, default=None
+        Names of the morph targets; by default alpha_1, alpha_2, ...
+    camera : {"weak_perspective", None}, default="weak_perspective"
+        What is known of the cameras. "weak_perspective" writes Euclidean shapes, None
+        affine ones, which look like those of figures.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero in the table: "upper" for images, whose y points down, "lower"
+        for a y that points up. "auto" is "lower" where 68 points of a face would stand
+        on their head otherwise.
+    mirrored : bool, default=False
+        Whether to take the mirror image in depth, which fits the table as well. Faces
+        of 68 points in the order of iBUG have the right depth without.
+
+    Raises
+    ------
+    ValueError
+        If the model has kept no frames, if the cameras see less than three directions
+        of space, if a parameter is not of the kind given above, or the points have no
+        triangles in the front view.
+    OSError
+        If the file cannot be written.
+
+    Warns
+    -----
+    UserWarning
+        If the cameras turn too little to tell the metric.
+
+    See Also
+    --------
+    write_viewer : A page for a browser.
+
+    Notes
+    -----
+    As glTF wants it, y points up and z to the viewer. The largest extent of the mean
+    shape is one unit, since the true size is not known; ``extras`` of the mesh has the
+    names of the points and by what the shapes were multiplied. Euclidean basis shapes
+    are the least squares fit to the shapes of the frames.
+    """
+    if Path(path).suffix.lower() != ".glb":
+        raise ValueError(f"path must end in .glb; got {os.fspath(path)}")
+    space = upright_space(model, camera, origin, mirrored)
+    n_components = len(model.basis_)
+    targets = names_of_components(names, n_components)
+    mean, basis = upright_basis(space, model)
+    mean = (mean - mean.mean(axis=0)) @ UPSIDE_DOWN
+    factor = 1 / np.ptp(mean, axis=0).max()
+    mean, basis = factor * mean, factor * (basis @ UPSIDE_DOWN)
+    if isinstance(edges, str) and edges == "auto":
+        links: NDArray | None = frontal_triangles(mean)
+    else:
+        links = choose_links(edges, mean)
+
+    file = Binary()
+    primitives = _primitives(file, mean, basis, links)
+    used = sorted({part["material"] for part in primitives})
+    for part in primitives:
+        part["material"] = used.index(part["material"])
+    mesh = {
+        "name": "mean shape",
+        "primitives": primitives,
+        "weights": [0.0] * n_components,
+        "extras": {
+            "targetNames": targets,
+            "pointNames": list(names_of_points(model)),
+            "factor": factor,
+        },
+    }
+    times, weights = _swings(n_components)
+    sampler = {
+        "input": file.add(times, bounds=True),
+        "interpolation": "LINEAR",
+        "output": file.add(weights.ravel()),
+    }
+    animation = {
+        "name": "basis shapes in turn",
+        "samplers": [sampler],
+        "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": f"isa_nrsfm {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "shape", "mesh": 0}],
+        "meshes": [mesh],
+        "materials": MATERIALS[: 1 + max(p["material"] for p in primitives)],
+        "animations": [animation],
+    }
+    Path(path).write_bytes(file.with_document(document))
+
+
+class Binary:
+    """
+    The arrays of a glTF file, one after the other.
+
+    Attributes
+    ----------
+    parts : list of bytes
+        The bytes of the arrays, whose numbers are multiples of four.
+    views, accessors : list of dict
+        Where each array is and what it holds, in the words of glTF.
+    """
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def add(
+        self, array: NDArray, use: int | None = None, *, bounds: bool = False
+    ) -> int:
+        """
+        Add an array and return its number.
+
+        Parameters
+        ----------
+        array : ndarray of shape (n,) or (n, 3)
+            Numbers or vectors; integers are indices.
+        use : int, default=None
+            What the bytes are for, VERTICES or INDICES.
+        bounds : bool, default=False
+            Whether to tell the smallest and the largest value.
+        """
+        if array.dtype.kind in "iu":
+            small = array.size == 0 or array.max() <= LARGEST_SHORT
+            kind, array = (
+                (SHORTS, array.astype("<u2"))
+                if small
+                else (INTEGERS, array.astype("<u4"))
+            )
+        else:
+            kind, array = FLOATS, array.astype("<f4")
+        accessor = {
+            "bufferView": len(self.views),
+            "componentType": kind,
+            "count": len(array),
+            "type": "SCALAR" if array.ndim == 1 else "VEC3",
+        }
+        if bounds:
+            rows = array.reshape(len(array), -1).astype(float)
+            accessor |= {"min": rows.min(axis=0).tolist()}
+            accessor |= {"max": rows.max(axis=0).tolist()}
+        view = {"buffer": 0, "byteOffset": self.size, "byteLength": array.nbytes}
+        self.views.append(view | ({} if use is None else {"target": use}))
+        self.accessors.append(accessor)
+        self.parts.append(_padded(array.tobytes(), b"\0"))
+        return len(self.accessors) - 1
+
+    @property
+    def size(self) -> int:
+        """The number of bytes so far."""
+        return sum(map(len, self.parts))
+
+    def with_document(self, document: dict[str, Any]) -> bytes:
+        """Return the file: header, the document that refers to the arrays, arrays."""
+        document = document | {
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": self.size}],
+        }
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False)
+        chunks = b"".join(
+            struct.pack("<I4s", len(content), kind) + content
+            for kind, content in (
+                (b"JSON", _padded(text.encode(), b" ")),
+                (b"BIN\0", b"".join(self.parts)),
+            )
+        )
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _padded(content: bytes, filler: bytes) -> bytes:
+    """Return bytes whose number is a multiple of four."""
+    return content + filler * (-len(content) % 4)
+
+
+def _primitives(
+    file: Binary, mean: NDArray, basis: NDArray, links: NDArray | None
+) -> list[dict[str, Any]]:
+    """Return the points, unless there are many on a surface, and what joins them."""
+    position = file.add(mean, VERTICES, bounds=True)
+    drifts = [file.add(drift, VERTICES, bounds=True) for drift in basis]
+    bare: dict[str, Any] = {
+        "attributes": {"POSITION": position},
+        "targets": [{"POSITION": drift} for drift in drifts],
+        "material": PLAIN,
+    }
+    primitives = [bare | {"mode": POINTS}]
+    if links is None or not len(links):
+        return primitives
+    indices = file.add(links.ravel(), INDICES)
+    if links.shape[1] == 2:
+        return [*primitives, bare | {"mode": LINES, "indices": indices}]
+    normals = vertex_normals(mean, links)
+    # Normals add up with the weights; what one standard deviation does to them.
+    turns = [vertex_normals(mean + drift, links) - normals for drift in basis]
+    surface = {
+        "attributes": bare["attributes"] | {"NORMAL": file.add(normals, VERTICES)},
+        "targets": [
+            {"POSITION": drift, "NORMAL": file.add(turn, VERTICES)}
+            for drift, turn in zip(drifts, turns, strict=True)
+        ],
+        "material": SURFACE,
+        "mode": TRIANGLES,
+        "indices": indices,
+    }
+    return [surface] if is_dense(mean) else [surface, *primitives]
+
+
+def _swings(n_components: int) -> tuple[NDArray, NDArray]:
+    """Return times (n,) and weights (n, n_components) of swings one after the other."""
+    phase = np.linspace(0, 1, KEYS)[1:]
+    swing = AMPLITUDE * np.sin(2 * np.pi * phase)
+    # Exactly at rest where the next one begins.
+    swing[-1] = 0.0
+    weights = np.kron(np.eye(n_components), swing[:, None])
+    times = (np.arange(n_components)[:, None] + phase).ravel()
+    return SECONDS * np.append(0.0, times), np.vstack([np.zeros(n_components), weights])

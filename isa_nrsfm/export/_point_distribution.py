@@ -1,0 +1,367 @@
+"""Point distribution models, and their files for OpenFace."""
+
+import os
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.io import loadmat, savemat
+
+from isa_nrsfm._frame_fit import compose
+from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
+from isa_nrsfm.plotting._edges import Origin
+
+SUFFIXES = (".txt", ".mat", ".npz")
+# The number by which OpenCV calls matrices of doubles.
+OPENCV_DOUBLES = 6
+COMMENTS = (
+    "The mean values of the components: x, y and z of all points",
+    "The principal components (eigenvectors), one a column",
+    "The variances of the components (eigenvalues)",
+)
+# Principal axes with a smaller share of the largest variance are rounding errors.
+SMALLEST_VARIANCE = 1e-10
+# Rounds of aligning shapes to their mean, and its relative change that ends them.
+MAX_ROUNDS, SETTLED = 100, 1e-12
+
+
+class PointDistributionModel(NamedTuple):
+    """
+    A point distribution model: mean, principal axes and variances of shapes.
+
+    A shape is ``mean + tensordot(scores, modes, 1)``. In the space x points right, y
+    down and z away from the viewer.
+
+    Attributes
+    ----------
+    mean : ndarray of shape (n_points, 3)
+        The mean shape, centred.
+    modes : ndarray of shape (n_modes, n_points, 3)
+        Principal axes, orthonormal as vectors of 3 n_points numbers, by decreasing
+        variance. The number of largest magnitude of each is positive.
+    eigenvalues : ndarray of shape (n_modes,)
+        Variances: the mean squares of the scores over the frames.
+    """
+
+    mean: NDArray
+    modes: NDArray
+    eigenvalues: NDArray
+
+    def scaled(self, factor: float) -> Self:
+        """
+        Return the model in another unit of length.
+
+        Parameters
+        ----------
+        factor : float
+            By how much the numbers grow: for millimetres, a distance on the object in
+            millimetres over the same distance on `mean`.
+
+        Returns
+        -------
+        PointDistributionModel
+            With ``factor * mean`` and ``factor ** 2 * eigenvalues``.
+        """
+        return self._replace(
+            mean=factor * self.mean, eigenvalues=factor**2 * self.eigenvalues
+        )
+
+
+def point_distribution_model(
+    model: Any,
+    *,
+    n_modes: float | None = None,
+    camera: Camera = "weak_perspective",
+    origin: Origin = "auto",
+    mirrored: bool = False,
+) -> PointDistributionModel:
+    """
+    Return the point distribution model of the frames that a model was fitted to.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    n_modes : int, float or None, default=None
+        Number of modes, or a share of the variance, between 0 and 1, of which as few
+        modes are taken as have it. None takes as many as there are basis shapes.
+    camera : {"weak_perspective", None}, default="weak_perspective"
+        What is known of the cameras. "weak_perspective" takes the Euclidean shapes of
+        the frames, as `AffineNRSfM.reconstruct` has them, aligned by rotations and
+        scales. None takes the affine shapes as they are.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero in the table: "upper" for images, whose y points down, "lower"
+        for a y that points up. "auto" is "lower" where 68 points of a face would stand
+        on their head otherwise.
+    mirrored : bool, default=False
+        Whether to take the mirror image in depth, which fits the table as well. Faces
+        of 68 points in the order of iBUG have the right depth without.
+
+    Returns
+    -------
+    PointDistributionModel
+        Named tuple of mean, modes and eigenvalues. Lengths are in units of images of
+        medium scale.
+
+    Raises
+    ------
+    ValueError
+        If the model has kept no frames, if the cameras see less than three directions
+        of space, if a parameter is not of the kind given above, or if the shapes have
+        fewer principal axes than `n_modes`.
+
+    Warns
+    -----
+    UserWarning
+        If the cameras turn too little to tell the metric.
+
+    See Also
+    --------
+    write_pdm : Write it to a file, for OpenFace among others.
+
+    Notes
+    -----
+    The modes are principal axes, not the independent basis shapes: uncorrelated,
+    orthogonal, and sorted by variance. Shapes are aligned as in generalised Procrustes
+    analysis [1]_, with scales that bring them to the tangent space of the mean: their
+    differences from it are orthogonal to it.
+
+    References
+    ----------
+    .. [1] J. C. Gower, "Generalized Procrustes analysis", Psychometrika 40, 1975.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import point_distribution_model
+    >>> faces = make_face_tracks(n_frames=100, n_components=2, random_state=0)
+    >>> model = AffineNRSfM(n_components=2, random_state=0).fit(faces.data)
+    >>> pdm = point_distribution_model(model)
+    >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
+    ((68, 3), (2, 68, 3), (2,))
+    """
+    _check_n_modes(n_modes)
+    space = upright_space(model, camera, origin, mirrored)
+    if space.metric is None:
+        shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
+        shapes = shapes @ space.transform.T
+    else:
+        shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
+        shapes = _aligned(shapes[np.isfinite(shapes).all(axis=(1, 2))])
+    mean = shapes.mean(axis=0)
+    modes, variances = _principal_axes((shapes - mean).reshape(len(shapes), -1))
+    n_kept = _number_of_modes(n_modes, len(model.basis_), variances)
+    modes = modes[:n_kept].reshape(-1, *mean.shape)
+    return PointDistributionModel(mean, modes, variances[:n_kept])
+
+
+def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None:
+    """
+    Write a point distribution model to a file.
+
+    Parameters
+    ----------
+    pdm : PointDistributionModel
+        The model.
+    path : str or path-like
+        The file. Its suffix tells the format: ``.txt`` is the text that OpenFace and
+        the CLM framework read, ``.mat`` has the variables M, V and E of their MATLAB
+        code, ``.npz`` has the arrays of the named tuple. An existing file is replaced.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is another one, or the arrays do not fit each other.
+    OSError
+        If the file cannot be written.
+
+    See Also
+    --------
+    read_pdm : Read it again.
+
+    Notes
+    -----
+    The text has three matrices: mean (3n x 1), principal components (3n x m) and
+    variances (1 x m), with the x of all n points first, then y, then z. Each has lines
+    of comment that begin with ``#``, its numbers of rows and columns, the number 6 (for
+    doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
+    """
+    suffix = _suffix(path)
+    mean, modes, eigenvalues = map(np.asarray, pdm)
+    n_modes = len(eigenvalues)
+    if (
+        mean.ndim != 2
+        or mean.shape[1] != 3
+        or modes.shape != (n_modes, *mean.shape)
+        or eigenvalues.shape != (n_modes,)
+    ):
+        raise ValueError(
+            "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
+            f"eigenvalues (n_modes,); got {mean.shape}, {modes.shape} and "
+            f"{eigenvalues.shape}"
+        )
+    if suffix == ".npz":
+        np.savez(path, mean=mean, modes=modes, eigenvalues=eigenvalues)
+        return
+    M = mean.T.reshape(-1, 1)
+    V = modes.transpose(2, 1, 0).reshape(-1, n_modes)
+    if suffix == ".mat":
+        savemat(path, {"M": M, "V": V, "E": eigenvalues[:, None]})
+        return
+    lines = []
+    for comment, matrix in zip(COMMENTS, (M, V, eigenvalues[None]), strict=True):
+        lines += [f"# {comment}", *map(str, (*matrix.shape, OPENCV_DOUBLES))]
+        lines += [" ".join(format(x, ".17g") for x in row) for row in matrix]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+
+
+def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
+    """
+    Read a point distribution model from a file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        A file that `write_pdm` has written, or one of OpenFace.
+
+    Returns
+    -------
+    PointDistributionModel
+        Named tuple of mean, modes and eigenvalues. What may follow them in a text, as
+        modes of expressions alone, is not read.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is none of ``.txt``, ``.mat`` and ``.npz``, or the file does not
+        have the three matrices, of shapes that fit each other.
+    OSError
+        If the file cannot be opened.
+
+    See Also
+    --------
+    write_pdm : Write such a file.
+    """
+    suffix = _suffix(path)
+    if suffix == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            names = PointDistributionModel._fields
+            absent = [name for name in names if name not in arrays]
+            if absent:
+                raise ValueError(f"{os.fspath(path)} has no {', '.join(absent)}")
+            return PointDistributionModel(*(arrays[name] for name in names))
+    if suffix == ".mat":
+        variables = loadmat(path)
+        absent = [name for name in "MVE" if name not in variables]
+        if absent:
+            raise ValueError(f"{os.fspath(path)} has no {', '.join(absent)}")
+        M, V, E = (variables[name].astype(np.float64) for name in "MVE")
+    else:
+        M, V, E = _read_matrices(path)
+    n_points, n_modes = M.size // 3, E.size
+    if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
+        raise ValueError(
+            f"{os.fspath(path)} should have a mean of 3n numbers, components of shape "
+            f"(3n, m) and m variances; got {M.size}, {V.shape} and {E.size}"
+        )
+    modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
+    return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of the path of a point distribution model."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(
+            f"a point distribution model is a file {', '.join(SUFFIXES[:-1])} or "
+            f"{SUFFIXES[-1]}; got {os.fspath(path)}"
+        )
+    return suffix
+
+
+def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
+    """Read the three matrices of a text."""
+    lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+    words = [word for line in lines if line[:1] != "#" for word in line.split()]
+    matrices = []
+    for comment in COMMENTS:
+        try:
+            n_rows, n_columns, _ = map(int, words[:3])
+            size = n_rows * n_columns
+            matrices.append(np.array(words[3 : 3 + size], float).reshape(n_rows, -1))
+            if matrices[-1].shape[1] != n_columns:
+                raise ValueError(f"{matrices[-1].shape[1]} columns for {n_columns}")
+        except ValueError as error:
+            raise ValueError(
+                f"{os.fspath(path)} is no point distribution model; where there should "
+                f"be {comment.partition(':')[0].lower()}: {error}"
+            ) from error
+        words = words[3 + size :]
+    return matrices
+
+
+def _check_n_modes(n_modes: Any) -> None:
+    """Raise if a number of modes or a share of the variance is neither."""
+    is_number = isinstance(n_modes, Integral) and not isinstance(n_modes, bool)
+    is_share = not isinstance(n_modes, Integral) and isinstance(n_modes, Real)
+    if n_modes is None or (is_number and n_modes >= 1):
+        return
+    if not (is_share and 0 < n_modes < 1):
+        raise ValueError(
+            "n_modes must be None, a whole number of at least 1 or a share between 0 "
+            f"and 1; got {n_modes!r}"
+        )
+
+
+def _number_of_modes(n_modes: Any, n_components: int, variances: NDArray) -> int:
+    """Return how many of the principal axes are wanted."""
+    n_axes = len(variances)
+    if n_modes is None:
+        return min(n_components, n_axes)
+    if not isinstance(n_modes, Integral):
+        share = np.cumsum(variances) / variances.sum()
+        return int(np.searchsorted(share, n_modes)) + 1
+    if int(n_modes) > n_axes:
+        raise ValueError(
+            f"n_modes must be at most {n_axes}, the number of principal axes of the "
+            f"shapes; got {n_modes}"
+        )
+    return int(n_modes)
+
+
+def _aligned(shapes: NDArray) -> NDArray:
+    """Return centred shapes turned to their mean, and scaled to its tangent space."""
+    shapes = shapes - shapes.mean(axis=1, keepdims=True)
+    mean = shapes.mean(axis=0)
+    aligned = shapes
+    for _ in range(MAX_ROUNDS):
+        left, stretch, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
+        turned = np.linalg.det(left @ right)
+        left[:, :, 2] *= turned[:, None]
+        stretch[:, 2] *= turned
+        # <aligned shape, mean> = <mean, mean>
+        scales = np.sum(mean**2) / stretch.sum(axis=1)
+        aligned = scales[:, None, None] * (shapes @ (left @ right))
+        previous, mean = mean, aligned.mean(axis=0)
+        if np.linalg.norm(mean - previous) <= SETTLED * np.linalg.norm(mean):
+            break
+    return aligned
+
+
+def _principal_axes(rows: NDArray) -> tuple[NDArray, NDArray]:
+    """Return orthonormal principal axes of centred rows and the variances on them."""
+    wide = len(rows) < rows.shape[1]
+    gram = rows @ rows.T if wide else rows.T @ rows
+    energies, vectors = np.linalg.eigh(gram)
+    large = energies > SMALLEST_VARIANCE * max(energies[-1], 0.0)
+    energies, vectors = energies[large][::-1], vectors[:, large][:, ::-1]
+    if wide:
+        # The products are orthogonal up to the rounding errors of the Gram matrix.
+        vectors = np.linalg.qr(rows.T @ vectors)[0]
+    axes = vectors.T
+    largest = np.abs(axes).argmax(axis=1, keepdims=True)
+    axes = axes * np.sign(np.take_along_axis(axes, largest, axis=1))
+    return axes, energies / len(rows)

@@ -1,0 +1,191 @@
+"""The upright space in which shapes are exported, and the shapes of a model in it.
+
+In that space x points right, y down and z away from the viewer, who sees the object
+from the front. Its lengths and angles are those of the object as far as the cameras of
+the fitted table tell them.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils import gen_batches
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm._canonical_pose import canonical_pose
+from isa_nrsfm._deformation_metric import (
+    DeformationMetric,
+    EuclideanFrames,
+    deformation_metric,
+    euclidean_frames,
+)
+from isa_nrsfm._metric import unit_cameras
+from isa_nrsfm._metric_upgrade import usable_cameras
+from isa_nrsfm.io._models import _check_class
+from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
+from isa_nrsfm.plotting._views import front_axes, viewing_transform
+
+Camera = Literal["weak_perspective"] | None
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
+# Half a turn about x takes shapes whose y points up to those whose y points down.
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+# So many numbers of shapes are computed at a time.
+BLOCK_SIZE = 2**23
+
+
+class UprightSpace(NamedTuple):
+    """
+    How the space of a model becomes upright.
+
+    Attributes
+    ----------
+    metric : DeformationMetric or None
+        The metric in which shapes are Euclidean; None for affine shapes.
+    transform : ndarray of shape (3, 3)
+        Takes Euclidean shapes, or affine ones, to the upright space:
+        ``shape @ transform.T``. Orthogonal for Euclidean shapes.
+    image_axes : ndarray of shape (3, 3)
+        Diagonal; takes the axes of an image and its depth to those of the upright
+        space.
+    """
+
+    metric: DeformationMetric | None
+    transform: NDArray
+    image_axes: NDArray
+
+
+def upright_space(
+    model: Any, camera: Camera, origin: Origin, mirrored: bool
+) -> UprightSpace:
+    """
+    Find the upright space of a fitted model.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    camera : {"weak_perspective", None}
+        What is known of the cameras. None takes the one affinity of space under which
+        they come nearest to weak-perspective ones, as figures do.
+    origin : {"auto", "upper", "lower"}
+        Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
+    mirrored : bool
+        Whether to take the mirror image in depth.
+
+    Returns
+    -------
+    UprightSpace
+        Faces of 68 points in the order of iBUG stand upright, look at the viewer and
+        have the depth that puts the nose in front. Other shapes are turned to the view
+        of the mean camera.
+
+    Raises
+    ------
+    ValueError
+        If the model is no AffineNRSfM or has kept no frames, if `camera` or `origin` is
+        something else, or if the cameras see less than three directions of space.
+    """
+    _check_class(model, "model")
+    check_is_fitted(model)
+    if camera not in ("weak_perspective", None):
+        raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
+    model._need_frames("exporting shapes")
+    if camera is None:
+        metric = None
+        transform = viewing_transform(model.motion_, model.reference_motion_)
+        shape = model.mean_shape_ @ transform.T
+    else:
+        metric = deformation_metric(model.motion_, model.alpha_)
+        to_metric = np.linalg.inv(metric.Q)
+        cameras, usable = usable_cameras(model.motion_)
+        axes = front_axes(
+            unit_cameras(cameras[usable] @ metric.Q),
+            model.reference_motion_ @ metric.Q,
+            to_metric @ to_metric.T,
+        )
+        transform = np.vstack([axes, np.cross(*axes)])
+        shape = model.mean_shape_ @ (transform @ to_metric).T
+
+    image_axes = np.eye(3)
+    if choose_origin(origin, shape) == "lower":
+        image_axes[1, 1] = -1
+        transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
+    if recognise_face(shape) is IBUG:
+        transform = canonical_pose(shape, scheme="ibug-68").rotation @ transform
+    if mirrored:
+        transform = MIRROR @ transform
+    # Rotations stay rotations.
+    image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
+    return UprightSpace(metric, transform, image_axes)
+
+
+def upright_frames(
+    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
+) -> EuclideanFrames:
+    """
+    Return shapes and poses of frames in an upright space with a metric.
+
+    Parameters
+    ----------
+    space : UprightSpace
+        Of the model, with a metric.
+    model : AffineNRSfM
+        The fitted model.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Affine cameras of the frames.
+    alpha : ndarray of shape (n_frames, n_components)
+        Their coefficients.
+
+    Returns
+    -------
+    EuclideanFrames
+        Shapes, rotations and scales as of `euclidean_frames`; NaN where a frame has no
+        camera. Rotations lead to the image turned upright.
+    """
+    assert space.metric is not None
+    shapes, rotations, scales = euclidean_frames(
+        space.metric, motion, alpha, model.mean_shape_, model.basis_
+    )
+    rotations = space.image_axes @ rotations @ space.transform.T
+    return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
+
+
+def upright_basis(space: UprightSpace, model: Any) -> tuple[NDArray, NDArray]:
+    """
+    Return the mean shape and the basis shapes in the upright space.
+
+    Euclidean shapes are not exactly linear in the coefficients, since the metric
+    depends on them: the least squares fit to the frames of the table is taken.
+
+    Parameters
+    ----------
+    space : UprightSpace
+        Of the model.
+    model : AffineNRSfM
+        The fitted model.
+
+    Returns
+    -------
+    mean_shape : ndarray of shape (n_points, 3)
+        The mean shape, centred.
+    basis : ndarray of shape (n_components, n_points, 3)
+        The basis shapes, for one unit of their coefficients.
+    """
+    if space.metric is None:
+        return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T
+    n_frames, n_components = model.alpha_.shape
+    size = model.mean_shape_.size
+    gram = np.zeros((1 + n_components, 1 + n_components))
+    product = np.zeros((1 + n_components, size))
+    for block in gen_batches(n_frames, max(1, BLOCK_SIZE // size)):
+        motion, alpha = model.motion_[block], model.alpha_[block]
+        shapes = upright_frames(space, model, motion, alpha).shapes
+        known = np.isfinite(shapes).all(axis=(1, 2))
+        weights = np.insert(np.asarray(alpha[known], dtype=np.float64), 0, 1.0, axis=1)
+        gram += weights.T @ weights
+        product += weights.T @ shapes[known].reshape(-1, size)
+    # Basis shapes of zeros have coefficients of zero.
+    fit = np.linalg.pinv(gram, hermitian=True) @ product
+    mean, *basis = fit.reshape(-1, *model.mean_shape_.shape)
+    return mean, np.array(basis)

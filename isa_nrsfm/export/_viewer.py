@@ -1,0 +1,236 @@
+"""A page that shows a shape model in any browser, without anything else."""
+
+import base64
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from importlib.resources import files
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import _safe_indexing
+from sklearn.utils.validation import _num_samples
+
+from isa_nrsfm.export._drawing import Links, choose_links, edges_of
+from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
+from isa_nrsfm.export._upright import (
+    UPSIDE_DOWN,
+    Camera,
+    UprightSpace,
+    upright_basis,
+    upright_frames,
+    upright_space,
+)
+from isa_nrsfm.plotting._edges import Origin
+
+# More labels than this cannot be told apart by their colours.
+MOST_LABELS = 30
+UNLABELLED = "(no label)"
+ABOUT = {
+    True: "Proportions are those that weak-perspective cameras tell.",
+    False: "Affine shapes: angles and depth are not those of the object.",
+}
+
+
+def write_viewer(
+    model: Any,
+    path: str | os.PathLike[str],
+    *,
+    X: Any = None,
+    labels: ArrayLike | None = None,
+    n_frames: int = 1000,
+    edges: Links = "auto",
+    names: Sequence[str] | None = None,
+    camera: Camera = "weak_perspective",
+    origin: Origin = "auto",
+    mirrored: bool = False,
+) -> None:
+    """
+    Write a page on which anybody can look at a shape model, in a browser.
+
+    The page is one file that needs no network and no other program. It shows the mean
+    shape in 3D with a slider for each basis shape, plays the frames of a table, with or
+    without their cameras, and has a plane of two coefficients in which a click shows a
+    frame.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    path : str or path-like
+        The file, with the suffix ``.html``. An existing file is replaced.
+    X : array-like of shape (n_rows, 2 * n_points), default=None
+        The table whose frames are shown; by default the one that the model was fitted
+        to. The page calls frames by their number, from 0, or by the index of a pandas
+        DataFrame.
+    labels : array-like of shape (n_rows,), default=None
+        Labels of the rows of the table, text or numbers, at most 30 different ones.
+        Frames have colours by them. None and NaN are rows without a label.
+    n_frames : int, default=1000
+        The page has no more frames than this, of rows evenly spread over the table.
+    edges : "auto", None or array-like, default="auto"
+        Pairs of points to be joined, of shape (n_edges, 2), or triangles (n_triangles,
+        3), whose sides are drawn. "auto" joins 68 points that look like a face in the
+        order of iBUG or of XM2VTS (as in MUCT).
+    names : sequence of str of length n_components, default=None
+        Names of the basis shapes; by default alpha_1, alpha_2, ...
+    camera : {"weak_perspective", None}, default="weak_perspective"
+        What is known of the cameras. "weak_perspective" shows Euclidean shapes, None
+        affine ones, which look like those of figures.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero in the table: "upper" for images, whose y points down, "lower"
+        for a y that points up. "auto" is "lower" where 68 points of a face would stand
+        on their head otherwise.
+    mirrored : bool, default=False
+        Whether to take the mirror image in depth, which fits the table as well; the
+        page can do it, too.
+
+    Raises
+    ------
+    ValueError
+        If the model has kept no frames, if the cameras see less than three directions
+        of space, if there is not one label a row, or if a parameter is not of the kind
+        given above.
+    OSError
+        If the file cannot be written.
+
+    Warns
+    -----
+    UserWarning
+        If the cameras turn too little to tell the metric.
+
+    See Also
+    --------
+    write_glb : A file for programs that show and animate 3D shapes.
+
+    Notes
+    -----
+    Euclidean basis shapes are the least squares fit to the shapes of the frames. Rows
+    of which too little is seen are not shown; the page says how many are.
+    """
+    if Path(path).suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"path must end in .html; got {os.fspath(path)}")
+    _check_n_frames(n_frames)
+    space = upright_space(model, camera, origin, mirrored)
+    components = names_of_components(names, len(model.basis_))
+    n_rows = len(model.alpha_) if X is None else _num_samples(X)
+    codes, categories = _codes(labels, n_rows)
+    rows = _evenly_spread(n_rows, n_frames)
+    if X is None:
+        motion, alpha = model.motion_[rows], model.alpha_[rows]
+    elif len(rows):
+        motion, _, alpha = model.decompose(_safe_indexing(X, rows))
+    else:
+        motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
+    seen = np.isfinite(alpha).all(axis=1)
+    rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
+
+    mean, basis = upright_basis(space, model)
+    links = choose_links(edges, mean)
+    centre = mean.mean(axis=0)
+    shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
+    shapes /= np.linalg.norm(shapes[0], axis=1).max()
+    rotations = _rotations(space, model, motion, alpha)
+    content = {
+        "about": ABOUT[space.metric is not None]
+        + " The mirror image in depth fits the images as well.",
+        "points": list(names_of_points(model)),
+        "components": components,
+        "categories": categories,
+        "rows": _row_names(X, rows),
+        "labels": codes[rows].tolist() if categories else [],
+        "count": _count(n_rows, len(seen), len(rows)),
+        "shapes": _encoded(shapes, "<f4"),
+        "edges": _encoded(edges_of(links), "<u4"),
+        "alpha": _encoded(alpha, "<f4"),
+        "rotations": _encoded(rotations, "<f4"),
+    }
+    Path(path).write_text(_page(content), encoding="utf-8", newline="\n")
+
+
+def _page(content: dict[str, Any]) -> str:
+    """Return the page with a content."""
+    folder = files("isa_nrsfm.export")
+    page = (folder / "viewer.html").read_text(encoding="utf-8")
+    script = (folder / "viewer.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    # Nothing in the data can end the element that holds it.
+    data = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    data = data.replace("<", "\\u003c")
+    page = page.replace("{{script-hash}}", f"sha256-{digest}", 1)
+    page = page.replace("{{script}}", script, 1)
+    return page.replace("{{model}}", data, 1)
+
+
+def _encoded(array: NDArray, dtype: str) -> str:
+    """Return the numbers of an array as text."""
+    return base64.b64encode(array.astype(dtype).tobytes()).decode()
+
+
+def _rotations(
+    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
+) -> NDArray:
+    """Return what turns the shapes of frames to how their cameras see them."""
+    if space.metric is None or not len(motion):
+        return np.empty((0, 3, 3))
+    rotations = upright_frames(space, model, motion, alpha).rotations
+    return UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
+
+
+def _evenly_spread(n_rows: int, n_frames: int) -> NDArray[np.intp]:
+    """Return at most n_frames of n_rows, the first and the last among them."""
+    return np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
+
+
+def _check_n_frames(n_frames: Any) -> None:
+    """Raise if a number of frames is none."""
+    if not isinstance(n_frames, Integral) or n_frames < 0:
+        raise ValueError(
+            f"n_frames must be a whole number, not negative; got {n_frames!r}"
+        )
+
+
+def _row_names(X: Any, rows: NDArray[np.intp]) -> list[str]:
+    """Return what rows of a table are called: the index of a DataFrame or numbers."""
+    names = X.index[rows] if hasattr(X, "iloc") else rows
+    return [str(name) for name in names]
+
+
+def _count(n_rows: int, n_chosen: int, n_shown: int) -> str:
+    """Say how many frames the page has."""
+    text = f"{n_chosen} of {n_rows} rows, evenly spread"
+    if n_chosen == n_rows:
+        text = f"{n_rows} rows"
+    if n_shown < n_chosen:
+        text += f"; {n_chosen - n_shown} of them show too few points"
+    return text + "."
+
+
+def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
+    """Return the number of the label of each row, and the labels."""
+    if labels is None:
+        return np.zeros(n_rows, dtype=np.intp), []
+    values = np.asarray(labels)
+    if values.shape != (n_rows,):
+        raise ValueError(
+            f"labels must hold {n_rows} labels, one a row; got shape {values.shape}"
+        )
+    texts, order = [], {}
+    for value in values.tolist():
+        missing = value is None or value != value
+        text = UNLABELLED if missing else str(value)
+        number = isinstance(value, Real)
+        order[text] = (missing, not number, value if number else 0, text)
+        texts.append(text)
+    categories = sorted(order, key=order.__getitem__)
+    if len(categories) > MOST_LABELS:
+        raise ValueError(
+            f"labels must have at most {MOST_LABELS} different values; got "
+            f"{len(categories)}"
+        )
+    code = {text: i for i, text in enumerate(categories)}
+    return np.array([code[text] for text in texts], dtype=np.intp), categories

@@ -1,0 +1,200 @@
+"""A headless browser for tests, driven through a pipe by the DevTools protocol."""
+
+import base64
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import signal
+import time
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--remote-debugging-pipe",
+)
+PATIENCE = 30.0
+
+
+def find_browser():
+    """Return the path of a browser, or None."""
+    return next(filter(None, map(shutil.which, NAMES)), None)
+
+
+class Browser:
+    """A browser with one page; messages that are no answers are in `events`."""
+
+    def __init__(self, program, profile):
+        # The browser reads from its file 3 and writes to its file 4.
+        theirs_in, self._to = os.pipe()
+        self._from, theirs_out = os.pipe()
+        high = [
+            fcntl.fcntl(file, fcntl.F_DUPFD, 20) for file in (theirs_in, theirs_out)
+        ]
+        quiet = os.open(os.devnull, os.O_RDWR)
+        places = zip([quiet, quiet, *high], [1, 2, 3, 4], strict=True)
+        command = [program, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+        self._process = os.posix_spawn(
+            program,
+            command,
+            os.environ,
+            file_actions=[(os.POSIX_SPAWN_DUP2, *place) for place in places],
+        )
+        for file in (theirs_in, theirs_out, quiet, *high):
+            os.close(file)
+        os.set_blocking(self._from, False)
+        self._rest, self._number, self._session = b"", 0, None
+        self.events = []
+        targets = self.call("Target.getTargets")["targetInfos"]
+        page = next(target for target in targets if target["type"] == "page")
+        attached = {"targetId": page["targetId"], "flatten": True}
+        self._session = self.call("Target.attachToTarget", **attached)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+
+    def close(self):
+        """End the browser and wait for it."""
+        with contextlib.suppress(OSError):
+            self._send("Browser.close", {}, None)
+        for file in (self._to, self._from):
+            os.close(file)
+        until = time.monotonic() + 5
+        while os.waitpid(self._process, os.WNOHANG)[0] == 0:
+            if time.monotonic() > until:
+                os.kill(self._process, signal.SIGKILL)
+            time.sleep(0.02)
+
+    def call(self, method, **parameters):
+        """Call a method of the protocol and return its answer."""
+        number = self._send(method, parameters, self._session)
+        while True:
+            message = self._receive()
+            if message.get("id") != number:
+                self.events.append(message)
+            elif "error" in message:
+                raise RuntimeError(f"{method}: {message['error']}")
+            else:
+                return message["result"]
+
+    def open(self, url, width=1200, height=800, mobile=False):
+        """Show a page in a window of a size, with no events before it."""
+        self.events.clear()
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=mobile,
+        )
+        self.call("Page.navigate", url=url)
+        self.wait("document.readyState === 'complete'")
+
+    def run(self, code):
+        """Return the value of an expression, once it is known."""
+        answer = self.call(
+            "Runtime.evaluate",
+            expression=code,
+            returnByValue=True,
+            awaitPromise=True,
+        )
+        if "exceptionDetails" in answer:
+            raise RuntimeError(f"{code}: {answer['exceptionDetails']}")
+        return answer["result"].get("value")
+
+    def wait(self, condition):
+        """Wait until a condition is true."""
+        until = time.monotonic() + PATIENCE
+        while not self.run(condition):
+            if time.monotonic() > until:
+                raise TimeoutError(condition)
+            time.sleep(0.02)
+
+    def drag(self, start, end):
+        """Drag with the mouse."""
+        for kind, (x, y) in (
+            ("mousePressed", start),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ):
+            self.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                buttons=1,
+                clickCount=1,
+            )
+
+    def press(self, key, code=0):
+        """Press a key."""
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=key,
+                windowsVirtualKeyCode=code,
+            )
+
+    def picture(self, path):
+        """Write what the window shows."""
+        data = self.call("Page.captureScreenshot", format="png")["data"]
+        path.write_bytes(base64.b64decode(data))
+
+    def complaints(self):
+        """Return what errors and warnings came up since the page was opened."""
+        self.run("new Promise(requestAnimationFrame)")
+        return [
+            event
+            for event in self.events
+            if event["method"] in ("Runtime.exceptionThrown", "Log.entryAdded")
+            or (
+                event["method"] == "Runtime.consoleAPICalled"
+                and event["params"]["type"] in ("error", "warning", "assert")
+            )
+        ]
+
+    def requests(self):
+        """Return the addresses that were asked for since the page was opened."""
+        return [
+            event["params"]["request"]["url"]
+            for event in self.events
+            if event["method"] == "Network.requestWillBeSent"
+        ]
+
+    def _send(self, method, parameters, session):
+        """Send a call and return its number."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        content = json.dumps(message).encode() + b"\0"
+        while content:
+            content = content[os.write(self._to, content) :]
+        return self._number
+
+    def _receive(self):
+        """Return the next message."""
+        until = time.monotonic() + PATIENCE
+        while b"\0" not in self._rest:
+            try:
+                got = os.read(self._from, 1 << 16)
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    raise TimeoutError("the browser does not answer") from None
+                time.sleep(0.005)
+                continue
+            if not got:
+                raise RuntimeError("the browser has gone")
+            self._rest += got
+        message, _, self._rest = self._rest.partition(b"\0")
+        return json.loads(message)

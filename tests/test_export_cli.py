@@ -1,0 +1,209 @@
+"""The command export, and what a fit writes for other programs."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from export_models import face_model, faces
+from numpy.testing import assert_array_equal
+from scipy.io import loadmat
+from test_export_gltf import Read
+from test_export_viewer import content_of
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.cli import main
+from isa_nrsfm.export import (
+    ShapeArrays,
+    point_distribution_model,
+    read_pdm,
+    write_glb,
+    write_viewer,
+)
+from isa_nrsfm.io import save_model
+
+QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures --output".split()]
+NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a model and a table with labels and a row too few."""
+    folder = tmp_path_factory.mktemp("export")
+    save_model(face_model(), folder / "model.skops")
+    named = AffineNRSfM(2, random_state=0)
+    named.fit(pd.DataFrame(faces().data[:50], columns=NAMES))
+    save_model(named, folder / "named.skops")
+    table = pd.DataFrame(faces().data[:9], columns=NAMES).round(3)
+    table.insert(0, " mood", ["calm", "glad", "sad"] * 3)
+    table.loc[4, NAMES[6:]] = np.nan
+    table.to_csv(folder / "table.csv", index=False)
+    return folder
+
+
+@pytest.fixture
+def export(folder, tmp_path, capsys):
+    """Return a function that exports a model: output file, report and errors."""
+
+    def run(name, *options, model="named.skops"):
+        output = tmp_path / name
+        options = [str(folder / o) if o == "table.csv" else str(o) for o in options]
+        argv = ["export", str(folder / model), *options, "--output", str(output)]
+        code = main(argv)
+        captured = capsys.readouterr()
+        assert code == (1 if captured.err else 0)
+        assert output.exists() == (code == 0)
+        return output, captured.out, captured.err
+
+    return run
+
+
+def test_the_suffix_tells_what_is_written(export, tmp_path):
+    output, report, _ = export("face.glb", model="model.skops")
+    write_glb(face_model(), tmp_path / "expected.glb")
+    assert output.read_bytes() == (tmp_path / "expected.glb").read_bytes()
+    assert f"{output.stat().st_size} bytes" in report
+
+    output, _, _ = export("face.HTML", model="model.skops")
+    write_viewer(face_model(), tmp_path / "expected.html")
+    assert output.read_text() == (tmp_path / "expected.html").read_text()
+
+    output, report, _ = export("pdm.txt", model="model.skops")
+    for read, computed in zip(
+        read_pdm(output), point_distribution_model(face_model()), strict=True
+    ):
+        assert_array_equal(read, computed)
+    assert "3 modes of 68 points" in report
+
+    output, _, _ = export("shapes.npz", model="model.skops")
+    with np.load(output) as arrays:
+        assert set(arrays) == set(ShapeArrays._fields)
+        assert_array_equal(arrays["basis"], face_model().basis_)
+
+
+def test_content_tells_a_point_distribution_model_from_shapes(export):
+    assert set(loadmat(export("a.mat")[0])) >= {"mean_shape", "alpha"}
+    assert set(loadmat(export("b.mat", "--content", "pdm")[0])) >= {"M", "V", "E"}
+    assert len(read_pdm(export("c.npz", "--content", "pdm")[0]).modes) == 2
+
+
+def test_options_reach_what_is_written(export):
+    pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
+    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model="model.skops")
+    expected = point_distribution_model(
+        face_model(), n_modes=1, camera=None, origin="lower", mirrored=True
+    )
+    for read, computed in zip(read_pdm(output), expected, strict=True):
+        assert_array_equal(read, computed)
+    assert len(read_pdm(export("b.txt", "--n-modes", "0.1")[0]).modes) == 1
+
+    output, _, _ = export("a.glb", "--names", "jaw open, smile", "--edges", "none")
+    assert Read(output).mesh["extras"]["targetNames"] == ["jaw open", "smile"]
+    assert len(Read(output).mesh["primitives"]) == 1
+
+
+def test_edges_are_pairs_of_names_of_points(export, tmp_path):
+    path = tmp_path / "edges.csv"
+    path.write_text("00,01\n 01, 02\n\n")
+    read = Read(export("a.glb", "--edges", path)[0])
+    assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
+    path.write_text("36,39,27\n")
+    read = Read(export("b.glb", "--edges", path)[0])
+    assert read.array(read.primitive(4)["indices"]).tolist() == [36, 39, 27]
+
+
+@pytest.mark.parametrize("text", ["00,1", "00", "00,01\n00,01,02", "00,01,02,03"])
+def test_other_edges_are_refused(export, tmp_path, text):
+    path = tmp_path / "edges.csv"
+    path.write_text(text)
+    _, _, error = export("a.glb", "--edges", path)
+    assert re.search(
+        r"edges\.csv, line \d: expected the names of two or three points .* such as "
+        r"00, 01; got '",
+        error,
+    )
+
+
+def test_a_file_without_edges_is_refused(export, tmp_path):
+    (tmp_path / "edges.csv").write_text("\n")
+    _, _, error = export("a.glb", "--edges", tmp_path / "edges.csv")
+    assert "has no edges; for points alone say --edges none" in error
+
+
+def test_the_viewer_shows_a_table_with_its_labels(export):
+    output, report, _ = export("a.html", "table.csv", "--label", "mood")
+    content = content_of(output)
+    assert content["categories"] == ["calm", "glad", "sad"]
+    assert content["rows"] == ["0", "1", "2", "3", "5", "6", "7", "8"]
+    assert content["labels"] == [0, 1, 2, 0, 2, 0, 1, 2]
+    assert "1 not shown: fewer than 4 points" in report
+    output, _, _ = export("b.html", "table.csv", "--skip-rows", "mood=^g")
+    assert content_of(output)["rows"] == ["0", "2", "3", "5", "6", "8"]
+    assert len(content_of(export("c.html", "--n-frames", "5")[0])["rows"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.foo", [], "expected a file with one of the suffixes .html, .htm, .glb"),
+        ("a.txt", ["--content", "glb"], "--content glb is written to files .glb; got"),
+        ("a.mat", ["--n-modes", "2"], "--n-modes is for pdm; "),
+        ("a.glb", ["table.csv"], "TABLE is for viewer; "),
+        ("a.txt", ["--edges", "none"], "--edges is for viewer and glb; "),
+        ("a.html", ["--label", "mood"], "--label needs a TABLE"),
+        ("a.glb", ["--zeros-missing"], "--zeros-missing needs a TABLE"),
+        ("a.html", ["table.csv", "--label", "age"], "has no column 'age' beside its"),
+        ("a.glb", ["--names", "jaw"], "names must hold 2 names"),
+        ("a.txt", ["--n-modes", "999"], "n_modes must be at most"),
+    ],
+)
+def test_what_does_not_fit_is_refused(export, name, options, message):
+    _, _, error = export(name, *options)
+    assert message in error
+
+
+@pytest.mark.parametrize("n_modes", ["0", "-1", "1.5", "many", "inf"])
+def test_numbers_of_modes_are_checked(export, n_modes, capsys):
+    with pytest.raises(SystemExit) as stop:
+        export("a.txt", "--n-modes", n_modes)
+    assert stop.value.code == 2
+    assert "expected a whole number or a share" in capsys.readouterr().err
+
+
+def test_inputs_are_not_overwritten(folder, capsys):
+    model = folder / "model.txt"
+    model.write_bytes((folder / "model.skops").read_bytes())
+    assert main(["export", str(model), "--output", str(model)]) == 1
+    assert "would be overwritten by the results" in capsys.readouterr().err
+
+
+def test_a_fit_writes_a_viewer_of_its_rows(tmp_path, capsys):
+    table = pd.DataFrame(faces().data[:50], columns=NAMES)
+    table.loc[0, NAMES[6:]] = np.nan
+    table.to_csv(tmp_path / "table.csv", index=False)
+    results = tmp_path / "results"
+    assert main(["fit", str(tmp_path / "table.csv"), *QUICK, str(results)]) == 0
+    content = content_of(results / "viewer.html")
+    assert content["rows"] == [str(i) for i in range(1, 50)]
+    assert content["components"] == ["alpha_1"]
+    assert content["points"][:2] == ["00", "01"]
+    assert content["rotations"]
+    assert capsys.readouterr().err == ""
+
+
+def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys):
+    # Cameras that turn about the viewing direction see two directions of space.
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, 40)
+    turns = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    tracks = rng.standard_normal((20, 2)) @ turns.transpose(2, 1, 0)
+    names = [f"{axis}{j}" for j in range(20) for axis in "xy"]
+    table = pd.DataFrame(tracks.reshape(40, 40), columns=names)
+    table.to_csv(tmp_path / "flat.csv", index=False)
+    results = tmp_path / "results"
+    assert main(["fit", str(tmp_path / "flat.csv"), *QUICK, str(results)]) == 0
+    error = capsys.readouterr().err
+    assert "warning: viewer.html has affine shapes: a metric upgrade needs" in error
+    content = content_of(results / "viewer.html")
+    assert content["about"].startswith("Affine shapes")
+    assert content["rotations"] == ""

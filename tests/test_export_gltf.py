@@ -1,0 +1,266 @@
+import json
+import os
+import shutil
+import struct
+import subprocess
+
+import numpy as np
+import pytest
+from export_models import N_COMPONENTS, blob_model, face_model
+from numpy.testing import assert_allclose, assert_array_equal
+
+from isa_nrsfm.export import _gltf, write_glb
+from isa_nrsfm.export._drawing import edges_of, frontal_triangles, vertex_normals
+from isa_nrsfm.export._upright import upright_basis, upright_space
+
+TYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
+VALIDATE = """
+const validator = require("gltf-validator");
+const content = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+validator.validateBytes(content).then((r) => console.log(JSON.stringify(r.issues)));
+"""
+
+
+class Read:
+    """A .glb file, read as the specification has it."""
+
+    def __init__(self, path):
+        content = path.read_bytes()
+        magic, version, size = struct.unpack("<4sII", content[:12])
+        assert (magic, version, size) == (b"glTF", 2, len(content))
+        chunks, place = [], 12
+        while place < size:
+            length, kind = struct.unpack("<I4s", content[place : place + 8])
+            assert length % 4 == 0
+            chunks.append((kind, content[place + 8 : place + 8 + length]))
+            place += 8 + length
+        (json_kind, text), (binary_kind, self.binary) = chunks
+        assert (json_kind, binary_kind) == (b"JSON", b"BIN\0")
+        self.document = json.loads(text)
+        assert self.document["buffers"] == [{"byteLength": len(self.binary)}]
+
+    def array(self, number):
+        accessor = self.document["accessors"][number]
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        start, end = view["byteOffset"], view["byteOffset"] + view["byteLength"]
+        array = np.frombuffer(self.binary[start:end], TYPES[accessor["componentType"]])
+        if accessor["type"] == "VEC3":
+            array = array.reshape(-1, 3)
+        assert len(array) == accessor["count"]
+        return array
+
+    @property
+    def mesh(self):
+        return self.document["meshes"][0]
+
+    def primitive(self, mode):
+        (found,) = (p for p in self.mesh["primitives"] if p["mode"] == mode)
+        return found
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Return a function that writes a model and reads the file."""
+
+    def write(model, **options):
+        path = tmp_path / "model.glb"
+        write_glb(model, path, **options)
+        return Read(path)
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def validate():
+    """Return a function that returns what the validator of Khronos finds."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    found = subprocess.run(
+        [node, "-e", 'require("gltf-validator")'], capture_output=True, env=os.environ
+    )
+    if found.returncode:
+        pytest.skip("gltf-validator is not installed: npm install, and set NODE_PATH")
+
+    def issues(path):
+        done = subprocess.run(
+            [node, "-e", VALIDATE, str(path)], capture_output=True, check=True
+        )
+        return json.loads(done.stdout)
+
+    return issues
+
+
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [
+        (face_model, {}),
+        (face_model, {"edges": [[0, 1], [1, 2]], "camera": None}),
+        (face_model, {"edges": [[36, 39, 27], [27, 42, 45]]}),
+        (face_model, {"edges": None, "names": ["jaw", "é", '"</x>"']}),
+        (blob_model, {"mirrored": True}),
+    ],
+    ids=["surface", "edges", "triangles", "points", "mirrored"],
+)
+def test_the_validator_of_khronos_finds_nothing(validate, tmp_path, make, options):
+    path = tmp_path / "model.glb"
+    write_glb(make(), path, **options)
+    issues = validate(path)
+    assert issues["messages"] == []
+    assert issues["numErrors"] == issues["numWarnings"] == 0
+
+
+def test_the_validator_would_find_something(validate, tmp_path, monkeypatch):
+    monkeypatch.setattr(_gltf, "vertex_normals", lambda mean, links: 2 * mean)
+    path = tmp_path / "model.glb"
+    write_glb(face_model(), path)
+    assert validate(path)["numErrors"] > 0
+
+
+def test_weights_are_coefficients(written):
+    model = face_model()
+    read = written(model)
+    surface = read.primitive(4)
+    mean = read.array(surface["attributes"]["POSITION"]).astype(float)
+    basis = [read.array(t["POSITION"]).astype(float) for t in surface["targets"]]
+    assert len(basis) == N_COMPONENTS
+    assert read.mesh["weights"] == [0.0] * N_COMPONENTS
+    # y up and z to the viewer, in a unit of its own.
+    expected = upright_basis(
+        upright_space(model, "weak_perspective", "auto", False), model
+    )
+    factor = read.mesh["extras"]["factor"]
+    turned = [factor * shape * [1, -1, -1] for shape in expected]
+    assert_allclose(mean, turned[0] - turned[0].mean(axis=0), atol=1e-6)
+    assert_allclose(basis, turned[1], atol=1e-6)
+    assert np.ptp(mean, axis=0).max() == pytest.approx(1)
+    assert mean[8, 1] < mean[27, 1]
+    assert mean[30, 2] > mean[0, 2]
+
+
+def test_names_are_those_of_points_and_basis_shapes(written):
+    extras = written(face_model()).mesh["extras"]
+    assert extras["targetNames"] == ["alpha_1", "alpha_2", "alpha_3"]
+    assert extras["pointNames"] == [str(j) for j in range(68)]
+    names = ["jaw", "smile \u2013 wide", "brows"]
+    assert written(face_model(), names=names).mesh["extras"]["targetNames"] == names
+
+
+def test_bounds_are_exact(written):
+    read = written(face_model())
+    primitive = read.primitive(4)
+    numbers = [primitive["attributes"]["POSITION"]]
+    numbers += [target["POSITION"] for target in primitive["targets"]]
+    for number in numbers:
+        accessor = read.document["accessors"][number]
+        assert_array_equal(accessor["min"], read.array(number).min(axis=0))
+        assert_array_equal(accessor["max"], read.array(number).max(axis=0))
+
+
+def test_normals_follow_the_morph_targets(written):
+    read = written(face_model())
+    surface = read.primitive(4)
+    corners = read.array(surface["indices"]).reshape(-1, 3).astype(int)
+    mean = read.array(surface["attributes"]["POSITION"]).astype(float)
+    normals = read.array(surface["attributes"]["NORMAL"])
+    assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    for target in surface["targets"]:
+        moved = mean + read.array(target["POSITION"])
+        expected = vertex_normals(moved, corners)
+        assert_allclose(normals + read.array(target["NORMAL"]), expected, atol=1e-4)
+
+
+def test_the_animation_swings_each_basis_shape_in_turn(written):
+    read = written(face_model())
+    (animation,) = read.document["animations"]
+    (sampler,), (channel,) = animation["samplers"], animation["channels"]
+    assert channel["target"] == {"node": 0, "path": "weights"}
+    times = read.array(sampler["input"])
+    accessor = read.document["accessors"][sampler["input"]]
+    assert accessor["min"] == [0.0]
+    assert accessor["max"] == [times[-1]]
+    assert np.all(np.diff(times) > 0)
+    weights = read.array(sampler["output"]).reshape(len(times), N_COMPONENTS)
+    assert_array_equal(weights[[0, -1]], 0)
+    assert np.all(np.count_nonzero(weights, axis=1) <= 1)
+    assert_allclose(weights.max(axis=0), 2)
+    assert_allclose(weights.min(axis=0), -2)
+    firsts = np.argmax(weights != 0, axis=0)
+    assert np.all(np.diff(firsts) > 0)
+
+
+def test_edges_are_lines_and_none_is_points_alone(written):
+    edges = [[0, 1], [1, 2], [5, 9]]
+    read = written(face_model(), edges=edges)
+    assert [p["mode"] for p in read.mesh["primitives"]] == [0, 1]
+    assert_array_equal(read.array(read.primitive(1)["indices"]), np.ravel(edges))
+    assert [
+        p["mode"] for p in written(face_model(), edges=None).mesh["primitives"]
+    ] == [0]
+
+
+def test_triangles_are_taken_as_they_are(written):
+    triangles = [[0, 36, 31], [2, 1, 0]]
+    read = written(face_model(), edges=triangles)
+    indices = read.array(read.primitive(4)["indices"])
+    assert_array_equal(indices, np.ravel(triangles))
+
+
+@pytest.mark.parametrize(("n_points", "dtype"), [(65535, "<u2"), (65536, "<u4")])
+def test_indices_are_as_small_as_can_be(n_points, dtype):
+    file = _gltf.Binary()
+    file.add(np.array([0, n_points - 1]))
+    assert TYPES[file.accessors[0]["componentType"]] == dtype
+
+
+def test_frontal_triangles_cover_the_front_view_and_face_the_viewer():
+    rng = np.random.default_rng(0)
+    square = np.array([[0, 0, 0], [1, 0, 3], [0, 1, 5], [1, 1, 0.0]])
+    shape = np.vstack([square, rng.random((30, 3))])
+    corners = frontal_triangles(shape)
+    a, b, c = shape[corners, :2].transpose(1, 0, 2)
+    areas = np.linalg.det(np.stack([b - a, c - a], axis=1)) / 2
+    assert areas.min() > 0
+    assert areas.sum() == pytest.approx(1)
+
+
+def test_points_on_a_line_have_no_triangles():
+    shape = np.column_stack([np.arange(9.0), np.arange(9.0), np.arange(9.0) ** 2])
+    with pytest.raises(ValueError, match="on one line in the front view"):
+        frontal_triangles(shape)
+
+
+def test_normals_of_points_without_triangles_look_at_the_viewer():
+    shape = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5.0]])
+    normals = vertex_normals(shape, np.array([[0, 2, 1]]))
+    assert_allclose(normals, [[0, 0, -1], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
+
+
+def test_edges_of_triangles_are_their_sides_once():
+    edges = edges_of(np.array([[0, 1, 2], [2, 1, 3]]))
+    assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"edges": [[0, 68]]}, "must name points 0 to 67; got 0 to 68"),
+        ({"edges": [[0, 1, 70]]}, "must name points 0 to 67; got 0 to 70"),
+        ({"edges": [[0, 1, 2, 3]]}, r"\(n_edges, 2\).*or \(n_triangles, 3\)"),
+        ({"edges": [[0.5, 1, 2]]}, r"\(n_edges, 2\).*or \(n_triangles, 3\)"),
+        ({"names": ["one"]}, "names must hold 3 names, one a basis shape; got 1"),
+        ({"camera": "perspective"}, "camera must be"),
+    ],
+    ids=["edge", "triangle", "square", "fraction", "names", "camera"],
+)
+def test_bad_options_are_refused(tmp_path, options, message):
+    path = tmp_path / "model.glb"
+    with pytest.raises(ValueError, match=message):
+        write_glb(face_model(), path, **options)
+    assert not path.exists()
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"path must end in \.glb; got .*model\.gltf"):
+        write_glb(face_model(), tmp_path / "model.gltf")

@@ -1,0 +1,247 @@
+import io
+
+import numpy as np
+import pytest
+from export_models import N_COMPONENTS, aligned, blob_model, face_model, faces
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.io import loadmat, savemat
+from scipy.linalg import subspace_angles
+
+from isa_nrsfm.export import (
+    PointDistributionModel,
+    point_distribution_model,
+    read_pdm,
+    write_pdm,
+)
+from isa_nrsfm.export._point_distribution import _principal_axes
+
+
+def scores_of(pdm, shapes):
+    """Return the scores of shapes that are aligned to the mean."""
+    flat = (shapes - pdm.mean).reshape(len(shapes), -1)
+    return flat @ pdm.modes.reshape(len(pdm.modes), -1).T
+
+
+def on_tangent_space(shapes, mean):
+    """Return shapes aligned to a mean, their differences from it orthogonal to it."""
+    shapes = aligned(shapes, mean)
+    scales = np.sum(mean**2) / np.sum(shapes * mean, axis=(1, 2))
+    return scales[:, None, None] * shapes
+
+
+def read_as_openface_does(path):
+    """Read a text as PDM::Read of OpenFace: from one place in the stream on."""
+    stream = io.BytesIO(path.read_bytes())
+
+    def peek():
+        here = stream.tell()
+        character = stream.read(1)
+        stream.seek(here)
+        return character
+
+    def skip_comments():
+        while peek() in (b"#", b"\n", b" ", b"\r"):
+            stream.readline()
+
+    def word():
+        while peek() and peek() in b" \t\r\n":
+            stream.read(1)
+        letters = b""
+        while peek() and peek() not in b" \t\r\n":
+            letters += stream.read(1)
+        return letters
+
+    matrices = []
+    for _ in range(3):
+        skip_comments()
+        n_rows, n_columns, kind = (int(word()) for _ in range(3))
+        assert kind == 6  # CV_64FC1, doubles
+        numbers = [float(word()) for _ in range(n_rows * n_columns)]
+        matrices.append(np.array(numbers).reshape(n_rows, n_columns))
+    skip_comments()
+    assert not stream.read()
+    return matrices
+
+
+@pytest.fixture(scope="module")
+def pdm():
+    return point_distribution_model(face_model())
+
+
+def test_modes_are_orthonormal_and_sorted(pdm):
+    flat = pdm.modes.reshape(len(pdm.modes), -1)
+    assert len(flat) == N_COMPONENTS
+    assert_allclose(flat @ flat.T, np.eye(N_COMPONENTS), atol=1e-12)
+    assert np.all(np.diff(pdm.eigenvalues) < 0)
+    assert_allclose(pdm.mean.mean(axis=0), 0, atol=1e-9)
+    largest = np.abs(flat).argmax(axis=1)
+    assert np.all(flat[np.arange(N_COMPONENTS), largest] > 0)
+
+
+def test_euclidean_shapes_of_the_frames_are_reproduced(pdm):
+    shapes = face_model().reconstruct(faces().data, camera="weak_perspective")
+    shapes = on_tangent_space(shapes, pdm.mean)
+    spread = np.sum((shapes - pdm.mean) ** 2)
+    errors = []
+    for model in (pdm, point_distribution_model(face_model(), n_modes=0.9999)):
+        scores = scores_of(model, shapes)
+        rebuilt = model.mean + np.tensordot(scores, model.modes, 1)
+        errors.append(np.sum((shapes - rebuilt) ** 2) / spread)
+        assert_allclose(np.mean(scores**2, axis=0), model.eigenvalues, rtol=1e-6)
+        assert_allclose(np.mean(scores, axis=0), 0, atol=1e-6)
+    assert errors[0] < 0.03
+    assert errors[1] < 1.01e-4
+
+
+def test_the_principal_axes_are_those_of_the_truth():
+    bunch = faces(noise=0.0)
+    pdm = point_distribution_model(face_model(noise=0.0))
+    mean = aligned(bunch.mean_shape, pdm.mean)
+    for _ in range(20):
+        shapes = on_tangent_space(bunch.shapes, mean)
+        mean = aligned(shapes.mean(axis=0), pdm.mean)
+    shapes = on_tangent_space(bunch.shapes, mean)
+    mean = shapes.mean(axis=0)
+    flat = (shapes - mean).reshape(len(shapes), -1)
+    _, values, axes = np.linalg.svd(flat, full_matrices=False)
+    size = np.linalg.norm(pdm.mean) / np.linalg.norm(mean)
+    assert_allclose(pdm.mean, size * mean, atol=1e-5 * size * np.abs(mean).max())
+    found = pdm.modes.reshape(N_COMPONENTS, -1)
+    angles = subspace_angles(found.T, axes[:N_COMPONENTS].T)
+    assert np.degrees(angles).max() < 1e-3
+    expected = size**2 * values[:N_COMPONENTS] ** 2 / len(flat)
+    assert_allclose(pdm.eigenvalues, expected, rtol=1e-5)
+
+
+def test_modes_are_not_the_independent_basis(pdm):
+    other = point_distribution_model(face_model(seed=1))
+    assert_allclose(other.mean, pdm.mean, atol=1e-3 * np.abs(pdm.mean).max())
+    assert_allclose(other.eigenvalues, pdm.eigenvalues, rtol=1e-2)
+
+
+def test_affine_shapes_have_as_many_modes_as_basis_shapes():
+    model = face_model()
+    pdm = point_distribution_model(model, camera=None, n_modes=0.999999)
+    assert len(pdm.modes) == N_COMPONENTS
+    with pytest.raises(ValueError, match="at most 3, the number of principal axes"):
+        point_distribution_model(model, camera=None, n_modes=4)
+
+
+def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
+    model = face_model()
+    everything = point_distribution_model(model, n_modes=0.999999).eigenvalues
+    share = np.cumsum(everything) / everything.sum()
+    for n_modes in (1, 2, 3):
+        between = share[n_modes - 1] - 1e-6
+        found = point_distribution_model(model, n_modes=float(between))
+        assert len(found.modes) == n_modes
+        exact = point_distribution_model(model, n_modes=n_modes)
+        for one, other in zip(found, exact, strict=True):
+            assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("shape", [(30, 12), (12, 30)])
+def test_principal_axes_of_few_and_of_many_frames(shape):
+    rows = np.random.default_rng(0).standard_normal(shape)
+    rows -= rows.mean(axis=0)
+    axes, variances = _principal_axes(rows)
+    _, values, right = np.linalg.svd(rows, full_matrices=False)
+    rank = min(shape[0] - 1, shape[1])
+    assert_allclose(variances, values[:rank] ** 2 / len(rows), rtol=1e-9)
+    cosines = np.abs(np.sum(axes * right[:rank], axis=1))
+    assert_allclose(cosines, 1)
+    assert_allclose(axes @ axes.T, np.eye(rank), atol=1e-12)
+
+
+@pytest.mark.parametrize("n_modes", [0, -1, 1.0, 1.5, 0.0, np.nan, True, "all"])
+def test_other_numbers_of_modes_are_refused(n_modes):
+    with pytest.raises(ValueError, match="n_modes must be None, a whole number"):
+        point_distribution_model(blob_model(), n_modes=n_modes)
+
+
+def test_another_unit_of_length(pdm):
+    scaled = pdm.scaled(2.5)
+    assert_allclose(scaled.mean, 2.5 * pdm.mean)
+    assert_allclose(scaled.eigenvalues, 6.25 * pdm.eigenvalues)
+    assert scaled.modes is pdm.modes
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".mat", ".npz"])
+def test_files_give_the_same_numbers_again(pdm, tmp_path, suffix):
+    path = tmp_path / f"pdm{suffix}"
+    write_pdm(pdm, path)
+    for written, read in zip(pdm, read_pdm(str(path)), strict=True):
+        assert_array_equal(read, written)
+
+
+def test_openface_reads_the_text(pdm, tmp_path):
+    path = tmp_path / "pdm.txt"
+    write_pdm(pdm, path)
+    mean, components, variances = read_as_openface_does(path)
+    assert mean.shape == (204, 1)
+    assert components.shape == (204, N_COMPONENTS)
+    assert variances.shape == (1, N_COMPONENTS)
+    # All x, then all y, then all z; a shape is mean + components * scores.
+    scores = np.array([1.0, -2.0, 0.5])
+    shape = (mean[:, 0] + components @ scores).reshape(3, 68).T
+    assert_allclose(shape, pdm.mean + np.tensordot(scores, pdm.modes, 1))
+    assert_array_equal(variances[0], pdm.eigenvalues)
+
+
+def test_matlab_code_has_its_variables(pdm, tmp_path):
+    path = tmp_path / "pdm.mat"
+    write_pdm(pdm, path)
+    variables = loadmat(path)
+    assert variables["M"].shape == (204, 1)
+    assert variables["V"].shape == (204, N_COMPONENTS)
+    assert variables["E"].shape == (N_COMPONENTS, 1)
+    assert_array_equal(variables["M"][68:136, 0], pdm.mean[:, 1])
+
+
+def test_texts_as_others_write_them_are_read(tmp_path):
+    # Rows that end in blanks, carriage returns, more matrices at the end.
+    text = (
+        "# mean\r\n6\r\n1\r\n6\r\n1 \r\n2 \r\n3 \r\n4 \r\n5 \r\n6 \r\n"
+        "# modes\r\n6\r\n1\r\n6\r\n" + "0.5 \r\n" * 6 + "# variances\r\n1\r\n1\r\n6\r\n"
+        "7 \r\n# of expressions\r\n1\r\n1\r\n6\r\n9\r\n"
+    )
+    path = tmp_path / "other.txt"
+    path.write_bytes(text.encode())
+    pdm = read_pdm(path)
+    assert_array_equal(pdm.mean, [[1, 3, 5], [2, 4, 6]])
+    assert_array_equal(pdm.modes, np.full((1, 2, 3), 0.5))
+    assert_array_equal(pdm.eigenvalues, [7])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no point distribution model; where there should be the mean"),
+        ("# mean\n3 1 6 1 2\n", "where there should be the mean"),
+        ("3 1 6 1 2 3 3 1 6 1 one 1 1 1 6 1", "there should be the principal comp"),
+        ("3 1 6 1 2 3 3 1 6 1 1 1 1 2 6 1 1", r"should have a mean of 3n numbers"),
+    ],
+    ids=["empty", "short", "no number", "misfit"],
+)
+def test_other_texts_are_refused(tmp_path, text, message):
+    path = tmp_path / "other.txt"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_pdm(path)
+
+
+def test_other_files_are_refused(pdm, tmp_path):
+    with pytest.raises(ValueError, match=r"\.txt, \.mat or \.npz; got"):
+        write_pdm(pdm, tmp_path / "pdm.csv")
+    with pytest.raises(ValueError, match=r"\.txt, \.mat or \.npz; got"):
+        read_pdm(tmp_path / "pdm.csv")
+    np.savez(tmp_path / "a.npz", mean=pdm.mean)
+    with pytest.raises(ValueError, match="has no modes, eigenvalues"):
+        read_pdm(tmp_path / "a.npz")
+    savemat(tmp_path / "a.mat", {"M": pdm.mean})
+    with pytest.raises(ValueError, match="has no V, E"):
+        read_pdm(tmp_path / "a.mat")
+    misfit = PointDistributionModel(pdm.mean, pdm.modes, pdm.eigenvalues[1:])
+    with pytest.raises(ValueError, match="eigenvalues"):
+        write_pdm(misfit, tmp_path / "a.txt")
+    assert not (tmp_path / "a.txt").exists()

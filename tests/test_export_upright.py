@@ -1,0 +1,120 @@
+import numpy as np
+import pytest
+from export_models import aligned, blob_model, face_model, faces
+from numpy.testing import assert_allclose
+from sklearn.decomposition import PCA
+from sklearn.exceptions import NotFittedError
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm.export import _upright
+from isa_nrsfm.export._upright import upright_basis, upright_frames, upright_space
+
+CHIN, NOSE, LEFT_JAW, RIGHT_JAW, BROW = 8, 30, 0, 16, 19
+
+
+def space_of(model, camera="weak_perspective", origin="auto", mirrored=False):
+    return upright_space(model, camera, origin, mirrored)
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+@pytest.mark.parametrize("camera", ["weak_perspective", None])
+def test_faces_stand_upright_and_look_at_the_viewer(camera, y_up):
+    model = face_model(y_up=y_up)
+    mean, _ = upright_basis(space_of(model, camera), model)
+    assert mean[BROW, 1] < mean[NOSE, 1] < mean[CHIN, 1]  # y points down
+    assert mean[LEFT_JAW, 0] < mean[NOSE, 0] < mean[RIGHT_JAW, 0]
+    assert mean[NOSE, 2] < mean[[LEFT_JAW, RIGHT_JAW], 2].min()  # z points away
+
+
+def test_the_mean_face_has_its_true_proportions():
+    truth, model = faces(), face_model()
+    mean, _ = upright_basis(space_of(model), model)
+    error = aligned(mean, truth.mean_shape) - truth.mean_shape
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
+    # The pose depends on a few points: the same, but for a few degrees of pitch.
+    cosines = np.sum(mean * truth.mean_shape, axis=0)
+    cosines /= np.linalg.norm(mean, axis=0) * np.linalg.norm(truth.mean_shape, axis=0)
+    assert cosines.min() > 0.99
+
+
+def test_images_with_y_up_lead_to_the_same_shapes():
+    down, up = face_model(), face_model(y_up=True)
+    mean, basis = upright_basis(space_of(down), down)
+    mean_up, basis_up = upright_basis(space_of(up), up)
+    assert_allclose(mean_up, mean, atol=1e-3 * np.abs(mean).max())
+    assert_allclose(np.abs(basis_up), np.abs(basis), atol=0.02 * np.abs(basis).max())
+
+
+@pytest.mark.parametrize("y_up", [False, True])
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("make", [face_model, blob_model])
+def test_frames_in_their_poses_have_the_images_of_the_model(make, mirrored, y_up):
+    model = make(y_up=True) if y_up and make is face_model else make()
+    origin = "lower" if y_up else "upper"
+    space = space_of(model, origin=origin, mirrored=mirrored)
+    frames = upright_frames(space, model, model.motion_, model.alpha_)
+    identity = np.broadcast_to(np.eye(3), frames.rotations.shape)
+    turned = frames.rotations @ frames.rotations.transpose(0, 2, 1)
+    assert_allclose(turned, identity, atol=1e-10)
+    assert_allclose(np.linalg.det(frames.rotations), 1.0)
+
+    scales = frames.scales[:, None, None]
+    images = scales * (frames.shapes @ frames.rotations[:, :2].transpose(0, 2, 1))
+    shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
+    expected = project(shapes, model.motion_, 0.0 * model.translation_)
+    expected = expected * [1, -1 if y_up else 1]  # upright images
+    assert_allclose(images, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_mirrored_shapes_have_the_opposite_depth():
+    model = blob_model()
+    mean, basis = upright_basis(space_of(model), model)
+    mirrored = upright_basis(space_of(model, mirrored=True), model)
+    assert_allclose(mirrored[0], mean * [1, 1, -1], atol=1e-9)
+    assert_allclose(mirrored[1], basis * [1, 1, -1], atol=1e-9)
+
+
+def test_an_origin_below_turns_shapes_over():
+    model = blob_model()
+    upper, _ = upright_basis(space_of(model, origin="upper"), model)
+    lower, _ = upright_basis(space_of(model, origin="lower"), model)
+    assert_allclose(lower, upper * [1, -1, -1], atol=1e-9)
+
+
+def test_basis_shapes_are_the_least_squares_fit_to_the_frames(monkeypatch):
+    model = face_model()
+    space = space_of(model)
+    shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
+    weights = np.insert(model.alpha_, 0, 1.0, axis=1)
+    best = np.linalg.lstsq(weights, shapes.reshape(len(shapes), -1), rcond=None)[0]
+    best = best.reshape(-1, 68, 3)
+    for size in (_upright.BLOCK_SIZE, 1000):
+        monkeypatch.setattr(_upright, "BLOCK_SIZE", size)
+        mean, basis = upright_basis(space, model)
+        found = np.concatenate([mean[None], basis])
+        assert_allclose(found, best, atol=1e-9 * np.abs(best).max())
+
+
+def test_affine_shapes_are_an_affinity_of_the_model():
+    model = face_model()
+    space = space_of(model, camera=None)
+    mean, basis = upright_basis(space, model)
+    assert_allclose(mean, model.mean_shape_ @ space.transform.T)
+    assert_allclose(basis, model.basis_ @ space.transform.T)
+
+
+def test_what_is_refused():
+    model = blob_model()
+    with pytest.raises(ValueError, match="model should be an AffineNRSfM; got PCA"):
+        space_of(PCA())
+    with pytest.raises(NotFittedError):
+        space_of(AffineNRSfM())
+    with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
+        space_of(model, camera="orthographic")
+    with pytest.raises(ValueError, match="origin must be"):
+        space_of(model, origin="left")
+    table = faces().data[:40]
+    without = AffineNRSfM(1, random_state=0, keep_frames=False).fit(table)
+    with pytest.raises(ValueError, match="exporting shapes needs the cameras"):
+        space_of(without)
