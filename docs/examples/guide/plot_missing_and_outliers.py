@@ -45,9 +45,11 @@ for i in (order[-1], order[0]):
 # What is needed
 # --------------
 #
-# - A row needs four points that are not on one line, else its camera is not determined.
-#   `AffineNRSfM.fit` names rows that show less, `AffineNRSfM.transform` returns NaN for
-#   them.
+# - Rows without any point, where tracking failed, are left out of the fit with a
+#   warning, and have NaN in ``alpha_``.
+# - Another row needs four points that are not on one line, else its camera is not
+#   determined. `AffineNRSfM.fit` names rows that show less, `AffineNRSfM.transform`
+#   returns NaN for them.
 # - Each point has to be seen in some frames; the error names the first that is not.
 # - A point with only one coordinate counts as not seen, with a warning.
 # - Zeros for points that were not seen, as some programs write them, have to be made
