@@ -241,7 +241,7 @@ class AffineNRSfM(
     reliability_ : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are not uncertainty, along
         uncorrelated directions, decreasing.
-    objective_history_ : ndarray of shape (n_iter_ + 1,)
+    objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log marginal likelihood plus the price of the stiffness, before
         the refinement and after each of its steps; it never rises.
     gradient_norm_ : float
@@ -267,7 +267,7 @@ class AffineNRSfM(
         Steps of the refinement; of a large table those with all of its frames.
     n_features_in_ : int
         Number of columns.
-    feature_names_in_ : ndarray of shape (n_features_in_,)
+    feature_names_in_ : ndarray of shape (`n_features_in_`,)
         Names of the columns, where the table is a dataframe with string names.
 
     See Also

@@ -16,7 +16,7 @@ import isa_nrsfm
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
-FOLDERS = ["isa_nrsfm", "tests", "benchmarks"]
+FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]
 OPTIONAL = [
     "h5py",
     "matplotlib",

@@ -203,7 +203,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         Steps for all prices together.
     n_features_in_ : int
         Number of columns.
-    feature_names_in_ : ndarray of shape (n_features_in_,)
+    feature_names_in_ : ndarray of shape (`n_features_in_`,)
         Names of the columns, where the table is a dataframe with string names.
 
     Warns

@@ -249,7 +249,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         Number of sweeps.
     n_features_in_ : int
         Number of columns.
-    feature_names_in_ : ndarray of shape (n_features_in_,)
+    feature_names_in_ : ndarray of shape (`n_features_in_`,)
         Names of the columns, where the table is a dataframe with string names.
 
     See Also

@@ -142,7 +142,7 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
         on the model; of frames of size one where frames are scaled.
     n_features_in_ : int
         Number of columns.
-    feature_names_in_ : ndarray of shape (n_features_in_,)
+    feature_names_in_ : ndarray of shape (`n_features_in_`,)
         Names of the columns, where the table is a dataframe with string names.
 
     See Also

@@ -1,0 +1,116 @@
+"""
+Make a shape model, and a page that shows it
+============================================
+
+Trackers such as OpenFace fit a *point distribution model* to images: a mean shape,
+principal axes of the shapes in 3D, and their variances. It is made from a table of
+landmarks, with your own points, in a few lines. So is a page for people who have a
+browser and no Python.
+"""
+
+# sphinx_gallery_thumbnail_number = 1
+import html
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export import (
+    point_distribution_model,
+    read_pdm,
+    write_glb,
+    write_pdm,
+    write_viewer,
+)
+from isa_nrsfm.plotting import BasisShapeDisplay
+
+faces = make_face_tracks(n_frames=300, random_state=0)
+model = AffineNRSfM(4, random_state=0).fit(faces.data)
+
+# %%
+# The modes are not the independent basis shapes. They are the principal axes of the
+# shapes of the frames, in true proportions and aligned to each other: orthogonal,
+# uncorrelated, strongest first.
+
+pdm = point_distribution_model(model)
+print("mean", pdm.mean.shape, "modes", pdm.modes.shape)
+print("standard deviations", np.sqrt(pdm.eigenvalues).round(3))
+
+# %%
+# Images do not tell the unit of length. One known distance does: the outer corners of
+# the eyes, in millimetres.
+
+known = np.linalg.norm(faces.neutral_shape[36] - faces.neutral_shape[45])
+pdm = pdm.scaled(known / np.linalg.norm(pdm.mean[36] - pdm.mean[45]))
+print(f"width of the mean face {np.ptp(pdm.mean[:, 0]):.1f} mm, ", end="")
+print(f"in truth {np.ptp(faces.mean_shape[:, 0]):.1f} mm")
+
+display = BasisShapeDisplay(
+    mean_shape=pdm.mean,
+    basis=pdm.modes * np.sqrt(pdm.eigenvalues)[:, None, None],
+    energy_share=pdm.eigenvalues / pdm.eigenvalues.sum(),
+    component_names=[f"Mode {k + 1}" for k in range(4)],
+)
+display.plot(n_columns=2)
+
+# %%
+# Is it the right one? Here the truth is known: the principal axes of the true shapes,
+# aligned likewise. The cosines of the angles between the two spaces of modes:
+
+
+def without_pose(shapes):
+    """Return shapes turned and scaled onto their mean, and flattened."""
+    for _ in range(5):
+        mean = shapes.mean(axis=0)
+        U, _, Vt = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
+        shapes = shapes @ U @ Vt
+        scale = np.sum(mean**2) / np.sum(shapes * mean, axis=(1, 2))
+        shapes = scale[:, None, None] * shapes
+    return shapes.reshape(len(shapes), -1)
+
+
+flat = without_pose(faces.shapes)
+axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][:4]
+found = pdm.modes.reshape(4, 68, 3)
+U, _, Vt = np.linalg.svd(pdm.mean.T @ flat.mean(axis=0).reshape(68, 3))
+found = (found @ U @ Vt).reshape(4, -1)
+print(np.linalg.svd(axes @ found.T, compute_uv=False).round(3))
+
+# %%
+# The files
+# ---------
+#
+# ``pdm.txt`` is what OpenFace reads as the shape model of a landmark detector. glTF
+# files (``.glb``) open in any 3D program, each basis shape as a morph target. The page
+# has a slider for each basis shape, and needs nothing but a browser. On the command
+# line: ``isa-nrsfm export model.skops --output pdm.txt``, or ``face.glb``, or
+# ``viewer.html``.
+
+correlation = np.abs(np.corrcoef(faces.alpha.T, model.alpha_.T)[:4, 4:])
+names = [faces.component_names[k] for k in correlation.argmax(axis=0)]
+labels = np.array(faces.component_names)[faces.strength.argmax(axis=1)]
+with TemporaryDirectory() as folder:
+    write_pdm(pdm, Path(folder, "pdm.txt"))
+    write_glb(model, Path(folder, "face.glb"), names=names)
+    write_viewer(model, Path(folder, "viewer.html"), labels=labels, names=names)
+    for path in sorted(Path(folder).iterdir()):
+        print(f"{path.name:12} {path.stat().st_size / 1000:.0f} kB")
+    again = read_pdm(Path(folder, "pdm.txt"))
+    page = Path(folder, "viewer.html").read_text(encoding="utf-8")
+print("the same model again:", np.allclose(again.modes, pdm.modes))
+
+# %%
+# This is the page, in a frame of this one. Drag to turn the face.
+
+
+class Framed:
+    """A page in a frame of a notebook or of this documentation."""
+
+    def _repr_html_(self):
+        style = "width: 100%; height: 44rem; border: 1px solid #8888"
+        return f'<iframe style="{style}" srcdoc="{html.escape(page)}"></iframe>'
+
+
+Framed()

@@ -1,0 +1,119 @@
+"""The code in the pages runs, and the pages name what there is."""
+
+import re
+from pathlib import Path
+from pkgutil import iter_modules
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import savemat
+
+import isa_nrsfm
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ["README.md", "docs/getting_started.md", "docs/migration.md"]
+BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+def text(page):
+    """Return the text of a page."""
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def blocks(page):
+    """Return the Python code of a page, block by block."""
+    return BLOCK.findall(text(page))
+
+
+@pytest.fixture
+def tables(tmp_path, monkeypatch):
+    """Write the files that the pages read, and go where they are."""
+    monkeypatch.chdir(tmp_path)
+    faces = make_face_tracks(n_frames=120, n_components=8, random_state=0)
+    frame = pd.DataFrame(faces.data, columns=faces.feature_names)
+    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 40))
+    frame.to_csv("faces.csv", index=False)
+    frame[:5].to_csv("new_faces.csv", index=False)
+
+
+@pytest.fixture
+def sequence(tables):
+    """Write the tracks of one camera in the orders of MATLAB code; return them."""
+    scene = make_nonrigid_tracks(
+        60, 20, 2, camera="orthographic", noise=0.001, missing=0.0, random_state=0
+    )
+    W = scene.tracks.transpose(0, 2, 1).reshape(120, 20)
+    savemat(
+        "tracks.mat",
+        {
+            "W": W,
+            "P": np.concatenate([W[::2], W[1::2]]),
+            "MD": np.zeros((60, 20)),
+            "W3": scene.tracks.transpose(2, 1, 0),
+            "S": scene.shapes.transpose(0, 2, 1).reshape(180, 20),
+        },
+    )
+    return scene
+
+
+def run(page):
+    """Run the code of a page, and return its names."""
+    names = {}
+    for code in blocks(page):
+        exec(compile(code, page, "exec"), names)
+    return names
+
+
+def test_links_of_the_readme_lead_somewhere():
+    links = re.findall(r"\]\((?!https?:)([^)#]+)\)", text("README.md"))
+    assert len(links) > 10
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_the_api_page_lists_all_public_modules():
+    modules = {m.name for m in iter_modules(isa_nrsfm.__path__)}
+    public = {name for name in modules - {"cli"} if not name.startswith("_")}
+    listed = re.findall(r"^   isa_nrsfm\.(\w+)$", text("docs/api.rst"), re.MULTILINE)
+    assert public == set(listed)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_have_code(page):
+    assert blocks(page)
+
+
+@pytest.mark.usefixtures("tables")
+def test_the_readme_runs():
+    names = run("README.md")
+    assert names["model"].alpha_.shape == (120, 9)
+
+
+@pytest.mark.usefixtures("tables")
+def test_getting_started_runs():
+    names = run("docs/getting_started.md")
+    table = pd.read_csv("alpha.csv")
+    assert list(table)[:2] == ["person", "affinenrsfm0"]
+    seen = names["points"].to_numpy()[0].reshape(-1, 2)
+    np.testing.assert_allclose(names["row"], seen, atol=10)
+    assert Path("shapes.png").stat().st_size
+    assert Path("rows.png").stat().st_size
+
+
+def test_orders_of_matlab_are_the_same_table(sequence):
+    names = run("docs/migration.md")
+    for table in ("X", "X_em", "X_toolbox"):
+        np.testing.assert_array_equal(names[table], sequence.data)
+    np.testing.assert_array_equal(names["W_again"], names["W"])
+    np.testing.assert_array_equal(names["truth"], sequence.shapes)
+
+
+def test_variables_of_matlab_are_the_model(sequence):
+    names = run("docs/migration.md")
+    model, F, P = names["model"], names["F"], names["P"]
+    seen = names["W"] - names["reprojected"]
+    assert np.sum(seen**2) < 1e-5 * np.sum(names["W"] ** 2)
+    shapes = names["S_bar"] + np.tensordot(names["Z"], names["V"].reshape(2, 3, P), 1)
+    np.testing.assert_allclose(shapes.reshape(3 * F, P), names["S"], atol=1e-6)
+    np.testing.assert_array_equal(names["R"][2:4], model.motion_[1])
