@@ -96,7 +96,8 @@ def diagnose(
     square = np.sum(alpha**2, axis=0) ** 2
     information = weak_information(mean_shape, basis, motion, alpha)
     known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
-    known = np.maximum(known, np.finfo(float).tiny)
+    floats = np.finfo(float)
+    known = np.maximum(known, max(floats.eps * known[0], floats.tiny))
     found = Diagnostics(
         np.linalg.svd(rows, compute_uv=False) / np.sqrt(len(rows)),
         float(np.sqrt(deformation / np.sum(mean_shape**2))),
