@@ -341,10 +341,11 @@ def fitted_posteriors(
     chosen = frames if sample is None else frames.take(sample)
     posteriors = _posterior_blocks(model, chosen, rows)
     used = np.unique(np.concatenate(list(posteriors.map(_starts_used))))
-    model = model._replace(starts=model.starts[used[used >= 0]])
-    if sample is not None:
-        posteriors = _posterior_blocks(model, frames, rows)
-    return model, posteriors
+    needed = model._replace(starts=model.starts[used[used >= 0]])
+    if sample is not None or len(needed.starts) < len(model.starts):
+        # The same to the last bit as fits of new frames, which have these starts.
+        posteriors = _posterior_blocks(needed, frames, rows)
+    return needed, posteriors
 
 
 def _starts_used(posterior: FramePosterior) -> NDArray:

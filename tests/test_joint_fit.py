@@ -393,7 +393,8 @@ class TestStiffness:
 def test_rigid_cameras_that_show_no_anisotropy_compare_with_none():
     tracks, _ = random_table()
     W = measurements(tracks, scale_frames=False)
-    problem = module._Problem(JointFrames.of_points(rows_of(tracks), True), W, 3, 0.1)
+    frames = JointFrames.of_points(rows_of(tracks), True)
+    problem = module._Problem(frames, module._SampleRows.of(W, frames), 3, 0.1, None)
     shapes = lifted_shapes(factorise(W, 2), lifted_directions(factorise(W, 2), 2))
     result = problem.refined(problem.start(shapes), 0.0, 0.1)
     assert module._Rigid(0.0, 1.0).ratio(result) == 1.0

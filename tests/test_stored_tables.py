@@ -19,6 +19,8 @@ OF_SHAPES = ("mean_shape_", "basis_", "singular_values_", "mode_covariance_")
 # Megabytes: blocks of few, of more and of all frames.
 NEEDED = r"needs the cameras .* keep_frames=False"
 MEMORIES = (0.02, 0.1, 1000)
+# A row that shows three of 20 points.
+FEW_POINTS = np.repeat([1.0, 2.0, 4.0, np.nan], [2, 2, 2, 34])
 
 
 def table(missing=0.0, n_points=20, n_frames=150):
@@ -218,9 +220,10 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("row", "message"),
         [
-            (np.nan, r"1 of 150 frame\(s\) show fewer .* the first is row 120"),
+            (FEW_POINTS, r"1 of 150 frame\(s\) show fewer .* the first is row 120"),
             (1.0, r"equal in 1 frame\(s\), the first is row 120"),
         ],
+        ids=["few points", "equal points"],
     )
     def test_rows_are_named(self, tmp_path, row, message):
         X = table()
