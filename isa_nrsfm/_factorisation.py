@@ -233,7 +233,8 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
 
     It starts from those of some of the rows, and ends when another pass over the matrix
-    adds less than 1e-6 of what is left to the energy that is found.
+    would add less than 1e-6 of what is left to the energy that is found: what it adds
+    shrinks from pass to pass, faster and faster.
     """
     width = k + OVERSAMPLING
     n_frames = blocks.n_frames
@@ -242,14 +243,18 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     last = np.linalg.qr(sample.T @ np.linalg.svd(sample @ sample.T)[0][:, :width])[0]
     basis, products = last, np.zeros((n_columns, 0))
     energy = sum(blocks.map(_energy))
-    found = 0.0
+    found, gains = 0.0, []
     for _ in range(MOST_PASSES):
         products = np.hstack([products, sum(blocks.map(partial(_squared, V=last)))])
         gram = basis.T @ products
         values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
         before, found = found, float(values[-k:].sum())
         little = CONVERGED * max(energy - found, ROUNDING * energy)
-        if found - before <= little or basis.shape[1] + width > n_columns:
+        gains.append(max(found - before, little))
+        following = gains[-1]
+        if len(gains) > 2:  # the first gain is from nothing
+            following *= min(gains[-1] / gains[-2], 1.0)
+        if following <= little or basis.shape[1] + width > n_columns:
             break
         last = products[:, -width:]
         for _ in range(2):  # twice is enough
