@@ -254,7 +254,7 @@ def euclidean_frames(
 def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
     """Return the metric with strains, their price being that of maximal evidence."""
     size = len(strain_basis("weak_perspective"))
-    n_equations = rigid.residuals.size
+    n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, ROUNDING**2)
     variance = STRAIN_DEVIATION**2
     fit = rigid
@@ -263,11 +263,10 @@ def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit
         ridge = noise / variance
         fit = refine_metric(cameras, fit.Q, "weak_perspective", alpha, strain, ridge)
         strain = fit.strain
-        slopes = fit.slopes.reshape(n_equations, -1)
-        curvature = slopes.T @ slopes
-        across = curvature[:size, size:]
-        inside = np.linalg.pinv(curvature[:size, :size], hermitian=True)
-        known = np.linalg.eigvalsh(curvature[size:, size:] - across.T @ inside @ across)
+        across = fit.curvature[:size, size:]
+        inside = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
+        own = fit.curvature[size:, size:] - across.T @ inside @ across
+        known = np.linalg.eigvalsh(own)
         known = np.maximum(known, 0.0)
         n_known = float(np.sum(known / (known + ridge)))
         freedom = max(n_equations - size - n_known, 0.1 * n_equations)
