@@ -76,6 +76,7 @@ def inverse3(packed: NDArray) -> NDArray:
     R = inverse_factor3(packed)
     return np.einsum("can,cbn->abn", R, R)
 
+
 def eigh3(packed: NDArray) -> tuple[NDArray, NDArray]:
     """
     Return eigenvalues and eigenvectors of symmetric 3x3 matrices.
