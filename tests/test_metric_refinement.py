@@ -220,12 +220,12 @@ class TestRefineMetric:
         assert fine.cost == pytest.approx(whole.cost, rel=1e-9)
 
     def test_converges_where_residuals_are_large(self, monkeypatch):
-        # Gauss-Newton steps alone need twice as many.
-        monkeypatch.setattr("isa_nrsfm._metric_refinement.MAX_STEPS", 14)
+        # Gauss-Newton steps alone leave a hundred times as much.
+        monkeypatch.setattr("isa_nrsfm._metric_refinement.MAX_STEPS", 16)
         motion = noisy_cameras(0, "weak_perspective")
         fit = refine_metric(motion, np.eye(3), "weak_perspective")
         assert fit.cost > 0.1
-        assert_allclose(fit.gradient, 0, atol=1e-9)
+        assert_allclose(fit.gradient, 0, atol=1e-8)
 
     def test_orthographic_minimum_is_that_of_the_linear_equations(self):
         # Where their solution is positive definite, as it is here.
