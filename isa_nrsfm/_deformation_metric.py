@@ -6,12 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._metric import symmetric_power
-from isa_nrsfm._metric_refinement import (
-    MetricFit,
-    exponential,
-    refine_metric,
-    strain_basis,
-)
+from isa_nrsfm._metric_equations import MetricFit, fit_at, frame_blocks, strain_basis
+from isa_nrsfm._metric_refinement import exponential, refine_fit
 from isa_nrsfm._metric_upgrade import (
     fit_metric,
     nearest_rotations,
@@ -29,6 +25,8 @@ LARGEST_STRAIN = 1.0
 # Rounds of estimating the deviation, and the change of its logarithm that ends them.
 MAX_ROUNDS = 15
 SETTLED = 0.05
+# Until then metrics are as good as that.
+ROUGH_STEP = 1e-4
 # Rounding errors of the residuals.
 ROUNDING = 1e-12
 
@@ -254,30 +252,29 @@ def euclidean_frames(
 def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
     """Return the metric with strains, their price being that of maximal evidence."""
     size = len(strain_basis("weak_perspective"))
-    n_equations = rigid.residuals.size
+    n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, ROUNDING**2)
     variance = STRAIN_DEVIATION**2
-    fit = rigid
-    strain = None
+    blocks = frame_blocks(cameras, alpha)
+    none = np.zeros((alpha.shape[1], 3, 3))
+    fit = fit_at(blocks, rigid.Q, none, "weak_perspective")
     for _ in range(MAX_ROUNDS):
         ridge = noise / variance
-        fit = refine_metric(cameras, fit.Q, "weak_perspective", alpha, strain, ridge)
-        strain = fit.strain
-        slopes = fit.slopes.reshape(n_equations, -1)
-        curvature = slopes.T @ slopes
-        across = curvature[:size, size:]
-        inside = np.linalg.pinv(curvature[:size, :size], hermitian=True)
-        known = np.linalg.eigvalsh(curvature[size:, size:] - across.T @ inside @ across)
+        fit = refine_fit(blocks, fit, "weak_perspective", ridge, ROUGH_STEP)
+        across = fit.curvature[:size, size:]
+        inside = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
+        own = fit.curvature[size:, size:] - across.T @ inside @ across
+        known = np.linalg.eigvalsh(own)
         known = np.maximum(known, 0.0)
         n_known = float(np.sum(known / (known + ridge)))
         freedom = max(n_equations - size - n_known, 0.1 * n_equations)
         previous = noise, variance
         noise = max(fit.cost / freedom, ROUNDING**2)
-        variance = np.sum(strain**2) / max(n_known, 1e-3)
+        variance = np.sum(fit.strain**2) / max(n_known, 1e-3)
         variance = np.clip(variance, ROUNDING, STRAIN_DEVIATION**2)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < SETTLED:
             break
-    return fit
+    return refine_fit(blocks, fit, "weak_perspective", ridge)
 
 
 def _turns_to(shapes: NDArray, mean_shape: NDArray) -> NDArray:

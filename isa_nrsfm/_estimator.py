@@ -48,7 +48,7 @@ from isa_nrsfm._independent_gauge import (
     independent_gauge,
 )
 from isa_nrsfm._joint_fit import fit_jointly
-from isa_nrsfm._metric_refinement import CAMERA_MODELS
+from isa_nrsfm._metric_equations import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._parameter_checks import fit_context
 from isa_nrsfm._robust import LOSSES, gross_outliers

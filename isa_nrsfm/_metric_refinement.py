@@ -1,26 +1,24 @@
 """The metric of space in which cameras are most nearly scaled rotations.
 
-A metric is a symmetric positive definite 3x3 matrix ``G = Q Q^T``: the rows of the
-camera M_i are orthogonal and of equal length in it where ``M_i Q = s_i R_i``, the first
-two rows of a scaled rotation. It may change with the deformation of the object, as
-``G_i = Q exp(sum_k alpha_ik E_k) Q^T`` with symmetric strains E_k.
-
-What is left of orthonormality is minimised by damped Gauss-Newton steps along
-geodesics, ``Q <- Q exp(E_0 / 2)``. Any step leads to a metric, so that a minimum is
-found also where the linear equations for the entries of G (`metric_quadric`) have an
-indefinite solution. The derivative of the exponential is that of Daleckii and Krein
-(Higham, "Functions of matrices", 2008, theorem 3.11).
+What is left of orthonormality (`orthonormality`) is minimised by damped Gauss-Newton
+steps along geodesics, ``Q <- Q exp(E_0 / 2)``. Any step leads to a metric, so that a
+minimum is found also where the linear equations for the entries of G (`metric_quadric`)
+have an indefinite solution. Where the residuals are large Gauss-Newton steps approach
+it slowly: what they miss of the curvature is learnt from how the gradient changes.
 """
-
-from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._metric import mean_gram, symmetric_power, unit_cameras
-
-CameraModel = Literal["orthographic", "weak_perspective"]
-CAMERA_MODELS = ("orthographic", "weak_perspective")
+from isa_nrsfm._metric_equations import (
+    Block,
+    CameraModel,
+    MetricFit,
+    fit_at,
+    frame_blocks,
+    strain_basis,
+)
 
 # Metrics that are nearly singular are saddle points. A start is one that stretches no
 # direction, relative to another one that the cameras see as well, by more than this.
@@ -34,98 +32,10 @@ EASED, STIFFENED = 0.2, 5.0
 LARGEST_DAMPING = 1e10
 # A step changes the logarithm of the metric of a frame by no more than about this.
 LONGEST_STEP = 2.0
-# Logarithms that are nearer to each other than this have the same exponential.
-EQUAL_STRETCHES = 1e-6
-
-
-class MetricFit(NamedTuple):
-    """
-    A metric of least squares.
-
-    Attributes
-    ----------
-    Q : ndarray of shape (3, 3)
-        Of the metric of frames without deformation.
-    strain : ndarray of shape (n_components, 3, 3)
-        E_k, symmetric and without trace.
-    residuals : ndarray of shape (n_frames, n)
-        As of `orthonormality`.
-    slopes : ndarray of shape (n_frames, n, n_numbers * (n_components + 1))
-        Their derivatives by the numbers of E_0 and of the E_k, the coefficients of
-        `strain_basis`.
-    """
-
-    Q: NDArray
-    strain: NDArray
-    residuals: NDArray
-    slopes: NDArray
-
-    @property
-    def cost(self) -> float:
-        """Sum of the squared residuals."""
-        return float(np.sum(self.residuals**2))
-
-    @property
-    def residual(self) -> float:
-        """Root mean square over the frames of the norm of the residuals."""
-        return float(np.sqrt(self.cost / len(self.residuals)))
-
-    @property
-    def condition_number(self) -> float:
-        """Condition number of the residuals as functions of the common metric."""
-        size = self.slopes.shape[2] // (len(self.strain) + 1)
-        slopes = self.slopes[:, :, :size].reshape(-1, size)
-        if len(slopes) < size:
-            return np.inf
-        values = np.linalg.svd(slopes, compute_uv=False)
-        return float(values[0] / values[-1]) if values[-1] > 0 else np.inf
-
-
-def strain_basis(camera: CameraModel) -> NDArray:
-    """
-    Return an orthonormal basis of the strains that cameras tell from none.
-
-    Parameters
-    ----------
-    camera : {"orthographic", "weak_perspective"}
-        With a scale of its own for each frame no strain has a trace.
-
-    Returns
-    -------
-    ndarray of shape (n_numbers, 3, 3)
-        Six symmetric matrices, or five without trace.
-    """
-    basis = np.zeros((6, 3, 3))
-    diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
-    basis[[[0], [1], [5]], [0, 1, 2], [0, 1, 2]] = diagonal
-    first, second = [0, 0, 1], [1, 2, 2]
-    basis[[2, 3, 4], first, second] = basis[[2, 3, 4], second, first] = np.sqrt(0.5)
-    return basis if camera == "orthographic" else basis[:5]
-
-
-def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
-    """
-    Return how far the rows of cameras are from those of rotations.
-
-    Parameters
-    ----------
-    gram : ndarray of shape (n_frames, 2, 2)
-        ``M_i G M_i^T``, the products of the rows in the metric.
-    camera : {"orthographic", "weak_perspective"}
-        Whether the rows should be those of a rotation or of a scaled rotation.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 3) or (n_frames, 2)
-        ``(xx - 1, sqrt(2) xy, yy - 1)``, of the norm ``||M_i G M_i^T - I||_F``, for
-        orthographic cameras, and ``(xx - yy, 2 xy) / (xx + yy)``, of the norm ``(s1^2 -
-        s2^2) / (s1^2 + s2^2)`` with s1, s2 the singular values of ``M_i Q``, for
-        weak-perspective ones: neither roll nor scale of a frame changes that.
-    """
-    xx, xy, yy = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
-    if camera == "orthographic":
-        return np.stack([xx - 1, np.sqrt(2) * xy, yy - 1], axis=1)
-    return np.stack([xx - yy, 2 * xy], axis=1) / (xx + yy)[:, None]
+# An update of the curvature whose cosine with the step is smaller is not safe.
+LEAST_ALONG = 1e-8
+# A share of the cost that is rounding errors.
+ROUNDING = 1e-14
 
 
 def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
@@ -161,11 +71,10 @@ def refine_metric(
     Q: NDArray,
     camera: CameraModel,
     alpha: NDArray | None = None,
-    strain: NDArray | None = None,
     ridge: float = 0.0,
 ) -> MetricFit:
     """
-    Minimise what is left of orthonormality from a start.
+    Minimise what is left of orthonormality from a start without strains.
 
     Parameters
     ----------
@@ -177,8 +86,6 @@ def refine_metric(
         What the cameras should be.
     alpha : ndarray of shape (n_frames, n_components), optional
         Coefficients of the strains; by default there are none.
-    strain : ndarray of shape (n_components, 3, 3), optional
-        Strains to start from, by default zeros.
     ridge : float, default=0.0
         Price of the squared norm of the strains.
 
@@ -187,76 +94,89 @@ def refine_metric(
     MetricFit
         A minimum of ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2``.
     """
-    alpha = np.zeros((len(motion), 0)) if alpha is None else alpha
+    if alpha is None:
+        alpha = np.zeros((len(motion), 0))
+    blocks = frame_blocks(motion, alpha)
+    start = fit_at(blocks, Q, np.zeros((alpha.shape[1], 3, 3)), camera)
+    return refine_fit(blocks, start, camera, ridge)
+
+
+def refine_fit(
+    blocks: list[Block],
+    fit: MetricFit,
+    camera: CameraModel,
+    ridge: float,
+    shortest_step: float = SHORTEST_STEP,
+) -> MetricFit:
+    """
+    Minimise what is left of orthonormality from any fit.
+
+    Parameters
+    ----------
+    blocks : list of tuple of ndarray
+        Of `frame_blocks`.
+    fit : MetricFit
+        The start, of `fit_at` for these blocks.
+    camera, ridge
+        As of `refine_metric`.
+    shortest_step : float
+        The search ends with a step of which no entry is larger.
+
+    Returns
+    -------
+    MetricFit
+        As of `refine_metric`.
+    """
     basis = strain_basis(camera)
-    size, n_components = len(basis), alpha.shape[1]
-    numbers = np.zeros((n_components, size))
-    if strain is not None:
-        numbers = np.einsum("kab,nab->kn", strain, basis)
-    prices = np.repeat([0.0, ridge], [size, size * n_components])
-    reach = 1.0 + np.abs(alpha).sum(axis=1).max(initial=0.0)
-
-    def reached(Q: NDArray, numbers: NDArray) -> tuple[float, MetricFit]:
-        strain = np.tensordot(numbers, basis, 1)
-        fit = MetricFit(Q, strain, *_linearised(motion @ Q, strain, alpha, camera))
-        return fit.cost + ridge * float(np.sum(numbers**2)), fit
-
-    value, fit = reached(Q, numbers)
+    size = len(basis)
+    numbers = np.einsum("kab,nab->kn", fit.strain, basis)
+    prices = np.repeat([0.0, ridge], [size, numbers.size])
+    reach = 1.0 + max(np.abs(alpha).sum(axis=0).max(initial=0) for _, alpha in blocks)
+    value = fit.cost + ridge * float(np.sum(numbers**2))
     damping = FIRST_DAMPING
+    missing = np.zeros_like(fit.curvature)
     for _ in range(MAX_STEPS):
-        slopes = fit.slopes.reshape(-1, len(prices))
-        curvature = slopes.T @ slopes + np.diag(prices)
-        gradient = slopes.T @ fit.residuals.ravel()
-        gradient[size:] += ridge * numbers.ravel()
+        curvature = fit.curvature + missing + np.diag(prices)
+        gradient = fit.gradient + prices * np.append(np.zeros(size), numbers)
         scale = np.maximum(curvature.diagonal(), 1e-12 * curvature.diagonal().max())
         step = -np.linalg.lstsq(curvature + np.diag(damping * scale), gradient)[0]
         step *= min(1.0, LONGEST_STEP / max(reach * np.abs(step).max(), 1e-300))
         change = np.tensordot(step[:size], basis, 1)
         changed = numbers + step[size:].reshape(numbers.shape)
-        new_value, new = reached(fit.Q @ exponential(change / 2), changed)
-        if new_value <= value:
+        new_Q = fit.Q @ exponential(change / 2)
+        new = fit_at(blocks, new_Q, np.tensordot(changed, basis, 1), camera)
+        new_value = new.cost + ridge * float(np.sum(changed**2))
+        if new_value <= value * (1 + ROUNDING):
+            missing = _missing_curvature(missing, step, fit, new, prices)
             value, numbers, fit = new_value, changed, new
             damping *= EASED
+        elif missing.any():
+            missing = np.zeros_like(missing)
         else:
             damping *= STIFFENED
-        if np.abs(step).max() < SHORTEST_STEP or damping > LARGEST_DAMPING:
+        if np.abs(step).max() < shortest_step or damping > LARGEST_DAMPING:
             break
     return fit
 
 
-def _linearised(
-    motion: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
-) -> tuple[NDArray, NDArray]:
-    """Return residuals of cameras ``M Q`` and derivatives by the numbers of strains."""
-    basis = strain_basis(camera)
-    stretch, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
-    grown = np.exp(stretch)
-    seen = motion @ axes
-    turned = seen.transpose(0, 2, 1)
-    gram = (seen * grown[:, None]) @ turned
-    residuals = orthonormality(gram, camera)
-    along = axes.transpose(0, 2, 1)[:, None] @ basis @ axes[:, None]
+def _missing_curvature(
+    missing: NDArray, step: NDArray, old: MetricFit, new: MetricFit, prices: NDArray
+) -> NDArray:
+    """
+    Return what ``J^T J`` lacks of the curvature after a step.
 
-    def derivative(factors: NDArray) -> NDArray:
-        change = seen[:, None] @ (factors[:, None] * along) @ turned[:, None]
-        xx, xy, yy = change[..., 0, 0], change[..., 0, 1], change[..., 1, 1]
-        if camera == "orthographic":
-            return np.stack([xx, np.sqrt(2) * xy, yy], axis=1)
-        grows = (xx + yy)[:, None]
-        rest = np.stack([xx - yy, 2 * xy], axis=1) - residuals[:, :, None] * grows
-        return rest / np.trace(gram, axis1=1, axis2=2)[:, None, None]
-
-    # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes by the mean of E_0 exp(E), exp(E) E_0.
-    mean = (grown[:, :, None] + grown[:, None]) / 2
-    parts = [derivative(mean)]
-    if alpha.shape[1]:
-        gap = stretch[:, :, None] - stretch[:, None]
-        close = np.abs(gap) < EQUAL_STRETCHES
-        rise = grown[:, :, None] - grown[:, None]
-        divided = np.where(close, mean, rise / np.where(close, 1.0, gap))
-        by_strain = derivative(divided)
-        parts += [by_strain * column[:, None, None] for column in alpha.T]
-    return residuals, np.concatenate(parts, axis=2)
+    The update of rank one by which the curvature explains the change of the gradient
+    (Nocedal, Wright, "Numerical optimization", 2006, chapter 6.2; only of the part that
+    is missing: Dennis, Gay, Welsch, "An adaptive nonlinear least-squares algorithm",
+    ACM Transactions on Mathematical Software 7, 1981). Zeros are returned where the
+    curvature would not be positive.
+    """
+    rest = new.gradient - old.gradient - (new.curvature + missing) @ step
+    along = rest @ step
+    if abs(along) > LEAST_ALONG * np.linalg.norm(rest) * np.linalg.norm(step):
+        missing = missing + np.outer(rest, rest) / along
+    whole = new.curvature + missing + np.diag(prices)
+    return missing if np.linalg.eigvalsh(whole)[0] > 0 else np.zeros_like(missing)
 
 
 def exponential(matrices: NDArray) -> NDArray:

@@ -13,13 +13,8 @@ from isa_nrsfm._metric import (
     symmetric_power,
     unit_cameras,
 )
-from isa_nrsfm._metric_refinement import (
-    CAMERA_MODELS,
-    CameraModel,
-    MetricFit,
-    refine_metric,
-    safe_start,
-)
+from isa_nrsfm._metric_equations import CAMERA_MODELS, CameraModel, MetricFit
+from isa_nrsfm._metric_refinement import refine_metric, safe_start
 
 # A condition number from which on the cameras hardly show the metric: rotations by
 # about five degrees have it.
@@ -254,9 +249,10 @@ def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
 
 def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
     """Return Q with a scale such that that of the cameras has mean square one."""
-    stretches = nearest_rotations(cameras @ Q)[1]
-    scales = np.trace(stretches, axis1=1, axis2=2) / 2
-    return Q / np.sqrt(np.mean(scales**2))
+    # A scale is the mean of the two singular values, the product of which is the area.
+    rows = cameras @ Q
+    area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
+    return Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
 
 
 def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:

@@ -82,6 +82,74 @@ def inverse3(packed: NDArray) -> NDArray:
     return np.einsum("can,cbn->abn", R, R)
 
 
+def eigh3(packed: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return eigenvalues and eigenvectors of symmetric 3x3 matrices.
+
+    Parameters
+    ----------
+    packed : ndarray of shape (6, n)
+        Symmetric matrices A, packed.
+
+    Returns
+    -------
+    values : ndarray of shape (3, n)
+        Eigenvalues. The first one is that which is farthest from the other two.
+    axes : ndarray of shape (3, 3, n)
+        ``A = axes diag(values) axes^T``, axes orthogonal up to rounding, also where
+        eigenvalues are equal.
+
+    Notes
+    -----
+    The first eigenvalue is the root of the cubic equation farthest from the others, by
+    a cosine (Smith, "Eigenvalues of a symmetric 3x3 matrix", Communications of the ACM
+    4, 1961), and so well apart that its eigenvector is safe. One rotation in the plane
+    across it gives the others.
+    """
+    mean = packed[:3].mean(axis=0)
+    rest = packed.copy()
+    rest[:3] -= mean
+    a, b, c, d, e, f = rest
+    size = np.sqrt((a * a + b * b + c * c) / 6 + (d * d + e * e + f * f) / 3)
+    rest /= np.where(size > 0, size, 1.0)
+    determinant = a * (b * c - f * f) - d * (d * c - e * f) + e * (d * f - b * e)
+    angle = np.arccos(np.minimum(np.abs(determinant) / 2, 1.0)) / 3
+    first = np.copysign(2 * np.cos(angle), determinant)
+
+    # The adjugate of the shifted matrix is a positive multiple of v v^T.
+    a, b, c = rest[:3] - first
+    x, y, z = b * c - f * f, a * c - e * e, a * b - d * d
+    xy, xz, yz = e * f - c * d, d * f - b * e, d * e - a * f
+    from_x, from_y = (x >= y) & (x >= z), y >= z
+    v = np.where(from_x, (x, xy, xz), np.where(from_y, (xy, y, yz), (xz, yz, z)))
+    v /= np.sqrt(_dot(v, v))
+    # Two axes across v (Duff et al., "Building an orthonormal basis, revisited",
+    # Journal of Computer Graphics Techniques 6, 2017).
+    sign = np.copysign(1.0, v[2])
+    share = -1 / (sign + v[2])
+    product = v[0] * v[1] * share
+    u = np.stack([1 + sign * v[0] ** 2 * share, sign * product, -sign * v[0]])
+    w = np.stack([product, sign + v[1] ** 2 * share, -v[1]])
+
+    full = unpack3(rest)
+    to_u, to_w = np.einsum("abn,bn->an", full, u), np.einsum("abn,bn->an", full, w)
+    uu, uw, ww = _dot(u, to_u), _dot(u, to_w), _dot(w, to_w)
+    # Jacobi's rotation, by no more than 45 degrees.
+    gap = (ww - uu) / 2
+    reach = np.abs(gap) + np.sqrt(gap * gap + uw * uw)
+    tangent = np.copysign(1.0, gap) * uw / np.where(reach > 0, reach, 1.0)
+    cosine = 1 / np.sqrt(1 + tangent * tangent)
+    sine = tangent * cosine
+    axes = np.stack([v, cosine * u - sine * w, sine * u + cosine * w], axis=1)
+    values = np.stack([first, uu - tangent * uw, ww + tangent * uw])
+    return values * size + mean, axes
+
+
+def _dot(u: NDArray, v: NDArray) -> NDArray:
+    """Return the scalar products of vectors (3, n)."""
+    return np.einsum("an,an->n", u, v)
+
+
 def pair_indices(k: int) -> tuple[NDArray, NDArray]:
     """Return row and column of the entries of packed symmetric k x k matrices."""
     return np.triu_indices(k)

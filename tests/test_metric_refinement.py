@@ -8,15 +8,22 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._metric import metric_quadric
-from isa_nrsfm._metric_refinement import (
+from isa_nrsfm._metric_equations import (
+    BLOCK_FRAMES,
     CAMERA_MODELS,
-    STRETCH_OF_START,
     _linearised,
-    exponential,
+    _normal_equations,
+    fit_at,
+    frame_blocks,
     orthonormality,
+    strain_basis,
+)
+from isa_nrsfm._metric_refinement import (
+    STRETCH_OF_START,
+    exponential,
+    refine_fit,
     refine_metric,
     safe_start,
-    strain_basis,
 )
 
 both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)
@@ -57,7 +64,7 @@ def bad_start(seed):
 def objective(motion, Q, camera, alpha, strain, ridge):
     turned = [Q @ expm(np.tensordot(a, strain, 1)) @ Q.T for a in alpha]
     gram = motion @ np.array(turned) @ motion.transpose(0, 2, 1)
-    rest = orthonormality(gram, camera)
+    rest = orthonormality(gram.transpose(1, 2, 0), camera)
     return np.sum(rest**2) + ridge * np.sum(strain**2)
 
 
@@ -74,16 +81,17 @@ class TestParts:
     def test_norms_of_the_residuals(self):
         cameras = np.random.default_rng(0).standard_normal((6, 2, 3))
         gram = cameras @ cameras.transpose(0, 2, 1)
+        last = gram.transpose(1, 2, 0)
         s1, s2 = np.linalg.svd(cameras, compute_uv=False).T
-        weak = np.linalg.norm(orthonormality(gram, "weak_perspective"), axis=1)
+        weak = np.linalg.norm(orthonormality(last, "weak_perspective"), axis=0)
         assert_allclose(weak, (s1**2 - s2**2) / (s1**2 + s2**2))
-        ortho = np.linalg.norm(orthonormality(gram, "orthographic"), axis=1)
+        ortho = np.linalg.norm(orthonormality(last, "orthographic"), axis=0)
         assert_allclose(ortho, np.linalg.norm(gram - np.eye(2), axis=(1, 2)))
 
     @both_cameras
     def test_derivatives_by_central_differences(self, camera):
         rng = np.random.default_rng(0)
-        motion, alpha = rng.standard_normal((4, 2, 3)), rng.standard_normal((4, 2))
+        motion, alpha = rng.standard_normal((4, 2, 3)), rng.standard_normal((2, 4))
         basis = strain_basis(camera)
         numbers = 0.3 * rng.standard_normal((2, len(basis)))
         numbers[1, 3:] = 0.0
@@ -92,20 +100,49 @@ class TestParts:
             first, rest = step[: len(basis)], step[len(basis) :].reshape(numbers.shape)
             moved = motion @ expm(np.tensordot(first, basis, 1) / 2)
             strain = np.tensordot(numbers + rest, basis, 1)
-            return _linearised(moved, strain, alpha, camera)
+            return _linearised(moved.transpose(1, 2, 0), strain, alpha, camera)
 
-        slopes = at(np.zeros(3 * len(basis)))[1]
-        for k, unit in enumerate(1e-6 * np.eye(3 * len(basis))):
+        residuals, slopes, own_slopes = at(np.zeros(3 * len(basis)))
+        by_strains = [own_slopes * coefficients for coefficients in alpha]
+        slopes = np.concatenate([slopes, *by_strains])
+        for slope, unit in zip(slopes, 1e-6 * np.eye(3 * len(basis)), strict=True):
             change = (at(unit)[0] - at(-unit)[0]) / 2e-6
-            assert_allclose(slopes[:, :, k], change, atol=1e-7)
+            assert_allclose(slope, change, atol=1e-7)
+
+        # The sums over frames are those of all derivatives.
+        parts = _linearised(
+            motion.transpose(1, 2, 0), np.tensordot(numbers, basis, 1), alpha, camera
+        )
+        cost, curvature, gradient = _normal_equations(alpha, *parts)
+        flat = slopes.reshape(len(slopes), -1)
+        assert cost == pytest.approx(np.sum(residuals**2))
+        assert_allclose(curvature, flat @ flat.T, atol=1e-12)
+        assert_allclose(gradient, flat @ residuals.ravel(), atol=1e-12)
 
     def test_derivative_where_there_is_no_strain(self):
         # Equal eigenvalues, whose divided difference is a derivative.
-        motion = np.random.default_rng(0).standard_normal((4, 2, 3))
-        slopes = _linearised(
-            motion, np.zeros((1, 3, 3)), np.ones((4, 1)), "weak_perspective"
-        )[1]
-        assert_allclose(slopes[:, :, :5], slopes[:, :, 5:])
+        cameras = np.random.default_rng(0).standard_normal((2, 3, 4))
+        _, slopes, own_slopes = _linearised(
+            cameras, np.zeros((1, 3, 3)), np.ones((1, 4)), "weak_perspective"
+        )
+        assert_allclose(slopes, own_slopes)
+
+    @both_cameras
+    def test_blocks_of_frames_add_up(self, camera):
+        rng = np.random.default_rng(0)
+        n = BLOCK_FRAMES + 10
+        motion, alpha = rng.standard_normal((n, 2, 3)), rng.standard_normal((n, 2))
+        strain = 0.1 * strain_basis(camera)[:2]
+        blocks = frame_blocks(motion, alpha)
+        assert [part.shape[-1] for part, _ in blocks] == [BLOCK_FRAMES, 10]
+        whole = fit_at(blocks, np.eye(3), strain, camera)
+        backwards = frame_blocks(motion[::-1], alpha[::-1])
+        turned = fit_at(backwards, np.eye(3), strain, camera)
+        assert whole.n_frames == turned.n_frames == n
+        assert whole.cost == pytest.approx(turned.cost, rel=1e-12)
+        scale = np.abs(whole.curvature).max()
+        assert_allclose(whole.curvature, turned.curvature, atol=1e-12 * scale)
+        assert_allclose(whole.gradient, turned.gradient, atol=1e-12 * scale)
 
     def test_exponential(self):
         roots = np.random.default_rng(0).standard_normal((4, 3, 3))
@@ -159,8 +196,7 @@ class TestRefineMetric:
         args = (camera, alpha, fit.strain, ridge)
         assert objective(motion, fit.Q, *args) == pytest.approx(here, rel=1e-9)
         basis = strain_basis(camera)
-        flat = fit.slopes.reshape(-1, 3 * len(basis))
-        gradient = flat.T @ fit.residuals.ravel()
+        gradient = fit.gradient.copy()
         own = ridge * np.einsum("kab,nab->kn", fit.strain, basis).ravel()
         gradient[len(basis) :] += own
         assert_allclose(gradient, 0, atol=1e-6)
@@ -170,6 +206,26 @@ class TestRefineMetric:
             moved = fit.Q @ expm(change[0] / 2)
             moved_args = (camera, alpha, fit.strain + change[1:], ridge)
             assert objective(motion, moved, *moved_args) > here
+
+    def test_going_on_from_a_rough_fit_ends_at_the_minimum(self):
+        rng = np.random.default_rng(4)
+        motion, alpha = noisy_cameras(4, "weak_perspective"), rng.random((30, 1))
+        whole = refine_metric(motion, np.eye(3), "weak_perspective", alpha, 0.5)
+        blocks = frame_blocks(motion, alpha)
+        start = fit_at(blocks, np.eye(3), np.zeros((1, 3, 3)), "weak_perspective")
+        rough = refine_fit(blocks, start, "weak_perspective", 0.5, 1e-2)
+        fine = refine_fit(blocks, rough, "weak_perspective", 0.5)
+        assert np.abs(rough.strain - whole.strain).max() > 1e-7
+        assert_allclose(fine.strain, whole.strain, atol=1e-8)
+        assert fine.cost == pytest.approx(whole.cost, rel=1e-9)
+
+    def test_converges_where_residuals_are_large(self, monkeypatch):
+        # Gauss-Newton steps alone leave a hundred times as much.
+        monkeypatch.setattr("isa_nrsfm._metric_refinement.MAX_STEPS", 16)
+        motion = noisy_cameras(0, "weak_perspective")
+        fit = refine_metric(motion, np.eye(3), "weak_perspective")
+        assert fit.cost > 0.1
+        assert_allclose(fit.gradient, 0, atol=1e-8)
 
     def test_orthographic_minimum_is_that_of_the_linear_equations(self):
         # Where their solution is positive definite, as it is here.
@@ -197,7 +253,7 @@ class TestRefineMetric:
         def cost(entries):
             root = entries.reshape(3, 3)
             gram = motion @ root @ root.T @ motion.transpose(0, 2, 1)
-            return np.sum(orthonormality(gram, camera) ** 2)
+            return np.sum(orthonormality(gram.transpose(1, 2, 0), camera) ** 2)
 
         found = [minimize(cost, rng.standard_normal(9)).fun for _ in range(20)]
         assert fit.cost <= min(found) * (1 + 1e-6)
@@ -207,7 +263,7 @@ class TestRefineMetric:
         linear = metric_quadric(motion)
         fit = refine_metric(motion, safe_start(motion, linear, "weak_perspective"),
                             "weak_perspective")  # fmt: skip
-        gram = motion @ linear @ motion.transpose(0, 2, 1)
+        gram = (motion @ linear @ motion.transpose(0, 2, 1)).transpose(1, 2, 0)
         before = np.sum(orthonormality(gram, "weak_perspective") ** 2)
         assert fit.cost < 0.999 * before
 

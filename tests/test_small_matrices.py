@@ -8,6 +8,7 @@ from isa_nrsfm._small_matrices import (
     COLUMNS,
     FEW,
     ROWS,
+    eigh3,
     inverse3,
     inverse_factor3,
     invert_positive,
@@ -50,6 +51,37 @@ class TestThreeByThree:
         A = positive_matrices(0, 3, 50)
         expected = np.linalg.inv(last_to_first(A))
         assert_allclose(last_to_first(inverse3(A[ROWS, COLUMNS])), expected, rtol=1e-9)
+
+    @pytest.mark.parametrize(
+        "values",
+        [
+            (-1.0, 0.3, 2.0),
+            (-2.0, 0.3, 1.0),
+            (1.0, 1.0, 2.0),
+            (1.0, 2.0, 2.0),
+            (-1.0, 0.0, 1.0),
+            (1.0, 1.0, 1.0),
+            (5.0, 5.0 + 1e-8, 5.0 + 3e-8),
+            (1e-30, 1e-30, 3e-30),
+            (0.0, 0.0, 0.0),
+        ],
+        ids=str,
+    )
+    def test_eigenvalues_and_axes(self, values):
+        Q = np.linalg.qr(np.random.default_rng(0).normal(size=(200, 3, 3)))[0]
+        # The identity and an exchange of axes, too: vectors along axes.
+        Q[0], Q[1] = np.eye(3), np.eye(3)[[2, 0, 1]]
+        A = (Q * np.array(values)) @ Q.swapaxes(1, 2)
+        A = 0.5 * (A + A.swapaxes(1, 2))
+        found, axes = eigh3(np.moveaxis(A, 0, -1)[ROWS, COLUMNS])
+        axes = last_to_first(axes)
+        unit = np.broadcast_to(np.eye(3), A.shape)
+        assert_allclose(axes.swapaxes(1, 2) @ axes, unit, atol=1e-14)
+        rounding = 1e-14 * max(np.abs(values))
+        rebuilt = (axes * found.T[:, None]) @ axes.swapaxes(1, 2)
+        assert_allclose(rebuilt, A, rtol=0, atol=rounding)
+        expected = np.broadcast_to(values, (200, 3))
+        assert_allclose(np.sort(found.T), expected, rtol=0, atol=rounding)
 
     def test_factor(self):
         A = positive_matrices(0, 3, 50)
