@@ -42,9 +42,10 @@ from isa_nrsfm._small_matrices import (
     COLUMNS,
     ROWS,
     SMALLEST_PIVOT,
+    diagonal_of,
     inverse_factor3,
     invert_positive,
-    packed_rows,
+    packed_gram,
     solve_positive,
     unpacked,
 )
@@ -557,16 +558,12 @@ def _evaluate(problem: _Problem, alpha: NDArray) -> _State:
 
     images = np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :])
     known = problem.gram.energies(images)[len(c) :]
-    for row in packed_rows(known):
-        row[0] += ridge
+    known[diagonal_of(known)] += ridge
     F = np.einsum("kabi,bri->kari", T[1:], camera)
     F -= P[1:]
     slope = 0.5 * np.einsum("kari,ari->ki", P[1:] - F, camera) - ridge * alpha
     F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(ridge))
-    schur = known.copy()
-    for k, row in enumerate(packed_rows(schur)):
-        row -= np.einsum("lmi,mi->li", F[k:], F[k])
-    return _State(alpha, camera, explained, slope, known, schur)
+    return _State(alpha, camera, explained, slope, known, known - packed_gram(F))
 
 
 def _descend(

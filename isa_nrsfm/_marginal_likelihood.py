@@ -37,8 +37,8 @@ from isa_nrsfm._frame_products import (
 from isa_nrsfm._small_matrices import (
     COLUMNS,
     ROWS,
+    diagonal_of,
     packed_rows,
-    pair_indices,
     sweep,
     unpack3,
     unpacked,
@@ -356,8 +356,7 @@ def _pass_over(
     seen = np.einsum("kari,rai->ki", products.cross, motion)
 
     # The posterior of the coefficients of each frame: rest is min_alpha.
-    first, second = pair_indices(n_shapes)
-    diagonal = (first == second) & (first > 0)
+    diagonal = diagonal_of(H)[1:]
     moving = H[diagonal].sum()
     H[diagonal] += noise
     H[0] += block.energy - 2 * seen[0]

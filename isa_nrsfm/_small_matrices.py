@@ -8,7 +8,6 @@ at each.
 """
 
 import math
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,13 +151,20 @@ def _dot(u: NDArray, v: NDArray) -> NDArray:
 
 def pair_indices(k: int) -> tuple[NDArray, NDArray]:
     """Return row and column of the entries of packed symmetric k x k matrices."""
-    return np.triu_indices(k)
+    rows = np.arange(k)
+    first = np.repeat(rows, k - rows)
+    # Row i begins where i rows, the j-th of them j short of k, have ended.
+    starts = rows * k - rows * (rows - 1) // 2
+    return first, np.arange(len(first)) - starts[first] + first
 
 
 def packed_rows(packed: NDArray) -> list[NDArray]:
     """Return views of the rows of packed matrices, each from the diagonal on."""
-    starts = np.cumsum([0, *range(_size(packed), 0, -1)])
-    return [packed[start:end] for start, end in pairwise(starts)]
+    rows, start = [], 0
+    for length in range(_size(packed), 0, -1):
+        rows.append(packed[start : start + length])
+        start += length
+    return rows
 
 
 def unpacked(packed: NDArray) -> NDArray:
@@ -168,6 +174,23 @@ def unpacked(packed: NDArray) -> NDArray:
     full = np.empty((k, k, *packed.shape[1:]))
     full[first, second] = full[second, first] = packed
     return full
+
+
+def diagonal_of(packed: NDArray) -> NDArray:
+    """Return where packed matrices have their diagonals."""
+    k = _size(packed)
+    return np.cumsum([0, *range(k, 1, -1)])[:k]
+
+
+def packed_gram(rows: NDArray) -> NDArray:
+    """Return the packed products ``A A^T`` of matrices (k, m, n)."""
+    k, _, n = rows.shape
+    if n <= FEW:
+        return np.einsum("kmn,lmn->kln", rows, rows)[pair_indices(k)]
+    packed = np.empty((k * (k + 1) // 2, n))
+    for i, row in enumerate(packed_rows(packed)):
+        np.einsum("lmn,mn->ln", rows[i:], rows[i], out=row)
+    return packed
 
 
 def _size(packed: NDArray) -> int:
@@ -195,10 +218,9 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         Whether all pivots are positive, that is, A is positive definite.
     """
     k, n = b.shape
-    if n <= FEW:
-        x = _solve_by_lapack(unpacked(A), b)
-        if x is not None:
-            return x, np.ones(n, dtype=bool)
+    if n <= FEW and _few_factors(A) is not None:
+        x = np.linalg.solve(unpacked(A).transpose(2, 0, 1), b.T[..., None])
+        return np.ascontiguousarray(x[..., 0].T), np.ones(n, dtype=bool)
     # The right side is the last entry of each row.
     rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
     diagonal = [row[0].copy() for row in rows]
@@ -216,18 +238,16 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     return x, positive
 
 
-def _solve_by_lapack(A: NDArray, b: NDArray) -> NDArray | None:
-    """Return the solutions if all matrices are positive definite, otherwise None."""
-    matrices = A.transpose(2, 0, 1)
+def _few_factors(A: NDArray) -> NDArray | None:
+    """Return Cholesky factors (n, k, k) if all matrices are positive definite."""
+    matrices = unpacked(A).transpose(2, 0, 1)
     try:
         factors = np.linalg.cholesky(matrices)
     except np.linalg.LinAlgError:
         return None
     pivots = np.diagonal(factors, axis1=1, axis2=2) ** 2
-    if (pivots <= SMALLEST_PIVOT * np.diagonal(A)).any():
-        return None
-    x = np.linalg.solve(matrices, b.T[..., None])
-    return np.ascontiguousarray(x[..., 0].T)
+    small = pivots <= SMALLEST_PIVOT * np.diagonal(matrices, axis1=1, axis2=2)
+    return None if small.any() else np.asarray(factors)
 
 
 def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -249,6 +269,16 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
+    n = A.shape[1]
+    if n <= FEW and (factors := _few_factors(A)) is not None:
+        inverse = np.linalg.inv(unpacked(A).transpose(2, 0, 1))
+        inverse = 0.5 * (inverse + inverse.swapaxes(1, 2)).transpose(1, 2, 0)
+        logarithms = np.log(np.diagonal(factors, axis1=1, axis2=2))
+        return (
+            inverse[pair_indices(len(inverse))],
+            2.0 * logarithms.sum(axis=1),
+            np.ones(n, dtype=bool),
+        )
     work = A.copy()
     log_determinant, positive = sweep(work)
     return np.negative(work, out=work), log_determinant, positive

@@ -14,7 +14,7 @@ from isa_nrsfm._optional import import_optional
 from isa_nrsfm._stored_table import StoredTable
 
 # Numbers and frames of a block of a table in memory: products of large blocks are fast.
-BLOCK_NUMBERS = 2**22
+BLOCK_NUMBERS = 2**21
 BLOCK_FRAMES = 2048
 # Numbers that are in memory, at most, for each number of a block that is read.
 COPIES = 8

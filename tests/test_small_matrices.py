@@ -8,10 +8,12 @@ from isa_nrsfm._small_matrices import (
     COLUMNS,
     FEW,
     ROWS,
+    diagonal_of,
     eigh3,
     inverse3,
     inverse_factor3,
     invert_positive,
+    packed_gram,
     packed_rows,
     pair_indices,
     solve_positive,
@@ -196,6 +198,17 @@ class TestPacking:
         for k, row in enumerate(packed_rows(matrices)):
             assert_array_equal(row, A[k, k:])
             assert row.base is matrices
+
+    def test_diagonal(self):
+        A = positive_matrices(0, 5, 3)
+        matrices = packed(A)
+        assert_array_equal(matrices[diagonal_of(matrices)], np.diagonal(A).T)
+
+    @pytest.mark.parametrize("n", NUMBERS)
+    def test_gram(self, n):
+        rows = np.random.default_rng(0).normal(size=(5, 4, n))
+        expected = np.einsum("kmn,lmn->kln", rows, rows)
+        assert_allclose(unpacked(packed_gram(rows)), expected, atol=1e-13)
 
 
 class TestSweep:
