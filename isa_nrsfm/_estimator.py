@@ -30,7 +30,7 @@ from isa_nrsfm._frame_fit import (
     PosteriorFrames,
     RigidFrames,
     compose,
-    fitted_posteriors,
+    posterior_blocks,
     posterior_moments,
     project,
     reprojection_error,
@@ -185,7 +185,8 @@ class AffineNRSfM(
         The most steps of the refinement.
     tol : float or None, default=None
         The joint refinement has converged when two successive steps each lower minus
-        twice the log likelihood by less than tol for each frame (0.025 by default), and
+        twice the log likelihood by less than tol for each frame (0.025 by default; its
+        first steps, on a sample of a large table, end before that), and
         the alternating one when a step would gain less than this share of the energy
         it explains (1e-10 by default).
     random_state : int, RandomState instance or None, default=None
@@ -829,8 +830,7 @@ class AffineNRSfM(
             self.loss,
             FrameMap.identity(self.n_components),
         )
-        part = sample.parts[0] if sample.parts else None
-        frames, posteriors = fitted_posteriors(frames, fitted.frames, table.rows, part)
+        posteriors = posterior_blocks(frames, fitted.frames, table.rows)
         motion, alpha, covariance = posterior_moments(posteriors)
         self.reliability_ = reliabilities(alpha, covariance)
         gauge = independent_gauge(fitted.shapes, motion, alpha, self.independence)

@@ -225,6 +225,7 @@ def _block_triangle(block: NDArray, V: NDArray | None) -> NDArray:
     matrix = _matrix(block)
     if V is not None:
         matrix = matrix @ V
+    matrix = matrix.astype(np.float64, copy=False)
     return _qr_factor(matrix) if len(matrix) > matrix.shape[1] else matrix
 
 

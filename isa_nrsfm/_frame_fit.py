@@ -309,51 +309,7 @@ class PosteriorFrames(NamedTuple):
         return fit
 
 
-def fitted_posteriors(
-    model: PosteriorFrames,
-    frames: JointFrames,
-    rows: FrameBlocks,
-    sample: NDArray | None,
-) -> tuple[PosteriorFrames, FrameBlocks]:
-    """
-    Return the fits of all frames of a table, and the model with the starts they need.
-
-    Starts that are best for no frame, of the sample if there is one, are left out.
-
-    Parameters
-    ----------
-    model : PosteriorFrames
-        The model of a frame.
-    frames, rows
-        As of `_posterior_blocks`.
-    sample : ndarray of int or None
-        Some of the frames.
-
-    Returns
-    -------
-    model : PosteriorFrames
-        The model of a frame, of which the fits are.
-    posteriors : FrameBlocks
-        Blocks of FramePosterior.
-    """
-    if model.loss != "linear":
-        return model, _posterior_blocks(model, frames, rows)
-    chosen = frames if sample is None else frames.take(sample)
-    posteriors = _posterior_blocks(model, chosen, rows)
-    used = np.unique(np.concatenate(list(posteriors.map(_starts_used))))
-    needed = model._replace(starts=model.starts[used[used >= 0]])
-    if sample is not None or len(needed.starts) < len(model.starts):
-        # The same to the last bit as fits of new frames, which have these starts.
-        posteriors = _posterior_blocks(needed, frames, rows)
-    return needed, posteriors
-
-
-def _starts_used(posterior: FramePosterior) -> NDArray:
-    """Return the starts that are best for some frames of a block, -1 for zero."""
-    return np.unique(posterior.start)
-
-
-def _posterior_blocks(
+def posterior_blocks(
     model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
 ) -> FrameBlocks:
     """

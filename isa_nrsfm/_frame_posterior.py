@@ -122,7 +122,6 @@ def fit_posterior(
     initial: NDArray | None = None,
     starts: NDArray | None = None,
     camera_precision: NDArray | None = None,
-    max_steps: int = MAX_STEPS,
 ) -> FramePosterior:
     """
     Return the most probable camera, position and coefficients of each frame.
@@ -145,8 +144,6 @@ def fit_posterior(
         frames whose first fit is much worse than the noise explains.
     camera_precision : ndarray of shape (3, 3), optional
         C, symmetric and positive semidefinite, in squared units of the shapes.
-    max_steps : int, default=60
-        The most steps of a search.
 
     Returns
     -------
@@ -168,7 +165,6 @@ def fit_posterior(
         initial=initial,
         starts=starts,
         camera_precision=camera_precision,
-        max_steps=max_steps,
     )
 
 
@@ -179,7 +175,6 @@ def fit_prepared(
     *,
     initial: NDArray | None = None,
     starts: NDArray | None = None,
-    max_steps: int = MAX_STEPS,
 ) -> FramePosterior:
     """
     Return the fits of `fit_posterior` for frames that are ready for products.
@@ -191,7 +186,7 @@ def fit_prepared(
         their inner products with the shapes.
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes in these coordinates; centred if they are points.
-    noise_variance, initial, starts, max_steps
+    noise_variance, initial, starts
         As of `fit_posterior`.
 
     Returns
@@ -205,7 +200,6 @@ def fit_prepared(
         noise_variance,
         initial=initial,
         starts=starts,
-        max_steps=max_steps,
     )
 
 
@@ -324,7 +318,6 @@ def _best_fits(
     initial: NDArray | None,
     starts: NDArray | None,
     camera_precision: NDArray | None = None,
-    max_steps: int,
 ) -> FramePosterior:
     """Return the best fits of `fit_posterior`."""
     weight, n_components = frames.weight, len(shapes) - 1
@@ -343,16 +336,15 @@ def _best_fits(
         part = frames.take(chosen), variance[chosen], initial
         return _fit(*part, white, prior, max_steps)
 
-    fits = fit(None, first, min(FIRST_STEPS, max_steps))
-    if max_steps > FIRST_STEPS:
-        # The few frames that take longer are brought together: short rows are slow.
-        slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
-        if len(slow):
-            _put(fits, slow, fit(slow, fits.alpha[slow], max_steps))
+    fits = fit(None, first, FIRST_STEPS)
+    # The few frames that take longer are brought together: short rows are slow.
+    slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
+    if len(slow):
+        _put(fits, slow, fit(slow, fits.alpha[slow], MAX_STEPS))
     poor = np.flatnonzero(_poorly_explained(fits, weight, variance))
     if len(extra) and len(poor):
         number = np.repeat(np.arange(len(extra)), len(poor))
-        others = fit(np.tile(poor, len(extra)), extra[number], max_steps)
+        others = fit(np.tile(poor, len(extra)), extra[number], MAX_STEPS)
         others = others._replace(start=number)
         # Of equal minima the first one is kept.
         objective = others.objective.reshape(len(extra), -1)

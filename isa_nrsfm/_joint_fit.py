@@ -51,10 +51,12 @@ ISOTROPIC_STARTS = 2
 # unit of the objective for each number, if it is above the tolerance.
 BY_CHANCE = 0.03
 # The stiff fit is taken where it brings the anisotropy below this share of it, and
-# where the free fit brings it above this multiple, unless the noise of the stiff fit is
-# so many times that of the free one.
+# where the free fit brings it above this multiple, or makes the cameras see so many
+# times more of the thinnest direction of the mean shape than the rigid ones do; unless
+# the noise of the stiff fit is so many times that of the free one.
 CLEARLY_LESS = 0.95
 DRIFTED = 1.5
+DEEPER = 3.0
 TOO_STIFF = 4.0
 # A stiff fit that leaves more than this share of what a rigid one leaves does not move.
 STILL_MOVING = 0.5
@@ -204,14 +206,14 @@ def fit_jointly(
     rigid = _Rigid.of(chosen, frames.coordinates(factors.rigid_shape), factors)
     n_isotropic = ISOTROPIC_STARTS if first is problem else 1
     best, price = _best(first, starts, n_isotropic, rigid, stiffness)
-    free = stiffness is None and price == 0
-    if free and rigid.ratio(best) > DRIFTED:
+    free, stiff = stiffness is None and price == 0, None
+    if free and rigid.drifted(best):
         stiff = first.best(starts[:n_isotropic], STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
     best = _finished(best, problems, price)
-    if free and price == 0 and rigid.ratio(best) > DRIFTED:
-        stiff = first.best(starts[:n_isotropic], STIFFNESS)
+    if free and price == 0 and rigid.drifted(best):
+        stiff = stiff or first.best(starts[:n_isotropic], STIFFNESS)
         stiff = _finished(stiff, problems, STIFFNESS)
         if stiff.state.noise < TOO_STIFF * best.state.noise:
             best, price = stiff, STIFFNESS
@@ -291,17 +293,32 @@ class _Rigid(NamedTuple):
 
     anisotropy: float  # of its cameras
     noise: float  # what it leaves, a coordinate
+    depth: float  # as of `_depth`
 
     @classmethod
     def of(cls, rows: "_SampleRows", shape: NDArray, factors: Factorisation) -> Self:
         """Return the cameras' anisotropy, and what the rigid shape leaves of rows."""
-        cameras = anisotropy(factors.rigid_motion.reshape(-1, 2, 3))
-        return cls(cameras, rows.rigid_noise(shape))
+        motion = factors.rigid_motion.reshape(-1, 2, 3)
+        depth = _depth(motion, factors.rigid_shape)
+        return cls(anisotropy(motion), rows.rigid_noise(shape), depth)
 
     def ratio(self, result: JointResult) -> float:
         """Return the anisotropy of a refinement's cameras relative to these."""
         cameras = anisotropy(result.state.motion.transpose(2, 0, 1))
         return cameras / self.anisotropy if self.anisotropy > 0 else 1.0
+
+    def drifted(self, result: JointResult) -> bool:
+        """Tell whether a refinement's cameras are far from these."""
+        shapes, motion, _ = result.state
+        depth = _depth(motion.transpose(2, 0, 1), shapes[0])
+        return self.ratio(result) > DRIFTED or 0 < DEEPER * self.depth < depth
+
+
+def _depth(motion: NDArray, shape: NDArray) -> float:
+    """Return the least singular value of the images ``M_i B_0``, for a frame."""
+    R = np.asarray(np.linalg.qr(shape.T, mode="r"))
+    seen = (motion @ R.T).reshape(-1, len(R))
+    return float(np.linalg.svd(seen, compute_uv=False)[-1] / np.sqrt(len(motion)))
 
 
 class _SampleRows(NamedTuple):

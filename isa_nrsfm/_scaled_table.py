@@ -155,7 +155,7 @@ def scaled_table(
         size = blocks.joined(robust_size, report.translation)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
-    # The products of large tables are as precise as these are given.
+    # Of large tables, what takes most is the memory and the search for the subspace.
     single = dtype == np.float32 and n_points >= MANY_POINTS and not robust
     single = single and bool((report.n_seen == n_points).all())
     unit_rows = partial(

@@ -246,8 +246,8 @@ def _few_factors(A: NDArray) -> NDArray | None:
     except np.linalg.LinAlgError:
         return None
     pivots = np.diagonal(factors, axis1=1, axis2=2) ** 2
-    small = pivots <= SMALLEST_PIVOT * np.diagonal(matrices, axis1=1, axis2=2)
-    return None if small.any() else np.asarray(factors)
+    kept = pivots > SMALLEST_PIVOT * np.diagonal(matrices, axis1=1, axis2=2)
+    return np.asarray(factors) if kept.all() else None
 
 
 def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:

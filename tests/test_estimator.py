@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm._joint_fit import STIFFNESS
 from isa_nrsfm._robust import robust_sizes
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -483,6 +483,15 @@ def test_single_precision_is_kept():
     reference = estimator().fit(table.astype(float))
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-4)
     assert_allclose(model.inverse_snr_, reference.inverse_snr_, rtol=1e-3)
+
+
+def test_large_tables_in_single_precision_have_the_same_noise():
+    tracks = make_nonrigid_tracks(2000, 250, 1, noise=0.001, random_state=0)
+    table = tracks.data.astype(np.float32)
+    single, double = (estimator(1).fit(X) for X in (table, table.astype(float)))
+    assert_allclose(single.noise_variance_, double.noise_variance_, rtol=1e-3)
+    assert_allclose(single.alpha_std_, double.alpha_std_, rtol=1e-3)
+    assert_allclose(single.rank_floor_, double.rank_floor_, rtol=1e-4)
 
 
 def test_fit_transform_returns_a_copy_of_alpha():

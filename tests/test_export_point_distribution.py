@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat, savemat
 from scipy.linalg import subspace_angles
 
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.export import (
     PointDistributionModel,
     point_distribution_model,
@@ -125,6 +126,19 @@ def test_affine_shapes_have_as_many_modes_as_basis_shapes():
     assert len(pdm.modes) == N_COMPONENTS
     with pytest.raises(ValueError, match="at most 3, the number of principal axes"):
         point_distribution_model(model, camera=None, n_modes=4)
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", None])
+def test_rows_without_points_are_left_out(camera):
+    table = faces().data.copy()
+    model = AffineNRSfM(N_COMPONENTS, random_state=0).fit(table[:100])
+    table[100:] = np.nan
+    with pytest.warns(UserWarning, match="show no point"):
+        with_empty = AffineNRSfM(N_COMPONENTS, random_state=0).fit(table)
+    found = point_distribution_model(with_empty, camera=camera)
+    expected = point_distribution_model(model, camera=camera)
+    for one, other in zip(found, expected, strict=True):
+        assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):

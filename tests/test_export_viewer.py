@@ -141,6 +141,11 @@ def test_labels_are_sorted_numbers_first_and_none_last(written):
     data = written(model, labels=labels)
     assert data["categories"] == ["9.5", "10", "a", "b", "(no label)"]
     assert data["labels"][:8] == [1, 0, 3, 4, 2, 4, 0, 1]
+    pd = pytest.importorskip("pandas", reason="needs the extra io")
+    labels = pd.array(["b", None, "a", "b"] * 10, dtype="string")
+    data = written(model, labels=labels)
+    assert data["categories"] == ["a", "b", "(no label)"]
+    assert data["labels"][:4] == [1, 2, 0, 1]
 
 
 def test_affine_shapes_have_no_poses_and_say_so(written):

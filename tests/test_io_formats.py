@@ -434,6 +434,13 @@ def test_points_without_a_confidence_are_kept(tmp_path):
     assert not landmarks.failed.any()
 
 
+def test_sleap_files_without_tracks_are_refused(tmp_path):
+    pytest.importorskip("h5py", reason="needs the extra h5")
+    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None][:, :0], names=[])
+    with pytest.raises(ValueError, match=r"a\.h5 .*one individual or more"):
+        read_landmarks(path)
+
+
 def test_sleap_files_that_contradict_themselves_are_refused(tmp_path):
     h5py = pytest.importorskip("h5py", reason="needs the extra h5")
     path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], names=["a", "b"])
@@ -512,6 +519,7 @@ def test_coco_results_have_confidences(tmp_path):
         (3, "expected an object"),
         ([3], "all results must be objects"),
         ([], "no frames"),
+        ([{"keypoints": [1] * 3, "image_id": [1]}], "a number or a text"),
         ([{"keypoints": [1, 2]}], "0 keypoints of 3 numbers; got 2"),
         ([{"keypoints": [1, 2, True]}], "a list of numbers; got"),
         ([{"keypoints": [1, 2, "3"]}], "a list of numbers; got"),

@@ -397,10 +397,33 @@ def test_rigid_cameras_that_show_no_anisotropy_compare_with_none():
     problem = module._Problem(frames, module._SampleRows.of(W, frames), 3, 0.1, None)
     shapes = lifted_shapes(factorise(W, 2), lifted_directions(factorise(W, 2), 2))
     result = problem.refined(problem.start(shapes), 0.0, 0.1)
-    assert module._Rigid(0.0, 1.0).ratio(result) == 1.0
-    of_half = module._Rigid(0.5, 1.0).ratio(result)
+    assert module._Rigid(0.0, 1.0, 1.0).ratio(result) == 1.0
+    of_half = module._Rigid(0.5, 1.0, 1.0).ratio(result)
     assert of_half != 1.0
-    assert module._Rigid(0.25, 1.0).ratio(result) == pytest.approx(2 * of_half)
+    assert module._Rigid(0.25, 1.0, 1.0).ratio(result) == pytest.approx(2 * of_half)
+
+
+def test_cameras_that_see_more_of_the_thinnest_direction_have_drifted():
+    tracks, _ = random_table()
+    W = measurements(tracks, scale_frames=False)
+    frames = JointFrames.of_points(rows_of(tracks), True)
+    rows = module._SampleRows.of(W, frames)
+    factors = factorise(W, 2)
+    shapes = lifted_shapes(factors, lifted_directions(factors, 2))
+    problem = module._Problem(frames, rows, 3, 0.1, None)
+    result = problem.refined(problem.start(shapes), 0.0, 0.1)
+    rigid = module._Rigid.of(rows, factors.rigid_shape, factors)
+    assert not rigid.drifted(result)
+    assert rigid._replace(depth=rigid.depth / 10).drifted(result)
+    assert not rigid._replace(depth=0.0).drifted(result)
+    # A stretched shape with cameras that make up for it gives the same images.
+    stretch = np.diag([1.0, 1.0, 100.0])
+    state = result.state
+    other = state._replace(
+        shapes=stretch @ state.shapes,
+        motion=np.einsum("rai,ab->rbi", state.motion, np.linalg.inv(stretch)),
+    )
+    assert not rigid._replace(anisotropy=0.0).drifted(result._replace(state=other))
 
 
 class TestLargeTables:

@@ -211,6 +211,14 @@ class TestPacking:
         assert_allclose(unpacked(packed_gram(rows)), expected, atol=1e-13)
 
 
+@pytest.mark.parametrize("n", NUMBERS)
+def test_nan_is_not_positive(n):
+    A = packed(positive_matrices(0, 4, n))
+    A[2, 1] = np.nan
+    assert not invert_positive(A)[2][1]
+    assert not solve_positive(A, np.ones((4, n)))[1][1]
+
+
 class TestSweep:
     @pytest.mark.parametrize("first", [0, 1, 3, 5])
     def test_identity(self, first):

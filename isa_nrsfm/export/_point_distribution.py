@@ -150,7 +150,9 @@ def point_distribution_model(
         shapes = shapes @ space.transform.T
     else:
         shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
-        shapes = _aligned(shapes[np.isfinite(shapes).all(axis=(1, 2))])
+    shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
+    if space.metric is not None:
+        shapes = _aligned(shapes)
     mean = shapes.mean(axis=0)
     modes, variances = _principal_axes((shapes - mean).reshape(len(shapes), -1))
     n_kept = _number_of_modes(n_modes, len(model.basis_), variances)

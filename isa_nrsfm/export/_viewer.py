@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import _safe_indexing
+from sklearn.utils._missing import is_pandas_na
 from sklearn.utils.validation import _num_samples
 
 from isa_nrsfm.export._drawing import Links, choose_links, edges_of
@@ -126,6 +127,7 @@ def write_viewer(
         motion, _, alpha = model.decompose(_safe_indexing(X, rows))
     else:
         motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
+    motion, alpha = np.asarray(motion), np.asarray(alpha)
     seen = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
 
@@ -221,7 +223,7 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
         )
     texts, order = [], {}
     for value in values.tolist():
-        missing = value is None or value != value
+        missing = value is None or is_pandas_na(value) or value != value
         text = UNLABELLED if missing else str(value)
         number = isinstance(value, Real)
         order[text] = (missing, not number, value if number else 0, text)

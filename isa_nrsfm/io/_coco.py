@@ -79,6 +79,8 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
 def _results(entries: list[Any]) -> _Instances:
     """Return what a list of results holds."""
     _refuse_non_objects(entries, "results")
+    if not all(isinstance(entry.get("image_id", 0), int | str) for entry in entries):
+        raise ValueError("the image_id of a result must be a number or a text")
     categories = {json.dumps(entry.get("category_id")) for entry in entries}
     if len(categories) > 1:
         raise ValueError(

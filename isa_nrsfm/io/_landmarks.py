@@ -165,6 +165,8 @@ def each_individual(
         every frame. Of several, those of which the frame shows no point have none; a
         frame in which nobody is seen has one row without points.
     """
+    if tracks.shape[1] == 0:
+        raise ValueError("expected points of one individual or more; got none")
     shown = np.asarray(~np.isnan(tracks).all(axis=(2, 3)))
     if shown.shape[1] == 1:
         rows = np.ones_like(shown)
