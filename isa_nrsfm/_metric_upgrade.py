@@ -269,8 +269,8 @@ def warn_if_degenerate(condition_number: float) -> None:
     if condition_number > LARGEST_CONDITION:
         warnings.warn(
             f"the cameras hardly determine the metric of space: its condition number "
-            f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}; depth and angles "
-            "may be wrong. They have to turn more, about other axes than the viewing "
-            "direction, or to be more",
+            f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
+            "may have wrong depth and angles. Take frames that are seen from more "
+            "sides, or more frames, or affine shapes (camera=None)",
             stacklevel=3,
         )

@@ -115,6 +115,8 @@ def fit_table(
         clock["choose"] = time.perf_counter()
     with _progress(estimator):
         estimator.fit(X)
+    if estimator.refinement == "joint":
+        estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
 
     write_results(folder, estimator, frames, std=args.std)
@@ -312,8 +314,10 @@ def _fitted_frames(estimator: AffineNRSfM, X: Any) -> FrameFit:
 
 def _strategy(args: Namespace) -> Any:
     """Return the independent subspace analysis that the options ask for."""
-    strategy = PooledFastICA() if args.isa == "pooled" else FastISA()
-    return strategy if args.n_init is None else strategy.set_params(n_init=args.n_init)
+    if args.n_init is None:
+        return None if args.isa == "pooled" else FastISA()
+    kind = PooledFastICA if args.isa == "pooled" else FastISA
+    return kind(n_init=args.n_init)
 
 
 @contextlib.contextmanager

@@ -133,10 +133,12 @@ def write_results(
 
 
 def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
-    """Write the viewer, with affine shapes where the cameras tell no others."""
+    """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
-        write_viewer(estimator, path, X=X)
-    except ValueError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            write_viewer(estimator, path, X=X)
+    except (ValueError, UserWarning) as error:
         warnings.warn(f"{path.name} has affine shapes: {error}", stacklevel=2)
         write_viewer(estimator, path, X=X, camera=None)
 
