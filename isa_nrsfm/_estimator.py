@@ -432,12 +432,12 @@ class AffineNRSfM(
         progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
         for name in (*OF_FRAMES, *OF_JOINT_FIT):
             self.__dict__.pop(name, None)
-        if self.refinement != "joint" and self.loss != "linear":
+        if not joint and self.loss != "linear":
             raise ValueError(
                 f"loss={self.loss!r} needs refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
-        if self.refinement != "joint" or self.loss != "linear":
+        if not joint or self.loss != "linear":
             if is_on_dask(X) or isinstance(X, StoredTable):
                 raise ValueError(
                     "tables that are not in memory need refinement='joint' and "

@@ -218,9 +218,11 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         Whether all pivots are positive, that is, A is positive definite.
     """
     k, n = b.shape
-    if n <= FEW and _few_factors(A) is not None:
-        x = np.linalg.solve(unpacked(A).transpose(2, 0, 1), b.T[..., None])
-        return np.ascontiguousarray(x[..., 0].T), np.ones(n, dtype=bool)
+    if n <= FEW:
+        matrices = unpacked(A).transpose(2, 0, 1)
+        if _cholesky(matrices) is not None:
+            x = np.linalg.solve(matrices, b.T[..., None])
+            return np.ascontiguousarray(x[..., 0].T), np.ones(n, dtype=bool)
     # The right side is the last entry of each row.
     rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
     diagonal = [row[0].copy() for row in rows]
@@ -238,9 +240,8 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     return x, positive
 
 
-def _few_factors(A: NDArray) -> NDArray | None:
-    """Return Cholesky factors (n, k, k) if all matrices are positive definite."""
-    matrices = unpacked(A).transpose(2, 0, 1)
+def _cholesky(matrices: NDArray) -> NDArray | None:
+    """Return the factors of matrices (n, k, k) if all are positive definite."""
     try:
         factors = np.linalg.cholesky(matrices)
     except np.linalg.LinAlgError:
@@ -270,15 +271,17 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         Whether all pivots are positive, that is, A is positive definite.
     """
     n = A.shape[1]
-    if n <= FEW and (factors := _few_factors(A)) is not None:
-        inverse = np.linalg.inv(unpacked(A).transpose(2, 0, 1))
-        inverse = 0.5 * (inverse + inverse.swapaxes(1, 2)).transpose(1, 2, 0)
-        logarithms = np.log(np.diagonal(factors, axis1=1, axis2=2))
-        return (
-            inverse[pair_indices(len(inverse))],
-            2.0 * logarithms.sum(axis=1),
-            np.ones(n, dtype=bool),
-        )
+    if n <= FEW:
+        matrices = unpacked(A).transpose(2, 0, 1)
+        if (factors := _cholesky(matrices)) is not None:
+            inverse = np.linalg.inv(matrices)
+            inverse = 0.5 * (inverse + inverse.swapaxes(1, 2)).transpose(1, 2, 0)
+            logarithms = np.log(np.diagonal(factors, axis1=1, axis2=2))
+            return (
+                inverse[pair_indices(len(inverse))],
+                2.0 * logarithms.sum(axis=1),
+                np.ones(n, dtype=bool),
+            )
     work = A.copy()
     log_determinant, positive = sweep(work)
     return np.negative(work, out=work), log_determinant, positive

@@ -38,3 +38,17 @@ def data_path():
 def load_data(data_path):
     """Return a function from the name of a data set to its arrays."""
     return lambda name: np.load(data_path(f"{name}.npz"), allow_pickle=False)
+
+
+@pytest.fixture
+def run(capsys):
+    """Return a function that runs a command: exit code, output and errors."""
+
+    def run_command(*argv):
+        from isa_nrsfm.cli import main
+
+        code = main([str(word) for word in argv])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run_command

@@ -68,18 +68,6 @@ def fitted(table, tmp_path_factory):
 
 
 @pytest.fixture
-def run(capsys):
-    """Return a function that runs a command: exit code, output and errors."""
-
-    def run_command(*argv):
-        code = main([str(word) for word in argv])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run_command
-
-
-@pytest.fixture
 def fails(run):
     """Return a function that runs a command that fails and returns its message."""
 

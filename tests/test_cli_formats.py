@@ -35,18 +35,6 @@ def tracks():
 
 
 @pytest.fixture
-def run(capsys):
-    """Return a function that runs a command: exit code, output and errors."""
-
-    def run_command(*argv):
-        code = main([str(word) for word in argv])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run_command
-
-
-@pytest.fixture
 def lost(tracks):
     """Return 20 points of which frame 7 shows none."""
     with_gap = tracks[20].copy()

@@ -136,7 +136,7 @@ def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")
+            warnings.simplefilter("error", UserWarning)
             write_viewer(estimator, path, X=X)
     except (ValueError, UserWarning) as error:
         warnings.warn(f"{path.name} has affine shapes: {error}", stacklevel=2)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from isa_nrsfm.plotting._edges import choose_edges
+from isa_nrsfm.plotting._edges import checked_links, choose_edges
 
 # Pairs of points, or triangles.
 Links = ArrayLike | Literal["auto"] | None
@@ -23,20 +23,9 @@ def choose_links(edges: Any, shape: NDArray) -> NDArray[np.intp] | None:
     shape : ndarray of shape (n_points, 3)
         The points to be joined, upright.
     """
-    if edges is None or isinstance(edges, str) or np.shape(edges)[1:] == (2,):
+    if edges is None or isinstance(edges, str):
         return choose_edges(edges, shape)
-    corners = np.asarray(edges)
-    if corners.ndim != 2 or corners.shape[1] != 3 or corners.dtype.kind not in "iu":
-        raise ValueError(
-            "edges must be integers of shape (n_edges, 2), a pair of points an edge, "
-            f"or (n_triangles, 3); got shape {corners.shape} and dtype {corners.dtype}"
-        )
-    if corners.size and (corners.min() < 0 or corners.max() >= len(shape)):
-        raise ValueError(
-            f"edges must name points 0 to {len(shape) - 1}; "
-            f"got {corners.min()} to {corners.max()}"
-        )
-    return corners.astype(np.intp)
+    return checked_links(edges, len(shape), triangles=True)
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:

@@ -10,7 +10,7 @@ from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._landmark_names import point_names
-from isa_nrsfm.io._models import _check_class
+from isa_nrsfm._model_class import check_class
 
 SUFFIXES = (".npz", ".mat")
 
@@ -81,7 +81,7 @@ def shape_arrays(model: Any) -> ShapeArrays:
     --------
     write_shapes : Write them to a file.
     """
-    _check_class(model, "model")
+    check_class(model, "model")
     check_is_fitted(model)
     n_components = len(model.basis_)
     kept = hasattr(model, "alpha_")

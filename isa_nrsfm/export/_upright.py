@@ -21,7 +21,7 @@ from isa_nrsfm._deformation_metric import (
 )
 from isa_nrsfm._metric import unit_cameras
 from isa_nrsfm._metric_upgrade import usable_cameras
-from isa_nrsfm.io._models import _check_class
+from isa_nrsfm._model_class import check_class
 from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
 from isa_nrsfm.plotting._views import front_axes, viewing_transform
 
@@ -86,7 +86,7 @@ def upright_space(
         If the model is no AffineNRSfM or has kept no frames, if `camera` or `origin` is
         something else, or if the cameras see less than three directions of space.
     """
-    _check_class(model, "model")
+    check_class(model, "model")
     check_is_fitted(model)
     if camera not in ("weak_perspective", None):
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,12 +71,11 @@ def read_openface(path: Path) -> Landmarks:
             raise ValueError("the column success must hold 0 and 1 only")
         failed = success == 0
         table["success"] = table["success"].astype(int)
-    return assemble(
+    return _with_other_columns(
         _tracks(table, found),
-        found.points,
-        table.drop(columns=found.interleaved),
+        table,
+        found,
         format="openface",
-        columns=found.interleaved,
         confidence=_of_all_points(table["confidence"], found),
         failed=failed,
     )
@@ -106,12 +105,11 @@ def read_pyfeat(path: Path) -> Landmarks:
         numbers=[*found.interleaved, *scored],
         text=("input",),
     )
-    return assemble(
+    return _with_other_columns(
         _tracks(table, found),
-        found.points,
-        table.drop(columns=found.interleaved),
+        table,
+        found,
         format="pyfeat",
-        columns=found.interleaved,
         confidence=_of_all_points(table["FaceScore"], found) if scored else None,
     )
 
@@ -167,13 +165,7 @@ def read_mesh_table(
             if known.size
             else "image_size is given, but there are no points"
         )
-    return assemble(
-        tracks,
-        found.points,
-        table.drop(columns=found.interleaved),
-        format="mediapipe",
-        columns=found.interleaved,
-    )
+    return _with_other_columns(tracks, table, found, format="mediapipe")
 
 
 def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
@@ -206,6 +198,22 @@ def _tracks(table: "pd.DataFrame", found: LandmarkColumns) -> NDArray[np.float64
     """Return the points (n_frames, n_points, 2) of a table."""
     return (
         table[found.interleaved].to_numpy(dtype=np.float64).reshape(len(table), -1, 2)
+    )
+
+
+def _with_other_columns(
+    tracks: NDArray[np.float64],
+    table: "pd.DataFrame",
+    found: LandmarkColumns,
+    **known: Any,
+) -> Landmarks:
+    """Return points under the names of their columns, and the columns beside them."""
+    return assemble(
+        tracks,
+        found.points,
+        table.drop(columns=found.interleaved),
+        columns=found.interleaved,
+        **known,
     )
 
 

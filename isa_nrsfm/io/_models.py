@@ -7,6 +7,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._callbacks import without_callbacks
+from isa_nrsfm._model_class import check_class
 from isa_nrsfm._optional import import_optional
 
 #: The types beside those that skops trusts by itself that a model file may contain.
@@ -64,7 +65,7 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     True
     """
     skops_io = import_optional("skops.io", extra="share")
-    _check_class(estimator, "estimator")
+    check_class(estimator, "estimator")
     check_is_fitted(estimator)
     contents = skops_io.dumps(without_callbacks(estimator))
     _refuse_untrusted(skops_io.get_untrusted_types(data=contents), "the estimator")
@@ -113,17 +114,9 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
         model = skops_io.loads(contents, trusted=list(TRUSTED_TYPES))
     except Exception as error:
         raise ValueError(f"{not_a_model}, or it is damaged: {error}") from error
-    _check_class(model, os.fspath(path))
+    check_class(model, os.fspath(path))
     check_is_fitted(model)
     return model
-
-
-def _check_class(estimator: object, where: str) -> None:
-    """Raise if an object is not the estimator of this package."""
-    if not isinstance(estimator, AffineNRSfM):
-        raise ValueError(
-            f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
-        )
 
 
 def _refuse_untrusted(types: list[str], where: str) -> None:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,18 +122,27 @@ def choose_edges(edges: Edges, shape: NDArray) -> NDArray[np.intp] | None:
             )
         face = recognise_face(shape)
         return None if face is None else face.edges
-    pairs = np.asarray(edges)
-    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+    return checked_links(edges, len(shape))
+
+
+def checked_links(
+    edges: Any, n_points: int, *, triangles: bool = False
+) -> NDArray[np.intp]:
+    """Return pairs of points, or triangles where these may be, or raise."""
+    links = np.asarray(edges)
+    widths = (2, 3) if triangles else (2,)
+    if links.ndim != 2 or links.shape[1] not in widths or links.dtype.kind not in "iu":
+        other = ", or (n_triangles, 3)" if triangles else ""
         raise ValueError(
-            "edges must be integers of shape (n_edges, 2), a pair of points an edge; "
-            f"got shape {pairs.shape} and dtype {pairs.dtype}"
+            "edges must be integers of shape (n_edges, 2), a pair of points an "
+            f"edge{other}; got shape {links.shape} and dtype {links.dtype}"
         )
-    if pairs.size and (pairs.min() < 0 or pairs.max() >= len(shape)):
+    if links.size and (links.min() < 0 or links.max() >= n_points):
         raise ValueError(
-            f"edges must name points 0 to {len(shape) - 1}; "
-            f"got {pairs.min()} to {pairs.max()}"
+            f"edges must name points 0 to {n_points - 1}; "
+            f"got {links.min()} to {links.max()}"
         )
-    return pairs.astype(np.intp)
+    return links.astype(np.intp)
 
 
 def choose_origin(origin: Origin, shape: NDArray) -> Literal["upper", "lower"]:
