@@ -20,7 +20,12 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._callbacks import CallbackSupportMixin, FitProgress
-from isa_nrsfm._camera import reference_camera
+from isa_nrsfm._frames.camera import reference_camera
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    full_rotations,
+    nearest_calibrated,
+)
 from isa_nrsfm._completion import complete_rows
 from isa_nrsfm._deformation_metric import deformation_metric
 from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
@@ -35,9 +40,11 @@ from isa_nrsfm._frame_fit import (
     project,
     reprojection_error,
 )
-from isa_nrsfm._frame_posterior import spread_starts
+from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._gauge import (
     canonical_gauge,
+    canonical_space,
+    euclidean_space,
     image_energies,
     mode_covariance,
     reorder_blocks,
@@ -47,7 +54,8 @@ from isa_nrsfm._independent_gauge import (
     FrameMap,
     independent_gauge,
 )
-from isa_nrsfm._joint_fit import fit_jointly
+from isa_nrsfm._joint.fit import fit_jointly
+from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._metric_equations import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._parameter_checks import fit_context
@@ -77,10 +85,10 @@ START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
 # What a fit may keep of the frames, and what only the joint refinement tells.
-OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_", "rotations_", "scales_")
 OF_JOINT_FIT = (
     "noise_variance_",
-    "stiffness_",
+    "camera_noise_ratio_",
     "reliability_",
     "objective_history_",
     "gradient_norm_",
@@ -158,6 +166,13 @@ class AffineNRSfM(
         from the paper's result and recovers the true shapes as far as the images
         determine them. "alternating" is the paper's alternating least squares for
         basis shapes and coefficients, with the rigid cameras held.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What is known of the cameras. "affine" assumes nothing: shapes are known up to
+        an affinity of space, and where an object moves much, as bodies do, cameras
+        absorb part of the deformation. "weak_perspective" are rotations with a scale
+        for each frame, a good model of most photos of objects that are far away for
+        their size; "orthographic" ones have the same scale in all frames. With these
+        shapes, lengths and angles are true, up to one mirror image (`mirror`).
     independence : {"shapes", "coefficients", None}, default="shapes"
         What fixes the basis of the joint refinement, which any mixing of its basis
         shapes leaves as likely: "shapes" makes these independent of each other over the
@@ -168,19 +183,13 @@ class AffineNRSfM(
         How points count that are far from the model: with "huber" from 1.5 and with
         "cauchy" from 2.5 standard deviations of the noise, which is estimated from the
         median, less than by their square. Only for the joint refinement.
-    stiffness : float or None, default=None
-        Price of what the basis shapes move in the images, added to minus twice the log
-        likelihood: ``stiffness * sum_ik ||M_i B_k||_F^2`` for frames of size one. With
-        free affine cameras large deformations, as in motion capture, can hardly be told
-        from camera motion and drift away without it; on faces it is not needed. None
-        chooses between 0 and 300 by what it does to the cameras, which should be close
-        to scaled orthographic ones.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
         Whether each centred frame is divided by the root mean square of its
         coordinates before the fit, so that photos of any resolution count alike;
         the scale is given back to `motion_`. With False frames count by their size.
+        With orthographic cameras, which have one scale, frames are not scaled.
     max_iter : int, default=1000
         The most steps of the refinement.
     tol : float or None, default=None
@@ -211,7 +220,9 @@ class AffineNRSfM(
     ----------
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is
-        the identity (of rank two for flat objects). x and y are the axes of the mean
+        the identity (of rank two for flat objects). With weak-perspective cameras only
+        the mean square of its coordinates is one, with orthographic ones it is in the
+        units of the table. x and y are the axes of the mean
         camera (so y points down for image coordinates), z is depth; its mirror image
         fits as well.
     basis_ : ndarray of shape (n_components, n_points, 3)
@@ -228,6 +239,13 @@ class AffineNRSfM(
     translation_ : ndarray of shape (n_frames, 2)
         Images of the origin of the shapes, in the units of the table: the centroids of
         complete frames.
+    rotations_ : ndarray of shape (n_frames, 3, 3)
+        Rotations of calibrated cameras, of determinant one: the rows are the axes of
+        the image, x, y and z (only with such cameras, as `scales_`).
+    scales_ : ndarray of shape (n_frames,)
+        Their scales, in units of the table per unit of the shapes; one where they are
+        orthographic. The image of frame i is ``scales_[i] * S_i @ rotations_[i, :2].T +
+        translation_[i]`` with ``S_i = reconstruct(X)[i]``.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
         as in the fit; of the points that are seen.
@@ -237,14 +255,16 @@ class AffineNRSfM(
     noise_variance_ : float
         Variance of the noise of a coordinate; of frames of size one where frames are
         scaled (joint refinement only, as are the next four).
-    stiffness_ : float
-        The stiffness that was used.
+    camera_noise_ratio_ : float
+        Noise variance of the fit with calibrated cameras, divided by that of the fit
+        with affine ones, from the frames that the first steps are made on; see
+        `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are not uncertainty, along
         uncorrelated directions, decreasing.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
-        Minus twice the log marginal likelihood plus the price of the stiffness, before
-        the refinement and after each of its steps; it never rises.
+        Minus twice the log posterior, up to a constant, before the last refinement and
+        after each of its steps; it never rises.
     gradient_norm_ : float
         Norm of its gradient at the end, in the metric of its curvature and relative to
         the root of the number of coordinates.
@@ -321,7 +341,9 @@ class AffineNRSfM(
     inverse_snr_: float
     rank_floor_: float
     noise_variance_: float
-    stiffness_: float
+    camera_noise_ratio_: float
+    rotations_: NDArray
+    scales_: NDArray
     reliability_: NDArray
     objective_history_: NDArray
     gradient_norm_: float
@@ -340,9 +362,9 @@ class AffineNRSfM(
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
         "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
         "refinement": [StrOptions({"joint", "alternating"}), None],
+        "camera": [StrOptions(set(CAMERAS))],
         "independence": [StrOptions(set(INDEPENDENCE)), None],
         "loss": [StrOptions(set(LOSSES))],
-        "stiffness": [None, Interval(Real, 0, None, closed="left")],
         "layout": [StrOptions(set(LAYOUTS))],
         "scale_frames": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
@@ -361,9 +383,9 @@ class AffineNRSfM(
         isa: Any = None,
         block_recovery: str = "generalized_eigen",
         refinement: str | None = "joint",
+        camera: str = "affine",
         independence: str | None = "shapes",
         loss: str = "linear",
-        stiffness: float | None = None,
         layout: Layout = "interleaved",
         scale_frames: bool = True,
         max_iter: int = 1000,
@@ -378,9 +400,9 @@ class AffineNRSfM(
         self.isa = isa
         self.block_recovery = block_recovery
         self.refinement = refinement
+        self.camera = camera
         self.independence = independence
         self.loss = loss
-        self.stiffness = stiffness
         self.layout = layout
         self.scale_frames = scale_frames
         self.max_iter = max_iter
@@ -453,11 +475,11 @@ class AffineNRSfM(
             self.n_components,
             layout=self.layout,
             names=names,
-            scale_frames=self.scale_frames,
+            scale_frames=self._scales_frames,
             robust=self.loss != "linear",
         )
         rows, sizes, n_points = table.rows, table.sizes, table.n_points
-        self._unit = 1.0 if self.scale_frames else float(sizes[0])
+        self._unit = 1.0 if self._scales_frames else float(sizes[0])
         outliers, used, complete = None, rows, table.complete
         if self.loss != "linear":
             outliers = gross_outliers(rows.whole().transpose(0, 2, 1))
@@ -498,7 +520,7 @@ class AffineNRSfM(
                 table, outliers, sample, factors, result, progress
             )
         else:
-            frames = self._keep(table, sample.W, result)
+            frames = self._keep(table, sample.W, factors, result)
         self._describe(table, frames)
         self._keep_frames(source, table, frames)
         progress("gauge and coefficients")
@@ -772,20 +794,24 @@ class AffineNRSfM(
             isa.set_params(verbose=self.verbose)
         return isa
 
-    def _random_state(self) -> np.random.RandomState:
-        """Return the generator of the joint refinement's starts."""
-        seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
-        return np.random.RandomState(seed)
-
-    def _keep(self, table: ScaledTable, W: NDArray, result: PaperResult) -> FrameFit:
+    def _keep(
+        self,
+        table: ScaledTable,
+        W: NDArray,
+        factors: Factorisation,
+        result: PaperResult,
+    ) -> FrameFit:
         """Set the shapes of the paper's pipeline and return the fit of the frames."""
-        dtype = table.dtype
-        completed = W.reshape(len(table.sizes), 2, -1).transpose(0, 2, 1)
-        paper = RigidFrames(result.mean_shape, result.basis)
-        rigid = paper.fit(completed, np.ones(len(completed)))
-        gauge = canonical_gauge(
-            result.mean_shape, result.basis, rigid.motion, rigid.alpha
-        )
+        dtype, sizes = table.dtype, table.sizes[:, None, None]
+        completed = W.reshape(len(sizes), 2, -1).transpose(0, 2, 1) * sizes
+        mean_shape, basis = result.mean_shape, result.basis
+        if self.camera != "affine":
+            mean_shape, basis = self._upgraded(table, factors, result)
+        paper = RigidFrames(mean_shape, basis, self.camera)
+        rigid = paper.fit(completed, table.sizes)
+        motion = rigid.motion / sizes
+        space = self._space(mean_shape, motion)
+        gauge = canonical_gauge(mean_shape, basis, motion, rigid.alpha, space)
         self.mean_shape_ = gauge.mean_shape.astype(dtype)
         self.basis_ = gauge.basis.astype(dtype)
         covariance = reorder_blocks(result.mode_covariance, gauge.order)
@@ -793,9 +819,26 @@ class AffineNRSfM(
         self._converged(result.converged, result.n_iter)
         # The coefficients are those that transform gives, from the stored shapes.
         self._frames: RigidFrames | PosteriorFrames = RigidFrames(
-            self.mean_shape_, self.basis_
+            self.mean_shape_, self.basis_, self.camera
         )
         return self._model.decompose(table.source)
+
+    def _upgraded(
+        self, table: ScaledTable, factors: Factorisation, result: PaperResult
+    ) -> tuple[NDArray, NDArray]:
+        """Return the paper's shapes in the metric of the rigid cameras."""
+        shapes = np.concatenate([result.mean_shape[None], result.basis])
+        scaled = self.camera == "weak_perspective"
+        _, shapes = rigid_start(factors, shapes.transpose(0, 2, 1), scaled)
+        shapes = table.sizes[0] * shapes.transpose(0, 2, 1)
+        return shapes[0], shapes[1:]
+
+    def _space(self, mean_shape: NDArray, motion: NDArray) -> NDArray:
+        """Return the affinity of space, or with calibrated cameras the rotation."""
+        if self.camera == "affine":
+            return canonical_space(mean_shape, motion)
+        unit = 1.0 if self.camera == "orthographic" else None
+        return euclidean_space(mean_shape, motion, unit)
 
     def _refine_jointly(
         self,
@@ -814,10 +857,10 @@ class AffineNRSfM(
             sample,
             factors,
             shapes.transpose(0, 2, 1),
+            rank_floor=self.rank_floor_,
+            camera=self.camera,
             outliers=outliers,
             loss=self.loss,
-            stiffness=self.stiffness,
-            random_state=self._random_state(),
             max_iter=self.max_iter,
             tol=JOINT_TOL if self.tol is None else self.tol,
             on_step=progress.step,
@@ -829,17 +872,25 @@ class AffineNRSfM(
             spread_starts(fitted.alpha, N_STARTS),
             self.loss,
             FrameMap.identity(self.n_components),
+            self.camera,
         )
         posteriors = posterior_blocks(frames, fitted.frames, table.rows)
         motion, alpha, covariance = posterior_moments(posteriors)
         self.reliability_ = reliabilities(alpha, covariance)
-        gauge = independent_gauge(fitted.shapes, motion, alpha, self.independence)
+        gauge = independent_gauge(
+            fitted.shapes,
+            motion,
+            alpha,
+            self.independence,
+            self.camera,
+            float(table.sizes[0]) if self.camera == "orthographic" else None,
+        )
         frames = frames._replace(gauge=gauge.frames)
         self.mean_shape_ = gauge.mean_shape.astype(table.dtype)
         self.basis_ = gauge.basis.astype(table.dtype)
         self._frames = frames
         self.noise_variance_ = self._unit**2 * fitted.noise_variance
-        self.stiffness_ = fitted.stiffness
+        self.camera_noise_ratio_ = fitted.camera_noise_ratio
         self.objective_history_ = fitted.history
         self.gradient_norm_ = fitted.gradient_norm
         self._converged(fitted.converged, len(fitted.history) - 1)
@@ -858,8 +909,13 @@ class AffineNRSfM(
             self.basis_,
             self.layout,
             getattr(self, "feature_names_in_", None),
-            None if self.scale_frames else self._unit,
+            None if self._scales_frames else self._unit,
         )
+
+    @property
+    def _scales_frames(self) -> bool:
+        """Whether each frame gets size one."""
+        return self.scale_frames and self.camera != "orthographic"
 
     def _describe(self, table: ScaledTable, frames: FrameFit) -> None:
         """Set what is said of the fit of all frames."""
@@ -872,7 +928,11 @@ class AffineNRSfM(
         )
         energy = image_energies(cameras, self.basis_, frames.alpha)
         self.energy_share_ = energy / (energy.sum() or 1.0)
-        self.reference_motion_ = reference_camera(cameras, sizes).astype(dtype)
+        reference = reference_camera(cameras, sizes)
+        if self.camera != "affine":
+            row, scale = nearest_calibrated(reference[None])
+            reference = (scale[:, None, None] * row)[0]
+        self.reference_motion_ = reference.astype(dtype)
         self.reference_translation_ = frames.translation.mean(axis=0).astype(dtype)
 
     def _keep_frames(self, source: Table, table: ScaledTable, frames: FrameFit) -> None:
@@ -884,6 +944,8 @@ class AffineNRSfM(
             self._frame_sizes = table.of_all_rows(table.sizes)
             kept = FrameFit(*map(source.blocks.spread, kept))
             self.motion_, self.translation_, self.alpha_, deviation = kept
+            if self.camera != "affine":
+                self.rotations_, self.scales_ = full_rotations(self.motion_)
             if self.refinement == "joint":
                 self.alpha_std_ = deviation
 

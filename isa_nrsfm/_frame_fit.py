@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._camera import rigid_cameras
+from isa_nrsfm._frames.camera import rigid_cameras
+from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frame_posterior import FramePosterior, fit_posterior, fit_prepared
+from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
 from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._independent_gauge import FrameMap
-from isa_nrsfm._joint_frames import JointFrames
+from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._robust import distant_points, robust_weights
 from isa_nrsfm._tracks import energies, measurement_matrix, seen_points
 
@@ -99,10 +100,14 @@ class RigidFrames(NamedTuple):
         Centred basis shapes, orthogonal to each other and to the mean shape as the
         paper's are: ``B_k B_l^T = 0`` (3x3) for different k and l. The least squares
         then separate where no point is missing.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras may be: the nearest ones to the affine cameras of the rigid fit.
+        Orthographic ones have the scale one.
     """
 
     mean_shape: NDArray
     basis: NDArray
+    camera: str = "affine"
 
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """
@@ -154,7 +159,7 @@ class RigidFrames(NamedTuple):
         alpha : ndarray of shape (n_frames, n_components)
             Coefficients.
         """
-        motion = rigid_cameras(W, self.mean_shape)
+        motion = self._cameras(W, self.mean_shape)
         n_components, n_points, _ = self.basis.shape
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
         P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
@@ -167,13 +172,21 @@ class RigidFrames(NamedTuple):
         visible = energy > UNSEEN * largest
         return motion, np.divide(along, energy, where=visible, out=np.zeros_like(along))
 
+    def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
+        """Return cameras (n_frames, 2, 3) that see a rigid shape best."""
+        motion = rigid_cameras(W, mean_shape)
+        if self.camera == "affine":
+            return motion
+        rows, scales = nearest_calibrated(motion)
+        return rows if self.camera == "orthographic" else scales[:, None, None] * rows
+
     def _together(
         self, points: NDArray, seen: NDArray
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Return the fit of a frame of which some points are seen."""
         centre, centroid = points.mean(axis=0), self.mean_shape[seen].mean(axis=0)
         W = (points - centre).T
-        motion = rigid_cameras(W, self.mean_shape[seen] - centroid)
+        motion = self._cameras(W, self.mean_shape[seen] - centroid)
         basis = self.basis[:, seen]
         middles = basis.mean(axis=1)
         images = (basis - middles[:, None]) @ motion[0].T
@@ -199,6 +212,8 @@ class PosteriorFrames(NamedTuple):
         How points count that are far from the model.
     gauge : FrameMap
         Takes the coefficients to the basis that is shown.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras may be; orthographic ones have the scale one.
     """
 
     shapes: NDArray
@@ -206,6 +221,7 @@ class PosteriorFrames(NamedTuple):
     starts: NDArray
     loss: str
     gauge: FrameMap
+    camera: str = "affine"
 
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """
@@ -264,7 +280,13 @@ class PosteriorFrames(NamedTuple):
             The fit, that of `posterior`.
         """
         fits = [
-            fit_prepared(part, self.shapes, self.noise_variance, starts=self.starts)
+            fit_prepared(
+                part,
+                self.shapes,
+                self.noise_variance,
+                camera=self.camera,
+                starts=self.starts,
+            )
             for part in block
         ]
         if len(fits) == 1:
@@ -273,18 +295,16 @@ class PosteriorFrames(NamedTuple):
 
     def posterior(self, tracks: NDArray) -> FramePosterior:
         """Return the fit of frames of size one, before the gauge."""
-        if self.loss == "linear":
-            return fit_posterior(
-                tracks, self.shapes, self.noise_variance, starts=self.starts
-            )
-        weights = np.where(distant_points(tracks), 0.0, 1.0)
-        fit = fit_posterior(
-            tracks,
-            self.shapes,
-            self.noise_variance,
-            weights=weights,
-            starts=self.starts,
+        fitted = partial(
+            fit_posterior,
+            shapes=self.shapes,
+            noise_variance=self.noise_variance,
+            camera=self.camera,
         )
+        if self.loss == "linear":
+            return fitted(tracks, starts=self.starts)
+        weights = np.where(distant_points(tracks), 0.0, 1.0)
+        fit = fitted(tracks, weights=weights, starts=self.starts)
         seen = seen_points(tracks)
         changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
         for _ in range(REWEIGHTINGS):
@@ -297,10 +317,8 @@ class PosteriorFrames(NamedTuple):
             changing = changing[unsettled]
             if not len(changing):
                 break
-            refit = fit_posterior(
+            refit = fitted(
                 tracks[changing],
-                self.shapes,
-                self.noise_variance,
                 weights=weights[changing],
                 initial=fit.alpha[changing],
             )

@@ -1,6 +1,6 @@
 """The canonical choice among shapes and cameras that fit a table equally well.
 
-An affinity of space, the order, scale and sign of the basis shapes are free: here
+An affinity of space (with calibrated cameras a rotation), the order, scale and sign of the basis shapes are free: here
 they are fixed. What stays free is the mirror image in depth: a table seen by affine
 cameras does not tell it.
 """
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._camera import mean_view
+from isa_nrsfm._frames.camera import mean_view
 from isa_nrsfm._factorisation import orientations
 
 # Frames that are taken together where much is computed of each.
@@ -78,6 +78,32 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     return canonical_rotation(mean_shape @ whitening, white_motion) @ whitening
 
 
+def euclidean_space(
+    mean_shape: NDArray, motion: NDArray, size: float | None
+) -> NDArray:
+    """
+    Return the rotation and the unit of space that show the mean shape from front.
+
+    Parameters
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        B_0, centred.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Calibrated cameras, each divided by the size of its frame.
+    size : float or None
+        What a unit of the shapes becomes; None to make the mean square of the
+        coordinates of the mean shape one.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        A positive multiple of the orthogonal matrix of `canonical_rotation`.
+    """
+    if size is None:
+        size = 1.0 / (np.sqrt(np.mean(mean_shape**2)) or 1.0)
+    return size * canonical_rotation(mean_shape, motion)
+
+
 # A basis shape with less than this share of the rigid motion's energy in the images
 # holds rounding errors only.
 NO_MOTION = 1e-20
@@ -97,19 +123,20 @@ class Gauge(NamedTuple):
         Where each basis shape was before.
     factors : ndarray of shape (n_components,)
         What it has been multiplied by, zero for those without motion.
-    space : ndarray of shape (3, 3)
-        The affinity of `canonical_space`.
     """
 
     mean_shape: NDArray
     basis: NDArray
     order: NDArray
     factors: NDArray
-    space: NDArray
 
 
 def canonical_gauge(
-    mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
+    mean_shape: NDArray,
+    basis: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    space: NDArray,
 ) -> Gauge:
     """
     Return the canonical shapes among those that fit equally well.
@@ -124,11 +151,13 @@ def canonical_gauge(
         Cameras, each divided by the size of its frame.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
+    space : ndarray of shape (3, 3)
+        The affinity of space, of `canonical_space` or `euclidean_space`.
 
     Returns
     -------
     Gauge
-        The shapes in the space of `canonical_space`, the basis by decreasing energy
+        The shapes in that space, the basis by decreasing energy
         in the images, ``sum_i ||alpha_ik M_i B_k||_F^2``, and such that the
         coefficients have unit variance over the frames (unit mean square where they
         do not vary) and a third moment that is not negative. A basis shape without
@@ -143,10 +172,7 @@ def canonical_gauge(
     size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
     factors = np.where(moving, orientations(alpha.T) * size, 0.0)
     scaled = factors[:, None, None] * basis
-    space = canonical_space(mean_shape, motion)
-    return Gauge(
-        mean_shape @ space.T, scaled[order] @ space.T, order, factors[order], space
-    )
+    return Gauge(mean_shape @ space.T, scaled[order] @ space.T, order, factors[order])
 
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._gauge import canonical_gauge, canonical_space
+from isa_nrsfm._gauge import canonical_gauge, canonical_space, euclidean_space
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 INDEPENDENCE = ("shapes", "coefficients")
@@ -97,7 +97,12 @@ class IndependentGauge(NamedTuple):
 
 
 def independent_gauge(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, independence: str | None
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    independence: str | None,
+    camera: str = "affine",
+    unit: float | None = None,
 ) -> IndependentGauge:
     """
     Return the independent basis of a fit.
@@ -113,16 +118,24 @@ def independent_gauge(
     independence : {"shapes", "coefficients", None}
         Whether the basis shapes are to be independent over the points or their
         coefficients over the frames; None takes the principal axes of the deformation.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras are: affinities of space, or with calibrated ones only rotations,
+        fit equally well. Scales of orthographic cameras absorb nothing.
+    unit : float, optional
+        What a unit of the shapes becomes with calibrated cameras, as of
+        `euclidean_space`.
 
     Returns
     -------
     IndependentGauge
         The basis, and the map of the frames to it.
     """
-    shift, motion, alpha = _centred(shapes, motion, alpha)
+    shift, motion, alpha = _centred(shapes, motion, alpha, camera != "orthographic")
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
     white = shapes[1:].transpose(0, 2, 1) @ space.T
+    if camera != "affine":
+        space = euclidean_space(shapes[0].T, motion, unit)
     if independence == "shapes":
         mixing = shared_mixing(white)
     elif independence == "coefficients":
@@ -131,18 +144,18 @@ def independent_gauge(
         mixing = _principal_axes(white, alpha)
     basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
     unmixing = np.linalg.inv(mixing).T
-    gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T)
+    gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
     factors = gauge.factors
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
     coefficients = np.linalg.inv(shift).T
     coefficients[1:] = scale[:, None] * (unmixing @ coefficients[1:])[gauge.order]
     return IndependentGauge(
-        gauge.mean_shape, gauge.basis, FrameMap(coefficients, gauge.space)
+        gauge.mean_shape, gauge.basis, FrameMap(coefficients, space)
     )
 
 
 def _centred(
-    shapes: NDArray, motion: NDArray, alpha: NDArray
+    shapes: NDArray, motion: NDArray, alpha: NDArray, scaled: bool
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the mixing of B_0, ..., B_K to centred coefficients and pure basis shapes.
@@ -150,13 +163,14 @@ def _centred(
     The coefficients get mean zero by ``B_0 + sum_k u_k B_k``, and the basis shapes
     ``tr(B_k B_0^+) = 0`` by ``B_k + v_k B_0``, which is ``<T B_k, T B_0> = 0`` where T
     whitens B_0. The one undoes the other a little: they alternate. Where that would
-    turn a frame inside out, or has no end, the basis shapes stay as they are. Cameras
-    and coefficients for the new shapes are returned, too.
+    turn a frame inside out, or has no end, or where cameras have no scales that absorb
+    it, the basis shapes stay as they are. Cameras and coefficients for the new shapes
+    are returned, too.
     """
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=1e-9), 1)
     first = total = _mean_shift(alpha)
     moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
-    for _ in range(MAX_SHIFTS):
+    for _ in range(MAX_SHIFTS if scaled else 0):
         current = np.tensordot(total, shapes, 1)
         inverse = np.linalg.pinv(current[0], rcond=1e-9)
         along = np.eye(len(shapes))

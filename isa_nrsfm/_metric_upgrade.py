@@ -247,6 +247,29 @@ def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
     return min(fits, key=lambda fit: fit.cost)
 
 
+def best_metric(motion: NDArray) -> NDArray:
+    """
+    Return Q with which cameras are most nearly scaled rotations.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        That of `metric_upgrade`, or the identity where the cameras do not see three
+        directions of space.
+    """
+    cameras, usable = usable_cameras(motion)
+    try:
+        fit = fit_metric(cameras[usable], "weak_perspective")
+    except ValueError:
+        return np.eye(3)
+    return scaled(symmetric_power(fit.Q @ fit.Q.T, 0.5), cameras[usable])
+
+
 def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
     """Return Q with a scale such that that of the cameras has mean square one."""
     # A scale is the mean of the two singular values, the product of which is the area.

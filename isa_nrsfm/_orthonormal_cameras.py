@@ -6,16 +6,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.optimize import OptimizeResult, minimize
 from sklearn.utils import check_array
 
 # Columns that are added at a time: as many as a basis shape has.
 STEP = 3
 # A column that the ones before it determine up to this share of it is left out.
 DEPENDENT = 1e-10
-# Slopes at which the minimisation ends: where starts can be compared, and where what is
-# left is rounding errors.
-ROUGH, FLAT = 1e-3, 1e-13
+# Steps after which starts can be compared: the best of the twenty then leads to the
+# least cost, or close to it.
+ROUGH_STEPS = 8
+# Damping of the steps, relative to the mean curvature: the first, how a good and a
+# failing step change it, and its bounds.
+FIRST_DAMPING = 1e-3
+EASED, RAISED = 0.1, 4.0
+SMALLEST_DAMPING, LARGEST_DAMPING = 1e-10, 1e8
+# A cost below this, or a step that gains less than this share of it, is the end.
+ROUNDING = 1e-26
+LEAST_GAIN = 1e-9
 # Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
 # by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2): by 4 tr C, on average over all
 # cameras. C is the noise variance times Q^T Q.
@@ -62,7 +69,7 @@ def orthonormal_cameras(
         Variance of the errors of the entries of P. It is that of the entries of W if P
         is its left singular vectors times its singular values.
     max_iter : int, default=2000
-        The most quasi-Newton steps for each number of columns.
+        The most steps for each number of columns.
 
     Returns
     -------
@@ -122,24 +129,58 @@ def orthonormal_cameras(
     mixing, least = np.eye(3), np.inf
     for n in range(3, n_columns + STEP, STEP):
         n = min(n, n_columns)
-        starts = [np.vstack([mixing, np.zeros((n - len(mixing), 3))])]
-        if 3 < n <= 3 + STEP:
-            triples = combinations(np.eye(n), 3)
-            starts += [np.column_stack(triple) for triple in triples]
-        arguments = basis[:, :n], inverse[:n, :n], price
-        if len(starts) > 1:
-            found = [_minimised(start, arguments, ROUGH, max_iter) for start in starts]
-            starts = [min(found, key=lambda result: result.fun).x]
-        best = _minimised(starts[0], arguments, FLAT, max_iter)
-        if not best.fun < least:
+        roots = np.sqrt(price) * inverse[:n, :n]
+        found, cost = orthonormal_mixture(basis[:, :n], mixing, roots, max_iter)
+        if not cost < least:
             break
-        least, mixing = best.fun, best.x.reshape(n, 3)
+        mixing, least = found, cost
     n = len(mixing)
     cameras = (basis[:, :n] @ mixing).reshape(-1, 2, 3)
     Q = np.zeros((P.shape[1], 3))
     Q[kept[:n]] = inverse[:n, :n] @ mixing
     cost = np.sum(orthonormality_residuals(cameras) ** 2) / len(cameras)
     return OrthonormalCameras(cameras, Q, float(cost))
+
+
+def orthonormal_mixture(
+    basis: NDArray,
+    mixing: NDArray,
+    penalty: NDArray | None = None,
+    max_iter: int = 200,
+) -> tuple[NDArray, float]:
+    """
+    Return a mixture of columns whose rows are most nearly orthonormal.
+
+    Parameters
+    ----------
+    basis : ndarray of shape (2 * n_frames, n_columns)
+        Columns of a motion factor, about as long as columns of cameras.
+    mixing : ndarray of shape (n_before, 3)
+        The best mixture of the first columns, to start from. Where there were three of
+        them, each three of the columns make a start, too.
+    penalty : ndarray of shape (n_columns, n_columns), optional
+        L, for a price of ``||L Q||^2``.
+    max_iter : int, default=200
+        The most Levenberg-Marquardt steps.
+
+    Returns
+    -------
+    mixing : ndarray of shape (n_columns, 3)
+        Q.
+    cost : float
+        Mean over the frames of the squares of `orthonormality_residuals`, plus the
+        price.
+    """
+    n = basis.shape[1]
+    L = np.zeros((0, n)) if penalty is None else penalty
+    start = np.vstack([mixing, np.zeros((n - len(mixing), 3))])
+    if len(mixing) == 3 < n <= 3 + STEP:
+        triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
+        starts = np.stack([start, *triples])
+        found, cost = _minimised(starts, basis, L, ROUGH_STEPS)
+        start = found[np.argmin(cost)]
+    found, cost = _minimised(start[None], basis, L, max_iter)
+    return found[0], float(cost[0])
 
 
 def nearest_orthonormal(cameras: NDArray) -> NDArray:
@@ -180,56 +221,65 @@ def orthonormality_residuals(cameras: NDArray) -> NDArray:
     return np.stack([np.vecdot(r1, r1) - 1.0, np.vecdot(r2, r2) - 1.0, across])
 
 
-def expected_cost(
-    mixing: NDArray, basis: NDArray, inverse: NDArray, price: float
-) -> tuple[float, NDArray]:
-    """
-    Return what `orthonormal_cameras` minimises, and its gradient.
-
-    Parameters
-    ----------
-    mixing : ndarray of shape (3 * n_columns,)
-        Mixing of the columns of the basis, row by row.
-    basis : ndarray of shape (2 * n_frames, n_columns)
-        Basis of the columns of P.
-    inverse : ndarray of shape (n_columns, n_columns)
-        Takes a mixing of the basis to Q.
-    price : float
-        Price of ``||Q||_F^2``.
-
-    Returns
-    -------
-    cost : float
-        Mean over the frames of the squares of `orthonormality_residuals`, plus the
-        price.
-    gradient : ndarray of shape (3 * n_columns,)
-        Its derivatives by the entries of the mixing.
-    """
-    mixing = mixing.reshape(-1, 3)
-    cameras = (basis @ mixing).reshape(-1, 2, 3)
-    Q = inverse @ mixing
-    xx, yy, xy = residuals = orthonormality_residuals(cameras)
-    slope = np.stack([xx, yy], axis=1)[..., None] * cameras
-    slope += xy[:, None, None] / np.sqrt(2.0) * cameras[:, ::-1]
-    n_frames = len(cameras)
-    cost = np.sum(residuals**2) / n_frames + price * np.sum(Q**2)
-    gradient = 4.0 / n_frames * basis.T @ slope.reshape(-1, 3)
-    gradient += 2.0 * price * inverse.T @ Q
-    return float(cost), gradient.ravel()
-
-
 def _minimised(
-    start: NDArray, arguments: tuple, slope: float, max_iter: int
-) -> OptimizeResult:
-    """Return the minimum of the expected cost next to a mixture."""
-    return minimize(
-        expected_cost,
-        start.ravel(),
-        args=arguments,
-        jac=True,
-        method="BFGS",
-        options={"gtol": slope, "maxiter": max_iter},
-    )
+    Q: NDArray, basis: NDArray, L: NDArray, max_iter: int
+) -> tuple[NDArray, NDArray]:
+    """
+    Return the least costs next to mixtures, by Levenberg-Marquardt steps.
+
+    Mixtures are (n_starts, n_columns, 3), costs (n_starts,).
+    """
+    n = Q[0].size
+    residuals, J = _residuals(Q, basis, L), _derivatives(Q, basis, L)
+    cost = np.vecdot(residuals, residuals)
+    damping, running = np.full(len(Q), FIRST_DAMPING), np.ones(len(Q), dtype=bool)
+    for _ in range(max_iter):
+        curvature = J.swapaxes(1, 2) @ J
+        scale = damping * np.trace(curvature, axis1=1, axis2=2) / n
+        slope = J.swapaxes(1, 2) @ residuals[..., None]
+        # The curvature is zero where no direction changes the cost.
+        scale = np.where(scale > 0, scale, 1.0)
+        step = np.linalg.solve(curvature + scale[:, None, None] * np.eye(n), slope)
+        moved = Q - step.reshape(Q.shape)
+        rest = _residuals(moved, basis, L)
+        reached = np.vecdot(rest, rest)
+        better = running & (reached < cost)
+        gain = np.where(better, cost - reached, np.inf)
+        ended = better & ((reached < ROUNDING) | (gain <= LEAST_GAIN * cost))
+        damping = np.where(
+            better, np.maximum(EASED * damping, SMALLEST_DAMPING), RAISED * damping
+        )
+        Q = np.where(better[:, None, None], moved, Q)
+        residuals = np.where(better[:, None], rest, residuals)
+        cost = np.where(better, reached, cost)
+        running &= ~ended & (damping < LARGEST_DAMPING)
+        if not running.any():
+            break
+        if better.any():
+            J = _derivatives(Q, basis, L)
+    return Q, cost
+
+
+def _residuals(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
+    """Return the residuals (n_starts, n) whose squares add up to the cost."""
+    n_frames = len(basis) // 2
+    cameras = (basis @ Q).reshape(-1, 2, 3)
+    residuals = orthonormality_residuals(cameras).reshape(3, len(Q), n_frames)
+    residuals = residuals.swapaxes(0, 1).reshape(len(Q), -1) / np.sqrt(n_frames)
+    return np.concatenate([residuals, (L @ Q).reshape(len(Q), -1)], axis=1)
+
+
+def _derivatives(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
+    """Return the derivatives of the residuals by the entries of mixtures."""
+    n_frames = len(basis) // 2
+    P = basis.reshape(n_frames, 2, -1, 1)
+    R = (basis @ Q).reshape(len(Q), n_frames, 2, 1, 3)
+    p1, p2, r1, r2 = P[:, 0], P[:, 1], R[:, :, 0], R[:, :, 1]
+    across = np.sqrt(2.0) * (p1 * r2 + p2 * r1)
+    rows = np.stack([2.0 * p1 * r1, 2.0 * p2 * r2, across], axis=1)
+    rows = rows.reshape(len(Q), 3 * n_frames, -1) / np.sqrt(n_frames)
+    prior = np.broadcast_to(np.kron(L, np.eye(3)), (len(Q), 3 * len(L), Q[0].size))
+    return np.concatenate([rows, prior], axis=1)
 
 
 def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -253,3 +303,23 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     root = np.sqrt(len(motion) / 3)
     inverse = solve_triangular(triangle, root * np.eye(len(kept)))
     return kept, root * basis, inverse
+
+
+def principal_columns(W: NDArray) -> NDArray:
+    """
+    Return the columns of the motion factor of a measurement matrix.
+
+    Parameters
+    ----------
+    W : ndarray of shape (2 * n_frames, n_points)
+        Measurement matrix.
+
+    Returns
+    -------
+    ndarray of shape (2 * n_frames, rank)
+        Its left singular vectors, those of the largest singular values first, as long
+        as columns of cameras are on average.
+    """
+    square, V = np.linalg.eigh(W.T @ W)
+    kept = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
+    return W @ (V[:, kept] * np.sqrt(len(W) / 3 / square[kept]))

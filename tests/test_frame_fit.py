@@ -13,7 +13,7 @@ from isa_nrsfm._frame_fit import (
     distances,
     project,
 )
-from isa_nrsfm._frame_posterior import fit_posterior
+from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm._robust import robust_weights
 from isa_nrsfm._tracks import centred_tracks, measurement_matrix

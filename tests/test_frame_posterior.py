@@ -7,7 +7,7 @@ from scenes import random_rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm import _frame_posterior as module
-from isa_nrsfm._frame_posterior import fit_posterior, spread_starts
+from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._frame_products import frame_products, frame_tracks, whitened
 from isa_nrsfm._small_matrices import unpacked
 

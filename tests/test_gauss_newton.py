@@ -8,10 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm import _gauss_newton as module
+from isa_nrsfm._joint import noise_free as module
 from isa_nrsfm._frame_blocks import MemoryBlocks
 from isa_nrsfm._frame_products import frame_tracks
-from isa_nrsfm._gauss_newton import (
+from isa_nrsfm._joint.noise_free import (
     FramesAndShapes,
     complete_frames,
     compressed,
@@ -260,10 +260,10 @@ class TestWholeTable:
         blocks = in_blocks([frame_tracks(scene.tracks, weights)])
         assert fit_without_noise(blocks, *scene[1:], 0.0) is None
 
-    @pytest.mark.parametrize("stiffness", [0.0, 0.5, 300.0])
-    def test_no_other_basis_is_likelier(self, stiffness):
+    @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
+    def test_no_other_basis_is_likelier(self, penalty):
         scene = random_scene()
-        shapes = likely_basis(*scene[1:], stiffness)
+        shapes = likely_basis(*scene[1:], penalty)
 
         def objective(shift, mixing):
             # alpha of these shapes from the true ones: S = B_0 + alpha B.
@@ -274,7 +274,7 @@ class TestWholeTable:
             moved = np.einsum("rai,kaj->ikrj", scene.motion, basis.reshape(2, 3, -1))
             gram = np.einsum("ikrj,ilrj->ikl", moved, moved)
             value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
-            return value + stiffness * np.trace(gram, axis1=1, axis2=2).sum()
+            return value + penalty * np.trace(gram, axis1=1, axis2=2).sum()
 
         least = objective(np.zeros(2), np.eye(2))
         rng = np.random.default_rng(6)

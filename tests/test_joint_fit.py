@@ -5,20 +5,20 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames, rotate_frames
 
-from isa_nrsfm import _joint_fit as module
+from isa_nrsfm._joint import fit as module
 from isa_nrsfm import _sampling as sampling
 from isa_nrsfm._completion import complete_tracks
 from isa_nrsfm._factorisation import factorise
 from isa_nrsfm._frame_blocks import MemoryBlocks
-from isa_nrsfm._frame_posterior import fit_posterior
-from isa_nrsfm._joint_fit import (
+from isa_nrsfm._frames.posterior import fit_posterior
+from isa_nrsfm._joint.fit import (
     STIFFNESS,
     fit_jointly,
     lifted_directions,
     lifted_shapes,
 )
-from isa_nrsfm._joint_frames import JointFrames
-from isa_nrsfm._marginal_likelihood import likelihood_of
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import likelihood_of
 from isa_nrsfm._sampling import sample_frames
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error

@@ -8,9 +8,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from isa_nrsfm import _joint_refinement as module
-from isa_nrsfm._joint_refinement import JointState, refine_joint
-from isa_nrsfm._marginal_likelihood import MarginalLikelihood, likelihood_of
+from isa_nrsfm._joint import quasi_newton as module
+from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
 
 DEVIATION = 0.03
 
@@ -51,17 +51,17 @@ def disturbed(state, seed=1, size=0.1):
     return JointState(shapes, motion, 5 * state.noise)
 
 
-def refined(scene, start=None, *, stiffness=0.0, max_iter=1000, tol=1e-3):
+def refined(scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3):
     start = disturbed(scene.truth) if start is None else start
-    likelihood = likelihood_of(scene.tracks, scene.weights, stiffness)
+    likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
     return refine_joint(likelihood, start, max_iter=max_iter, tol=tol)
 
 
 @cache
-def optimum(kind="complete", stiffness=0.0):
+def optimum(kind="complete", penalty=0.0):
     """Return a minimum of the objective to many digits, and its table."""
     scene = random_scene(kind=kind)
-    return scene, refined(scene, stiffness=stiffness, max_iter=5000, tol=1e-10)
+    return scene, refined(scene, penalty=penalty, max_iter=5000, tol=1e-10)
 
 
 def images(scene, result):
@@ -94,14 +94,14 @@ KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
 
 class TestHistory:
     @KINDS
-    @pytest.mark.parametrize("stiffness", [0.0, 10.0])
+    @pytest.mark.parametrize("penalty", [0.0, 10.0])
     def test_falls_from_the_objective_at_the_start_to_that_at_the_end(
-        self, kind, stiffness
+        self, kind, penalty
     ):
         scene = random_scene(kind=kind)
         start = disturbed(scene.truth)
-        result = refined(scene, start, stiffness=stiffness)
-        likelihood = likelihood_of(scene.tracks, scene.weights, stiffness)
+        result = refined(scene, start, penalty=penalty)
+        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
         assert result.converged
         assert len(result.history) > 5
         assert (np.diff(result.history) < 0).all()
@@ -135,12 +135,12 @@ class TestHistory:
 
 class TestOptimum:
     @KINDS
-    @pytest.mark.parametrize("stiffness", [0.0, 10.0])
-    def test_objective_rises_in_every_direction(self, kind, stiffness):
-        scene, result = optimum(kind, stiffness)
+    @pytest.mark.parametrize("penalty", [0.0, 10.0])
+    def test_objective_rises_in_every_direction(self, kind, penalty):
+        scene, result = optimum(kind, penalty)
         assert result.converged
         assert result.gradient_norm < 5e-6
-        likelihood = likelihood_of(scene.tracks, scene.weights, stiffness)
+        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
         rng = np.random.default_rng(2)
         shapes, motion, noise = result.state
         for _ in range(10):
@@ -205,14 +205,14 @@ class TestOptimum:
         without = refined(scene, max_iter=300, tol=0.0).history[-1]
         assert with_memory - best.history[-1] < 0.3 * (without - best.history[-1])
 
-    def test_stiffness_makes_the_basis_shapes_move_less(self):
+    def test_penalty_makes_the_basis_shapes_move_less(self):
         scene = random_scene()
 
         def energy(result):
             moved = result.state.motion.transpose(2, 0, 1)[:, None]
             return np.sum((moved @ result.state.shapes[1:]) ** 2)
 
-        energies = [energy(refined(scene, stiffness=s)) for s in (0.0, 1.0, 100.0)]
+        energies = [energy(refined(scene, penalty=s)) for s in (0.0, 1.0, 100.0)]
         assert (np.diff(energies) < 0).all()
 
 
@@ -220,12 +220,12 @@ class TestFirstStep:
     """The step without memory, from a state that is near enough to take it whole."""
 
     @KINDS
-    @pytest.mark.parametrize("stiffness", [0.0, 10.0])
-    def test_is_that_of_expectation_maximisation(self, kind, stiffness):
+    @pytest.mark.parametrize("penalty", [0.0, 10.0])
+    def test_is_that_of_expectation_maximisation(self, kind, penalty):
         scene = random_scene(kind=kind)
         start = disturbed(scene.truth, size=0.01)
-        likelihood = likelihood_of(scene.tracks, scene.weights, stiffness)
-        state = refined(scene, start, stiffness=stiffness, max_iter=1).state
+        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
+        state = refined(scene, start, penalty=penalty, max_iter=1).state
         passed = likelihood(*start)
         half = start.noise / 2
         shapes = start.shapes.reshape(-1, scene.tracks.shape[1]).T.copy()
@@ -346,10 +346,10 @@ class TestWithoutNoise:
         assert likelihood(*result.state).residual < 1e-9 * likelihood.square
 
     @KINDS
-    @pytest.mark.parametrize("stiffness", [0.0, 10.0])
-    def test_residual_is_rounding_errors(self, kind, stiffness):
+    @pytest.mark.parametrize("penalty", [0.0, 10.0])
+    def test_residual_is_rounding_errors(self, kind, penalty):
         scene = random_scene(noise=0.0, kind=kind)
-        result = refined(scene, stiffness=stiffness)
+        result = refined(scene, penalty=penalty)
         assert result.converged
         assert (np.diff(result.history) <= 0).all()
         weights = 1.0 if scene.weights is None else np.sqrt(scene.weights)[..., None]
@@ -383,7 +383,7 @@ class TestWithoutNoise:
         likelihood = likelihood_of(random_scene(noise=0.0).tracks, None, 0.0)
         noises = []
 
-        def fail(blocks, shapes, motion, alpha, stiffness):
+        def fail(blocks, shapes, motion, alpha, penalty):
             passed = likelihood(shapes, motion, 1e-12)
             noises.append(passed.residual / likelihood.n_seen)
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._marginal_likelihood import likelihood_of
+from isa_nrsfm._joint.likelihood import likelihood_of
 
 NOISE = 0.05
 STIFFNESS = 7.0
@@ -20,9 +20,9 @@ class Scene(NamedTuple):
     shapes: NDArray  # (n_components + 1, 3, n_points)
     motion: NDArray  # (2, 3, n_frames)
 
-    def at(self, stiffness=0.0, noise=NOISE, **options):
+    def at(self, penalty=0.0, noise=NOISE, **options):
         """Return the objective and its derivatives."""
-        likelihood = likelihood_of(self.tracks, self.weights, stiffness, **options)
+        likelihood = likelihood_of(self.tracks, self.weights, penalty, **options)
         return likelihood(self.shapes, self.motion, noise)
 
 
@@ -74,18 +74,18 @@ def coefficients(points, shapes, root, M, noise):
     return np.linalg.solve(precision, X.T @ y / noise), np.linalg.inv(precision)
 
 
-def second_moments(scene, noise, stiffness):
-    """Yield E of each frame with what the stiffness adds to it, and the mean of c."""
+def second_moments(scene, noise, penalty):
+    """Yield E of each frame with what the penalty adds to it, and the mean of c."""
     for points, shapes, root, M, _ in frame_by_frame(scene):
         alpha, covariance = coefficients(points, shapes, root, M, noise)
         c = np.concatenate([[1.0], alpha])
         E = np.outer(c, c)
-        E[1:, 1:] += covariance + noise * stiffness * np.eye(len(alpha))
+        E[1:, 1:] += covariance + noise * penalty * np.eye(len(alpha))
         yield E, c
 
 
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted", "missing"])
-STIFF = pytest.mark.parametrize("stiffness", [0.0, STIFFNESS])
+STIFF = pytest.mark.parametrize("penalty", [0.0, STIFFNESS])
 
 
 class TestValue:
@@ -103,7 +103,7 @@ class TestValue:
         assert scene.at().value == pytest.approx(expected, rel=1e-12)
 
     @KINDS
-    def test_stiffness_adds_the_energy_of_the_images_of_the_basis_shapes(self, kind):
+    def test_penalty_adds_the_energy_of_the_images_of_the_basis_shapes(self, kind):
         scene = random_scene(kind)
         energy = sum(
             np.sum((root * (M @ shapes[1:])) ** 2)
@@ -171,10 +171,10 @@ class TestGradient:
     @KINDS
     @STIFF
     @pytest.mark.parametrize("name", ["shapes", "motion"])
-    def test_against_differences(self, kind, stiffness, name):
+    def test_against_differences(self, kind, penalty, name):
         scene = random_scene(kind)
         gradient = getattr(
-            scene.at(stiffness),
+            scene.at(penalty),
             {"shapes": "shape", "motion": "motion"}[name] + "_gradient",
         )
         rng = np.random.default_rng(1)
@@ -185,17 +185,17 @@ class TestGradient:
                 scene._replace(**{name: getattr(scene, name) + sign * step * change})
                 for sign in (1, -1)
             )
-            slope = (above.at(stiffness).value - below.at(stiffness).value) / (2 * step)
+            slope = (above.at(penalty).value - below.at(penalty).value) / (2 * step)
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
 
     @KINDS
     @STIFF
-    def test_by_the_logarithm_of_the_noise_against_differences(self, kind, stiffness):
+    def test_by_the_logarithm_of_the_noise_against_differences(self, kind, penalty):
         scene, step = random_scene(kind), 1e-5
         above, below = (
-            scene.at(stiffness, NOISE * np.exp(sign * step)).value for sign in (1, -1)
+            scene.at(penalty, NOISE * np.exp(sign * step)).value for sign in (1, -1)
         )
-        gradient = scene.at(stiffness).noise_gradient
+        gradient = scene.at(penalty).noise_gradient
         assert gradient == pytest.approx((above - below) / (2 * step), rel=1e-6)
 
     @KINDS
@@ -208,14 +208,14 @@ class TestGradient:
 class TestCurvature:
     @KINDS
     @STIFF
-    def test_of_the_shapes_at_each_point(self, kind, stiffness):
+    def test_of_the_shapes_at_each_point(self, kind, penalty):
         scene = random_scene(kind)
-        got = scene.at(stiffness).shape_curvature
+        got = scene.at(penalty).shape_curvature
         n_shapes, _, n_points = scene.shapes.shape
         expected = np.zeros((n_points, 3 * n_shapes, 3 * n_shapes))
         weights = 1.0 if scene.weights is None else scene.weights
         weights = np.broadcast_to(weights, scene.tracks.shape[:2])
-        moments = second_moments(scene, NOISE, stiffness)
+        moments = second_moments(scene, NOISE, penalty)
         for i, (E, _) in enumerate(moments):
             M = scene.motion[..., i]
             expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
@@ -224,10 +224,10 @@ class TestCurvature:
 
     @KINDS
     @STIFF
-    def test_of_the_cameras(self, kind, stiffness):
+    def test_of_the_cameras(self, kind, penalty):
         scene = random_scene(kind)
-        got = scene.at(stiffness).motion_curvature
-        moments = second_moments(scene, NOISE, stiffness)
+        got = scene.at(penalty).motion_curvature
+        moments = second_moments(scene, NOISE, penalty)
         frames = frame_by_frame(scene)
         for i, ((E, _), (_, shapes, root, _, _)) in enumerate(
             zip(moments, frames, strict=True)
@@ -239,16 +239,16 @@ class TestCurvature:
 
     @STIFF
     def test_newton_steps_with_them_are_those_of_expectation_maximisation(
-        self, stiffness
+        self, penalty
     ):
         # M_i = (sum_k c_ik W_i B_k^T) A_i^-1 for the shapes held, and
         # B = N^-1 sum_i (c_i (x) M_i^T) W_i for the cameras held.
         scene = random_scene("complete")
-        passed = scene.at(stiffness)
+        passed = scene.at(penalty)
         n_shapes = len(scene.shapes)
         N = np.zeros((3 * n_shapes, 3 * n_shapes))
         R = np.zeros((3 * n_shapes, scene.tracks.shape[1]))
-        moments = second_moments(scene, NOISE, stiffness)
+        moments = second_moments(scene, NOISE, penalty)
         for i, (E, c) in enumerate(moments):
             W = scene.tracks[i].T - scene.tracks[i].mean(axis=0)[:, None]
             A = np.einsum("kl,kaj,lbj->ab", E, scene.shapes, scene.shapes)
@@ -266,10 +266,10 @@ class TestCurvature:
         assert_allclose(moved, np.linalg.solve(N, R), atol=1e-10)
 
     @STIFF
-    def test_noise_of_expectation_maximisation(self, stiffness):
+    def test_noise_of_expectation_maximisation(self, penalty):
         # The noise gradient vanishes where s2 is the mean of the expected residual.
         scene = random_scene("missing")
-        passed = scene.at(stiffness)
+        passed = scene.at(penalty)
         expected = passed.residual
         for points, shapes, root, M, _ in frame_by_frame(scene):
             images = np.array([(root * (M @ B)).ravel() for B in shapes[1:]])
@@ -348,7 +348,7 @@ class TestWeights:
 
     def test_are_inverse_variances(self):
         # All of them times w is noise divided by w, but for the count of log s2; the
-        # price of the stiffness is per weighted energy.
+        # price of the penalty is per weighted energy.
         scene = random_scene("missing")
         n_seen = np.isfinite(scene.tracks).sum()
         doubled = scene._replace(weights=2 * scene.weights)
@@ -361,7 +361,7 @@ class TestWeights:
 
 
 class TestInvariances:
-    """Of the model, with the stiffness, which shares them."""
+    """Of the model, with the penalty, which shares them."""
 
     @KINDS
     def test_affinity_of_space(self, kind):

@@ -18,7 +18,7 @@ from isa_nrsfm._block_structure import (
 from isa_nrsfm._completion import complete_tracks
 from isa_nrsfm._factorisation import Factorisation, factorise
 from isa_nrsfm._independent_gauge import independent_gauge
-from isa_nrsfm._joint_fit import fit_jointly
+from isa_nrsfm._joint.fit import fit_jointly
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._refinement import refine_alternating
 from isa_nrsfm._sampling import sample_frames
@@ -235,7 +235,7 @@ class JointRefinement(Stage):
             self.of_sample,
             self.shapes.transpose(0, 2, 1),
             loss="linear",
-            stiffness=None,
+            penalty=None,
             random_state=np.random.RandomState(0),
             max_iter=1000,
             tol=0.05,

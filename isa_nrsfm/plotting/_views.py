@@ -9,7 +9,7 @@ the affinity under which the cameras are as nearly as possible scaled orthograph
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._camera import DEGENERATE_MEAN
+from isa_nrsfm._frames.camera import DEGENERATE_MEAN
 from isa_nrsfm._metric import (
     mean_gram,
     metric_quadric,

@@ -39,7 +39,7 @@ from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frame_fit import stacked_motion
-from isa_nrsfm._frame_posterior import fit_posterior, fit_prepared
+from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frame_products import FrameTracks
 
 # Multiplications of a step: it takes a part of a second.
@@ -91,7 +91,7 @@ def fit_without_noise(
     shapes: NDArray,
     motion: NDArray,
     alpha: NDArray,
-    stiffness: float,
+    penalty: float,
 ) -> tuple[NDArray, NDArray] | None:
     """
     Return shapes and cameras that leave as little as possible of tracks.
@@ -107,7 +107,7 @@ def fit_without_noise(
         Cameras to start from.
     alpha : ndarray of shape (n_components, n_frames)
         Coefficients to start from.
-    stiffness : float
+    penalty : float
         As in `MarginalLikelihood`.
 
     Returns
@@ -137,7 +137,7 @@ def fit_without_noise(
     alpha = alpha.copy()
     alpha[:, frames] = found.alpha.T
     motion, alpha = _all_frames(blocks, shapes, motion, alpha)
-    return likely_basis(shapes, motion, alpha, stiffness), motion
+    return likely_basis(shapes, motion, alpha, penalty), motion
 
 
 def complete_frames(
@@ -480,7 +480,7 @@ def _fitted(
 
 
 def likely_basis(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, stiffness: float
+    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: float
 ) -> NDArray:
     """
     Return the same shapes in the basis of greatest marginal likelihood.
@@ -488,7 +488,7 @@ def likely_basis(
     Without noise it is free to shift the mean shape, and to mix the basis shapes by any
     A: alpha becomes ``A^-1 (alpha - mean)``, and the objective changes by
 
-        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + stiffness tr(A^T H A)
+        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A)
 
     with H the sum over the frames of ``<M B_k, M B_l>``. Where the covariance of the
     coefficients is the identity and H is diagonal, A is diagonal, too.
@@ -501,7 +501,7 @@ def likely_basis(
         Cameras.
     alpha : ndarray of shape (n_components, n_frames)
         Coefficients.
-    stiffness : float
+    penalty : float
         As in `MarginalLikelihood`.
 
     Returns
@@ -518,7 +518,7 @@ def likely_basis(
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
     cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
     energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
-    price = stiffness * np.maximum(energy, 0.0)
+    price = penalty * np.maximum(energy, 0.0)
     scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))
     basis = scale[:, None, None] * np.tensordot(axes.T, basis, 1)
     return np.concatenate([mean_shape[None], basis])

@@ -1,4 +1,4 @@
-"""The affine camera: the one place that knows a camera is a free 2x3 matrix."""
+"""Affine cameras of rigid shapes, and the common view of many cameras."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._frame_products import FrameTracks, joined_frames
-from isa_nrsfm._marginal_likelihood import BLOCK_FRAMES, prepared_frames
+from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, prepared_frames
 from isa_nrsfm._tracks import energies, seen_points
 
 

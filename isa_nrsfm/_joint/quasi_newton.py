@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._gauss_newton import fit_without_noise
-from isa_nrsfm._marginal_likelihood import MarginalLikelihood
-from isa_nrsfm._small_matrices import inverse3
+from isa_nrsfm._frames.camera_models import AffineCameras, CameraModel
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
+from isa_nrsfm._joint.noise_free import fit_without_noise
 
 # Steps whose curvature is remembered, of tables with so many frames that these would be
 # more numbers than that at least so many.
@@ -79,18 +79,30 @@ class JointResult(NamedTuple):
         still possible, under the root.
     converged : bool
         Whether it stopped by itself.
+    residual : float
+        Mean square of what the shapes with the means of the coefficients leave.
+    left : float
+        The noise variance, or the residual where that is more.
     """
 
     state: JointState
     history: NDArray
     gradient_norm: float
     converged: bool
+    residual: float
+    left: float
+
+    def followed_by(self, other: "JointResult") -> "JointResult":
+        """Return the result of another refinement of the same objective after this."""
+        return other._replace(history=np.concatenate([self.history, other.history]))
 
 
 def refine_joint(
     likelihood: MarginalLikelihood,
     start: JointState,
+    cameras: CameraModel,
     *,
+    least_noise: float = NOISE_FLOOR,
     max_iter: int,
     tol: float,
     on_step: Callable[[], None] | None = None,
@@ -117,15 +129,17 @@ def refine_joint(
     JointResult
         The result.
     """
-    floor = NOISE_FLOOR * likelihood.square / likelihood.n_seen
+    floor = least_noise * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
-    point = _Point(likelihood, start, floor)
-    remembered = min(MEMORY_NUMBERS // (2 * point.vector.size), MEMORY)
+    point = _Point(likelihood, cameras, start, floor)
+    remembered = min(MEMORY_NUMBERS // (2 * point.gradient.size), MEMORY)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(
         maxlen=max(remembered, LEAST_MEMORY)
     )
     history = [point.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
+    if cameras.calibrated or not cameras.n_parameters:
+        exact = 0.0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
             on_step()
@@ -142,13 +156,13 @@ def refine_joint(
         if not point.gradient @ step < 0:
             memory.clear()
             step = -point.precondition(point.gradient)
-        reached = _line_search(likelihood, point, step, floor)
+        reached, moved = _line_search(likelihood, point, step, floor)
         if reached is None:
             if not memory:  # not even downhill: rounding errors are left
                 small_steps = 2
             memory.clear()
             continue
-        _remember(memory, point, reached)
+        _remember(memory, moved, reached.gradient - point.gradient)
         gain = point.value - reached.value
         rounding = ROUNDING * likelihood.square / reached.state.noise
         small = gain < max(tol * likelihood.n_frames, rounding)
@@ -162,15 +176,15 @@ def refine_joint(
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
         small_steps >= 2 and bool(np.isfinite(point.value)),
+        point.residual,
+        point.left,
     )
 
 
 def _remember(
-    memory: deque[tuple[NDArray, NDArray, float]], point: "_Point", reached: "_Point"
+    memory: deque[tuple[NDArray, NDArray, float]], moved: NDArray, change: NDArray
 ) -> None:
     """Remember the curvature along a step, if it is positive."""
-    moved = reached.vector - point.vector
-    change = reached.gradient - point.gradient
     curvature = float(moved @ change)
     if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
         memory.append((moved, change, curvature))
@@ -185,47 +199,50 @@ def _without_noise(
         return None
     alpha = likelihood.coefficients(*point.state).T
     found = fit_without_noise(
-        likelihood.frames, shapes, motion, alpha, likelihood.stiffness
+        likelihood.frames, shapes, motion, alpha, likelihood.penalty
     )
     if found is None:
         return None
     left = likelihood(*found, floor).residual / likelihood.n_seen
     if left > point.left:
         return None
-    reached = _Point(likelihood, JointState(*found, max(left, floor)), floor)
+    state = JointState(*found, max(left, floor))
+    reached = _Point(likelihood, point.cameras, state, floor)
     return reached if reached.value < point.value else None
 
 
 class _Point:
     """A state with the objective, its gradient and its curvature there."""
 
-    def __init__(self, likelihood: MarginalLikelihood, state: JointState, floor: float):
+    def __init__(
+        self,
+        likelihood: MarginalLikelihood,
+        cameras: CameraModel,
+        state: JointState,
+        floor: float,
+    ):
         passed = likelihood(*state)
+        self.state, self.cameras = state, cameras
         self.n_seen = likelihood.n_seen
         self.value = passed.value
-        # A coordinate: what the noise says, or the residual where it says more.
-        self.left = max(state.noise, passed.residual / likelihood.n_seen)
+        self.residual = passed.residual / likelihood.n_seen
+        # What the noise says, or the residual where it says more.
+        self.left = max(state.noise, self.residual)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             passed.shape_gradient,
-            passed.motion_gradient,
+            cameras.gradient(state.motion, passed.motion_gradient),
             # Noise that is least already does not fall.
             min(passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
         self.curvature = passed.shape_curvature, passed.motion_curvature
-        self.vector = _stacked(state.shapes, state.motion, np.log(state.noise))
-        first = state.shapes.size  # parts of the vector: the arrays can be large
-        self.state = JointState(
-            self.vector[:first].reshape(state.shapes.shape),
-            self.vector[first:-1].reshape(state.motion.shape),
-            state.noise,
-        )
 
     @cached_property
     def metric(self) -> tuple[NDArray, NDArray]:
         """Inverses of the curvatures by the shapes and by the cameras."""
         by_shapes, by_motion = self.curvature
-        return np.linalg.inv(regular(by_shapes)), inverse3(by_motion)
+        inverse = self.cameras.inverse_curvature(self.state.motion, by_motion)
+        return np.linalg.inv(regular(by_shapes)), inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
         """Return a vector times the inverse of the curvature."""
@@ -237,17 +254,25 @@ class _Point:
             stacked = by_shapes[0] @ stacked
         else:
             stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
-        motion = sum(motion[:, [b]] * by_motion[b] for b in range(3))
+        motion = self.cameras.product(by_motion, motion)
         return _stacked(half * stacked, half * motion, noise / self.n_seen)
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
         """Return the parts of a vector, shapes, cameras and noise."""
-        shapes, motion, _ = self.state
-        first = shapes.size
+        first = self.state.shapes.size
         return (
-            vector[:first].reshape(shapes.shape),
-            vector[first:-1].reshape(motion.shape),
+            vector[:first].reshape(self.state.shapes.shape),
+            vector[first:-1].reshape(self.cameras.n_parameters, self.state.motion.shape[-1]),
             vector[-1],
+        )
+
+    def moved(self, step: NDArray, floor: float) -> JointState:
+        """Return the state after a step."""
+        shapes, motion, noise = self.split(step)
+        return JointState(
+            self.state.shapes + shapes,
+            self.cameras.moved(self.state.motion, motion),
+            max(self.state.noise * np.exp(noise), floor),
         )
 
 
@@ -284,17 +309,22 @@ def _inverse_hessian_product(
 
 def _line_search(
     likelihood: MarginalLikelihood, point: _Point, step: NDArray, floor: float
-) -> _Point | None:
-    """Return the first point along a step that is low enough, None where none is."""
+) -> tuple[_Point | None, NDArray]:
+    """Return the first point along a step that is low enough, and the way to it."""
     slope = point.gradient @ step
-    length = min(1.0, LARGEST_NOISE_STEP / max(abs(step[-1]), 1e-300))
+    length = min(
+        1.0,
+        LARGEST_NOISE_STEP / max(abs(step[-1]), 1e-300),
+        point.cameras.largest_length(point.split(step)[1]),
+    )
     while length > SHORTEST_STEP:
-        shapes, motion, noise = point.split(point.vector + length * step)
-        state = JointState(shapes, motion, max(np.exp(noise), floor))
-        reached = _Point(likelihood, state, floor)
+        moved = length * step
+        state = point.moved(moved, floor)
+        reached = _Point(likelihood, point.cameras, state, floor)
         if reached.value <= point.value + SUFFICIENT_DECREASE * length * slope:
-            return reached
+            moved[-1] = np.log(reached.state.noise / point.state.noise)
+            return reached, moved
         # The minimum of the parabola through what is known, kept within bounds.
         excess = reached.value - point.value - length * slope
         length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
-    return None
+    return None, step

@@ -7,7 +7,7 @@ log likelihoods of all frames are, up to a constant ::
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
                        + log det(I + H_i / s2) ]
 
-with N the number of coordinates that were seen. The objective is that plus ``stiffness
+with N the number of coordinates that were seen. The objective is that plus ``penalty
 * sum_i tr H_i``, a price for what the basis shapes move the points in the images.
 Positions are those of least squares: tracks and shapes are centred over the points of a
 frame (shapes have to be centred where no weights are given). The gradient follows from
@@ -34,15 +34,8 @@ from isa_nrsfm._frame_products import (
     frame_tracks,
     shared_gram,
 )
-from isa_nrsfm._small_matrices import (
-    COLUMNS,
-    ROWS,
-    diagonal_of,
-    packed_rows,
-    sweep,
-    unpack3,
-    unpacked,
-)
+from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
+from isa_nrsfm._small_matrices import diagonal_of, unpack3, unpacked
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
@@ -119,7 +112,7 @@ def prepared_frames(
 def likelihood_of(
     tracks: NDArray,
     weights: NDArray | None,
-    stiffness: float,
+    penalty: float,
     block_frames: int = BLOCK_FRAMES,
 ) -> "MarginalLikelihood":
     """
@@ -129,7 +122,7 @@ def likelihood_of(
     ----------
     tracks, weights, block_frames
         As of `prepared_frames`.
-    stiffness : float
+    penalty : float
         As of `MarginalLikelihood`.
 
     Returns
@@ -139,7 +132,7 @@ def likelihood_of(
     """
     blocks = [[block] for block in prepared_frames(tracks, weights, block_frames)]
     lengths = [len(block.weight) for (block,) in blocks]
-    return MarginalLikelihood(MemoryBlocks(blocks, lengths), stiffness)
+    return MarginalLikelihood(MemoryBlocks(blocks, lengths), penalty)
 
 
 class MarginalLikelihood:
@@ -150,7 +143,7 @@ class MarginalLikelihood:
     ----------
     frames : FrameBlocks
         Blocks as of `prepared_frames`, either all with weights or none.
-    stiffness : float
+    penalty : float
         Factor of ``sum_i tr H_i``.
     known : tuple of float, optional
         What `totals` returns for these blocks, where it is known.
@@ -168,12 +161,12 @@ class MarginalLikelihood:
     def __init__(
         self,
         frames: FrameBlocks,
-        stiffness: float,
+        penalty: float,
         known: tuple[float, float] | None = None,
     ):
         self.frames = frames
         self.n_frames = frames.n_frames
-        self.stiffness = stiffness
+        self.penalty = penalty
         self.n_seen, self.square = totals(frames) if known is None else known
 
     def __call__(self, shapes: NDArray, motion: NDArray, noise: float) -> Passed:
@@ -251,7 +244,7 @@ class MarginalLikelihood:
             shapes=shapes,
             gram=shared_gram(shapes),
             noise=noise,
-            stiffness=self.stiffness,
+            penalty=self.penalty,
             tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
         )
 
@@ -305,7 +298,7 @@ def _pass_over_block(
     shapes: NDArray,
     gram: SharedGram,
     noise: float,
-    stiffness: float,
+    penalty: float,
     tiny_noise: bool,
 ) -> Passed:
     """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
@@ -314,7 +307,7 @@ def _pass_over_block(
         end = start + len(frames.weight)
         part = motion[:, :, start:end]
         parts.append(
-            _pass_over(frames, shapes, gram, part, noise, stiffness, tiny_noise)
+            _pass_over(frames, shapes, gram, part, noise, penalty, tiny_noise)
         )
         start = end
     if len(parts) == 1:
@@ -339,7 +332,7 @@ def _pass_over(
     gram: SharedGram,
     motion: NDArray,
     noise: float,
-    stiffness: float,
+    penalty: float,
     tiny_noise: bool,
 ) -> Passed:
     """
@@ -350,68 +343,42 @@ def _pass_over(
     """
     n_shapes, _, n_points = shapes.shape
     products = frame_products(block, shapes, gram)
-    flat_tracks = block.weighted.reshape(n_points, -1)
-    cameras = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])  # M^T M
-    H = products.gram.energies(cameras)
-    seen = np.einsum("kari,rai->ki", products.cross, motion)
+    posterior = coefficient_posterior(products, motion, noise, refined=tiny_noise)
+    c, alpha = posterior.c, posterior.alpha
+    value = np.sum(posterior.objective / noise + posterior.log_determinant)
+    value += penalty * posterior.image_energy.sum()
+    residual = float(posterior.residual(noise).sum())
+    spread = float(posterior.spread(noise).sum())
 
-    # The posterior of the coefficients of each frame: rest is min_alpha.
-    diagonal = diagonal_of(H)[1:]
-    moving = H[diagonal].sum()
-    H[diagonal] += noise
-    H[0] += block.energy - 2 * seen[0]
-    H[1:n_shapes] = seen[1:] - H[1:n_shapes]
-    equations = H.copy() if tiny_noise else None
-    logdet, _ = sweep(H, 1)
-    rest, alpha, Q = H[0], H[1:n_shapes], H[n_shapes:]  # Q is minus the inverse
-    if equations is not None:
-        # Divided by so little, what rounding leaves of the equations counts.
-        left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
-        alpha -= _product(Q, left)
-        rest -= np.einsum("ki,ki->i", alpha, left)
-    rest = np.maximum(rest, 0.0)  # with s2 |alpha|^2; less is rounding errors
-    value = np.sum(rest / noise + logdet - len(alpha) * np.log(noise))
-    residual = rest.sum() - noise * np.sum(alpha**2)
-    spread = noise * (alpha.size + noise * H[diagonal].sum())
-
-    # Second moments of c, with what the stiffness adds to them.
-    c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
-    packed = H
-    packed *= -noise
-    packed[:n_shapes] = 0.0
-    for k, row in enumerate(packed_rows(packed)):
-        row += c[k] * c[k:]
-    packed[diagonal] += noise * stiffness
-    motion_curvature = products.gram.moments(packed)
+    # Second moments of c, with what the prior of the basis shapes adds to them.
+    moments = posterior.second_moments(noise)
+    moments[diagonal_of(moments)[1:]] += noise * penalty
+    cameras = camera_gram(motion)
+    motion_curvature = products.gram.moments(moments)
     A = unpack3(motion_curvature)
     motion_gradient = np.einsum("rbi,bai->rai", motion, A)
     motion_gradient -= np.einsum("ki,kari->rai", c, products.cross)
     X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
-    shape_gradient = X @ flat_tracks.T
+    shape_gradient = X @ block.weighted.reshape(n_points, -1).T
     if block.weights is None:
-        shape_curvature = (packed @ cameras.T)[:, :, None]
+        shape_curvature = (moments @ cameras.T)[:, :, None]
     else:
-        moments = (packed[:, None] * cameras).reshape(6 * len(packed), -1)
-        shape_curvature = (moments @ block.weights.T).reshape(-1, 6, n_points)
+        pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
+        shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
         # The position of a frame follows the weighted means of its points.
-        mixed = np.einsum("kli,lbi->kbi", unpacked(packed), products.shape_centroid)
+        mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
     return Passed(
-        float(value + stiffness * moving),
+        float(value),
         (-2 / noise) * shape_gradient.reshape(shapes.shape),
         (2 / noise) * motion_gradient,
-        -float(residual + spread) / noise,
+        -(residual + spread) / noise,
         shape_curvature,
         motion_curvature,
         alpha,
-        float(residual),
+        residual,
     )
-
-
-def _product(packed: NDArray, vectors: NDArray) -> NDArray:
-    """Return the products of packed symmetric matrices with vectors (k, n)."""
-    return np.einsum("kli,li->ki", unpacked(packed), vectors)
 
 
 def kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:

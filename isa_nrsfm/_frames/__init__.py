@@ -1,0 +1,1 @@
+"""Camera, position and coefficients of single frames, for given shapes."""

@@ -1,0 +1,294 @@
+"""Camera models: which 2x3 matrices a camera may be, and how to move among them.
+
+A camera M_i of a frame is a free 2x3 matrix (affine), the first two rows of a rotation
+times a scale (weak perspective), or such rows with a scale that is known
+(orthographic). Everything else treats cameras alike: it knows the derivative ``G_i =
+dF/dM_i`` of an objective and its curvature ``A_i`` by the rows of M_i, and a model
+takes both to its own parameters.
+
+A calibrated camera moves along its tangents ``D_c = M hat(e_c)``, c = x, y, z, of
+rotation vectors w, and ``D_4 = M`` of the logarithm of the scale ::
+
+    M(w, l) = exp(l) M exp(hat(w)),   hat(w) v = w x v,
+
+so that with rows m_r of M the gradient is ``sum_r G_r x m_r`` and ``<M, G>``, and the
+curvature ``tr(D_c A D_d^T)``. Cameras are (2, 3, n_frames) here, frames last.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._small_matrices import COLUMNS, ROWS, inverse3, unpack3
+
+# Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
+RIDGE = 1e-9
+# No camera turns by more than that, in radians, in one step.
+LARGEST_TURN = 1.0
+
+
+class CameraModel(Protocol):
+    """
+    What a fit of many frames needs to know of the cameras.
+
+    Attributes
+    ----------
+    n_parameters : int
+        Of a camera.
+    calibrated : bool
+        Whether cameras are scaled rotations.
+    """
+
+    n_parameters: int
+    calibrated: bool
+
+    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+        """Return cameras (2, 3, n) after steps (n_parameters, n)."""
+
+    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+        """Return dF/dparameters (n_parameters, n) from dF/dM (2, 3, n)."""
+
+    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+        """Return the inverse curvature for packed curvatures (6, n) of the rows."""
+
+    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
+        """Return vectors (n_parameters, n) times an inverse curvature."""
+
+    def largest_length(self, step: NDArray) -> float:
+        """Return how many times a step may be made at once."""
+
+
+class AffineCameras:
+    """Free 2x3 matrices; the parameters are their entries, row by row."""
+
+    n_parameters = 6
+    calibrated = False
+
+    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+        """Return cameras (2, 3, n) after steps (6, n)."""
+        return motion + step.reshape(motion.shape)
+
+    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+        """Return the derivative by the entries (6, n)."""
+        return slope.reshape(6, -1)
+
+    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+        """Return the inverses (3, 3, n) of the curvatures by each row."""
+        return inverse3(curvature)
+
+    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
+        """Return vectors (6, n) times the inverse curvature."""
+        rows = vector.reshape(2, 3, -1)
+        return np.einsum("abn,rbn->ran", inverse, rows).reshape(6, -1)
+
+    def largest_length(self, step: NDArray) -> float:
+        """Return infinity: any matrix is a camera."""
+        return np.inf
+
+
+class HeldCameras:
+    """Cameras that are known."""
+
+    n_parameters = 0
+    calibrated = False
+
+    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+        """Return the cameras."""
+        return motion
+
+    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+        """Return no derivative."""
+        return np.zeros((0, motion.shape[-1]))
+
+    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+        """Return no curvature."""
+        return np.zeros((0, 0, motion.shape[-1]))
+
+    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
+        """Return no step."""
+        return vector
+
+    def largest_length(self, step: NDArray) -> float:
+        """Return infinity."""
+        return np.inf
+
+
+class CalibratedCameras:
+    """
+    Rotations times a scale.
+
+    Parameters
+    ----------
+    scaled : bool
+        Whether the scales are unknown (weak perspective); otherwise they stay as they
+        are (orthographic).
+    """
+
+    calibrated = True
+
+    def __init__(self, scaled: bool):
+        self.scaled = scaled
+        self.n_parameters = 4 if scaled else 3
+
+    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+        """Return cameras (2, 3, n) after rotation vectors and log scales."""
+        turned = rotated(motion, step[:3])
+        return np.exp(step[3]) * turned if self.scaled else turned
+
+    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+        """Return the derivative by the tangents (n_parameters, n)."""
+        gradient = np.empty((self.n_parameters, motion.shape[-1]))
+        gradient[:3] = _cross(slope, motion).sum(axis=0)
+        if self.scaled:
+            gradient[3] = np.einsum("rai,rai->i", motion, slope)
+        return gradient
+
+    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+        """Return the inverses (n_parameters, n_parameters, n) of the curvatures."""
+        C, across, scale = tangent_curvature(motion, curvature)
+        C[:3] += RIDGE * C[:3].mean(axis=0)
+        inverse = inverse3(C)
+        if not self.scaled:
+            return inverse
+        # The inverse of [[C, c], [c^T, d]] by its Schur complement.
+        turn = np.einsum("abn,bn->an", inverse, across)
+        rest = scale - np.einsum("an,an->n", across, turn)
+        rest = np.maximum(rest, RIDGE * scale)
+        rest = np.divide(1.0, rest, where=rest > 0, out=np.zeros_like(rest))
+        full = np.empty((4, 4, motion.shape[-1]))
+        full[:3, :3] = inverse + rest * turn[:, None] * turn
+        full[:3, 3] = full[3, :3] = -rest * turn
+        full[3, 3] = rest
+        return full
+
+    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
+        """Return vectors (n_parameters, n) times the inverse curvature."""
+        return np.einsum("abn,bn->an", inverse, vector)
+
+    def largest_length(self, step: NDArray) -> float:
+        """Return what turns no camera by more than a radian."""
+        angle = np.sqrt(np.einsum("an,an->n", step[:3], step[:3]).max(initial=0.0))
+        return LARGEST_TURN / angle if angle > 0 else np.inf
+
+
+CAMERAS: dict[str, CameraModel] = {
+    "affine": AffineCameras(),
+    "weak_perspective": CalibratedCameras(scaled=True),
+    "orthographic": CalibratedCameras(scaled=False),
+}
+
+
+def tangent_curvature(
+    motion: NDArray, curvature: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return the curvature ``tr(D_c A D_d^T)`` along the tangents of calibrated cameras.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (2, 3, n_frames)
+        M.
+    curvature : ndarray of shape (6, n_frames)
+        A, packed.
+
+    Returns
+    -------
+    turns : ndarray of shape (6, n_frames)
+        That of rotations, ``sum_r hat(m_r)^T A hat(m_r) = (tr A tr N - tr A N) I -
+        tr(A) N - tr(N) A + A N + N A`` with ``N = M^T M``, packed.
+    across : ndarray of shape (3, n_frames)
+        That of rotations and the logarithm of the scale, ``sum_r A m_r x m_r``.
+    scale : ndarray of shape (n_frames,)
+        That of the logarithm of the scale, ``tr(A N)``.
+    """
+    N = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])
+    full_A, full_N = unpack3(curvature), unpack3(N)
+    product = np.einsum("abi,bci->aci", full_A, full_N)
+    scale = np.einsum("aai->i", product)
+    trace_A, trace_N = curvature[:3].sum(axis=0), N[:3].sum(axis=0)
+    turns = product[ROWS, COLUMNS] + product[COLUMNS, ROWS]
+    turns -= trace_A * N + trace_N * curvature
+    turns[:3] += trace_A * trace_N - scale
+    pulled = np.einsum("abi,rbi->rai", full_A, motion)
+    return turns, _cross(pulled, motion).sum(axis=0), scale
+
+
+def rotated(motion: NDArray, turns: NDArray) -> NDArray:
+    """
+    Return cameras times rotations, ``M exp(hat(w))``.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (2, 3, n_frames)
+        M.
+    turns : ndarray of shape (3, n_frames)
+        Rotation vectors w, in radians.
+
+    Returns
+    -------
+    ndarray of shape (2, 3, n_frames)
+        Rows ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2``, t = |w|.
+    """
+    angle = np.sqrt(np.einsum("an,an->n", turns, turns))
+    along = np.einsum("ran,an->rn", motion, turns)[:, None]
+    # sin(t) / t and (1 - cos(t)) / t^2 = 2 (sin(t/2) / t)^2, also for t = 0.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    moved = np.cos(angle) * motion + first * _cross(motion, turns[None])
+    return moved + second * along * turns
+
+
+def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return the orthonormal rows nearest to cameras, and their scales.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    rows : ndarray of shape (n_frames, 2, 3)
+        Their polar factors.
+    scales : ndarray of shape (n_frames,)
+        Means of their singular values.
+    """
+    U, values, Vt = np.linalg.svd(motion, full_matrices=False)
+    return U @ Vt, values.mean(axis=1)
+
+
+def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return rotations (n_frames, 3, 3) and scales of calibrated cameras.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Scaled orthonormal rows; NaN where a frame has no camera.
+
+    Returns
+    -------
+    rotations : ndarray of shape (n_frames, 3, 3)
+        Rotations of determinant one; the first two rows are those of the cameras.
+    scales : ndarray of shape (n_frames,)
+        Their scales.
+    """
+    scales = np.sqrt(np.einsum("irc,irc->i", motion, motion) / 2)
+    size = np.where(scales > 0, scales, 1.0)
+    rows = motion / size[:, None, None]
+    depth = np.cross(rows[:, 0], rows[:, 1])
+    return np.concatenate([rows, depth[:, None]], axis=1), scales
+
+
+def _cross(a: NDArray, b: NDArray) -> NDArray:
+    """Return the cross products of vectors (..., 3, n)."""
+    return np.stack(
+        [
+            a[..., 1, :] * b[..., 2, :] - a[..., 2, :] * b[..., 1, :],
+            a[..., 2, :] * b[..., 0, :] - a[..., 0, :] * b[..., 2, :],
+            a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :],
+        ],
+        axis=-2,
+    )

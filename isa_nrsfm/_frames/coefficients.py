@@ -1,0 +1,135 @@
+"""Posterior of the coefficients of frames whose cameras are known.
+
+With ``c = (1, a)``, ``a ~ N(0, I)`` and noise of variance s2 it is normal, with ::
+
+    Q = (H + s2 I)^-1,  mean Q (q - h),  covariance s2 Q,
+
+``H_kl = <M B_k, M B_l>``, ``h_k = H_k0`` and ``q_k = <P_k, M>``, k, l >= 1 (Bishop,
+"Pattern recognition and machine learning", 2006, section 12.2). Frames are the last
+index of all arrays.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frame_products import FrameProducts
+from isa_nrsfm._small_matrices import (
+    COLUMNS,
+    ROWS,
+    diagonal_of,
+    packed_rows,
+    sweep,
+    unpacked,
+)
+
+
+class CoefficientPosterior(NamedTuple):
+    """
+    Posterior of the coefficients of frames.
+
+    Attributes
+    ----------
+    c : ndarray of shape (n_shapes, n_frames)
+        One, and the means of the coefficients.
+    inverse : ndarray of shape (n_pairs, n_frames)
+        Minus Q, packed; in the rows of all shapes, of which the first says nothing.
+    objective : ndarray of shape (n_frames,)
+        ``min_a ||W - M S(a)||^2 + s2 |a|^2``.
+    log_determinant : ndarray of shape (n_frames,)
+        ``log det(I + H / s2)``.
+    image_energy : ndarray of shape (n_frames,)
+        ``tr H``, what the basis shapes move in the image.
+    """
+
+    c: NDArray
+    inverse: NDArray
+    objective: NDArray
+    log_determinant: NDArray
+    image_energy: NDArray
+
+    @property
+    def alpha(self) -> NDArray:
+        """Means of the coefficients (n_components, n_frames)."""
+        return self.c[1:]
+
+    def residual(self, noise: NDArray | float) -> NDArray:
+        """Return ``||W - M S||^2`` at the means."""
+        return self.objective - noise * np.einsum("ki,ki->i", self.alpha, self.alpha)
+
+    def spread(self, noise: NDArray | float) -> NDArray:
+        """Return ``tr(H s2 Q)``, what the uncertainty moves in the image."""
+        diagonal = diagonal_of(self.inverse)[1:]
+        return noise * (len(diagonal) + noise * self.inverse[diagonal].sum(axis=0))
+
+    def second_moments(self, noise: NDArray | float) -> NDArray:
+        """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
+        moments = self.inverse * -noise
+        moments[: len(self.c)] = 0.0
+        for k, row in enumerate(packed_rows(moments)):
+            row += self.c[k] * self.c[k:]
+        return moments
+
+
+def camera_gram(motion: NDArray) -> NDArray:
+    """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
+    return np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])
+
+
+def coefficient_posterior(
+    products: FrameProducts,
+    motion: NDArray,
+    noise: NDArray | float,
+    *,
+    refined: bool = False,
+) -> CoefficientPosterior:
+    """
+    Return the posterior of the coefficients of frames.
+
+    Parameters
+    ----------
+    products : FrameProducts
+        Sums of the frames for the shapes.
+    motion : ndarray of shape (2, 3, n_frames)
+        Cameras.
+    noise : float or ndarray of shape (n_frames,)
+        s2.
+    refined : bool, default=False
+        Whether the equations are solved once more for what the first solution leaves:
+        divided by a tiny noise, what rounding leaves of them counts.
+
+    Returns
+    -------
+    CoefficientPosterior
+        The posterior.
+    """
+    H = products.gram.energies(camera_gram(motion))
+    seen = np.einsum("kari,rai->ki", products.cross, motion)
+    n_shapes = len(seen)
+    diagonal = diagonal_of(H)[1:]
+    image_energy = H[diagonal].sum(axis=0)
+    # [[||W - M B_0||^2, (q - h)^T], [q - h, H + s2 I]], then swept.
+    H[diagonal] += noise
+    H[0] += products.energy - 2 * seen[0]
+    H[1:n_shapes] = seen[1:] - H[1:n_shapes]
+    equations = H.copy() if refined else None
+    log_determinant, _ = sweep(H, 1)
+    objective, alpha = H[0], H[1:n_shapes]
+    if equations is not None:
+        left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
+        alpha -= _product(H[n_shapes:], left)
+        objective -= np.einsum("ki,ki->i", alpha, left)
+    c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
+    return CoefficientPosterior(
+        c,
+        H,
+        np.maximum(objective, 0.0),  # less is rounding errors
+        log_determinant - len(alpha) * np.log(noise),
+        image_energy,
+    )
+
+
+def _product(packed: NDArray, vectors: NDArray) -> NDArray:
+    """Return the products of packed symmetric matrices with vectors (k, n)."""
+    return np.einsum("kli,li->ki", unpacked(packed), vectors)

@@ -1,0 +1,412 @@
+"""Camera, position and coefficients of single frames, for given shapes and noise.
+
+Frames are fitted by themselves, in blocks, by the search of their camera model. Where
+the first start leads to a fit that is much worse than the noise explains, others
+follow.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frame_products import (
+    FrameProducts,
+    FrameTracks,
+    determines_camera,
+    frame_products,
+    frame_tracks,
+)
+from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._small_matrices import unpacked
+
+# Frames in a block: enough to be worth the calls, few enough for the cache. Frames
+# with missing points have a Gram matrix each.
+COMPLETE_BLOCK = 2048
+WEIGHTED_BLOCK = 512
+MAX_STEPS = 60
+# Steps after which the frames that have not converged are brought together.
+FIRST_STEPS = 5
+# Objectives that differ by less than this share of them are equal.
+EQUAL = 1e-10
+# An objective so many times what the noise explains may be a minimum too high.
+SUSPICIOUS = 3.0
+
+SEARCHES: dict[str, Callable[[NDArray], FrameSearch]] = {
+    "affine": AffineSearch,
+    "weak_perspective": partial(CalibratedSearch, scaled=True),
+    "orthographic": partial(CalibratedSearch, scaled=False),
+}
+
+
+class FramePosterior(NamedTuple):
+    """
+    Fits of frames; NaN for frames whose points do not determine a camera.
+
+    Attributes
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, in the units of the tracks per unit of the shapes.
+    translation : ndarray of shape (n_frames, 2)
+        Image of the origin of the shapes.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    covariance : ndarray of shape (n_frames, n_components, n_components)
+        Posterior covariance of alpha in the normal approximation at the optimum
+        (Laplace), with the uncertainty of camera and position: noise variance times
+        the inverse of the Schur complement.
+    objective : ndarray of shape (n_frames,)
+        ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2`` at the optimum, in squared
+        units of the tracks, to 1e-12 of the energy of the frame (of its centred
+        tracks).
+    residual : ndarray of shape (n_frames,)
+        ``sum_j w_ij ||m_ij - M S_j - t||^2``, as precise as that.
+    converged : ndarray of bool, shape (n_frames,)
+        Whether the search ended in a minimum, by a Newton step too small to matter.
+    start : ndarray of int, shape (n_frames,)
+        Which of the extra starts led there, -1 for the start from zero. Starts that
+        lead nowhere on many frames are not needed for others like them.
+    """
+
+    motion: NDArray
+    translation: NDArray
+    alpha: NDArray
+    covariance: NDArray
+    objective: NDArray
+    residual: NDArray
+    converged: NDArray
+    start: NDArray
+
+
+def fit_posterior(
+    tracks: NDArray,
+    shapes: NDArray,
+    noise_variance: NDArray | float,
+    *,
+    camera: str = "affine",
+    weights: NDArray | None = None,
+    initial: NDArray | None = None,
+    starts: NDArray | None = None,
+) -> FramePosterior:
+    """
+    Return the most probable camera, position and coefficients of each frame.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks, in any place; NaN where a point is missing.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes, rows centred, scaled such that alpha ~ N(0, I).
+    noise_variance : float or ndarray of shape (n_frames,)
+        Variance of a coordinate, in squared units of the tracks. At least 1e-13 of the
+        energy of a frame is taken.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras may be; orthographic ones have the scale one.
+    weights : ndarray of shape (n_frames, n_points), optional
+        Not negative, zero for missing points; by default 1 for all that are not NaN.
+    initial : ndarray of shape (n_frames, n_components), optional
+        Coefficients to start from, by default zeros.
+    starts : ndarray of shape (n_starts, n_components), optional
+        Coefficients to start from besides these, `spread_starts` for instance, for
+        frames whose first fit is much worse than the noise explains.
+
+    Returns
+    -------
+    FramePosterior
+        The best fit of each frame. It does not depend on the other frames beyond
+        rounding errors. Affine cameras are zero across shapes that are all flat. If
+        only the mean shape is, zero can be a saddle point of the objective: where the
+        search goes from there is up to rounding, and a start helps. Frames whose
+        points, those of positive weight, leave the mean shape flat along a direction in
+        which it is not (always fewer than four points of a solid) have NaN.
+    """
+    tracks = np.asarray(tracks)
+    missing = np.isnan(tracks[..., 0]) | np.isnan(tracks[..., 1])
+    seen = np.where(missing, 0.0, 1.0 if weights is None else weights)
+    return _best_fits(
+        _Tracks(tracks, seen),
+        SEARCHES[camera](shapes),
+        noise_variance,
+        initial=initial,
+        starts=starts,
+    )
+
+
+def fit_prepared(
+    frames: FrameTracks,
+    shapes: NDArray,
+    noise_variance: NDArray | float,
+    *,
+    camera: str = "affine",
+    initial: NDArray | None = None,
+    starts: NDArray | None = None,
+) -> FramePosterior:
+    """
+    Return the fits of `fit_posterior` for frames that are ready for products.
+
+    Parameters
+    ----------
+    frames : FrameTracks
+        The frames. They may be given in other coordinates than points: what counts is
+        their inner products with the shapes.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes in these coordinates; centred if they are points.
+    noise_variance, camera, initial, starts
+        As of `fit_posterior`.
+
+    Returns
+    -------
+    FramePosterior
+        The best fit of each frame.
+    """
+    return _best_fits(
+        _Prepared(frames),
+        SEARCHES[camera](shapes),
+        noise_variance,
+        initial=initial,
+        starts=starts,
+    )
+
+
+def approximate_cameras(
+    frames: FrameTracks,
+    shapes: NDArray,
+    noise_variance: float,
+    *,
+    camera: str = "affine",
+) -> NDArray:
+    """
+    Return cameras close to those of `fit_prepared`, by a few steps from zero.
+
+    Parameters
+    ----------
+    frames, shapes, noise_variance, camera
+        As of `fit_prepared`; all frames determine a camera.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    """
+    search, prepared = SEARCHES[camera](shapes), _Prepared(frames)
+    motion = np.empty((len(frames.weight), 2, 3))
+    for block, products in prepared.blocks(search.shapes):
+        variance = np.full(len(block), noise_variance)
+        found = search.rough_cameras(products, variance, prepared.n_points)
+        motion[block] = found.transpose(2, 0, 1)
+    return search.cameras(motion)
+
+
+class _Tracks(NamedTuple):
+    """Frames that are given by their tracks."""
+
+    tracks: NDArray  # (n_frames, n_points, 2)
+    weights: NDArray  # (n_frames, n_points)
+
+    @property
+    def n_points(self) -> float:
+        """Number of points of a frame."""
+        return self.weights.shape[1]
+
+    @property
+    def weight(self) -> NDArray:
+        """Sum of the weights of each frame."""
+        return self.weights.sum(axis=1)
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(self.tracks[frames], self.weights[frames])
+
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+        """Yield blocks of the frames that determine a camera, and their products."""
+        tracks, weights = self
+        complete = (weights == 1.0).all(axis=1)
+        frames = np.flatnonzero(complete)
+        for first in range(0, len(frames), COMPLETE_BLOCK):
+            block = frames[first : first + COMPLETE_BLOCK]
+            yield block, frame_products(frame_tracks(tracks[block]), shapes)
+        frames = np.flatnonzero(~complete)
+        for first in range(0, len(frames), WEIGHTED_BLOCK):
+            block = frames[first : first + WEIGHTED_BLOCK]
+            part = frame_tracks(tracks[block], weights[block])
+            yield _determined(block, frame_products(part, shapes), shapes)
+
+
+class _Prepared(NamedTuple):
+    """Frames that are ready for products."""
+
+    frames: FrameTracks
+
+    @property
+    def n_points(self) -> float:
+        """Number of points of a frame, also where it is given in other coordinates."""
+        if self.frames.weights is None:
+            return self.frames.weight[0]
+        return len(self.frames.weights)
+
+    @property
+    def weight(self) -> NDArray:
+        """Sum of the weights of each frame."""
+        return self.frames.weight
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(self.frames.take(frames))
+
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+        """Yield blocks of the frames that determine a camera, and their products."""
+        complete = self.frames.weights is None
+        length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
+        for first in range(0, len(self.weight), length):
+            block = np.arange(first, min(first + length, len(self.weight)))
+            part = self.frames.take(slice(first, first + length))
+            products = frame_products(part, shapes)
+            yield (
+                (block, products) if complete else _determined(block, products, shapes)
+            )
+
+
+def _determined(
+    frames: NDArray, products: FrameProducts, shapes: NDArray
+) -> tuple[NDArray, FrameProducts]:
+    """Return those of some frames that determine a camera, and their products."""
+    usable = np.flatnonzero(determines_camera(products, shapes[0]))
+    return frames[usable], products.take(usable)
+
+
+def _best_fits(
+    frames: _Tracks | _Prepared,
+    search: FrameSearch,
+    noise_variance: NDArray | float,
+    *,
+    initial: NDArray | None,
+    starts: NDArray | None,
+) -> FramePosterior:
+    """Return the best fits of `fit_posterior`."""
+    weight, n_components = frames.weight, len(search.shapes) - 1
+    n_frames = len(weight)
+    variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
+    first = np.zeros((n_frames, n_components)) if initial is None else initial
+    extra = np.zeros((0, n_components)) if starts is None else np.asarray(starts)
+
+    def fit(chosen: NDArray, initial: NDArray, max_steps: int) -> FramePosterior:
+        every = len(chosen) == n_frames and (chosen == np.arange(n_frames)).all()
+        part = frames if every else frames.take(chosen)
+        return _fit(part, search, variance[chosen], initial, max_steps)
+
+    fits = fit(np.arange(n_frames), first, FIRST_STEPS)
+    # The few frames that take longer are brought together: short rows are slow.
+    slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
+    if len(slow):
+        _put(fits, slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+    poor = np.flatnonzero(_poorly_explained(fits, weight, variance))
+    if len(extra) and len(poor):
+        number = np.repeat(np.arange(len(extra)), len(poor))
+        others = fit(np.tile(poor, len(extra)), extra[number], MAX_STEPS)
+        others = others._replace(start=number)
+        # Of equal minima the first one is kept.
+        objective = others.objective.reshape(len(extra), -1)
+        best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
+        best = best * len(poor) + np.arange(len(poor))
+        gain = fits.objective[poor] - others.objective[best]
+        better = gain > EQUAL * fits.objective[poor]
+        _put(fits, poor[better], _take(others, best[better]))
+    return fits._replace(motion=search.cameras(fits.motion))
+
+
+def _fit(
+    frames: _Tracks | _Prepared,
+    search: FrameSearch,
+    variance: NDArray,
+    initial: NDArray,
+    max_steps: int,
+) -> FramePosterior:
+    """Return the minima that frames reach from given coefficients."""
+    n_frames, n_components = initial.shape
+    fits = FramePosterior(
+        motion=np.full((n_frames, 2, 3), np.nan),
+        translation=np.full((n_frames, 2), np.nan),
+        alpha=np.full((n_frames, n_components), np.nan),
+        covariance=np.full((n_frames, n_components, n_components), np.nan),
+        objective=np.full(n_frames, np.nan),
+        residual=np.full(n_frames, np.nan),
+        converged=np.zeros(n_frames, dtype=bool),
+        start=np.full(n_frames, -1),
+    )
+    for block, products in frames.blocks(search.shapes):
+        found = search.fit(
+            products,
+            variance[block],
+            frames.n_points,
+            np.ascontiguousarray(initial[block].T),
+            max_steps,
+        )
+        c = with_one(found.alpha)
+        origin = np.einsum("kai,ki->ai", products.shape_centroid, c)
+        fits.motion[block] = found.motion.transpose(2, 0, 1)
+        fits.translation[block] = (
+            products.centroid - np.einsum("rai,ai->ri", found.motion, origin)
+        ).T
+        fits.alpha[block] = found.alpha.T
+        fits.covariance[block] = unpacked(found.covariance).transpose(2, 0, 1)
+        fits.objective[block] = found.objective
+        fits.residual[block] = found.residual
+        fits.converged[block] = found.converged
+    return fits
+
+
+def _take(fits: FramePosterior, frames: NDArray) -> FramePosterior:
+    """Return the fits of some of the frames."""
+    return FramePosterior(*(each[frames] for each in fits))
+
+
+def _put(fits: FramePosterior, frames: NDArray, others: FramePosterior) -> None:
+    """Set the fits of some of the frames."""
+    for each, other in zip(fits, others, strict=True):
+        each[frames] = other
+
+
+def _poorly_explained(
+    fits: FramePosterior, weight: NDArray, variance: NDArray
+) -> NDArray:
+    """
+    Return whether objectives are much larger than the noise explains.
+
+    Minimised over alpha, f / s2 is the squared Mahalanobis distance of a frame from the
+    model. With the true camera and shape it is chi-squared with two degrees of freedom
+    a point, less the eight of camera and position.
+    """
+    freedom = np.maximum(2.0 * weight - 8.0, 1.0)
+    return fits.objective > SUSPICIOUS * variance * freedom
+
+
+def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
+    """
+    Return coefficients that are far from zero and from each other.
+
+    Parameters
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients of many frames; rows with NaN are left out.
+    n_starts : int
+        How many are wanted.
+
+    Returns
+    -------
+    ndarray of shape (n_starts, n_components)
+        Rows of alpha, fewer if there are not as many different ones, each the one
+        farthest from zero and from those before it.
+    """
+    alpha = alpha[np.isfinite(alpha).all(axis=1)]
+    distance = np.einsum("ik,ik->i", alpha, alpha)
+    chosen: list[int] = []
+    while len(chosen) < n_starts and distance.max(initial=0.0) > 0:
+        chosen.append(int(np.argmax(distance)))
+        difference = alpha - alpha[chosen[-1]]
+        nearest = np.einsum("ik,ik->i", difference, difference)
+        distance = np.minimum(distance, nearest)
+    return alpha[chosen]

@@ -1,0 +1,1 @@
+"""Cameras, shapes and noise of greatest marginal likelihood, all frames together."""

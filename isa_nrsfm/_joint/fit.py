@@ -1,0 +1,286 @@
+"""The joint fit: from the paper's result to the shapes of greatest likelihood.
+
+1. Calibrated cameras to start from (`starts`), the choice of them by the objective.
+2. The fit of calibrated cameras, shapes and noise. While the model may be wrong the
+   noise has a floor: what a few basis shapes leave of an object is not noise, and would
+   be explained by depths and cameras that are not there. Tables without noise tell that
+   they are by what is left at the floor.
+3. For affine cameras, the same with cameras that are free.
+
+Large tables take the first steps on a sample, and the last ones on all frames.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils.parallel import _threadpool_controller_decorator
+
+from isa_nrsfm._factorisation import Factorisation
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    CalibratedCameras,
+    CameraModel,
+)
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import totals
+from isa_nrsfm._joint.many_points import (
+    has_many_points,
+    in_all_points,
+    leading_directions,
+)
+from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
+from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
+from isa_nrsfm._joint.reweighting import reweighted
+from isa_nrsfm._joint.starts import best_start
+from isa_nrsfm._robust import ROUNDING
+from isa_nrsfm._sampling import Sample
+from isa_nrsfm._tracks import seen_points
+
+# The steps on a sample end at this share of what its shapes explain by chance alone, a
+# unit of the objective for each number, if it is above the tolerance.
+BY_CHANCE = 0.03
+# Tables of few frames are refined to this share of the tolerance, with affine and with
+# calibrated cameras: it costs little, and the noise of many points can be small enough
+# to need it.
+POLISH = 0.01
+CALIBRATED_POLISH = 0.1
+FEW_FRAMES = 2000
+# A fit that leaves less than this share of the least noise may be one of a table without
+# noise. It is one if the noise falls below the second share of the mean square, and it
+# can be none if no model with as many basis shapes leaves so little.
+LEFT_OVER = 0.1
+EXACT = 1e-10
+# Steps that tell whether it falls.
+EXACT_STEPS = 400
+# Rounds in which frames that are reversed in depth are turned.
+REVERSALS = 5
+# Steps of the fit that is only compared.
+COMPARED_STEPS = 60
+
+
+class JointFit(NamedTuple):
+    """
+    Result of the joint fit of a table.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        B_0, ..., B_K, centred, in coordinates in which alpha is drawn from N(0, I).
+    alpha : ndarray of shape (n_chosen, n_components)
+        Means of the coefficients in these coordinates, of the frames of the sample.
+    noise_variance : float
+        Variance of the noise of a coordinate, for the degrees of freedom that cameras
+        and shapes leave.
+    camera_noise_ratio : float
+        Noise variance with calibrated cameras, divided by that with affine ones, of
+        the frames of the sample.
+    history : ndarray of shape (n_iter + 1,)
+        The objective at the start and after each step, of the last refinement.
+    gradient_norm : float
+        As in `JointResult`.
+    converged : bool
+        Whether the refinement has converged.
+    frames : JointFrames
+        The frames as they were fitted in the end.
+    """
+
+    shapes: NDArray
+    alpha: NDArray
+    noise_variance: float
+    camera_noise_ratio: float
+    history: NDArray
+    gradient_norm: float
+    converged: bool
+    frames: JointFrames
+
+
+# The products are of small blocks: more threads would wait for each other.
+@_threadpool_controller_decorator(limits=1, user_api="blas")
+def fit_jointly(
+    rows: FrameBlocks,
+    n_seen: NDArray,
+    sample: Sample,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    *,
+    rank_floor: float,
+    camera: str,
+    outliers: NDArray | None = None,
+    loss: str,
+    max_iter: int,
+    tol: float,
+    on_step: Callable[[], None] | None = None,
+) -> JointFit:
+    """
+    Start and run the joint fit.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
+        NaN where a point is missing.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that each frame shows.
+    sample : Sample
+        The frames that the first steps are made on.
+    factors : Factorisation
+        Of their measurement matrix.
+    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes of the paper's pipeline.
+    rank_floor : float
+        The share of the energy that any model with as many basis shapes leaves, where
+        no point is missing.
+    camera : {"affine", "weak_perspective", "orthographic"}
+        What cameras may be.
+    outliers : ndarray of bool, shape (n_frames, n_points), optional
+        Points that are left out at first and that a robust loss takes in again; to be
+        given with such a loss.
+    loss : {"linear", "huber", "cauchy"}
+        How points count that are far from the model.
+    max_iter : int
+        The most steps.
+    tol, on_step
+        As in `refine_joint`.
+
+    Returns
+    -------
+    JointFit
+        The fit.
+    """
+    n_shapes, _, n_points = paper_shapes.shape
+    n_frames = len(n_seen)
+    complete = bool((n_seen == n_points).all())
+    wide = complete and loss == "linear" and has_many_points(n_points, n_shapes)
+    used = None
+    if wide:
+        frames = JointFrames.along(rows, leading_directions(factors))
+    elif loss == "linear":
+        frames = JointFrames.of_points(rows, complete)
+    else:
+        used = seen_points(rows.whole().transpose(0, 2, 1))
+        if outliers is not None:
+            used &= ~outliers
+        weights = None if used.all() else used * 1.0
+        frames = JointFrames.of_points(rows, complete, weights)
+
+    # The problems of the samples and of all frames.
+    n_numbers, energy = totals(frames.blocks)
+    penalty = n_numbers / (BASIS_STD**2 * energy * n_frames)
+    steps = Steps(max_iter, tol, on_step, to_the_end=n_frames <= FEW_FRAMES)
+    problem = JointProblem(frames, steps, penalty)
+    by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
+    problems = [
+        problem.part(part, tol=max(tol, by_chance / len(part)), to_the_end=False)
+        for part in sample.parts
+    ]
+    problems.append(problem)
+    first = problems[0]
+
+    # Calibrated cameras, on the first sample.
+    name = "weak_perspective" if camera == "affine" else camera
+    state = best_start(first, sample.W, factors, paper_shapes, CAMERAS[name])
+    result = _calibrated_fit(first, state, CAMERAS[name])
+    # Free cameras: the fit itself, or only to be compared.
+    cameras = CAMERAS[camera]
+    max_iter = first.steps.max_iter
+    if camera != "affine":
+        max_iter = min(max_iter, COMPARED_STEPS)
+    state = first.aligned(result.state, "affine")
+    free = _refined(first, state, CAMERAS["affine"], max_iter=max_iter)
+    ratio = result.left / min(free.left, result.left)
+    if camera == "affine":
+        result = free
+    least_noise = LEAST_NOISE
+    if not complete or rank_floor < EXACT:
+        result, least_noise = _without_floor(first, result, cameras)
+    refined = partial(_refined, cameras=cameras, least_noise=least_noise)
+    for larger in problems[1:]:
+        result = refined(larger, larger.aligned(result.state, camera))
+    if wide:
+        result, problem = in_all_points(result, problem, rows, refined)
+    noise, n_fitted = result.state.noise, 0
+    if used is not None:
+        # The scale of the noise is that of the residual with the coefficients fitted.
+        result, noise = reweighted(problem, rows, used, result, loss, refined)
+        n_fitted = n_shapes - 1
+    shapes = problem.frames.points(result.state.shapes)
+    state = result.state._replace(shapes=first.frames.coordinates(shapes))
+    if sample.parts:
+        state = state._replace(motion=state.motion[:, :, sample.parts[0]])
+    unknowns = (2 + cameras.n_parameters, n_fitted)
+    noise *= _freedom_correction(n_seen, n_points, n_shapes, *unknowns)
+    return JointFit(
+        shapes - shapes.mean(axis=2, keepdims=True),
+        first.coefficients(state),
+        max(noise, ROUNDING**2),
+        ratio,
+        result.history,
+        result.gradient_norm,
+        result.converged,
+        problem.frames,
+    )
+
+
+def _calibrated_fit(
+    problem: JointProblem, state: JointState, cameras: CalibratedCameras
+) -> JointResult:
+    """Return the fit of calibrated cameras in which no frame is reversed in depth."""
+    result = _refined(problem, state, cameras)
+    for _ in range(REVERSALS):
+        state, n_reversed = problem.reversed_back(result.state, cameras)
+        if not n_reversed:
+            break
+        result = result.followed_by(_refined(problem, state, cameras))
+    return result
+
+
+def _refined(
+    problem: JointProblem,
+    state: JointState,
+    cameras: CameraModel,
+    least_noise: float = LEAST_NOISE,
+    **steps: Any,
+) -> JointResult:
+    """Return a refinement of all frames of a problem."""
+    if problem.steps.to_the_end:
+        polish = CALIBRATED_POLISH if cameras.calibrated else POLISH
+        steps = {"tol": problem.steps.tol * polish, **steps}
+    return problem.refined(state, cameras, least_noise, **steps)
+
+
+def _without_floor(
+    problem: JointProblem, result: JointResult, cameras: CameraModel
+) -> tuple[JointResult, float]:
+    """Return the fit of a table without noise, if it is one, and the least noise."""
+    n_seen, energy = problem.totals
+    mean_square = energy / n_seen
+    if result.residual < LEFT_OVER * LEAST_NOISE * mean_square:
+        max_iter = min(EXACT_STEPS, problem.steps.max_iter)
+        exact = _refined(
+            problem, result.state, cameras, NOISE_FLOOR, max_iter=max_iter
+        )
+        if exact.state.noise < EXACT * mean_square:
+            return result.followed_by(exact), NOISE_FLOOR
+    return result, LEAST_NOISE
+
+
+def _freedom_correction(
+    n_seen: NDArray, n_points: int, n_shapes: int, n_pose: int, n_fitted: int
+) -> float:
+    """
+    Return numbers seen divided by the degrees of freedom of the residual.
+
+    Each frame has the unknowns of a camera and a position; the shapes have three each a
+    point, but for the affinity and the mixing. Coefficients that have been integrated
+    out take none, those that are fitted to a frame take one each. At least a tenth of
+    the numbers counts as free.
+    """
+    n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
+    unknowns = (
+        (n_pose + n_fitted) * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
+    )
+    return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))

@@ -1,0 +1,96 @@
+"""The joint fit of tables with many points, along few directions.
+
+The shapes of greatest likelihood are combinations of the rows of the measurement
+matrix. Complete frames with many points are given by their products with directions,
+those of the factorisation at first. Along the directions that are missing one step of
+expectation maximisation in all points leads; they are added until it gains nothing.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._factorisation import Factorisation
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_fit import stacked_motion
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.problem import JointProblem
+from isa_nrsfm._joint.quasi_newton import JointResult, JointState, regular
+
+# Frames with more points than that, and than so many times the rows of all shapes, are
+# given by directions.
+LEAST_POINTS = 200
+WIDE = 8
+# So many times at most directions are added.
+WIDENINGS = 20
+# Singular values of shapes below this share of the largest are rounding errors.
+FLAT = 1e-12
+
+
+def has_many_points(n_points: int, n_shapes: int) -> bool:
+    """Return whether complete frames are to be given by directions."""
+    return n_points > max(WIDE * 3 * n_shapes, LEAST_POINTS)
+
+
+def leading_directions(factors: Factorisation) -> NDArray:
+    """Return orthonormal directions (n_directions, n_points) of all factors."""
+    shapes = np.concatenate([factors.rigid_shape, factors.signals])
+    shapes = shapes[shapes.any(axis=1)]
+    return shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
+
+
+def in_all_points(
+    result: JointResult,
+    problem: JointProblem,
+    rows: FrameBlocks,
+    refined: Callable[[JointProblem, JointState], JointResult],
+) -> tuple[JointResult, JointProblem]:
+    """
+    Return the refinement in all points of one along some directions.
+
+    Parameters
+    ----------
+    result : JointResult
+        The refinement along the directions of the problem.
+    problem : JointProblem
+        The problem.
+    rows : FrameBlocks
+        Blocks of complete frames (n_frames, 2, n_points).
+    refined : callable
+        Refines a state of a problem.
+
+    Returns
+    -------
+    result : JointResult
+        The refinement, along directions of which no others gain anything.
+    problem : JointProblem
+        The problem along these directions.
+    """
+    for _ in range(WIDENINGS):
+        state = result.state
+        before = problem.frames.points(state.shapes)
+        # The shapes of a step of expectation maximisation: N B = R.
+        passed = problem.likelihood(*state)
+        curvature = regular(passed.shape_curvature)[0]
+        right = sum(
+            rows.map(_right_side, state.motion.transpose(2, 0, 1), passed.alpha.T)
+        ).reshape(len(curvature), -1)
+        after = np.linalg.solve(curvature, right)
+        change = after - before.reshape(after.shape)
+        gain = float(np.vdot(change, curvature @ change)) / state.noise
+        if gain < problem.steps.tol * problem.n_frames:
+            break
+        both = np.concatenate([after, before.reshape(after.shape)])
+        _, size, directions = np.linalg.svd(both, full_matrices=False)
+        frames = JointFrames.along(rows, directions[size > FLAT * size[0]])
+        problem = problem.of(frames)
+        shapes = frames.coordinates(after.reshape(before.shape))
+        further = refined(problem, state._replace(shapes=shapes))
+        result = result.followed_by(further)
+    return result, problem
+
+
+def _right_side(rows: NDArray, motion: NDArray, alpha: NDArray) -> NDArray:
+    """Return ``sum_i (c_i (x) M_i)^T W_i`` of a block."""
+    return stacked_motion(motion, alpha).T @ rows.reshape(2 * len(rows), -1)

@@ -1,0 +1,78 @@
+"""The joint fit with a robust loss, by iteratively reweighted least squares."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.problem import JointProblem
+from isa_nrsfm._joint.quasi_newton import JointResult, JointState
+from isa_nrsfm._robust import ROUNDING, median_noise, robust_weights
+from isa_nrsfm._tracks import seen_points
+
+# Rounds of reweighting, and the change of the weights that ends them.
+ROUNDS = 20
+SETTLED_WEIGHTS = 1e-2
+
+
+def reweighted(
+    problem: JointProblem,
+    rows: FrameBlocks,
+    used: NDArray,
+    result: JointResult,
+    loss: str,
+    refined: Callable[[JointProblem, JointState], JointResult],
+) -> tuple[JointResult, float]:
+    """
+    Return the refinement whose weights agree with what it leaves.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        The problem, with the weights of before.
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
+    used : ndarray of bool, shape (n_frames, n_points)
+        Points that have counted so far.
+    result : JointResult
+        The refinement.
+    loss : {"huber", "cauchy"}
+        The loss.
+    refined : callable
+        Refines a state of a problem.
+
+    Returns
+    -------
+    result : JointResult
+        The refinement.
+    noise_variance : float
+        Of a coordinate, by the median.
+    """
+    tracks = rows.whole().transpose(0, 2, 1)
+    seen = seen_points(tracks)
+    counted, weights = used * 1.0, np.zeros(seen.shape)
+    for _ in range(ROUNDS):
+        shapes, motion, _ = result.state
+        stacked = shapes.transpose(0, 2, 1)
+        alpha = problem.coefficients(result.state)
+        model = project(
+            compose(stacked[0], stacked[1:], alpha),
+            motion.transpose(2, 0, 1),
+            np.zeros(2),
+        )
+        rest = np.where(seen[..., None], tracks - model, 0.0)
+        position = np.einsum("ij,ijc->ic", counted, rest)
+        rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
+        distance = np.linalg.norm(rest, axis=2)
+        deviation = max(median_noise(distance[seen]), ROUNDING)
+        previous, weights = weights, np.zeros(seen.shape)
+        weights[seen] = robust_weights(loss, distance[seen] / deviation)
+        if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
+            break
+        problem = problem.of(JointFrames.of_points(rows, False, weights))
+        counted = weights
+        result = refined(problem, result.state)
+    return result, deviation**2

@@ -1,0 +1,257 @@
+"""Where the joint fit starts: calibrated cameras, and the shapes that they see.
+
+The cameras of an object that deforms are mixtures of few columns of the motion factor
+of its table (Xiao, Chai, Kanade 2006). How many, the cost of the mixture does not tell:
+with more columns it always falls. So mixtures of more and more columns are tried, after
+the rigid cameras, as long as the objective of the fit says that they are better.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._factorisation import Factorisation
+from isa_nrsfm._frames.camera_models import (
+    CalibratedCameras,
+    HeldCameras,
+    nearest_calibrated,
+)
+from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
+from isa_nrsfm._joint.quasi_newton import JointState
+from isa_nrsfm._metric_upgrade import best_metric
+from isa_nrsfm._orthonormal_cameras import orthonormal_mixture, principal_columns
+from isa_nrsfm._sampling import rigid_energy, spread
+
+# Columns of the mixtures: three for the rigid object and as many for each basis shape.
+WIDTHS = (6, 9, 12, 18, 24, 36)
+# Steps of all starts with their cameras held, and of the best with cameras that move.
+HELD_STEPS = 6
+FREED_STEPS = 30
+# They end when they gain less than that for each frame: starts that lead elsewhere
+# differ by tens.
+COMPARED_TOL = 0.5
+# Share of what the mean shape leaves that counts as noise at the start.
+FIRST_NOISE = 0.1
+
+
+class Comparison(NamedTuple):
+    """
+    How starts are compared.
+
+    Attributes
+    ----------
+    n_frames : int
+        The frames that are looked at.
+    n_finalists : int
+        How many starts go on with cameras that move.
+    """
+
+    n_frames: int
+    n_finalists: int
+
+
+# Tables of few frames have several minima (motion capture), and time; samples of large
+# tables are of many people or things, and the same minimum is found from all starts.
+SMALL, LARGE = Comparison(400, 3), Comparison(200, 1)
+
+
+def rigid_start(
+    factors: Factorisation, paper_shapes: NDArray, scaled: bool
+) -> tuple[NDArray, NDArray]:
+    """
+    Return the paper's result with calibrated cameras.
+
+    Parameters
+    ----------
+    factors : Factorisation
+        Of a measurement matrix.
+    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes that the rigid cameras see.
+    scaled : bool
+        Whether cameras have scales of their own; otherwise all have the scale one.
+
+    Returns
+    -------
+    motion : ndarray of shape (n_frames, 2, 3)
+        The calibrated cameras that are nearest to the rigid ones, in the metric of
+        space in which these are most nearly calibrated.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        The shapes in that metric.
+    """
+    Q = best_metric(factors.rigid_motion.reshape(-1, 2, 3))
+    rows, sizes = nearest_calibrated(factors.rigid_motion.reshape(-1, 2, 3) @ Q)
+    shapes = np.linalg.solve(Q, paper_shapes)
+    if scaled:
+        return sizes[:, None, None] * rows, shapes
+    return rows, sizes.mean() * shapes
+
+
+def mixed_cameras(
+    rows: NDArray, scales: NDArray | None, chosen: NDArray
+) -> Iterator[NDArray]:
+    """
+    Yield calibrated cameras that are mixtures of more and more columns.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Complete frames, centred.
+    scales : ndarray of shape (n_frames,) or None
+        Rough scales of the cameras, by which the frames are divided; None for cameras
+        of scale one.
+    chosen : ndarray of int, shape (n_chosen,)
+        Frames from which the mixtures are found.
+
+    Yields
+    ------
+    ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    """
+    unit = rows if scales is None else rows / scales[:, None, None]
+    P = principal_columns(unit.reshape(2 * len(unit), -1)).reshape(len(unit), 2, -1)
+    few = P[chosen].reshape(2 * len(chosen), -1)
+    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3))
+    rank = P.shape[2]
+    for n in sorted({min(n, rank) for n in WIDTHS if n < rank + 3}):
+        mixing, _ = orthonormal_mixture(few[:, :n], mixing)
+        found, sizes = nearest_calibrated(P[..., :n] @ mixing)
+        yield found if scales is None else (scales * sizes)[:, None, None] * found
+
+
+def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
+    """
+    Return shapes that explain what given cameras see.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Complete frames, centred.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Scaled rotations.
+    n_components : int
+        K.
+
+    Returns
+    -------
+    ndarray of shape (n_components + 1, 3, n_points)
+        The mean shape of least squares, and the principal directions of what it leaves,
+        lifted to the image plane in space, ``M^+ (W - M B_0)``: one standard deviation
+        of their coefficients each. Zeros where there are not as many.
+    """
+    gram = np.einsum("ira,irb->ab", motion, motion)
+    right = np.einsum("ira,irj->aj", motion, rows)
+    mean_shape = np.linalg.lstsq(gram, right)[0]
+    size = np.einsum("irc,irc->i", motion, motion) / 2
+    size = np.where(size > 0, size, 1.0)
+    rest = (rows - motion @ mean_shape) / size[:, None, None]
+    lifted = (motion.swapaxes(1, 2) @ rest).reshape(len(rows), -1)
+    values, axes = _leading(lifted, n_components)
+    basis = np.zeros((n_components, *mean_shape.shape))
+    basis[: len(values)] = (values[:, None] * axes).reshape(-1, *mean_shape.shape)
+    return np.concatenate([mean_shape[None], basis / np.sqrt(len(rows))])
+
+
+def _leading(rows: NDArray, n: int) -> tuple[NDArray, NDArray]:
+    """Return the largest n singular values of a matrix and the right vectors."""
+    tall = len(rows) > rows.shape[1]
+    square, vectors = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)
+    values = np.sqrt(np.maximum(square[::-1][:n], 0.0))
+    vectors = vectors[:, ::-1][:, :n].T
+    if not tall:
+        vectors = vectors @ rows / np.where(values > 0, values, 1.0)[:, None]
+    return values, vectors
+
+
+def best_start(
+    problem: JointProblem,
+    W: NDArray,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    cameras: CalibratedCameras,
+) -> JointState:
+    """
+    Return the start of greatest likelihood.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        The frames to be fitted.
+    W : ndarray of shape (2 * n_frames, n_points)
+        Their measurement matrix, completed where points are missing.
+    factors : Factorisation
+        Of W.
+    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes of the paper's pipeline.
+    cameras : CalibratedCameras
+        Calibrated cameras.
+
+    Returns
+    -------
+    JointState
+        Shapes, cameras of all frames, and noise.
+    """
+    rows = problem.frames.coordinates(W).reshape(problem.n_frames, 2, -1)
+    order = np.argsort(rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape)))
+    comparison = SMALL if problem.steps.to_the_end else LARGE
+    few = np.sort(spread(order, min(comparison.n_frames, len(order))))
+    part = problem.part(few, tol=COMPARED_TOL)
+    motion, shapes = rigid_start(
+        factors, problem.frames.coordinates(paper_shapes), cameras.scaled
+    )
+    shapes[1:] *= _deviations(rows[few], motion[few], shapes)[:, None, None]
+    n_components = len(shapes) - 1
+    trials = [
+        _trial(part, rows[few], motion, few, given)
+        for given in (shapes, lifted_shapes(rows[few], motion[few], n_components))
+    ]
+    scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
+    for mixed in mixed_cameras(rows, scales if cameras.scaled else None, few):
+        given = lifted_shapes(rows[few], mixed[few], n_components)
+        trials.append(_trial(part, rows[few], mixed, few, given))
+        if len(trials) > 3 and trials[-1].value > trials[-2].value:
+            break
+    trials.sort(key=lambda trial: trial.value)
+    finalists = [
+        (part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS), trial)
+        for trial in trials[: comparison.n_finalists]
+    ]
+    result, trial = min(finalists, key=lambda pair: pair[0].history[-1])
+    motion = trial.motion
+    motion[few] = result.state.motion.transpose(2, 0, 1)
+    return result.state._replace(motion=frames_last(motion))
+
+
+class _Trial(NamedTuple):
+    """A start after the first steps with its cameras held."""
+
+    value: float
+    state: JointState  # of the compared frames
+    motion: NDArray  # of all frames (n_frames, 2, 3)
+
+
+def _trial(
+    part: JointProblem, rows: NDArray, motion: NDArray, few: NDArray, shapes: NDArray
+) -> _Trial:
+    """Return a start after some steps of the shapes of the compared frames."""
+    rest = rows - motion[few] @ shapes[0]
+    n_seen, energy = part.totals
+    noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
+    state = JointState(shapes, frames_last(motion[few]), noise)
+    result = part.refined(state, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS)
+    return _Trial(result.history[-1], result.state, motion)
+
+
+def _deviations(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
+    """Return the deviations of least squares coefficients of orthogonal shapes."""
+    images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
+    along = np.einsum("ikrj,irj->ik", images, rows)
+    energy = np.einsum("ikrj,ikrj->ik", images, images)
+    alpha = np.divide(along, energy, where=energy > 0, out=np.zeros_like(along))
+    return alpha.std(axis=0)
+
+
+def frames_last(motion: NDArray) -> NDArray:
+    """Return cameras (n_frames, 2, 3) as (2, 3, n_frames)."""
+    return np.ascontiguousarray(motion.transpose(1, 2, 0))
