@@ -265,15 +265,6 @@ def _posterior(problem: _Problem, motion: NDArray) -> CoefficientPosterior:
     return coefficient_posterior(problem.products, motion, problem.noise)
 
 
-def _tangents(motion: NDArray, scaled: bool) -> NDArray:
-    """Return the tangents D_c (p, 2, 3, n) of cameras."""
-    zero = np.zeros_like(motion[:, 0])
-    x, y, z = motion[:, 0], motion[:, 1], motion[:, 2]
-    rows = [(zero, z, -y), (-z, zero, x), (y, -x, zero)]  # m x e_c
-    tangents = [np.stack(row, axis=1) for row in rows]
-    return np.stack([*tangents, motion] if scaled else tangents)
-
-
 def _coupling(
     problem: _Problem, motion: NDArray, posterior: CoefficientPosterior
 ) -> NDArray:
@@ -282,7 +273,7 @@ def _coupling(
     T = products.gram.products(posterior.c)[1:]
     F = np.einsum("rbi,kbai->krai", motion, T)
     F -= products.cross[1:].swapaxes(1, 2)
-    D = _tangents(motion, problem.cameras.scaled)
+    D = problem.cameras.tangents(motion)
     return np.einsum("crai,krai->cki", D, F)
 
 

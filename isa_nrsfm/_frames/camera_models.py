@@ -34,17 +34,23 @@ class CameraModel(Protocol):
 
     Attributes
     ----------
+    name : str
+        What users call it.
     n_parameters : int
         Of a camera.
     calibrated : bool
         Whether cameras are scaled rotations.
     """
 
+    name: str
     n_parameters: int
     calibrated: bool
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (n_parameters, n)."""
+
+    def tangents(self, motion: NDArray) -> NDArray:
+        """Return the derivatives (n_parameters, 2, 3, n) of cameras."""
 
     def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
         """Return dF/dparameters (n_parameters, n) from dF/dM (2, 3, n)."""
@@ -62,12 +68,18 @@ class CameraModel(Protocol):
 class AffineCameras:
     """Free 2x3 matrices; the parameters are their entries, row by row."""
 
+    name = "affine"
     n_parameters = 6
     calibrated = False
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (6, n)."""
         return motion + step.reshape(motion.shape)
+
+    def tangents(self, motion: NDArray) -> NDArray:
+        """Return matrices with one entry that is one."""
+        entries = np.eye(6).reshape(6, 2, 3, 1)
+        return np.broadcast_to(entries, (6, *motion.shape))
 
     def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
         """Return the derivative by the entries (6, n)."""
@@ -90,12 +102,17 @@ class AffineCameras:
 class HeldCameras:
     """Cameras that are known."""
 
+    name = "held"
     n_parameters = 0
     calibrated = False
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return the cameras."""
         return motion
+
+    def tangents(self, motion: NDArray) -> NDArray:
+        """Return no derivative."""
+        return np.zeros((0, *motion.shape))
 
     def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
         """Return no derivative."""
@@ -129,12 +146,21 @@ class CalibratedCameras:
 
     def __init__(self, scaled: bool):
         self.scaled = scaled
+        self.name = "weak_perspective" if scaled else "orthographic"
         self.n_parameters = 4 if scaled else 3
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after rotation vectors and log scales."""
         turned = rotated(motion, step[:3])
         return np.exp(step[3]) * turned if self.scaled else turned
+
+    def tangents(self, motion: NDArray) -> NDArray:
+        """Return ``M hat(e_c)``, and M itself where there are scales."""
+        zero = np.zeros_like(motion[:, 0])
+        x, y, z = motion[:, 0], motion[:, 1], motion[:, 2]
+        rows = [(zero, z, -y), (-z, zero, x), (y, -x, zero)]  # m x e_c
+        tangents = [np.stack(row, axis=1) for row in rows]
+        return np.stack([*tangents, motion] if self.scaled else tangents)
 
     def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
         """Return the derivative by the tangents (n_parameters, n)."""
@@ -173,9 +199,8 @@ class CalibratedCameras:
 
 
 CAMERAS: dict[str, CameraModel] = {
-    "affine": AffineCameras(),
-    "weak_perspective": CalibratedCameras(scaled=True),
-    "orthographic": CalibratedCameras(scaled=False),
+    model.name: model
+    for model in (AffineCameras(), CalibratedCameras(True), CalibratedCameras(False))
 }
 
 

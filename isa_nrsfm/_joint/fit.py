@@ -1,16 +1,17 @@
 """The joint fit: from the paper's result to the shapes of greatest likelihood.
 
 1. Calibrated cameras to start from (`starts`), the choice of them by the objective.
-2. The fit of calibrated cameras, shapes and noise. While the model may be wrong the
+2. The fit of calibrated cameras, shapes and noise, of the best starts. While the model may be wrong the
    noise has a floor: what a few basis shapes leave of an object is not noise, and would
    be explained by depths and cameras that are not there. Tables without noise tell that
    they are by what is left at the floor.
-3. For affine cameras, the same with cameras that are free.
+3. For affine cameras, the same with cameras that are free, from there or from the
+   paper's result, whichever leads to the lower objective.
 
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -35,7 +36,7 @@ from isa_nrsfm._joint.many_points import (
 from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
 from isa_nrsfm._joint.reweighting import reweighted
-from isa_nrsfm._joint.starts import best_start
+from isa_nrsfm._joint.starts import affine_start, best_starts
 from isa_nrsfm._robust import ROUNDING
 from isa_nrsfm._sampling import Sample
 from isa_nrsfm._tracks import seen_points
@@ -182,15 +183,22 @@ def fit_jointly(
 
     # Calibrated cameras, on the first sample.
     name = "weak_perspective" if camera == "affine" else camera
-    state = best_start(first, sample.W, factors, paper_shapes, CAMERAS[name])
-    result = _calibrated_fit(first, state, CAMERAS[name])
-    # Free cameras: the fit itself, or only to be compared.
+    starts = best_starts(first, sample.W, factors, paper_shapes, CAMERAS[name])
+    result = _least(_calibrated_fit(first, state, CAMERAS[name]) for state in starts)
+    # Free cameras, from there and from the paper's result: the fit itself, or only to
+    # be compared.
     cameras = CAMERAS[camera]
     max_iter = first.steps.max_iter
     if camera != "affine":
         max_iter = min(max_iter, COMPARED_STEPS)
-    state = first.aligned(result.state, "affine")
-    free = _refined(first, state, CAMERAS["affine"], max_iter=max_iter)
+    starts = [
+        first.aligned(result.state, "affine"),
+        affine_start(first, sample.W, paper_shapes),
+    ]
+    free = _least(
+        _refined(first, state, CAMERAS["affine"], max_iter=max_iter)
+        for state in starts
+    )
     ratio = result.left / min(free.left, result.left)
     if camera == "affine":
         result = free
@@ -223,6 +231,11 @@ def fit_jointly(
         result.converged,
         problem.frames,
     )
+
+
+def _least(results: Iterable[JointResult]) -> JointResult:
+    """Return the refinement of the least objective."""
+    return min(results, key=lambda result: result.history[-1])
 
 
 def _calibrated_fit(

@@ -39,6 +39,7 @@ from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frame_fit import stacked_motion
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frame_products import FrameTracks
 
@@ -92,6 +93,7 @@ def fit_without_noise(
     motion: NDArray,
     alpha: NDArray,
     penalty: float,
+    cameras: CameraModel,
 ) -> tuple[NDArray, NDArray] | None:
     """
     Return shapes and cameras that leave as little as possible of tracks.
@@ -109,6 +111,8 @@ def fit_without_noise(
         Coefficients to start from.
     penalty : float
         As in `MarginalLikelihood`.
+    cameras : CameraModel
+        How cameras may move.
 
     Returns
     -------
@@ -132,11 +136,11 @@ def fit_without_noise(
     start = FramesAndShapes(
         b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
     )
-    found = minimise(rows, start)
+    found = minimise(rows, start, cameras)
     shapes = (found.shapes @ V.T).reshape(shapes.shape)
     alpha = alpha.copy()
     alpha[:, frames] = found.alpha.T
-    motion, alpha = _all_frames(blocks, shapes, motion, alpha)
+    motion, alpha = _all_frames(blocks, shapes, motion, alpha, cameras.name)
     return likely_basis(shapes, motion, alpha, penalty), motion
 
 
@@ -289,7 +293,7 @@ def motion_rows(motion: NDArray, alpha: NDArray) -> NDArray:
     return stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
 
 
-def frame_tangents(state: FramesAndShapes) -> NDArray:
+def frame_tangents(state: FramesAndShapes, cameras: CameraModel) -> NDArray:
     """
     Return the derivatives of the images by cameras and coefficients.
 
@@ -297,22 +301,24 @@ def frame_tangents(state: FramesAndShapes) -> NDArray:
     ----------
     state : FramesAndShapes
         Where.
+    cameras : CameraModel
+        How cameras may move.
 
     Returns
     -------
-    ndarray of shape (n_frames, 2 * n_directions, 6 + n_components)
-        Of ``M_i S_i``, rows one after the other, by the rows of M_i and by alpha_i.
+    ndarray of shape (n_frames, 2 * n_directions, n_parameters + n_components)
+        Of ``M_i S_i``, rows one after the other, by the parameters of M_i and by
+        alpha_i.
     """
     b, motion, alpha = state
     n_frames, n_components = alpha.shape
     shapes = b.reshape(n_components + 1, 3, -1)
     frame_shapes = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
     n_directions = b.shape[1]
-    tangents = np.zeros((n_frames, 2, n_directions, 6 + n_components))
-    for row in range(2):
-        cameras = slice(3 * row, 3 * row + 3)
-        tangents[:, row, :, cameras] = frame_shapes.swapaxes(1, 2)
-    tangents[..., 6:] = np.einsum("ira,kad->irdk", motion, shapes[1:])
+    D = cameras.tangents(motion.transpose(1, 2, 0))
+    by_camera = np.einsum("crai,iad->irdc", D, frame_shapes)
+    by_alpha = np.einsum("ira,kad->irdk", motion, shapes[1:])
+    tangents = np.concatenate([by_camera, by_alpha], axis=3)
     return tangents.reshape(n_frames, 2 * n_directions, -1)
 
 
@@ -320,14 +326,17 @@ class _Frames(NamedTuple):
     """Frames at a state: residuals, and what cameras and coefficients do about them."""
 
     rest: NDArray  # W_i - X_i b (n, 2 n_directions)
-    tangent: NDArray  # Q_i (n, 2 n_directions, 6 + K)
-    factor: NDArray  # of the tangents, Q_i times it (n, 6 + K, 6 + K)
+    tangent: NDArray  # Q_i (n, 2 n_directions, n_parameters + K)
+    factor: NDArray  # of the tangents, Q_i times it
+    cameras: CameraModel
 
     @classmethod
-    def at(cls, rows: NDArray, state: FramesAndShapes) -> "_Frames":
+    def at(
+        cls, rows: NDArray, state: FramesAndShapes, cameras: CameraModel
+    ) -> "_Frames":
         """Return the frames with their residual and their tangent space."""
         rest = rows - motion_rows(state.motion, state.alpha) @ state.shapes
-        tangents = frame_tangents(state)
+        tangents = frame_tangents(state, cameras)
         size = np.linalg.norm(tangents, axis=1)
         Q, R = np.linalg.qr(tangents)
         diagonal = np.arange(R.shape[-1])
@@ -335,17 +344,21 @@ class _Frames(NamedTuple):
         Q *= kept[:, None]
         R *= kept[..., None]
         R[:, diagonal, diagonal] += ~kept
-        return cls(rest.reshape(len(rows), -1), Q, R)
+        return cls(rest.reshape(len(rows), -1), Q, R, cameras)
 
     def moved(self, state: FramesAndShapes, rest: NDArray) -> FramesAndShapes:
         """Return cameras and coefficients after the step that a residual asks for."""
         along = self.tangent.swapaxes(1, 2) @ rest[..., None]
         step = np.linalg.solve(self.factor, along)[..., 0]
-        motion = state.motion + step[:, :6].reshape(-1, 2, 3)
-        return FramesAndShapes(state.shapes, motion, state.alpha + step[:, 6:])
+        n = self.cameras.n_parameters
+        motion = self.cameras.moved(state.motion.transpose(1, 2, 0), step[:, :n].T)
+        alpha = state.alpha + step[:, n:]
+        return FramesAndShapes(state.shapes, motion.transpose(2, 0, 1), alpha)
 
 
-def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
+def minimise(
+    rows: NDArray, start: FramesAndShapes, cameras: CameraModel
+) -> FramesAndShapes:
     """
     Return the state of least residual that Levenberg-Marquardt steps lead to.
 
@@ -355,6 +368,8 @@ def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
         Tracks of the frames.
     start : FramesAndShapes
         Where to start.
+    cameras : CameraModel
+        How cameras may move.
 
     Returns
     -------
@@ -363,7 +378,7 @@ def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
     """
     state = start
     energy = float(np.vdot(rows, rows))
-    frames = _Frames.at(rows, state)
+    frames = _Frames.at(rows, state, cameras)
     square = float(np.vdot(frames.rest, frames.rest))
     damping, small_steps, system = FIRST_DAMPING, 0, None
     for _ in range(MAX_STEPS):
@@ -374,7 +389,7 @@ def minimise(rows: NDArray, start: FramesAndShapes) -> FramesAndShapes:
         if system is None:
             system = normal_equations(frames, state)
         trial = _stepped(rows, state, frames, system, damping)
-        after = _Frames.at(rows, trial)
+        after = _Frames.at(rows, trial, cameras)
         reached = float(np.vdot(after.rest, after.rest))
         if not reached < square:
             damping *= RAISED
@@ -427,7 +442,7 @@ def _stepped(
     rest = frames.rest - (X @ step).reshape(len(rows), -1)
     moved = state._replace(shapes=state.shapes + step)
     moved = _better(rows, moved, frames.moved(moved, rest))
-    frames = _Frames.at(rows, moved)
+    frames = _Frames.at(rows, moved, frames.cameras)
     return _better(rows, moved, frames.moved(moved, frames.rest))
 
 
@@ -448,11 +463,16 @@ def _better(
 
 
 def _all_frames(
-    blocks: FrameBlocks, shapes: NDArray, motion: NDArray, alpha: NDArray
+    blocks: FrameBlocks,
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    camera: str,
 ) -> tuple[NDArray, NDArray]:
     """Return cameras and coefficients of all frames for given shapes."""
     motion, alpha = motion.copy(), alpha.copy()
-    fits = blocks.map(partial(_fitted, shapes=shapes), alpha.T.copy())
+    fitted = partial(_fitted, shapes=shapes, camera=camera)
+    fits = blocks.map(fitted, alpha.T.copy())
     for part, (cameras, coefficients) in zip(blocks.slices, fits, strict=True):
         known = np.isfinite(coefficients).all(axis=1)
         frames = np.arange(part.start, part.stop)[known]
@@ -462,7 +482,7 @@ def _all_frames(
 
 
 def _fitted(
-    block: list[FrameTracks], initial: NDArray, shapes: NDArray
+    block: list[FrameTracks], initial: NDArray, shapes: NDArray, camera: str
 ) -> tuple[NDArray, NDArray]:
     """Return cameras and coefficients of a block, from given coefficients."""
     fits, first = [], 0
@@ -470,10 +490,16 @@ def _fitted(
         W, seen = _tracks_of(part)
         start = initial[first : first + len(W)]
         if seen is None:
-            fits.append(fit_prepared(part, shapes, 0.0, initial=start))
+            fits.append(
+                fit_prepared(part, shapes, 0.0, camera=camera, initial=start)
+            )
         else:
             tracks = W.swapaxes(1, 2)
-            fits.append(fit_posterior(tracks, shapes, 0.0, weights=seen, initial=start))
+            fits.append(
+                fit_posterior(
+                    tracks, shapes, 0.0, camera=camera, weights=seen, initial=start
+                )
+            )
         first += len(W)
     motion = np.concatenate([fit.motion for fit in fits])
     return motion, np.concatenate([fit.alpha for fit in fits])

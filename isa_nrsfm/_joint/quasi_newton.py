@@ -138,7 +138,7 @@ def refine_joint(
     )
     history = [point.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
-    if cameras.calibrated or not cameras.n_parameters:
+    if not cameras.n_parameters:
         exact = 0.0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
@@ -199,7 +199,7 @@ def _without_noise(
         return None
     alpha = likelihood.coefficients(*point.state).T
     found = fit_without_noise(
-        likelihood.frames, shapes, motion, alpha, likelihood.penalty
+        likelihood.frames, shapes, motion, alpha, likelihood.penalty, point.cameras
     )
     if found is None:
         return None

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._factorisation import Factorisation
+from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
     CalibratedCameras,
     HeldCameras,
@@ -164,15 +165,41 @@ def _leading(rows: NDArray, n: int) -> tuple[NDArray, NDArray]:
     return values, vectors
 
 
-def best_start(
+def affine_start(
+    problem: JointProblem, W: NDArray, paper_shapes: NDArray
+) -> JointState:
+    """
+    Return the paper's result, rigid cameras and basis shapes, as a start.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        The frames to be fitted.
+    W : ndarray of shape (2 * n_frames, n_points)
+        Their measurement matrix, completed where points are missing.
+    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes of the paper's pipeline.
+
+    Returns
+    -------
+    JointState
+        Shapes, each one deviation of its coefficient, cameras and noise.
+    """
+    shapes = problem.frames.coordinates(paper_shapes)
+    W = problem.frames.coordinates(W)
+    rows, motion = W.reshape(problem.n_frames, 2, -1), rigid_cameras(W, shapes[0].T)
+    return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
+
+
+def best_starts(
     problem: JointProblem,
     W: NDArray,
     factors: Factorisation,
     paper_shapes: NDArray,
     cameras: CalibratedCameras,
-) -> JointState:
+) -> list[JointState]:
     """
-    Return the start of greatest likelihood.
+    Return the starts of greatest likelihood, the best one first.
 
     Parameters
     ----------
@@ -189,7 +216,7 @@ def best_start(
 
     Returns
     -------
-    JointState
+    list of JointState
         Shapes, cameras of all frames, and noise.
     """
     rows = problem.frames.coordinates(W).reshape(problem.n_frames, 2, -1)
@@ -200,27 +227,22 @@ def best_start(
     motion, shapes = rigid_start(
         factors, problem.frames.coordinates(paper_shapes), cameras.scaled
     )
-    shapes[1:] *= _deviations(rows[few], motion[few], shapes)[:, None, None]
+    shapes = _scaled(rows[few], motion[few], shapes)
     n_components = len(shapes) - 1
     trials = [
-        _trial(part, rows[few], motion, few, given)
+        _trial(part, rows, motion, few, given)
         for given in (shapes, lifted_shapes(rows[few], motion[few], n_components))
     ]
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
     for mixed in mixed_cameras(rows, scales if cameras.scaled else None, few):
         given = lifted_shapes(rows[few], mixed[few], n_components)
-        trials.append(_trial(part, rows[few], mixed, few, given))
+        trials.append(_trial(part, rows, mixed, few, given))
         if len(trials) > 3 and trials[-1].value > trials[-2].value:
             break
     trials.sort(key=lambda trial: trial.value)
-    finalists = [
-        (part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS), trial)
-        for trial in trials[: comparison.n_finalists]
+    return [
+        _freed(part, trial, few, cameras) for trial in trials[: comparison.n_finalists]
     ]
-    result, trial = min(finalists, key=lambda pair: pair[0].history[-1])
-    motion = trial.motion
-    motion[few] = result.state.motion.transpose(2, 0, 1)
-    return result.state._replace(motion=frames_last(motion))
 
 
 class _Trial(NamedTuple):
@@ -235,21 +257,38 @@ def _trial(
     part: JointProblem, rows: NDArray, motion: NDArray, few: NDArray, shapes: NDArray
 ) -> _Trial:
     """Return a start after some steps of the shapes of the compared frames."""
-    rest = rows - motion[few] @ shapes[0]
-    n_seen, energy = part.totals
-    noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
-    state = JointState(shapes, frames_last(motion[few]), noise)
+    state = _first_state(part, rows[few], motion[few], shapes)
     result = part.refined(state, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS)
     return _Trial(result.history[-1], result.state, motion)
 
 
-def _deviations(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
-    """Return the deviations of least squares coefficients of orthogonal shapes."""
+def _freed(
+    part: JointProblem, trial: _Trial, few: NDArray, cameras: CalibratedCameras
+) -> JointState:
+    """Return a start after some steps of the cameras of the compared frames."""
+    result = part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS)
+    motion = frames_last(trial.motion)
+    motion[:, :, few] = result.state.motion
+    return result.state._replace(motion=motion)
+
+
+def _first_state(
+    problem: JointProblem, rows: NDArray, motion: NDArray, shapes: NDArray
+) -> JointState:
+    """Return cameras and shapes, with part of what the mean shape leaves as noise."""
+    rest = rows - motion @ shapes[0]
+    n_seen, energy = problem.totals
+    noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
+    return JointState(shapes, frames_last(motion), noise)
+
+
+def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
+    """Return orthogonal shapes times the deviation of their coefficients."""
     images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
     along = np.einsum("ikrj,irj->ik", images, rows)
     energy = np.einsum("ikrj,ikrj->ik", images, images)
     alpha = np.divide(along, energy, where=energy > 0, out=np.zeros_like(along))
-    return alpha.std(axis=0)
+    return np.concatenate([shapes[:1], alpha.std(axis=0)[:, None, None] * shapes[1:]])
 
 
 def frames_last(motion: NDArray) -> NDArray:
