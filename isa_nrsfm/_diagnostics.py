@@ -14,6 +14,12 @@ LEAST_RELIABILITY = 0.8
 NO_VARIANCE = 1e-14
 # Standard deviation of a number of V_k, from which on it counts as not determined.
 LARGEST_DEVIATION = 0.1
+# Ratios of noise variances, calibrated to affine, up to which cameras are calibrated
+# ones as far as the table tells, and from which on they are not. Artificial tables:
+# weak-perspective cameras have 1.02, perspective ones at 8, 4 and 2.5 radii (to be seen
+# by ``python -m benchmarks.accuracy cameras``) and K too small lie between, cameras
+# that stretch the image by 15 percent and more have 20 to 50.
+SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 
 
 class Diagnostics(NamedTuple):
@@ -42,7 +48,13 @@ class Diagnostics(NamedTuple):
         order in the deformation alone; of each V_k (3x3) all but the trace can be
         known, and these are the deviations of their principal directions, from the
         noise and with everything else known: an entry of 0.1 adds a tenth of the mean
-        shape, per standard deviation of a coefficient.
+        shape, per standard deviation of a coefficient. Calibrated cameras absorb
+        rotations only, so that these are upper bounds for them.
+    camera_noise_ratio : float
+        Noise variance of the fit with calibrated cameras, divided by that of the fit
+        with affine ones.
+    camera_meaning : str
+        What that ratio says of the cameras, in a sentence.
     """
 
     camera_singular_values: NDArray
@@ -50,6 +62,8 @@ class Diagnostics(NamedTuple):
     reliability: NDArray
     effective_frames: NDArray
     weak_deviations: NDArray
+    camera_noise_ratio: float
+    camera_meaning: str
 
 
 def diagnose(
@@ -59,6 +73,7 @@ def diagnose(
     alpha: NDArray,
     noise_variance: float,
     reliability: NDArray,
+    camera_noise_ratio: float,
 ) -> Diagnostics:
     """
     Return how far a table determines a fit, and warn where it does not.
@@ -77,6 +92,8 @@ def diagnose(
         Variance of a coordinate of frames of size one.
     reliability : ndarray of shape (n_components,)
         As of `reliabilities`.
+    camera_noise_ratio : float
+        As of `Diagnostics`.
 
     Returns
     -------
@@ -104,6 +121,8 @@ def diagnose(
         reliability,
         np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
         np.sqrt(noise_variance / known),
+        camera_noise_ratio,
+        camera_meaning(camera_noise_ratio),
     )
     unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
     if unsupported:
@@ -122,6 +141,35 @@ def diagnose(
             stacklevel=3,
         )
     return found
+
+
+def camera_meaning(ratio: float) -> str:
+    """
+    Return what the noise of calibrated cameras says of the cameras.
+
+    Parameters
+    ----------
+    ratio : float
+        Noise variance with calibrated cameras, divided by that with affine ones.
+
+    Returns
+    -------
+    str
+        A sentence.
+    """
+    if ratio < SAME_NOISE:
+        what = "calibrated cameras explain the table as well as affine ones"
+    elif ratio < OTHER_CAMERAS:
+        what = (
+            "affine cameras explain somewhat more than calibrated ones: there may be "
+            "too few basis shapes, whose part the cameras take over, or perspective"
+        )
+    else:
+        what = (
+            "the cameras are affine but not calibrated ones: pixels that are not "
+            "square, or images that were stretched"
+        )
+    return f"{what} (noise variance {ratio:.3g} times that of affine cameras)"
 
 
 def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:

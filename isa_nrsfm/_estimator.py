@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -20,16 +21,16 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._callbacks import CallbackSupportMixin, FitProgress
-from isa_nrsfm._frames.camera import reference_camera
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    full_rotations,
-    nearest_calibrated,
-)
 from isa_nrsfm._completion import complete_rows
 from isa_nrsfm._deformation_metric import deformation_metric
 from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
-from isa_nrsfm._factorisation import Factorisation, block_triplets, factorise
+from isa_nrsfm._factorisation import (
+    Factorisation,
+    Triplets,
+    block_triplets,
+    factorise,
+)
+from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frame_fit import (
     FrameFit,
     PosteriorFrames,
@@ -39,6 +40,12 @@ from isa_nrsfm._frame_fit import (
     posterior_moments,
     project,
     reprojection_error,
+)
+from isa_nrsfm._frames.camera import reference_camera
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    full_rotations,
+    nearest_calibrated,
 )
 from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._gauge import (
@@ -54,7 +61,7 @@ from isa_nrsfm._independent_gauge import (
     FrameMap,
     independent_gauge,
 )
-from isa_nrsfm._joint.fit import fit_jointly
+from isa_nrsfm._joint.fit import count_components, fit_jointly
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._metric_equations import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
@@ -64,7 +71,11 @@ from isa_nrsfm._sampling import Sample, sample_frames
 from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._stored_table import StoredTable
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._table_checks import check_names
+from isa_nrsfm._table_checks import (
+    check_names,
+    largest_n_components,
+    most_for_frames,
+)
 from isa_nrsfm._table_model import TableModel
 from isa_nrsfm._table_sources import (
     CHECKS,
@@ -82,6 +93,8 @@ JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 # Runs of FastICA, and steps and tolerance of the paper's refinement, where the result
 # is only a start.
 START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
+# Basis shapes of which "auto" takes the relevant ones.
+MOST_COMPONENTS = 12
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
 # What a fit may keep of the frames, and what only the joint refinement tells.
@@ -142,9 +155,11 @@ class AffineNRSfM(
 
     Parameters
     ----------
-    n_components : int, default=3
+    n_components : int or "auto", default=3
         K, the number of basis shapes. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames.
+        ``ceil(8 (K + 2) / 5)`` frames. "auto" takes those of twelve, or of as many as
+        the table allows, that are relevant (joint refinement only); ``len(basis_)`` is
+        what was found.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or
         `PooledFastICA`, with subspaces of size three; None is ``PooledFastICA()``, with
@@ -358,7 +373,10 @@ class AffineNRSfM(
     feature_names_in_: NDArray
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "n_components": [Interval(Integral, 1, None, closed="left")],
+        "n_components": [
+            Interval(Integral, 1, None, closed="left"),
+            StrOptions({"auto"}),
+        ],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
         "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
         "refinement": [StrOptions({"joint", "alternating"}), None],
@@ -378,7 +396,7 @@ class AffineNRSfM(
 
     def __init__(
         self,
-        n_components: int = 3,
+        n_components: Any = 3,
         *,
         isa: Any = None,
         block_recovery: str = "generalized_eigen",
@@ -470,51 +488,19 @@ class AffineNRSfM(
         source = self._opened(X, reset=True)
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
-        table = scaled_table(
-            source,
-            self.n_components,
-            layout=self.layout,
-            names=names,
-            scale_frames=self._scales_frames,
-            robust=self.loss != "linear",
-        )
-        rows, sizes, n_points = table.rows, table.sizes, table.n_points
-        self._unit = 1.0 if self._scales_frames else float(sizes[0])
-        outliers, used, complete = None, rows, table.complete
-        if self.loss != "linear":
-            outliers = gross_outliers(rows.whole().transpose(0, 2, 1))
-            used = rows.derive(rows_without, outliers)
-            complete = complete and not outliers.any()
-        if not complete:
-            used = complete_rows(used, n_points, self.n_components)
+        n_components = self.n_components
+        if n_components == "auto":
+            n_components = self._count_components(source, names)
+        table = self._scaled_table(source, n_components, names)
+        self._unit = 1.0 if self._scales_frames else float(table.sizes[0])
+        outliers, used = self._completed(table, n_components)
         progress("table")
-
-        shape = 2 * len(sizes), n_points
-        triplets = block_triplets(used, shape, 3 * self.n_components + 3)
-        if joint:
-            sample = sample_frames(used, n_points, triplets.vectors[:3])
-        else:
-            sample = Sample(used.whole().reshape(shape), [])
-        factors = factorise(sample.W, self.n_components, table.precision, triplets)
+        triplets, sample, factors = self._factors(table, used, n_components)
         progress("factorisation")
-        self.isa_ = self._strategy()
-        with warnings.catch_warnings():
-            if joint and self.isa is None:
-                # It makes no difference to the joint refinement, which starts there.
-                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
-            result = run_paper_pipeline(
-                factors,
-                self.n_components,
-                self.isa_,
-                block_recovery=self.block_recovery,
-                refinement="alternating" if joint else self.refinement,
-                max_iter=START_STEPS if joint else self.max_iter,
-                tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
-                report=progress,
-            )
+        self.isa_, result = self._paper_result(factors, n_components, progress)
         self.singular_values_ = self._unit * triplets.values
         self.rank_floor_ = triplets.rest_share
-        self._n_features_out = self.n_components
+        self._n_features_out = n_components
         if joint:
             frames = self._refine_jointly(
                 table, outliers, sample, factors, result, progress
@@ -592,13 +578,13 @@ class AffineNRSfM(
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
         camera : {"orthographic", "weak_perspective"} or None, default=None
-            What is known of the cameras. None returns the affine shapes, in the space
-            of `mean_shape_`: angles and proportions in depth are not those of the
-            object. Otherwise shapes are Euclidean, up to rotation and mirror image,
-            which are the same for all frames. "weak_perspective" lets each camera have
-            a scale of its own, so that the sizes of the shapes mean nothing;
-            "orthographic" has one scale for all, so that shapes are in the units of the
-            table.
+            What is known of the cameras, for a model with affine ones. None returns the
+            affine shapes, in the space of `mean_shape_`: angles and proportions in
+            depth are not those of the object. Otherwise shapes are Euclidean, up to
+            rotation and mirror image, which are the same for all frames.
+            "weak_perspective" lets each camera have a scale of its own, so that the
+            sizes of the shapes mean nothing; "orthographic" has one scale for all, so
+            that shapes are in the units of the table.
 
         Returns
         -------
@@ -609,8 +595,9 @@ class AffineNRSfM(
         Raises
         ------
         ValueError
-            If `camera` is something else, or if the cameras of the fitted table see
-            less than three directions of space.
+            If `camera` is something else, if the cameras of the fitted table see less
+            than three directions of space, or if the model has other calibrated cameras
+            than those that are asked for.
 
         Warns
         -----
@@ -624,18 +611,66 @@ class AffineNRSfM(
         Notes
         -----
         The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
-        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is.
+        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is. Models
+        that were fitted with calibrated cameras have Euclidean shapes as they are: no
+        shape is turned, and `scales_` and `rotations_` belong to them.
         """
         if camera is not None and camera not in CAMERA_MODELS:
             raise ValueError(
                 f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
             )
         table = self._opened(X)
-        metric = None
-        if camera is not None:
+        fitted, metric = self._frames.camera, None
+        if fitted != "affine" and camera not in (None, fitted):
+            raise ValueError(
+                f"the model was fitted with camera={fitted!r}, whose shapes are "
+                f"Euclidean as they are; got camera={camera!r}"
+            )
+        if camera is not None and fitted == "affine":
             self._need_frames("reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
-        return self._model.reconstruct(table, metric, camera == "orthographic")
+        scaled = metric is not None and camera == "orthographic"
+        return self._model.reconstruct(table, metric, scaled)
+
+    def mirror(self) -> Self:
+        """
+        Turn the model into its mirror image in depth, which fits as well.
+
+        Neither affine nor calibrated cameras tell an object from its mirror image: the
+        fit takes the one of which the mean shape has a depth of positive third moment.
+        Where it is the wrong one, for instance a face whose nose points away, this
+        takes the other one. Coefficients, reprojection and score stay as they are.
+
+        Returns
+        -------
+        AffineNRSfM
+            The same estimator: the signs of z of its shapes and of the third column of
+            its cameras are changed, and rotations are ``D R D`` with ``D = diag(1, 1,
+            -1)``.
+
+        Examples
+        --------
+        >>> from isa_nrsfm import AffineNRSfM
+        >>> from isa_nrsfm.datasets import make_face_tracks
+        >>> faces = make_face_tracks(n_frames=100, random_state=0)
+        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
+        >>> depth = model.mean_shape_[:, 2].copy()
+        >>> bool((model.mirror().mean_shape_[:, 2] == -depth).all())
+        True
+        """
+        check_is_fitted(self)
+        depth = np.array([1.0, 1.0, -1.0])
+        dtype = self.mean_shape_.dtype
+        for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
+            if hasattr(self, name):
+                setattr(self, name, getattr(self, name) * depth.astype(dtype))
+        if hasattr(self, "rotations_"):
+            turned = depth[:, None] * self.rotations_ * depth
+            self.rotations_ = turned.astype(dtype, copy=False)
+        signs = np.tile(depth, len(self.basis_))
+        self.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        self._frames = self._frames.mirrored()
+        return self
 
     def reproject(self, X: Any) -> NDArray:
         """
@@ -728,7 +763,7 @@ class AffineNRSfM(
         -------
         Diagnostics
             Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames and weak_deviations.
+            effective_frames, weak_deviations, camera_noise_ratio and camera_meaning.
 
         Raises
         ------
@@ -757,6 +792,7 @@ class AffineNRSfM(
             np.asarray(self.alpha_, dtype=np.float64)[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
+            self.camera_noise_ratio_,
         )
 
     def __sklearn_tags__(self) -> Any:
@@ -770,6 +806,102 @@ class AffineNRSfM(
         """Return what a notebook shows: scikit-learn's picture, and a summary."""
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
+
+    def _count_components(self, source: Table, names: NDArray | None) -> int:
+        """Return the number of basis shapes that a table supports."""
+        if self.refinement != "joint":
+            raise ValueError(
+                "n_components='auto' needs refinement='joint'; "
+                f"got refinement={self.refinement!r}"
+            )
+        table = self._scaled_table(source, 1, names)
+        most = largest_n_components(table.n_points)
+        most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
+        outliers, used = self._completed(table, most)
+        _, sample, factors = self._factors(table, used, most)
+        _, result = self._paper_result(factors, most, lambda stage: None)
+        found = count_components(
+            table.rows,
+            table.n_seen,
+            sample,
+            factors,
+            _stacked_shapes(result),
+            camera=self.camera,
+            outliers=outliers,
+            loss=self.loss,
+            max_iter=self.max_iter,
+            tol=JOINT_TOL if self.tol is None else self.tol,
+        )
+        if found == most:
+            warnings.warn(
+                f"all {most} basis shapes that were tried are relevant: the table may "
+                f"ask for more than n_components={most}",
+                stacklevel=4,
+            )
+        return found
+
+    def _scaled_table(
+        self, source: Table, n_components: int, names: NDArray | None
+    ) -> ScaledTable:
+        """Return a table checked and made ready for the fit."""
+        return scaled_table(
+            source,
+            n_components,
+            layout=self.layout,
+            names=names,
+            scale_frames=self._scales_frames,
+            robust=self.loss != "linear",
+        )
+
+    def _completed(
+        self, table: ScaledTable, n_components: int
+    ) -> tuple[NDArray | None, FrameBlocks]:
+        """Return gross outliers, with a robust loss, and frames without gaps."""
+        outliers, used, complete = None, table.rows, table.complete
+        if self.loss != "linear":
+            outliers = gross_outliers(table.rows.whole().transpose(0, 2, 1))
+            used = table.rows.derive(rows_without, outliers)
+            complete = complete and not outliers.any()
+        if not complete:
+            used = complete_rows(used, table.n_points, n_components)
+        return outliers, used
+
+    def _factors(
+        self, table: ScaledTable, used: FrameBlocks, n_components: int
+    ) -> tuple[Triplets, Sample, Factorisation]:
+        """Return the singular triplets of a table, and the factors of a sample."""
+        shape = 2 * len(table.sizes), table.n_points
+        triplets = block_triplets(used, shape, 3 * n_components + 3)
+        if self.refinement == "joint":
+            sample = sample_frames(used, table.n_points, triplets.vectors[:3])
+        else:
+            sample = Sample(used.whole().reshape(shape), [])
+        factors = factorise(sample.W, n_components, table.precision, triplets)
+        return triplets, sample, factors
+
+    def _paper_result(
+        self,
+        factors: Factorisation,
+        n_components: int,
+        report: Callable[[str], None],
+    ) -> tuple[Any, PaperResult]:
+        """Return the fitted strategy and what the paper's pipeline finds with it."""
+        joint, isa = self.refinement == "joint", self._strategy()
+        with warnings.catch_warnings():
+            if joint and self.isa is None:
+                # It makes no difference to the joint refinement, which starts there.
+                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
+            result = run_paper_pipeline(
+                factors,
+                n_components,
+                isa,
+                block_recovery=self.block_recovery,
+                refinement="alternating" if joint else self.refinement,
+                max_iter=START_STEPS if joint else self.max_iter,
+                tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
+                report=report,
+            )
+        return isa, result
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with what it leaves open filled in."""
@@ -827,9 +959,8 @@ class AffineNRSfM(
         self, table: ScaledTable, factors: Factorisation, result: PaperResult
     ) -> tuple[NDArray, NDArray]:
         """Return the paper's shapes in the metric of the rigid cameras."""
-        shapes = np.concatenate([result.mean_shape[None], result.basis])
         scaled = self.camera == "weak_perspective"
-        _, shapes = rigid_start(factors, shapes.transpose(0, 2, 1), scaled)
+        _, shapes = rigid_start(factors, _stacked_shapes(result), scaled)
         shapes = table.sizes[0] * shapes.transpose(0, 2, 1)
         return shapes[0], shapes[1:]
 
@@ -850,13 +981,12 @@ class AffineNRSfM(
         progress: FitProgress,
     ) -> FrameFit:
         """Set the shapes of the joint refinement and return the fit of the frames."""
-        shapes = np.concatenate([result.mean_shape[None], result.basis])
         fitted = fit_jointly(
             table.rows,
             table.n_seen,
             sample,
             factors,
-            shapes.transpose(0, 2, 1),
+            _stacked_shapes(result),
             rank_floor=self.rank_floor_,
             camera=self.camera,
             outliers=outliers,
@@ -871,7 +1001,7 @@ class AffineNRSfM(
             fitted.noise_variance,
             spread_starts(fitted.alpha, N_STARTS),
             self.loss,
-            FrameMap.identity(self.n_components),
+            FrameMap.identity(len(result.basis)),
             self.camera,
         )
         posteriors = posterior_blocks(frames, fitted.frames, table.rows)
@@ -980,6 +1110,12 @@ class AffineNRSfM(
         least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
         X = validate_data(self, X, reset=reset, **CHECKS, **least)
         return Table.in_memory(X, self.n_jobs if reset else 1, whole=not reset)
+
+
+def _stacked_shapes(result: PaperResult) -> NDArray:
+    """Return mean shape and basis shapes (n_components + 1, 3, n_points)."""
+    shapes = np.concatenate([result.mean_shape[None], result.basis])
+    return shapes.transpose(0, 2, 1)
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

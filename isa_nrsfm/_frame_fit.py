@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frame_blocks import FrameBlocks
+from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
-from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._robust import distant_points, robust_weights
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 # A basis shape whose image has less than this share of the energy that the camera could
 # show of it is seen end on: its image is rounding errors.
 UNSEEN = 1e-28
+# What mirrors shapes and cameras in depth.
+MIRROR = np.array([1.0, 1.0, -1.0])
 # Rounds of a robust fit, and the change of the weights that ends them.
 REWEIGHTINGS = 50
 SETTLED = 1e-4
@@ -108,6 +110,12 @@ class RigidFrames(NamedTuple):
     mean_shape: NDArray
     basis: NDArray
     camera: str = "affine"
+
+    def mirrored(self) -> "RigidFrames":
+        """Return the model with shapes mirrored in depth."""
+        return self._replace(
+            mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
+        )
 
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """
@@ -222,6 +230,11 @@ class PosteriorFrames(NamedTuple):
     loss: str
     gauge: FrameMap
     camera: str = "affine"
+
+    def mirrored(self) -> "PosteriorFrames":
+        """Return the model with shapes that are shown mirrored in depth."""
+        space = MIRROR[:, None] * self.gauge.space
+        return self._replace(gauge=self.gauge._replace(space=space))
 
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """

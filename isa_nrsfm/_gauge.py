@@ -1,8 +1,8 @@
 """The canonical choice among shapes and cameras that fit a table equally well.
 
-An affinity of space (with calibrated cameras a rotation), the order, scale and sign of the basis shapes are free: here
-they are fixed. What stays free is the mirror image in depth: a table seen by affine
-cameras does not tell it.
+An affinity of space (with calibrated cameras a rotation), the order, scale and sign of
+the basis shapes are free: here they are fixed. What stays free is the mirror image in
+depth: the tables do not tell it.
 """
 
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera import mean_view
 from isa_nrsfm._factorisation import orientations
+from isa_nrsfm._frames.camera import mean_view
 
 # Frames that are taken together where much is computed of each.
 BLOCK_FRAMES = 4096

@@ -209,6 +209,11 @@ def smallest_n_frames(n_components: int) -> int:
     return -(-8 * (n_components + 2) // 5)
 
 
+def most_for_frames(n_frames: int) -> int:
+    """Return the largest K that so many frames determine, at least 1."""
+    return max(5 * n_frames // 8 - 2, 1)
+
+
 def check_size(n_frames: int, n_points: int, n_components: int) -> None:
     """Refuse a table that is too small for the number of basis shapes."""
     largest = largest_n_components(n_points)

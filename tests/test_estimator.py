@@ -20,7 +20,6 @@ from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
-from isa_nrsfm._joint.fit import STIFFNESS
 from isa_nrsfm._robust import robust_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
@@ -32,7 +31,7 @@ TABLE = FACES.data
 ONLY_JOINT = (
     "alpha_std_",
     "noise_variance_",
-    "stiffness_",
+    "camera_noise_ratio_",
     "reliability_",
     "objective_history_",
     "gradient_norm_",
@@ -119,7 +118,11 @@ def model():
         {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
         {"loss": "huber"},
         {"loss": "cauchy", "independence": None},
-        {"stiffness": 10.0},
+        {"camera": "weak_perspective"},
+        {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
+        {"camera": "orthographic"},
+        {"camera": "orthographic", "refinement": "alternating"},
+        {"camera": "weak_perspective", "refinement": None},
         {"n_components": 1},
         {"n_components": 6},
         {"refinement": "alternating"},
@@ -162,7 +165,7 @@ def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
     if refinement == "joint":
         in_type_of_the_table["alpha_std_"] = (N_FRAMES, n_components)
         assert model.reliability_.shape == (n_components,)
-        for name in ("noise_variance_", "stiffness_", "gradient_norm_"):
+        for name in ("noise_variance_", "camera_noise_ratio_", "gradient_norm_"):
             assert isinstance(getattr(model, name), float), name
         assert model.objective_history_.shape == (model.n_iter_ + 1,)
         assert np.isfinite(model.objective_history_).all()
@@ -200,7 +203,7 @@ def test_defaults_are_the_documented_ones():
     assert model.refinement == "joint"
     assert model.independence == "shapes"
     assert model.loss == "linear"
-    assert model.stiffness is None
+    assert model.camera == "affine"
     assert model.layout == "interleaved"
     assert model.scale_frames is True
 
@@ -312,8 +315,7 @@ def test_objective_never_rises(variant):
     history = model.objective_history_
     assert np.all(np.diff(history) <= 1e-9 * np.abs(history).max())
     assert 0 <= model.gradient_norm_ < 0.1
-    chosen = (0.0, STIFFNESS) if model.stiffness is None else (model.stiffness,)
-    assert model.stiffness_ in chosen
+    assert model.camera_noise_ratio_ >= 1
 
 
 def test_deviations_are_positive_and_below_the_prior(variant):
@@ -756,8 +758,9 @@ def test_methods_need_a_fitted_model():
         {"independence": "points"},
         {"loss": "squared"},
         {"loss": None},
-        {"stiffness": -1.0},
-        {"stiffness": "auto"},
+        {"camera": "perspective"},
+        {"camera": None},
+        {"n_components": "best"},
         {"layout": "xy"},
         {"scale_frames": "yes"},
         {"max_iter": 0},
@@ -838,13 +841,6 @@ def test_robust_losses_need_the_joint_refinement(refinement, loss):
         ValueError, match=f"loss='{loss}' needs refinement='joint'; got"
     ):
         estimator(refinement=refinement, loss=loss).fit(TABLE)
-
-
-def test_stiffness_zero_is_not_raised():
-    soft, stiff = (estimator(stiffness=s).fit(TABLE) for s in (0, 1e6))
-    assert soft.stiffness_ == 0
-    assert np.linalg.norm(stiff.basis_) < np.linalg.norm(soft.basis_)
-    assert stiff.inverse_snr_ > soft.inverse_snr_
 
 
 def test_shapes_of_frames_do_not_depend_on_the_independence(model):

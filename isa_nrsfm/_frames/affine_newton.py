@@ -151,9 +151,7 @@ class _Problem(NamedTuple):
         )
 
 
-def _problem(
-    products: FrameProducts, variance: NDArray, n_points: float
-) -> _Problem:
+def _problem(products: FrameProducts, variance: NDArray, n_points: float) -> _Problem:
     """Return the problem with its ridges, each relative to the frame."""
     energy, weight = products.energy, products.weight
     ridge = np.maximum(variance, RIDGE * energy)

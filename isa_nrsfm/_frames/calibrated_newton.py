@@ -36,8 +36,10 @@ from isa_nrsfm._frames.coefficients import (
 )
 from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._small_matrices import (
-    invert_positive,
+    COLUMNS,
+    ROWS,
     inverse3,
+    invert_positive,
     solve_positive,
     unpack3,
     unpacked,
@@ -235,10 +237,8 @@ def _better(problem: _Problem, motion: NDArray, other: NDArray) -> NDArray:
 
 def _packed3(full: NDArray) -> NDArray:
     """Return symmetric matrices (..., 3, 3, n) packed."""
-    return np.stack(
-        [full[..., a, b, :] for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))],
-        axis=-2,
-    )
+    pairs = zip(ROWS, COLUMNS, strict=True)
+    return np.stack([full[..., a, b, :] for a, b in pairs], axis=-2)
 
 
 class _State(NamedTuple):
@@ -300,9 +300,7 @@ def _curvature(
             (slope[:, 0] * motion[:, 1] - slope[:, 1] * motion[:, 0]).sum(axis=0),
         ]
     )
-    first = np.stack(
-        [xx, xy, xz, across[0], yy, yz, across[1], zz, across[2], scale]
-    )
+    first = np.stack([xx, xy, xz, across[0], yy, yz, across[1], zz, across[2], scale])
     second = np.stack(
         [
             bent[0, 0], bent[0, 1], bent[0, 2], gradient[0],

@@ -39,8 +39,8 @@ class CoefficientPosterior(NamedTuple):
         ``min_a ||W - M S(a)||^2 + s2 |a|^2``.
     log_determinant : ndarray of shape (n_frames,)
         ``log det(I + H / s2)``.
-    image_energy : ndarray of shape (n_frames,)
-        ``tr H``, what the basis shapes move in the image.
+    image_energy : ndarray of shape (n_components, n_frames)
+        ``H_kk``, what the basis shapes move in the image.
     """
 
     c: NDArray
@@ -108,7 +108,7 @@ def coefficient_posterior(
     seen = np.einsum("kari,rai->ki", products.cross, motion)
     n_shapes = len(seen)
     diagonal = diagonal_of(H)[1:]
-    image_energy = H[diagonal].sum(axis=0)
+    image_energy = H[diagonal]
     # [[||W - M B_0||^2, (q - h)^T], [q - h, H + s2 I]], then swept.
     H[diagonal] += noise
     H[0] += products.energy - 2 * seen[0]

@@ -1,10 +1,10 @@
 """The joint fit: from the paper's result to the shapes of greatest likelihood.
 
 1. Calibrated cameras to start from (`starts`), the choice of them by the objective.
-2. The fit of calibrated cameras, shapes and noise, of the best starts. While the model may be wrong the
-   noise has a floor: what a few basis shapes leave of an object is not noise, and would
-   be explained by depths and cameras that are not there. Tables without noise tell that
-   they are by what is left at the floor.
+2. The fit of calibrated cameras, shapes and noise, from the best starts. While the
+   model may be wrong the noise has a floor: what a few basis shapes leave of an object
+   is not noise, and would be explained by depths and cameras that are not there. Tables
+   without noise tell that they are by what is left at the floor.
 3. For affine cameras, the same with cameras that are free, from there or from the
    paper's result, whichever leads to the lower objective.
 
@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils.parallel import _threadpool_controller_decorator
 
@@ -35,6 +34,7 @@ from isa_nrsfm._joint.many_points import (
 )
 from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
+from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
 from isa_nrsfm._joint.starts import affine_start, best_starts
 from isa_nrsfm._robust import ROUNDING
@@ -50,9 +50,9 @@ BY_CHANCE = 0.03
 POLISH = 0.01
 CALIBRATED_POLISH = 0.1
 FEW_FRAMES = 2000
-# A fit that leaves less than this share of the least noise may be one of a table without
-# noise. It is one if the noise falls below the second share of the mean square, and it
-# can be none if no model with as many basis shapes leaves so little.
+# A fit that leaves less than this share of the least noise may be one of a table
+# without noise. It is one if the noise falls below the second share of the mean square,
+# and it can be none if no model with as many basis shapes leaves so little.
 LEFT_OVER = 0.1
 EXACT = 1e-10
 # Steps that tell whether it falls.
@@ -153,67 +153,22 @@ def fit_jointly(
         The fit.
     """
     n_shapes, _, n_points = paper_shapes.shape
-    n_frames = len(n_seen)
-    complete = bool((n_seen == n_points).all())
-    wide = complete and loss == "linear" and has_many_points(n_points, n_shapes)
-    used = None
-    if wide:
-        frames = JointFrames.along(rows, leading_directions(factors))
-    elif loss == "linear":
-        frames = JointFrames.of_points(rows, complete)
-    else:
-        used = seen_points(rows.whole().transpose(0, 2, 1))
-        if outliers is not None:
-            used &= ~outliers
-        weights = None if used.all() else used * 1.0
-        frames = JointFrames.of_points(rows, complete, weights)
-
-    # The problems of the samples and of all frames.
-    n_numbers, energy = totals(frames.blocks)
-    penalty = n_numbers / (BASIS_STD**2 * energy * n_frames)
-    steps = Steps(max_iter, tol, on_step, to_the_end=n_frames <= FEW_FRAMES)
-    problem = JointProblem(frames, steps, penalty)
-    by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
-    problems = [
-        problem.part(part, tol=max(tol, by_chance / len(part)), to_the_end=False)
-        for part in sample.parts
-    ]
-    problems.append(problem)
-    first = problems[0]
-
-    # Calibrated cameras, on the first sample.
-    name = "weak_perspective" if camera == "affine" else camera
-    starts = best_starts(first, sample.W, factors, paper_shapes, CAMERAS[name])
-    result = _least(_calibrated_fit(first, state, CAMERAS[name]) for state in starts)
-    # Free cameras, from there and from the paper's result: the fit itself, or only to
-    # be compared.
-    cameras = CAMERAS[camera]
-    max_iter = first.steps.max_iter
-    if camera != "affine":
-        max_iter = min(max_iter, COMPARED_STEPS)
-    starts = [
-        first.aligned(result.state, "affine"),
-        affine_start(first, sample.W, paper_shapes),
-    ]
-    free = _least(
-        _refined(first, state, CAMERAS["affine"], max_iter=max_iter)
-        for state in starts
-    )
-    ratio = result.left / min(free.left, result.left)
-    if camera == "affine":
-        result = free
+    steps = Steps(max_iter, tol, on_step)
+    ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
+    first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
+    result, ratio = _first_fit(first, sample, factors, paper_shapes, camera)
     least_noise = LEAST_NOISE
-    if not complete or rank_floor < EXACT:
+    if not ready.complete or rank_floor < EXACT:
         result, least_noise = _without_floor(first, result, cameras)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
-    for larger in problems[1:]:
+    for larger in ready.problems[1:]:
         result = refined(larger, larger.aligned(result.state, camera))
-    if wide:
+    if ready.wide:
         result, problem = in_all_points(result, problem, rows, refined)
     noise, n_fitted = result.state.noise, 0
-    if used is not None:
+    if ready.used is not None:
         # The scale of the noise is that of the residual with the coefficients fitted.
-        result, noise = reweighted(problem, rows, used, result, loss, refined)
+        result, noise = reweighted(problem, rows, ready.used, result, loss, refined)
         n_fitted = n_shapes - 1
     shapes = problem.frames.points(result.state.shapes)
     state = result.state._replace(shapes=first.frames.coordinates(shapes))
@@ -231,6 +186,118 @@ def fit_jointly(
         result.converged,
         problem.frames,
     )
+
+
+@_threadpool_controller_decorator(limits=1, user_api="blas")
+def count_components(
+    rows: FrameBlocks,
+    n_seen: NDArray,
+    sample: Sample,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    *,
+    camera: str,
+    outliers: NDArray | None = None,
+    loss: str,
+    max_iter: int,
+    tol: float,
+) -> int:
+    """
+    Return the number of basis shapes that a table supports.
+
+    Parameters
+    ----------
+    rows, n_seen, sample, factors, paper_shapes
+        As of `fit_jointly`, with more basis shapes than are expected.
+    camera, outliers, loss, max_iter, tol
+        As of `fit_jointly`.
+
+    Returns
+    -------
+    int
+        The number, at least one: the basis shapes of a fit of the sample that are
+        relevant.
+    """
+    steps = Steps(max_iter, tol)
+    ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
+    first = ready.problems[0]
+    result, _ = _first_fit(first, sample, factors, paper_shapes, camera)
+    return max(relevant_components(first, result.state, CAMERAS[camera]), 1)
+
+
+class _Ready(NamedTuple):
+    """A table that is ready for the joint fit."""
+
+    problems: list[JointProblem]  # of the samples and of all frames
+    complete: bool  # whether all points are seen
+    wide: bool  # whether frames are given by directions
+    used: NDArray | None  # points that count at first, with a robust loss
+
+
+def _ready(
+    rows: FrameBlocks,
+    n_seen: NDArray,
+    sample: Sample,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    outliers: NDArray | None,
+    loss: str,
+    steps: Steps,
+) -> _Ready:
+    """Return a table ready for the joint fit."""
+    n_shapes, _, n_points = paper_shapes.shape
+    n_frames = len(n_seen)
+    complete = bool((n_seen == n_points).all())
+    wide = complete and loss == "linear" and has_many_points(n_points, n_shapes)
+    used = None
+    if wide:
+        frames = JointFrames.along(rows, leading_directions(factors))
+    elif loss == "linear":
+        frames = JointFrames.of_points(rows, complete)
+    else:
+        used = seen_points(rows.whole().transpose(0, 2, 1))
+        if outliers is not None:
+            used &= ~outliers
+        weights = None if used.all() else used * 1.0
+        frames = JointFrames.of_points(rows, complete, weights)
+    n_numbers, energy = totals(frames.blocks)
+    penalty = n_numbers / (BASIS_STD**2 * energy * n_frames)
+    steps = steps._replace(to_the_end=n_frames <= FEW_FRAMES)
+    problem = JointProblem(frames, steps, penalty)
+    by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
+    problems = [
+        problem.part(part, tol=max(steps.tol, by_chance / len(part)), to_the_end=False)
+        for part in sample.parts
+    ]
+    return _Ready([*problems, problem], complete, wide, used)
+
+
+def _first_fit(
+    problem: JointProblem,
+    sample: Sample,
+    factors: Factorisation,
+    paper_shapes: NDArray,
+    camera: str,
+) -> tuple[JointResult, float]:
+    """Return the fit of the sample, and the ratio of noises of `JointFit`."""
+    calibrated = CAMERAS["weak_perspective" if camera == "affine" else camera]
+    starts = best_starts(problem, sample.W, factors, paper_shapes, calibrated)
+    result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
+    # Free cameras, from there and from the paper's result: the fit itself, or only to
+    # be compared.
+    max_iter = problem.steps.max_iter
+    if camera != "affine":
+        max_iter = min(max_iter, COMPARED_STEPS)
+    states = (
+        problem.aligned(result.state, "affine"),
+        affine_start(problem, sample.W, paper_shapes),
+    )
+    free = _least(
+        _refined(problem, state, CAMERAS["affine"], max_iter=max_iter)
+        for state in states
+    )
+    ratio = result.left / min(free.left, result.left)
+    return free if camera == "affine" else result, ratio
 
 
 def _least(results: Iterable[JointResult]) -> JointResult:
@@ -273,9 +340,7 @@ def _without_floor(
     mean_square = energy / n_seen
     if result.residual < LEFT_OVER * LEAST_NOISE * mean_square:
         max_iter = min(EXACT_STEPS, problem.steps.max_iter)
-        exact = _refined(
-            problem, result.state, cameras, NOISE_FLOOR, max_iter=max_iter
-        )
+        exact = _refined(problem, result.state, cameras, NOISE_FLOOR, max_iter=max_iter)
         if exact.state.noise < EXACT * mean_square:
             return result.followed_by(exact), NOISE_FLOOR
     return result, LEAST_NOISE

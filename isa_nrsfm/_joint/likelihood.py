@@ -112,7 +112,7 @@ def prepared_frames(
 def likelihood_of(
     tracks: NDArray,
     weights: NDArray | None,
-    penalty: float,
+    penalty: NDArray | float,
     block_frames: int = BLOCK_FRAMES,
 ) -> "MarginalLikelihood":
     """
@@ -161,7 +161,7 @@ class MarginalLikelihood:
     def __init__(
         self,
         frames: FrameBlocks,
-        penalty: float,
+        penalty: NDArray | float,
         known: tuple[float, float] | None = None,
     ):
         self.frames = frames
@@ -298,7 +298,7 @@ def _pass_over_block(
     shapes: NDArray,
     gram: SharedGram,
     noise: float,
-    penalty: float,
+    penalty: NDArray | float,
     tiny_noise: bool,
 ) -> Passed:
     """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
@@ -306,9 +306,7 @@ def _pass_over_block(
     for frames in block:
         end = start + len(frames.weight)
         part = motion[:, :, start:end]
-        parts.append(
-            _pass_over(frames, shapes, gram, part, noise, penalty, tiny_noise)
-        )
+        parts.append(_pass_over(frames, shapes, gram, part, noise, penalty, tiny_noise))
         start = end
     if len(parts) == 1:
         return parts[0]
@@ -332,7 +330,7 @@ def _pass_over(
     gram: SharedGram,
     motion: NDArray,
     noise: float,
-    penalty: float,
+    penalty: NDArray | float,
     tiny_noise: bool,
 ) -> Passed:
     """
@@ -346,13 +344,13 @@ def _pass_over(
     posterior = coefficient_posterior(products, motion, noise, refined=tiny_noise)
     c, alpha = posterior.c, posterior.alpha
     value = np.sum(posterior.objective / noise + posterior.log_determinant)
-    value += penalty * posterior.image_energy.sum()
+    value += np.sum(penalty * posterior.image_energy.sum(axis=1))
     residual = float(posterior.residual(noise).sum())
     spread = float(posterior.spread(noise).sum())
 
     # Second moments of c, with what the prior of the basis shapes adds to them.
     moments = posterior.second_moments(noise)
-    moments[diagonal_of(moments)[1:]] += noise * penalty
+    moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
     cameras = camera_gram(motion)
     motion_curvature = products.gram.moments(moments)
     A = unpack3(motion_curvature)

@@ -39,9 +39,9 @@ from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frame_fit import stacked_motion
+from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
-from isa_nrsfm._frame_products import FrameTracks
 
 # Multiplications of a step: it takes a part of a second.
 STEP_COST = 2e9
@@ -490,9 +490,7 @@ def _fitted(
         W, seen = _tracks_of(part)
         start = initial[first : first + len(W)]
         if seen is None:
-            fits.append(
-                fit_prepared(part, shapes, 0.0, camera=camera, initial=start)
-            )
+            fits.append(fit_prepared(part, shapes, 0.0, camera=camera, initial=start))
         else:
             tracks = W.swapaxes(1, 2)
             fits.append(

@@ -57,7 +57,7 @@ class JointProblem:
         The frames.
     steps : Steps
         How long its steps go on.
-    penalty : float
+    penalty : float or ndarray of shape (n_components,)
         As of `MarginalLikelihood`.
     """
 
@@ -65,7 +65,7 @@ class JointProblem:
         self,
         frames: JointFrames,
         steps: Steps,
-        penalty: float,
+        penalty: NDArray | float,
     ):
         self.frames, self.steps, self.penalty = frames, steps, penalty
 
@@ -77,6 +77,10 @@ class JointProblem:
     def of(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
         return type(self)(frames, self.steps, self.penalty)
+
+    def with_penalty(self, penalty: NDArray) -> Self:
+        """Return the problem with a penalty for each basis shape."""
+        return type(self)(self.frames, self.steps, penalty)
 
     @property
     def n_frames(self) -> int:

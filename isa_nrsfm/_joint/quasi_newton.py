@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import AffineCameras, CameraModel
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.noise_free import fit_without_noise
 
@@ -262,7 +262,9 @@ class _Point:
         first = self.state.shapes.size
         return (
             vector[:first].reshape(self.state.shapes.shape),
-            vector[first:-1].reshape(self.cameras.n_parameters, self.state.motion.shape[-1]),
+            vector[first:-1].reshape(
+                self.cameras.n_parameters, self.state.motion.shape[-1]
+            ),
             vector[-1],
         )
 

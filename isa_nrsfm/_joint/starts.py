@@ -220,7 +220,9 @@ def best_starts(
         Shapes, cameras of all frames, and noise.
     """
     rows = problem.frames.coordinates(W).reshape(problem.n_frames, 2, -1)
-    order = np.argsort(rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape)))
+    order = np.argsort(
+        rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape))
+    )
     comparison = SMALL if problem.steps.to_the_end else LARGE
     few = np.sort(spread(order, min(comparison.n_frames, len(order))))
     part = problem.part(few, tol=COMPARED_TOL)

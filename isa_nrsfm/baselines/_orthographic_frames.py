@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frame_fit import compose
+from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
 from isa_nrsfm._tracks import measurement_matrix
 
