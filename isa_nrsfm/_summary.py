@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from isa_nrsfm._diagnostics import camera_meaning
+
 # Basis shapes whose energy is listed, at most.
 MOST_LISTED = 12
 
@@ -41,13 +43,17 @@ def _lines(model: Any) -> dict[str, str]:
         fitted = np.isfinite(model._frame_sizes)
         without = f", {(~fitted).sum()} rows without points" * (not fitted.all())
         lines["Frames"] = f"{fitted.sum()}{without}"
+    camera = model._frames.camera.replace("_", " ")
+    ratio = getattr(model, "camera_noise_ratio_", None)
+    meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
+    lines["Cameras"] = f"{camera}{meaning}"
     floor = _percent(model.rank_floor_)
     lines["Inverse SNR"] = f"{_percent(model.inverse_snr_)}, rank floor {floor}"
     if hasattr(model, "noise_variance_"):
         noise = math.sqrt(model.noise_variance_)
         lines["Noise"] = (
             f"{_percent(noise)} of a frame's size"
-            if model.scale_frames
+            if model._scales_frames
             else f"{noise:.3g} in the units of the table"
         )
     shares = [_percent(share) for share in model.energy_share_]

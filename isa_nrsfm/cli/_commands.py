@@ -32,6 +32,7 @@ from isa_nrsfm.cli._outputs import (
     write_report,
     write_results,
 )
+from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.cli._report import (
     fit_text,
     lay_out,
@@ -89,6 +90,11 @@ def fit_table(
             "--std: only --refinement joint knows the standard deviations of the "
             f"coefficients; got --refinement {args.refinement}"
         )
+    if args.n_components[0] == AUTO and args.refinement != "joint":
+        raise ValueError(
+            "--n-components auto needs --refinement joint; got --refinement "
+            f"{args.refinement}"
+        )
     folder = Path(args.output)
     clock = {"": time.perf_counter()}
     frames = _read_frames(args)
@@ -103,6 +109,7 @@ def fit_table(
         isa=_strategy(args),
         block_recovery=args.block_recovery,
         refinement=None if args.refinement == "none" else args.refinement,
+        camera=args.camera,
         independence=None if args.independence == "none" else args.independence,
         loss=args.loss,
         scale_frames=not args.no_scale_frames,

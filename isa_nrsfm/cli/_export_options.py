@@ -26,7 +26,8 @@ examples:
   isa-nrsfm export results/model.skops faces.csv --label expression --output faces.html
 
 Shapes are upright and frontal, and have the proportions that weak-perspective cameras
-tell, except in .npz and .mat, which have the arrays as they are in the model.""",
+tell, except in .npz and .mat, which have the arrays as they are in the model. Models of
+'fit --camera weak_perspective' or 'orthographic' have true proportions as they are.""",
 )
 
 
@@ -85,8 +86,9 @@ def add_export_options(
     group.add_argument(
         "--camera",
         choices=["weak_perspective", "none"],
-        help="what is known of the cameras; none for affine shapes, whose angles and "
-        "depth are not those of the object (default: weak_perspective)",
+        help="what is known of the cameras of a model with affine ones; none for "
+        "affine shapes, whose angles and depth are not those of the object (default: "
+        "weak_perspective)",
     )
     group.add_argument(
         "--origin",

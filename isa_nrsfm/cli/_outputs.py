@@ -30,7 +30,8 @@ FIGURES = {
 TABLES = {
     "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
-    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; "
+    "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; of "
+    "calibrated cameras a scale times two rows of a rotation; "
     "inverse_snr is the energy of the reprojection error relative to the frame's",
 }
 ARRAYS = {

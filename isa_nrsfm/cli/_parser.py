@@ -6,12 +6,15 @@ from typing import Any, NamedTuple
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._independent_gauge import INDEPENDENCE
 from isa_nrsfm._robust import LOSSES
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
 from isa_nrsfm.io import FORMATS
 
 PROGRAM = "isa-nrsfm"
+# What stands for the number of basis shapes where the table is to tell it.
+AUTO = "auto"
 # A range of more numbers of basis shapes is a mistake.
 _MOST_CHOICES = 100
 
@@ -39,6 +42,7 @@ _FIT_EXAMPLES = """\
 examples:
   isa-nrsfm fit faces.csv --n-components 9 --output results
   isa-nrsfm fit faces.csv --n-components 1-12 --output results
+  isa-nrsfm fit body.csv --camera weak_perspective -k auto --output results
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
   isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
@@ -212,7 +216,16 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
         default=str(defaults["n_components"]),
         help="number of basis shapes (default: %(default)s). Of several, such as 1-8 "
         "or 3,6,9, that is taken which best predicts held-out points of held-out "
-        "frames",
+        "frames; auto takes those of twelve that the table determines",
+    )
+    group.add_argument(
+        "--camera",
+        choices=list(CAMERAS),
+        default=defaults["camera"],
+        help="what is known of the cameras: affine assumes nothing, weak_perspective "
+        "ones are rotations with a scale for each frame, orthographic ones have one "
+        "scale for all frames; with the last two shapes have true proportions "
+        "(default: %(default)s)",
     )
     group.add_argument(
         "--isa",
@@ -258,7 +271,8 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--no-scale-frames",
         action="store_true",
-        help="let frames count by their size in the image; otherwise all count alike",
+        help="let frames count by their size in the image, as orthographic cameras "
+        "always do; otherwise all count alike",
     )
     group.add_argument(
         "--random-state",
@@ -343,8 +357,10 @@ def _positive(text: str) -> int:
     return _whole_number(text, 1, 2**31 - 1)
 
 
-def _numbers_of_shapes(text: str) -> tuple[int, ...]:
-    """Read numbers of basis shapes, such as 9, 1-8 or 3,6,9; ascending."""
+def _numbers_of_shapes(text: str) -> tuple[int, ...] | tuple[str]:
+    """Read numbers of basis shapes, such as 9, 1-8 or 3,6,9, ascending; or auto."""
+    if text.strip() == AUTO:
+        return (AUTO,)
     numbers: set[int] = set()
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")

@@ -2,6 +2,7 @@
 
 import math
 import platform
+import textwrap
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -10,15 +11,25 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm._diagnostics import camera_meaning
 from isa_nrsfm._frame_fit import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
+from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.metrics import inverse_snr
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
 _MOST_ROWS = 10
+_TEXT_WIDTH = 90
+CAMERA_TITLES = {
+    "affine": "affine: shapes are known up to an affinity of space",
+    "weak_perspective": "weak-perspective: shapes have true proportions, up to a "
+    "mirror image",
+    "orthographic": "orthographic: shapes have true proportions, up to a mirror "
+    "image, in the units of the table",
+}
 
 
 def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
@@ -56,7 +67,7 @@ def quality_report(estimator: AffineNRSfM, X: Any, fit: FrameFit) -> dict[str, A
             X,
             fitted_table(estimator, fit),
             layout=estimator.layout,
-            scale_frames=estimator.scale_frames,
+            scale_frames=estimator._scales_frames,
         ),
         "held_out_error": -estimator.score(X),
         "rms_point_error": np.sqrt(2 * np.nanmean(off**2)),
@@ -79,12 +90,17 @@ def model_report(estimator: AffineNRSfM, X: Any, frames: Frames) -> dict[str, An
     names = component_names(len(estimator.basis_))
     # Known only where the fit has seen the table as it is.
     floor = frames.seen.all() and estimator.loss == "linear"
+    ratio = getattr(estimator, "camera_noise_ratio_", None)
     return {
         "n_components": len(estimator.basis_),
         **quality_report(estimator, X, fitted_frames(estimator)),
         "inverse_snr": estimator.inverse_snr_,
         "rank_floor": estimator.rank_floor_ if floor else None,
         "noise_variance": getattr(estimator, "noise_variance_", None),
+        "frames_scaled": estimator._scales_frames,
+        "camera": estimator.camera,
+        "camera_noise_ratio": ratio,
+        "camera_meaning": None if ratio is None else camera_meaning(ratio),
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": [
@@ -130,7 +146,7 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
         noise = math.sqrt(model["noise_variance"])
         unit = (
             f"{_percent(noise)} of the frame's size"
-            if model["parameters"]["scale_frames"]
+            if model["frames_scaled"]
             else f"{noise:.3g} in the units of the table"
         )
         fit.append(f"noise {unit}, standard deviation of a coordinate")
@@ -150,10 +166,16 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
     title = (
         f"{shapes} fitted to {table['n_frames']} frames of {table['n_points']} points"
     )
+    choice = {}
+    if "choice" in report:
+        choice["Choice"] = _choice_lines(report["choice"])
+    elif model["parameters"]["n_components"] == AUTO:
+        choice["Choice"] = [f"K = {n_components}: what the table determines"]
     sections = {
         "Table": table_lines(table),
-        **({"Choice": _choice_lines(report["choice"])} if "choice" in report else {}),
+        **choice,
         "Fit": fit,
+        "Cameras": _camera_lines(model),
         "Alpha": alpha,
         "Files": files,
     }
@@ -212,6 +234,12 @@ def _choice_lines(choice: dict[str, Any]) -> list[str]:
     if choice["chosen"] == choice["n_components"][-1]:
         lines.append("larger K may be better: this is the largest that was tried")
     return lines
+
+
+def _camera_lines(model: dict[str, Any]) -> list[str]:
+    """Say what cameras the model has, and what the noise says of them."""
+    lines = [CAMERA_TITLES[model["camera"]]]
+    return lines + textwrap.wrap(model["camera_meaning"] or "", _TEXT_WIDTH)
 
 
 def lay_out(sections: Mapping[str, Sequence[str]]) -> str:

@@ -85,8 +85,9 @@ def write_glb(
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras. "weak_perspective" writes Euclidean shapes, None
-        affine ones, which look like those of figures.
+        What is known of the cameras of a model with affine ones. "weak_perspective"
+        writes Euclidean shapes, None affine ones, which look like those of figures. A
+        model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where 68 points of a face would stand
@@ -118,7 +119,8 @@ def write_glb(
     As glTF wants it, y points up and z to the viewer. The largest extent of the mean
     shape is one unit, since the true size is not known; ``extras`` of the mesh has the
     names of the points and by what the shapes were multiplied. Euclidean basis shapes
-    are the least squares fit to the shapes of the frames.
+    of affine cameras are the least squares fit to the shapes of the frames; those of
+    calibrated cameras are the model's.
     """
     if Path(path).suffix.lower() != ".glb":
         raise ValueError(f"path must end in .glb; got {os.fspath(path)}")

@@ -88,9 +88,10 @@ def point_distribution_model(
         Number of modes, or a share of the variance, between 0 and 1, of which as few
         modes are taken as have it. None takes as many as there are basis shapes.
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras. "weak_perspective" takes the Euclidean shapes of
-        the frames, as `AffineNRSfM.reconstruct` has them, aligned by rotations and
-        scales. None takes the affine shapes as they are.
+        What is known of the cameras of a model with affine ones. "weak_perspective"
+        takes the Euclidean shapes of the frames, as `AffineNRSfM.reconstruct` has them,
+        aligned by rotations and scales. None takes the affine shapes as they are. A
+        model with calibrated cameras has Euclidean shapes, which are aligned likewise.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where 68 points of a face would stand
@@ -103,7 +104,7 @@ def point_distribution_model(
     -------
     PointDistributionModel
         Named tuple of mean, modes and eigenvalues. Lengths are in units of images of
-        medium scale.
+        medium scale, with calibrated cameras in those of `AffineNRSfM.mean_shape_`.
 
     Raises
     ------
@@ -145,13 +146,13 @@ def point_distribution_model(
     """
     _check_n_modes(n_modes)
     space = upright_space(model, camera, origin, mirrored)
-    if space.metric is None:
+    if space.camera is None:
         shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
         shapes = shapes @ space.transform.T
     else:
         shapes = upright_frames(space, model, model.motion_, model.alpha_).shapes
     shapes = shapes[np.isfinite(shapes).all(axis=(1, 2))]
-    if space.metric is not None:
+    if space.camera is not None:
         shapes = _aligned(shapes)
     mean = shapes.mean(axis=0)
     modes, variances = _principal_axes((shapes - mean).reshape(len(shapes), -1))

@@ -25,13 +25,13 @@ class ShapeArrays(NamedTuple):
     Attributes
     ----------
     mean_shape : ndarray of shape (n_points, 3)
-        Mean shape, in the space of the affine cameras.
+        Mean shape, in the space of the cameras; Euclidean where these are calibrated.
     basis : ndarray of shape (n_components, n_points, 3)
         Basis shapes, for one standard deviation of their coefficients.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the frames of the table; of no frames if none were kept.
     motion : ndarray of shape (n_frames, 2, 3)
-        Affine cameras of the frames.
+        Cameras of the frames.
     translation : ndarray of shape (n_frames, 2)
         Images of the shapes' origin.
     energy_share : ndarray of shape (n_components,)

@@ -2,7 +2,8 @@
 
 In that space x points right, y down and z away from the viewer, who sees the object
 from the front. Its lengths and angles are those of the object as far as the cameras of
-the fitted table tell them.
+the fitted table tell them. Models with calibrated cameras have Euclidean shapes as they
+are, which are only turned.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -19,11 +20,13 @@ from isa_nrsfm._deformation_metric import (
     deformation_metric,
     euclidean_frames,
 )
+from isa_nrsfm._frame_fit import compose
+from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._metric import unit_cameras
 from isa_nrsfm._metric_upgrade import usable_cameras
 from isa_nrsfm._model_class import check_class
 from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
-from isa_nrsfm.plotting._views import front_axes, viewing_transform
+from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform
 
 Camera = Literal["weak_perspective"] | None
 
@@ -40,8 +43,11 @@ class UprightSpace(NamedTuple):
 
     Attributes
     ----------
+    camera : {"weak_perspective", "orthographic"} or None
+        The cameras that tell true proportions; None for affine shapes.
     metric : DeformationMetric or None
-        The metric in which shapes are Euclidean; None for affine shapes.
+        The metric in which shapes are Euclidean; None for affine shapes, and for those
+        of calibrated cameras, which are Euclidean as they are.
     transform : ndarray of shape (3, 3)
         Takes Euclidean shapes, or affine ones, to the upright space:
         ``shape @ transform.T``. Orthogonal for Euclidean shapes.
@@ -50,6 +56,7 @@ class UprightSpace(NamedTuple):
         space.
     """
 
+    camera: str | None
     metric: DeformationMetric | None
     transform: NDArray
     image_axes: NDArray
@@ -66,8 +73,9 @@ def upright_space(
     model : AffineNRSfM
         A fitted model that has kept its frames.
     camera : {"weak_perspective", None}
-        What is known of the cameras. None takes the one affinity of space under which
-        they come nearest to weak-perspective ones, as figures do.
+        What is known of the cameras of a model with affine ones. None takes the one
+        affinity of space under which they come nearest to weak-perspective ones, as
+        figures do. Without meaning for a model with calibrated cameras.
     origin : {"auto", "upper", "lower"}
         Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
     mirrored : bool
@@ -91,8 +99,12 @@ def upright_space(
     if camera not in ("weak_perspective", None):
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     model._need_frames("exporting shapes")
-    if camera is None:
-        metric = None
+    fitted, metric = model._frames.camera, None
+    told: str | None = camera if fitted == "affine" else fitted
+    if fitted != "affine":
+        transform = euclidean_axes(model)
+        shape = model.mean_shape_ @ transform.T
+    elif camera is None:
         transform = viewing_transform(model.motion_, model.reference_motion_)
         shape = model.mean_shape_ @ transform.T
     else:
@@ -117,36 +129,40 @@ def upright_space(
         transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(metric, transform, image_axes)
+    return UprightSpace(told, metric, transform, image_axes)
 
 
 def upright_frames(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
 ) -> EuclideanFrames:
     """
-    Return shapes and poses of frames in an upright space with a metric.
+    Return Euclidean shapes and poses of frames in an upright space.
 
     Parameters
     ----------
     space : UprightSpace
-        Of the model, with a metric.
+        Of the model, with cameras that tell true proportions.
     model : AffineNRSfM
         The fitted model.
     motion : ndarray of shape (n_frames, 2, 3)
-        Affine cameras of the frames.
+        Cameras of the frames.
     alpha : ndarray of shape (n_frames, n_components)
         Their coefficients.
 
     Returns
     -------
     EuclideanFrames
-        Shapes, rotations and scales as of `euclidean_frames`; NaN where a frame has no
-        camera. Rotations lead to the image turned upright.
+        Shapes, rotations and scales as of `euclidean_frames`, or those of a model with
+        calibrated cameras; NaN where a frame has no camera. Rotations lead to the image
+        turned upright.
     """
-    assert space.metric is not None
-    shapes, rotations, scales = euclidean_frames(
-        space.metric, motion, alpha, model.mean_shape_, model.basis_
-    )
+    if space.metric is None:
+        rotations, scales = full_rotations(np.asarray(motion, dtype=np.float64))
+        shapes = compose(model.mean_shape_, model.basis_, alpha)
+    else:
+        shapes, rotations, scales = euclidean_frames(
+            space.metric, motion, alpha, model.mean_shape_, model.basis_
+        )
     rotations = space.image_axes @ rotations @ space.transform.T
     return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
 
@@ -155,8 +171,9 @@ def upright_basis(space: UprightSpace, model: Any) -> tuple[NDArray, NDArray]:
     """
     Return the mean shape and the basis shapes in the upright space.
 
-    Euclidean shapes are not exactly linear in the coefficients, since the metric
-    depends on them: the least squares fit to the frames of the table is taken.
+    Euclidean shapes of affine cameras are not exactly linear in the coefficients, since
+    the metric depends on them: the least squares fit to the frames of the table is
+    taken.
 
     Parameters
     ----------

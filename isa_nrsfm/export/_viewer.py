@@ -32,8 +32,9 @@ from isa_nrsfm.plotting._edges import Origin
 MOST_LABELS = 30
 UNLABELLED = "(no label)"
 ABOUT = {
-    True: "Proportions are those that weak-perspective cameras tell.",
-    False: "Affine shapes: angles and depth are not those of the object.",
+    "weak_perspective": "Proportions are those that weak-perspective cameras tell.",
+    "orthographic": "Proportions are those that orthographic cameras tell.",
+    None: "Affine shapes: angles and depth are not those of the object.",
 }
 
 
@@ -80,8 +81,9 @@ def write_viewer(
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras. "weak_perspective" shows Euclidean shapes, None
-        affine ones, which look like those of figures.
+        What is known of the cameras of a model with affine ones. "weak_perspective"
+        shows Euclidean shapes, None affine ones, which look like those of figures. A
+        model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where 68 points of a face would stand
@@ -110,8 +112,9 @@ def write_viewer(
 
     Notes
     -----
-    Euclidean basis shapes are the least squares fit to the shapes of the frames. Rows
-    of which too little is seen are not shown; the page says how many are.
+    Euclidean basis shapes of affine cameras are the least squares fit to the shapes of
+    the frames; those of calibrated cameras are the model's. Rows of which too little is
+    seen are not shown; the page says how many are.
     """
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"path must end in .html; got {os.fspath(path)}")
@@ -138,7 +141,7 @@ def write_viewer(
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
     rotations = _rotations(space, model, motion, alpha)
     content = {
-        "about": ABOUT[space.metric is not None]
+        "about": ABOUT[space.camera]
         + " The mirror image in depth fits the images as well.",
         "points": list(names_of_points(model)),
         "components": components,
@@ -177,7 +180,7 @@ def _rotations(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
 ) -> NDArray:
     """Return what turns the shapes of frames to how their cameras see them."""
-    if space.metric is None or not len(motion):
+    if space.camera is None or not len(motion):
         return np.empty((0, 3, 3))
     rotations = upright_frames(space, model, motion, alpha).rotations
     return UPSIDE_DOWN @ rotations @ UPSIDE_DOWN

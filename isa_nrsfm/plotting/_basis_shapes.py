@@ -24,7 +24,7 @@ from isa_nrsfm.plotting._axes import (
 )
 from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
 from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
-from isa_nrsfm.plotting._views import viewing_transform
+from isa_nrsfm.plotting._views import view_of
 
 # Arrows that end where their points go, and are of the same width in all axes.
 ARROW_STYLE = {
@@ -118,10 +118,10 @@ class BasisShapeDisplay:
     An affine factorisation leaves a 3x3 affinity of space open. `from_estimator`
     chooses the one under which the cameras come nearest to scaled orthographic ones
     [1]_, so that shapes have natural proportions, and turns the mean camera's view to
-    the front. Where the cameras go round the object and have no mean view, their axis
-    keeps its direction in the images and the front is where the object is broadest.
-    Depth is known up to its mirror image: the side view may show the left or the right
-    side.
+    the front. Shapes of calibrated cameras are only turned. Where the cameras go round
+    the object and have no mean view, their axis keeps its direction in the images and
+    the front is where the object is broadest. Depth is known up to its mirror image:
+    the side view may show the left or the right side.
 
     References
     ----------
@@ -217,7 +217,7 @@ class BasisShapeDisplay:
             axes is not that of the shapes.
         """
         check_is_fitted(estimator, "mean_shape_")
-        view = viewing_transform(estimator.motion_, estimator.reference_motion_)
+        view = view_of(estimator)
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,

@@ -23,7 +23,7 @@ from isa_nrsfm.plotting._axes import (
     percent,
 )
 from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
-from isa_nrsfm.plotting._views import viewing_transform
+from isa_nrsfm.plotting._views import view_of
 
 MOST_FRAMES = 6  # unless asked for
 PANEL_WIDTH, TITLE_HEIGHT, LEGEND_HEIGHT = 2.3, 0.4, 0.3  # inches
@@ -235,7 +235,7 @@ class ReprojectionDisplay:
         check_is_fitted(estimator, "mean_shape_")
         rows = choose_frames(len(X), n_frames, frames, random_state)
         table = _safe_indexing(X, rows)
-        view = viewing_transform(estimator.motion_, estimator.reference_motion_)
+        view = view_of(estimator)
         mean_shape = estimator.mean_shape_ @ view.T
         layout = estimator.layout
         labelled = hasattr(X, "iloc")  # pandas: rows have names

@@ -3,8 +3,11 @@
 A factorisation into affine cameras and shapes is known up to one 3x3 affinity of
 space. Drawn as they are, the shapes look squashed and sheared. The functions here find
 the affinity under which the cameras are as nearly as possible scaled orthographic
-(weak perspective) ones, and turn the shapes until they face the mean camera.
+(weak perspective) ones, and turn the shapes until they face the mean camera. Shapes of
+calibrated cameras have true proportions as they are, and are only turned.
 """
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +51,50 @@ def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray
     broadest = np.linalg.eigh(across @ spread @ across)[1][:, -1]
     axis, turned = np.outer(left[:, 0], right[0]), np.outer(left[:, 1], broadest)
     return axis + turned * (1 if np.sum(turned * reference) >= 0 else -1)
+
+
+def view_of(estimator: Any) -> NDArray:
+    """
+    Return the transform of the space of a fitted model into the viewing frame.
+
+    Parameters
+    ----------
+    estimator : AffineNRSfM
+        A fitted model that has kept its frames.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        That of `viewing_transform`, or with calibrated cameras `euclidean_axes` times
+        the median scale of the cameras.
+    """
+    if not hasattr(estimator, "rotations_"):
+        return viewing_transform(estimator.motion_, estimator.reference_motion_)
+    scales = np.asarray(estimator.scales_)
+    return np.nanmedian(scales) * euclidean_axes(estimator)
+
+
+def euclidean_axes(estimator: Any) -> NDArray:
+    """
+    Return the axes of the viewing frame of a model with calibrated cameras.
+
+    Parameters
+    ----------
+    estimator : AffineNRSfM
+        A fitted model with calibrated cameras that has kept its frames.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        A rotation T: ``shape @ T.T`` is seen from the front.
+    """
+    shape = estimator.mean_shape_
+    axes = front_axes(
+        unit_cameras(np.asarray(estimator.motion_)),
+        estimator.reference_motion_,
+        shape.T @ shape / len(shape),
+    )
+    return np.vstack([axes, np.cross(*axes)])
 
 
 def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
