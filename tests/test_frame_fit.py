@@ -13,6 +13,7 @@ from isa_nrsfm._frame_fit import (
     distances,
     project,
 )
+from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._independent_gauge import FrameMap
 from isa_nrsfm._robust import robust_weights
@@ -178,6 +179,83 @@ class TestRigidFrames:
         assert_array_equal(fitted.alpha[:, 1], 0)
 
 
+CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+
+
+class TestCalibratedRigidFrames:
+    @CALIBRATED
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_cameras_are_the_nearest_to_those_of_the_rigid_fit(self, camera, missing):
+        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
+        tracks = hide(tracks, missing)
+        affine = rigid(tracks, mean_shape, basis)
+        frames = RigidFrames(mean_shape, basis, camera)
+        fitted = frames.fit(tracks, np.ones(len(tracks)))
+        rows, scales = nearest_calibrated(affine.motion)
+        if camera == "weak_perspective":
+            rows = scales[:, None, None] * rows
+        assert_allclose(fitted.motion, rows, atol=1e-12)
+
+    @CALIBRATED
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_position_and_coefficients_are_those_of_least_squares(
+        self, camera, missing
+    ):
+        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
+        tracks = hide(tracks, missing)
+        frames = RigidFrames(mean_shape, basis, camera)
+        fitted = frames.fit(tracks, np.ones(len(tracks)))
+        for i, points in enumerate(tracks):
+            seen = ~np.isnan(points[:, 0])
+            images = basis[:, seen] @ fitted.motion[i].T
+            design = np.concatenate([images, *[np.ones((2, seen.sum(), 2))]])
+            design[-2:] *= np.eye(2)[:, None]
+            rest = points[seen] - mean_shape[seen] @ fitted.motion[i].T
+            found = np.linalg.lstsq(design.reshape(len(design), -1).T, rest.ravel())[0]
+            assert_allclose(fitted.alpha[i], found[:-2], atol=1e-9)
+            assert_allclose(fitted.translation[i], found[-2:], atol=1e-9)
+
+    @CALIBRATED
+    def test_rigid_tracks_are_exact(self, camera):
+        _, mean_shape, basis, (motion, translation, _) = random_fit(0)
+        rows, scales = nearest_calibrated(motion)
+        if camera == "weak_perspective":
+            rows = scales[:, None, None] * rows
+        tracks = project(mean_shape, rows, translation)
+        for each in (tracks, hide(tracks, 0.3)):
+            fitted = RigidFrames(mean_shape, basis, camera).fit(each, np.ones(12))
+            assert_allclose(fitted.motion, rows, atol=1e-11)
+            assert_allclose(fitted.translation, translation, atol=1e-11)
+            assert_allclose(fitted.alpha, 0.0, atol=1e-10)
+
+
+class TestMirrored:
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+    def test_rigid_frames_have_the_same_images(self, camera):
+        tracks, mean_shape, basis, _ = random_fit(0, noise=0.1)
+        model = RigidFrames(mean_shape, basis, camera)
+        mirrored = model.mirrored()
+        depth = np.array([1.0, 1.0, -1.0])
+        assert_array_equal(mirrored.mean_shape, mean_shape * depth)
+        assert_array_equal(mirrored.basis, basis * depth)
+        one, other = (each.fit(tracks, np.ones(12)) for each in (model, mirrored))
+        assert_allclose(other.motion, one.motion * depth, atol=1e-12)
+        assert_allclose(other.alpha, one.alpha, atol=1e-10)
+        assert_allclose(other.translation, one.translation, atol=1e-12)
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+    def test_posterior_frames_have_mirrored_cameras(self, camera):
+        model, tracks = posterior_frames(0)
+        model = model._replace(camera=camera)
+        one, other = (
+            each.fit(tracks, np.ones(12)) for each in (model, model.mirrored())
+        )
+        assert_allclose(other.motion, one.motion * [1.0, 1.0, -1.0], atol=1e-12)
+        assert_array_equal(other.alpha, one.alpha)
+        assert_array_equal(other.alpha_std, one.alpha_std)
+        assert_array_equal(other.translation, one.translation)
+
+
 def turns(n):
     """Return rotations of images, (n, 2, 2)."""
     angle = np.random.default_rng(1).uniform(0, 6, n)
@@ -227,6 +305,24 @@ class TestPosteriorFrames:
         assert_allclose(fitted.translation, expected.translation * scale, rtol=1e-9)
         motion = expected.motion * scale[..., None]
         assert_allclose(fitted.motion, motion, atol=1e-9 * np.abs(motion).max())
+
+    @CALIBRATED
+    @pytest.mark.parametrize("missing", [0.0, 0.3])
+    def test_calibrated_cameras(self, camera, missing):
+        frames, tracks = posterior_frames(0)
+        frames, tracks = frames._replace(camera=camera), hide(tracks, missing)
+        sizes = np.linspace(0.5, 200.0, len(tracks))
+        fitted = frames.fit(tracks * sizes[:, None, None], sizes)
+        expected = fit_posterior(
+            tracks, frames.shapes, NOISE**2, camera=camera, starts=frames.starts
+        )
+        assert_allclose(fitted.alpha, expected.alpha, atol=1e-8)
+        motion = expected.motion * sizes[:, None, None]
+        assert_allclose(fitted.motion, motion, atol=1e-8 * np.abs(motion).max())
+        gram = fitted.motion @ fitted.motion.swapaxes(1, 2)
+        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+        unit = np.broadcast_to(np.eye(2), gram.shape)
+        assert_allclose(gram / scale, unit, atol=1e-11)
 
     def test_images_do_not_depend_on_the_gauge(self):
         frames, tracks = posterior_frames(0)

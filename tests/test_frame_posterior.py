@@ -6,9 +6,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm import _frame_posterior as module
-from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._frame_products import frame_products, frame_tracks, whitened
+from isa_nrsfm._frames import affine_newton, posterior
+from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._small_matrices import unpacked
 
 NOISE = 0.02
@@ -34,14 +34,12 @@ def images(shapes, motion, translation, alpha):
     return (motion @ frames).swapaxes(1, 2) + translation[:, None]
 
 
-def cost(tracks, shapes, variance, fits, weights=None, C=None):
+def cost(tracks, shapes, variance, fits, weights=None):
     """Return f of each frame by its definition."""
     difference = tracks - images(shapes, fits.motion, fits.translation, fits.alpha)
     w = np.ones(tracks.shape[:2]) if weights is None else weights
     squares = np.nansum(w[..., None] * difference**2, axis=(1, 2))
-    prior = np.zeros((3, 3)) if C is None else C
-    cameras = np.einsum("irc,cd,ird->i", fits.motion, prior, fits.motion)
-    return squares + variance * np.sum(fits.alpha**2, axis=1) + cameras
+    return squares + variance * np.sum(fits.alpha**2, axis=1)
 
 
 def energy_of(tracks):
@@ -67,7 +65,7 @@ def problem_of(tracks, shapes, variance, weights=None):
     white, _ = whitened(shapes)
     products = frame_products(frame_tracks(tracks, weights), white)
     variance = np.full(len(tracks), variance)
-    return module._problem(products, variance, np.zeros((3, 3)), shapes.shape[2])
+    return affine_newton._problem(products, variance, shapes.shape[2])
 
 
 class TestOptimum:
@@ -82,15 +80,13 @@ class TestOptimum:
         assert_allclose(fits.residual, 0, atol=1e-9)
 
     @pytest.mark.parametrize("gaps", [False, True])
-    @pytest.mark.parametrize("prior", [False, True])
-    def test_objective_by_definition_rises_in_every_direction(self, gaps, prior):
+    def test_objective_by_definition_rises_in_every_direction(self, gaps):
         tracks, shapes, _ = random_scene(0)
         if gaps:
             tracks = with_gaps(tracks, 0)
         rng = np.random.default_rng(1)
-        C = np.cov(rng.normal(size=(3, 9))) if prior else None
-        fits = fit_posterior(tracks, shapes, NOISE**2, camera_precision=C)
-        least = cost(tracks, shapes, NOISE**2, fits, C=C)
+        fits = fit_posterior(tracks, shapes, NOISE**2)
+        least = cost(tracks, shapes, NOISE**2, fits)
         assert_allclose(fits.objective, least, atol=1e-12 * energy_of(tracks))
         residual = cost(tracks, shapes, 0.0, fits)
         assert_allclose(fits.residual, residual, atol=1e-12 * energy_of(tracks))
@@ -102,7 +98,7 @@ class TestOptimum:
                 moved = fits._replace(
                     motion=moved[0], translation=moved[1], alpha=moved[2]
                 )
-                rises.append(cost(tracks, shapes, NOISE**2, moved, C=C) - least)
+                rises.append(cost(tracks, shapes, NOISE**2, moved) - least)
             # Equal on both sides: the slope is zero, not only small.
             assert (np.array(rises) > 0).all()
             assert_allclose(rises[0], rises[1], rtol=1e-2)
@@ -124,12 +120,12 @@ class TestOptimum:
         for w in (None, weights):
             problem = problem_of(tracks, shapes, NOISE, w)
             alpha = np.random.default_rng(2).normal(size=(3, 5))
-            state = module._evaluate(problem, alpha)
+            state = affine_newton._evaluate(problem, alpha)
             h = 1e-5
             for k in range(3):
                 e = h * np.eye(3)[:, [k]]
-                above = module._evaluate(problem, alpha + e)
-                below = module._evaluate(problem, alpha - e)
+                above = affine_newton._evaluate(problem, alpha + e)
+                below = affine_newton._evaluate(problem, alpha - e)
                 slope = (above.explained - below.explained) / (4 * h)
                 assert_allclose(state.slope[k], slope, rtol=1e-6, atol=1e-7)
                 bend = (below.slope - above.slope) / (2 * h)
@@ -215,8 +211,8 @@ class TestInvariance:
         tracks, shapes, _ = random_scene(0)
         tracks[::2] = with_gaps(tracks[::2], 0)
         expected = fit_posterior(tracks, shapes, NOISE**2)
-        monkeypatch.setattr(module, "COMPLETE_BLOCK", 4)
-        monkeypatch.setattr(module, "WEIGHTED_BLOCK", 7)
+        monkeypatch.setattr(posterior, "COMPLETE_BLOCK", 4)
+        monkeypatch.setattr(posterior, "WEIGHTED_BLOCK", 7)
         assert_same_fits(fit_posterior(tracks, shapes, NOISE**2), expected, 1e-11)
 
     def test_memory_order(self):
@@ -479,7 +475,7 @@ class TestStarts:
         starts = rng.normal(size=(20, len(shapes) - 1)) * np.repeat([1, 2], 10)[:, None]
         with monkeypatch.context() as patch:
             patch.setattr(
-                module,
+                posterior,
                 "_poorly_explained",
                 lambda fits, seen, variance: np.ones(len(seen), dtype=bool),
             )
@@ -513,13 +509,13 @@ class TestStarts:
         rng = np.random.default_rng(0)
         for size in (0.0, 1.0, 3.0):
             start = size * rng.normal(size=(4, len(tracks)))
-            before = module._evaluate(problem, start).explained
-            found, there = module._descend(problem, start, module.MAX_STEPS)
-            state = module._evaluate(problem, found)
+            before = affine_newton._evaluate(problem, start).explained
+            found, there = affine_newton._descend(problem, start, posterior.MAX_STEPS)
+            state = affine_newton._evaluate(problem, found)
             assert (state.explained >= before - 1e-12 * problem.energy).all()
             assert there.mean() > 0.995
             assert (np.linalg.eigvalsh(unpacked(state.schur).T)[there] > 0).all()
-            step, _ = module.solve_positive(state.schur, state.slope)
+            step, _ = affine_newton.solve_positive(state.schur, state.slope)
             assert np.abs(step[:, there]).max() < 1e-7
 
     def test_a_start_leads_to_the_minimum_it_is_in(self):
@@ -527,7 +523,9 @@ class TestStarts:
         expected = fit_posterior(tracks, shapes, NOISE**2)
         # From the truth of each frame the search ends in the same place.
         problem = problem_of(tracks, shapes, NOISE**2)
-        found, converged = module._descend(problem, alpha.T.copy(), module.MAX_STEPS)
+        found, converged = affine_newton._descend(
+            problem, alpha.T.copy(), posterior.MAX_STEPS
+        )
         assert_allclose(found.T, expected.alpha, atol=1e-9)
         assert converged.all()
 
@@ -535,7 +533,7 @@ class TestStarts:
         tracks, shapes, _ = random_scene(0)
         starts = np.random.default_rng(1).normal(size=(5, 3))
         tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
-        poor = module._poorly_explained(
+        poor = posterior._poorly_explained(
             fit_posterior(tracks, shapes, NOISE**2),
             np.full(30, 20.0),
             np.full(30, NOISE**2),

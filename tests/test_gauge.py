@@ -6,12 +6,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import permute_frames, random_rotation, rotate_frames
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.camera import mean_view
 from isa_nrsfm._frame_fit import RigidFrames, compose, project
+from isa_nrsfm._frames.camera import mean_view
 from isa_nrsfm._gauge import (
     canonical_gauge,
     canonical_rotation,
     canonical_space,
+    euclidean_space,
     image_energies,
     mode_covariance,
     reorder_blocks,
@@ -34,8 +35,8 @@ class Scene:
             self.motion[:, :, 3 - flat :] = 0
 
     def canonical(self):
-        gauge = canonical_gauge(self.mean_shape, self.basis, self.motion, self.alpha)
         A = canonical_space(self.mean_shape, self.motion)
+        gauge = canonical_gauge(self.mean_shape, self.basis, self.motion, self.alpha, A)
         return gauge, self.motion @ np.linalg.inv(A)
 
     def scattered(self):
@@ -171,6 +172,66 @@ class TestSpace:
         assert np.isfinite(gauge.basis).all()
 
 
+class TestEuclideanSpace:
+    """With calibrated cameras space is turned, not stretched."""
+
+    def scene(self, spread=0.3):
+        rng = np.random.default_rng(0)
+        scene = Scene()
+        turns = Rotation.from_rotvec(spread * rng.normal(size=(30, 3))).as_matrix()
+        scene.motion = rng.uniform(0.5, 2.0, 30)[:, None, None] * turns[:, :2]
+        return scene
+
+    @pytest.mark.parametrize("size", [None, 1.0, 7.0])
+    def test_is_a_multiple_of_an_orthogonal_matrix(self, size):
+        scene = self.scene()
+        A = euclidean_space(scene.mean_shape, scene.motion, size)
+        if size is None:
+            size = 1 / np.sqrt(np.mean(scene.mean_shape**2))
+        assert_allclose(A @ A.T, size**2 * np.eye(3), atol=1e-12 * size**2)
+        expected = canonical_rotation(scene.mean_shape, scene.motion)
+        assert_allclose(A, size * expected, rtol=1e-12)
+
+    def test_mean_square_of_the_mean_shape_is_one(self):
+        scene = self.scene()
+        for unit in (1e-9, 1.0, 1e9):
+            A = euclidean_space(unit * scene.mean_shape, scene.motion / unit, None)
+            shape = unit * scene.mean_shape @ A.T
+            assert np.mean(shape**2) == pytest.approx(1.0)
+
+    @pytest.mark.parametrize("spread", [0.3, 3.0])
+    def test_any_rotation_before_leads_to_the_same_space(self, spread):
+        scene = self.scene(spread)
+        A = euclidean_space(scene.mean_shape, scene.motion, None)
+        for turn in (random_rotation(1), -random_rotation(2)):
+            shape, motion = scene.mean_shape @ turn.T, scene.motion @ turn.T
+            B = euclidean_space(shape, motion, None)
+            assert_allclose(shape @ B.T, scene.mean_shape @ A.T, atol=1e-11)
+
+    def test_a_gauge_in_it_keeps_images(self):
+        scene = self.scene()
+        A = euclidean_space(scene.mean_shape, scene.motion, None)
+        gauge = canonical_gauge(
+            scene.mean_shape, scene.basis, scene.motion, scene.alpha, A
+        )
+        motion = scene.motion @ np.linalg.inv(A)
+        alpha = scene.alpha[:, gauge.order] / gauge.factors
+        assert_allclose(
+            project(compose(gauge.mean_shape, gauge.basis, alpha), motion, np.zeros(2)),
+            project(
+                compose(scene.mean_shape, scene.basis, scene.alpha),
+                scene.motion,
+                np.zeros(2),
+            ),
+            atol=1e-10,
+        )
+
+    def test_mean_shape_of_zeros(self):
+        scene = self.scene()
+        A = euclidean_space(0 * scene.mean_shape, scene.motion, None)
+        assert_allclose(A @ A.T, np.eye(3), atol=1e-12)
+
+
 class TestBasis:
     def test_images_stay_as_they_are(self):
         scene = Scene()
@@ -275,7 +336,8 @@ class TestBasis:
         scene = Scene()
         gauge, motion = scene.canonical()
         alpha = coefficients(scene, gauge)
-        again = canonical_gauge(gauge.mean_shape, gauge.basis, motion, alpha)
+        A = canonical_space(gauge.mean_shape, motion)
+        again = canonical_gauge(gauge.mean_shape, gauge.basis, motion, alpha, A)
         assert_allclose(again.mean_shape, gauge.mean_shape, atol=1e-12)
         assert_allclose(again.basis, gauge.basis, atol=1e-10)
         assert_array_equal(again.order, [0, 1, 2])

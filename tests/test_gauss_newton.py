@@ -8,9 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._joint import noise_free as module
 from isa_nrsfm._frame_blocks import MemoryBlocks
 from isa_nrsfm._frame_products import frame_tracks
+from isa_nrsfm._frames.camera_models import CAMERAS, nearest_calibrated
+from isa_nrsfm._joint import noise_free as module
 from isa_nrsfm._joint.noise_free import (
     FramesAndShapes,
     complete_frames,
@@ -24,6 +25,9 @@ from isa_nrsfm._joint.noise_free import (
 )
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
+
+EACH = pytest.mark.parametrize("camera", CAMERAS)
+AFFINE = CAMERAS["affine"]
 
 
 def in_blocks(parts):
@@ -44,13 +48,20 @@ class Scene(NamedTuple):
         return np.einsum("kaj,ki->ija", shapes, c)
 
 
-def random_scene(seed=0, n_frames=40, n_points=30, n_components=2, noise=0.0):
+def random_scene(
+    seed=0, n_frames=40, n_points=30, n_components=2, noise=0.0, camera="affine"
+):
     """Return a table that follows the model, and what made it."""
     rng = np.random.default_rng(seed)
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
     shapes[1:] *= 0.3
     shapes -= shapes.mean(axis=2, keepdims=True)
     motion = rng.normal(size=(2, 3, n_frames))
+    if camera != "affine":
+        rows, scales = nearest_calibrated(motion.transpose(2, 0, 1))
+        motion = rows.transpose(1, 2, 0)
+        if camera == "weak_perspective":
+            motion = scales * motion
     alpha = rng.normal(size=(n_components, n_frames))
     c = np.vstack([np.ones(n_frames), alpha])
     tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
@@ -58,14 +69,21 @@ def random_scene(seed=0, n_frames=40, n_points=30, n_components=2, noise=0.0):
     return Scene(tracks - tracks.mean(axis=1, keepdims=True), shapes, motion, alpha)
 
 
-def in_row_space(scene, size=0.0, seed=1):
+def in_row_space(scene, size=0.0, seed=1, camera="affine"):
     """Return tracks in a basis of their row space, and a state some way off."""
     rng = np.random.default_rng(seed)
     b = scene.shapes.reshape(-1, scene.shapes.shape[2])
     rows, V = compressed(scene.tracks.swapaxes(1, 2), b)
     exact = b @ V, scene.motion.transpose(2, 0, 1), scene.alpha.T
-    moved = (part + size * rng.normal(size=part.shape) for part in exact)
-    return rows, FramesAndShapes(*moved)
+    shapes, motion, alpha = (
+        part + size * rng.normal(size=part.shape) for part in exact
+    )
+    if camera != "affine":
+        cameras = CAMERAS[camera]
+        step = size * rng.normal(size=(cameras.n_parameters, len(motion)))
+        step[3:] /= max(size, 1.0)  # of the logarithms of the scales
+        motion = cameras.moved(scene.motion, step).transpose(2, 0, 1)
+    return rows, FramesAndShapes(shapes, motion, alpha)
 
 
 def images(state):
@@ -76,6 +94,17 @@ def square(rows, state):
     return float(np.sum((rows - images(state)) ** 2))
 
 
+def assert_of_model(motion, camera):
+    """Check that cameras (n_frames, 2, 3) are those of a model."""
+    if camera == "affine":
+        return
+    gram = motion @ motion.swapaxes(1, 2)
+    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+    assert_allclose(gram / scale, np.broadcast_to(np.eye(2), gram.shape), atol=1e-11)
+    if camera == "orthographic":
+        assert_allclose(scale, 1.0, rtol=1e-11)
+
+
 def with_gaps(tracks, share, seed=2):
     """Return tracks with random points that are missing, and the weights."""
     weights = 1.0 * (np.random.default_rng(seed).random(tracks.shape[:2]) >= share)
@@ -83,29 +112,38 @@ def with_gaps(tracks, share, seed=2):
 
 
 class TestEquations:
-    def test_tangents_are_the_derivatives_by_cameras_and_coefficients(self):
-        _, state = in_row_space(random_scene(), size=0.1)
-        tangents = frame_tangents(state)
-        step = 1e-6
-        for column in range(tangents.shape[2]):
-            motion, alpha = state.motion.copy(), state.alpha.copy()
-            if column < 6:
-                motion[:, column // 3, column % 3] += step
-            else:
-                alpha[:, column - 6] += step
-            change = images(FramesAndShapes(state.shapes, motion, alpha))
-            change = (change - images(state)).reshape(len(motion), -1) / step
-            assert_allclose(change, tangents[:, :, column], atol=1e-8)
+    @EACH
+    def test_tangents_are_the_derivatives_by_cameras_and_coefficients(self, camera):
+        _, state = in_row_space(random_scene(camera=camera), size=0.1, camera=camera)
+        cameras = CAMERAS[camera]
+        tangents = frame_tangents(state, cameras)
+        n, h = cameras.n_parameters, 1e-5
+        assert tangents.shape[2] == n + 2
+        for column in range(n + 2):
+            change = 0.0
+            for sign in (1, -1):
+                step, alpha = np.zeros((n, len(state.motion))), state.alpha.copy()
+                if column < n:
+                    step[column] = sign * h
+                else:
+                    alpha[:, column - n] += sign * h
+                motion = cameras.moved(state.motion.transpose(1, 2, 0), step)
+                moved = FramesAndShapes(state.shapes, motion.transpose(2, 0, 1), alpha)
+                change = change + sign * images(moved).reshape(len(alpha), -1)
+            assert_allclose(change / (2 * h), tangents[:, :, column], atol=1e-8)
 
-    def test_they_are_those_of_all_unknowns_with_the_frames_eliminated(self):
-        rows, state = in_row_space(random_scene(n_frames=15), size=0.1)
-        frames = module._Frames.at(rows, state)
+    @EACH
+    def test_they_are_those_of_all_unknowns_with_the_frames_eliminated(self, camera):
+        scene = random_scene(n_frames=15, camera=camera)
+        rows, state = in_row_space(scene, size=0.1, camera=camera)
+        cameras = CAMERAS[camera]
+        frames = module._Frames.at(rows, state, cameras)
         system = normal_equations(frames, state)
         X = motion_rows(state.motion, state.alpha)
         n_directions = rows.shape[2]
         matrix, right = 0.0, 0.0
         for x, tangent, rest in zip(
-            X, frame_tangents(state), rows - images(state), strict=True
+            X, frame_tangents(state, cameras), rows - images(state), strict=True
         ):
             by_shapes = np.kron(x, np.eye(n_directions))
             off = np.eye(len(tangent)) - tangent @ np.linalg.pinv(tangent)
@@ -115,40 +153,56 @@ class TestEquations:
         assert_allclose(system.matrix, scaling.T @ matrix @ scaling, atol=1e-10)
         assert_allclose(system.slope.ravel(), scaling.T @ right, atol=1e-10)
 
+    @EACH
     @pytest.mark.parametrize("n_components", [1, 2, 4])
-    def test_nothing_but_the_basis_is_free(self, n_components):
-        # A 3x3 affinity and a mixing of all shapes, which share one scale.
-        scene = random_scene(n_components=n_components)
+    def test_nothing_but_the_basis_is_free(self, n_components, camera):
+        scene = random_scene(n_components=n_components, camera=camera)
         rows, state = in_row_space(scene)
-        system = normal_equations(module._Frames.at(rows, state), state)
-        values = np.linalg.eigvalsh(system.matrix)
-        n_free = (n_components + 1) ** 2 + 8
+        frames = module._Frames.at(rows, state, CAMERAS[camera])
+        values = np.linalg.eigvalsh(normal_equations(frames, state).matrix)
+        n_free = {
+            # A 3x3 affinity and a mixing of all shapes, which share one scale.
+            "affine": (n_components + 1) ** 2 + 8,
+            # A rotation instead.
+            "weak_perspective": (n_components + 1) ** 2 + 3,
+            # Nor does a scale of a frame absorb parts along the mean shape.
+            "orthographic": (n_components + 1) * n_components + 3,
+        }[camera]
         assert_allclose(values[:n_free], 0.0, atol=1e-10)
         assert values[n_free] > 1e-4
         assert values[-1] < 1 + 1e-10
 
 
 class TestMinimise:
+    @EACH
     @pytest.mark.parametrize("seed", range(3))
-    def test_exact_tables_are_fitted_to_rounding_errors(self, seed):
-        rows, start = in_row_space(random_scene(seed), size=0.05)
-        end = minimise(rows, start)
+    def test_exact_tables_are_fitted_to_rounding_errors(self, seed, camera):
+        scene = random_scene(seed, camera=camera)
+        rows, start = in_row_space(scene, size=0.05, camera=camera)
+        end = minimise(rows, start, CAMERAS[camera])
+        assert_of_model(end.motion, camera)
         assert square(rows, start) > 1e-4 * np.vdot(rows, rows)
         assert square(rows, end) < 1e-28 * np.vdot(rows, rows)
 
-    def test_the_first_order_conditions_hold_where_there_is_noise(self):
-        rows, start = in_row_space(random_scene(noise=1e-3), size=0.02)
-        end = minimise(rows, start)
-        frames = module._Frames.at(rows, end)
+    @EACH
+    def test_the_first_order_conditions_hold_where_there_is_noise(self, camera):
+        scene = random_scene(noise=1e-3, camera=camera)
+        rows, start = in_row_space(scene, size=0.02, camera=camera)
+        end = minimise(rows, start, CAMERAS[camera])
+        frames = module._Frames.at(rows, end, CAMERAS[camera])
         rest = np.sqrt(square(rows, end))
         along = np.einsum("ipt,ip->it", frames.tangent, frames.rest)
         assert np.abs(along).max() < 1e-3 * rest
         assert np.abs(normal_equations(frames, end).slope).max() < 1e-3 * rest
 
+    @EACH
     @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
-    def test_it_never_ends_above_the_start(self, size):
-        rows, start = in_row_space(random_scene(noise=0.1), size=size)
-        assert square(rows, minimise(rows, start)) < square(rows, start)
+    def test_it_never_ends_above_the_start(self, size, camera):
+        scene = random_scene(noise=0.1, camera=camera)
+        rows, start = in_row_space(scene, size=size, camera=camera)
+        end = minimise(rows, start, CAMERAS[camera])
+        assert square(rows, end) < square(rows, start)
+        assert_of_model(end.motion, camera)
 
     def test_steps_go_along_with_the_basis(self, monkeypatch):
         monkeypatch.setattr(module, "MAX_STEPS", 3)
@@ -167,9 +221,9 @@ class TestMinimise:
             (start.alpha + shift) @ np.linalg.inv(mixing),
         )
         assert_allclose(images(turned), images(start), atol=1e-12)
-        expected = images(minimise(rows, start))
+        expected = images(minimise(rows, start, AFFINE))
         assert np.abs(expected - images(start)).max() > 0.1
-        assert_allclose(images(minimise(rows, turned)), expected, atol=1e-8)
+        assert_allclose(images(minimise(rows, turned, AFFINE)), expected, atol=1e-8)
 
 
 class TestRowSpace:
@@ -219,10 +273,11 @@ class TestRowSpace:
 
 
 class TestWholeTable:
+    @EACH
     @pytest.mark.parametrize("gaps", [0.0, 0.2])
     @pytest.mark.parametrize("n_components", [1, 3])
-    def test_images_of_all_frames_are_exact(self, gaps, n_components):
-        scene = random_scene(n_components=n_components)
+    def test_images_of_all_frames_are_exact(self, gaps, n_components, camera):
+        scene = random_scene(n_components=n_components, camera=camera)
         tracks, weights = with_gaps(scene.tracks, gaps)
         parts = slice(0, 15), slice(15, 40)
         blocks = in_blocks(
@@ -234,8 +289,12 @@ class TestWholeTable:
             for part in (scene.shapes, scene.motion, scene.alpha)
         ]
         near[0] -= near[0].mean(axis=2, keepdims=True)
+        if camera != "affine":
+            step = 0.01 * rng.normal(size=(CAMERAS[camera].n_parameters, 40))
+            near[1] = CAMERAS[camera].moved(scene.motion, step)
         copies = [part.copy() for part in near]
-        shapes, motion = fit_without_noise(blocks, *near, 0.0)
+        shapes, motion = fit_without_noise(blocks, *near, 0.0, CAMERAS[camera])
+        assert_of_model(motion.transpose(2, 0, 1), camera)
         for part, copy in zip(near, copies, strict=True):
             assert_array_equal(part, copy)
         # What the cameras leave open are the coefficients.
@@ -249,16 +308,16 @@ class TestWholeTable:
         scene = random_scene()
         monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 8)
         blocks = in_blocks([frame_tracks(scene.tracks)])
-        assert fit_without_noise(blocks, *scene[1:], 0.0) is None
+        assert fit_without_noise(blocks, *scene[1:], 0.0, AFFINE) is None
         monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 9)
-        assert fit_without_noise(blocks, *scene[1:], 0.0) is not None
+        assert fit_without_noise(blocks, *scene[1:], 0.0, AFFINE) is not None
 
     def test_nor_where_no_frame_tells_its_missing_points(self):
         scene = random_scene()
         order = np.random.default_rng(4).random(scene.tracks.shape[:2]).argsort(axis=1)
         weights = 1.0 * (order < 9)
         blocks = in_blocks([frame_tracks(scene.tracks, weights)])
-        assert fit_without_noise(blocks, *scene[1:], 0.0) is None
+        assert fit_without_noise(blocks, *scene[1:], 0.0, AFFINE) is None
 
     @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
     def test_no_other_basis_is_likelier(self, penalty):

@@ -247,6 +247,86 @@ class TestInvariance:
         assert_allclose(turn @ got.shapes, expected.shapes, atol=1e-7)
 
 
+def calibrated(fit, camera):
+    """Return a fit with calibrated cameras."""
+    U, S, Vt = np.linalg.svd(fit.motion, full_matrices=False)
+    rows = U @ Vt
+    if camera == "weak_perspective":
+        rows = S.mean(axis=1)[:, None, None] * rows
+    return fit._replace(motion=rows)
+
+
+BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+
+
+class TestCalibratedCameras:
+    """Space may only be turned, and orthographic cameras absorb no scales."""
+
+    def canonical(self, fit, independence, camera, unit=None):
+        gauge = independent_gauge(*fit, independence, camera, unit)
+        covariance = np.broadcast_to(np.eye(3), (60, 3, 3))
+        motion, alpha, _ = gauge.frames.apply(fit.motion, fit.alpha, covariance)
+        shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
+        return Fit(shapes.transpose(0, 2, 1), motion, alpha), gauge.frames.space
+
+    @BOTH
+    @EACH
+    @pytest.mark.parametrize("unit", [None, 3.0])
+    def test_images_stay_and_cameras_stay_calibrated(self, camera, independence, unit):
+        fit = calibrated(random_fit(), camera)
+        result, space = self.canonical(fit, independence, camera, unit)
+        assert_allclose(result.images(), fit.images(), atol=1e-10)
+        size = np.linalg.norm(space, axis=0)
+        assert_allclose(space @ space.T, size[0] ** 2 * np.eye(3), atol=1e-10)
+        gram = result.motion @ result.motion.swapaxes(1, 2)
+        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+        unit_gram = np.broadcast_to(np.eye(2), gram.shape)
+        assert_allclose(gram / scale, unit_gram, atol=1e-10)
+        if camera == "orthographic":
+            assert_allclose(scale, 1 / size[0] ** 2, rtol=1e-10)
+        if unit is None:
+            assert np.mean(result.shapes[0] ** 2) == pytest.approx(1.0)
+        else:
+            assert size[0] == pytest.approx(unit)
+
+    @BOTH
+    @EACH
+    def test_conditions(self, camera, independence):
+        fit = calibrated(random_fit(), camera)
+        result, _ = self.canonical(fit, independence, camera)
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
+        assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
+        if camera == "weak_perspective":
+            # Without part along the mean shape, where that is white.
+            inverse = np.linalg.pinv(result.shapes[0])
+            along = np.einsum("kaj,ja->k", result.shapes[1:], inverse)
+            assert_allclose(along, 0, atol=1e-10)
+
+    @BOTH
+    @EACH
+    def test_another_fit_that_is_as_good_leads_to_the_same(self, camera, independence):
+        fit = calibrated(random_fit(), camera)
+        mixing = random_mixing(1, 4, shift=0.01)
+        if camera == "orthographic":
+            mixing[1:, 0] = 0.0
+        space = random_rotation(1)
+        alpha, scale = remixed(fit.alpha, mixing)
+        other = Fit(
+            space @ np.tensordot(mixing, fit.shapes, 1),
+            scale[:, None, None] * fit.motion @ space.T,
+            alpha,
+        )
+        assert_allclose(other.images(), fit.images(), atol=1e-10)
+        expected, _ = self.canonical(fit, independence, camera)
+        assert_same(self.canonical(other, independence, camera)[0], expected)
+
+    @EACH
+    def test_orthographic_shapes_of_frames_are_only_turned(self, independence):
+        fit = calibrated(random_fit(), "orthographic")
+        result, space = self.canonical(fit, independence, "orthographic", 1.0)
+        assert_allclose(space @ fit.frames(), result.frames(), atol=1e-10)
+
+
 class TestStandardDeviations:
     @EACH
     def test_are_those_of_random_coefficients(self, independence):

@@ -8,11 +8,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
 from isa_nrsfm._joint import quasi_newton as module
-from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
+from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 
 DEVIATION = 0.03
+AFFINE = CAMERAS["affine"]
 
 
 class Scene(NamedTuple):
@@ -54,7 +56,7 @@ def disturbed(state, seed=1, size=0.1):
 def refined(scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3):
     start = disturbed(scene.truth) if start is None else start
     likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-    return refine_joint(likelihood, start, max_iter=max_iter, tol=tol)
+    return refine_joint(likelihood, start, AFFINE, max_iter=max_iter, tol=tol)
 
 
 @cache
@@ -334,6 +336,231 @@ class TestInvariances:
         assert_allclose(got.state.shapes, expected.state.shapes[..., points], atol=1e-4)
 
 
+def calibrated_scene(camera, seed=0, noise=DEVIATION, kind="complete"):
+    """Return a table of calibrated cameras, and what made it."""
+    rng = np.random.default_rng(seed)
+    scene = random_scene(seed, noise, kind)
+    rows, scales = nearest_calibrated(scene.truth.motion.transpose(2, 0, 1))
+    motion = rows.transpose(1, 2, 0)
+    if camera == "weak_perspective":
+        motion = scales * motion
+    c = np.vstack([np.ones(40), rng.normal(size=(2, 40))])
+    tracks = np.einsum("rai,kaj,ki->ijr", motion, scene.truth.shapes, c)
+    tracks += noise * rng.normal(size=tracks.shape)
+    tracks[np.isnan(scene.tracks)] = np.nan
+    if kind == "complete":
+        tracks -= tracks.mean(axis=1, keepdims=True)
+    return Scene(tracks, scene.weights, scene.truth._replace(motion=motion))
+
+
+def disturbed_by(cameras, state, seed=1, size=0.1):
+    """Return a state that is some way off, with cameras of the model."""
+    moved = disturbed(state, seed, size)
+    step = size * np.random.default_rng(seed).normal(size=(cameras.n_parameters, 40))
+    return moved._replace(motion=cameras.moved(state.motion, step))
+
+
+@cache
+def calibrated_optimum(camera, kind="complete"):
+    """Return a minimum of the objective with calibrated cameras, and its table."""
+    scene, cameras = calibrated_scene(camera, kind=kind), CAMERAS[camera]
+    likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
+    start = disturbed_by(cameras, scene.truth)
+    result = refine_joint(likelihood, start, cameras, max_iter=5000, tol=1e-10)
+    return scene, likelihood, start, result
+
+
+CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+
+
+class TestCalibratedCameras:
+    @CALIBRATED
+    @KINDS
+    def test_history_falls_and_cameras_stay_calibrated(self, camera, kind):
+        _, likelihood, start, result = calibrated_optimum(camera, kind)
+        assert result.converged
+        assert (np.diff(result.history) < 0).all()
+        assert result.history[0] == likelihood(*start).value
+        assert result.history[-1] == likelihood(*result.state).value
+        motion = result.state.motion.transpose(2, 0, 1)
+        gram = motion @ motion.swapaxes(1, 2)
+        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+        unit = np.broadcast_to(np.eye(2), gram.shape)
+        assert_allclose(gram / scale, unit, atol=1e-11)
+        if camera == "orthographic":
+            assert_allclose(scale, 1.0, rtol=1e-11)
+
+    @CALIBRATED
+    @KINDS
+    def test_objective_rises_in_every_direction(self, camera, kind):
+        _, likelihood, _, result = calibrated_optimum(camera, kind)
+        cameras = CAMERAS[camera]
+        assert result.gradient_norm < 5e-6
+        rng = np.random.default_rng(2)
+        shapes, motion, noise = result.state
+        for _ in range(10):
+            change = rng.normal(size=shapes.shape)
+            step = rng.normal(size=(cameras.n_parameters, motion.shape[2]))
+            rises = []
+            for size in (-1e-3, 1e-3):
+                moved = likelihood(
+                    shapes + size * change,
+                    cameras.moved(motion, size * step),
+                    noise * np.exp(size),
+                )
+                rises.append(moved.value - result.history[-1])
+            assert min(rises) > 0
+            assert_allclose(rises[0], rises[1], rtol=0.1)
+
+    @CALIBRATED
+    def test_gradient_norm_by_its_definition(self, camera):
+        scene, cameras = calibrated_scene(camera), CAMERAS[camera]
+        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        start = disturbed_by(cameras, scene.truth)
+        result = refine_joint(likelihood, start, cameras, max_iter=3, tol=1e-3)
+        passed = likelihood(*result.state)
+        noise, motion = result.state.noise, result.state.motion
+        square = passed.noise_gradient**2 / likelihood.n_seen
+        for g in passed.shape_gradient.reshape(9, -1).T:
+            square += noise / 2 * g @ np.linalg.solve(passed.shape_curvature[0], g)
+        D = cameras.tangents(motion)
+        slope = np.einsum("crai,rai->ci", D, passed.motion_gradient)
+        for i, g in enumerate(slope.T):
+            xx, yy, zz, xy, xz, yz = passed.motion_curvature[:, i]
+            A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            curvature = np.einsum("cra,ab,drb->cd", D[..., i], A, D[..., i])
+            square += noise / 2 * g @ np.linalg.solve(curvature, g)
+        expected = np.sqrt(square / likelihood.n_seen)
+        assert result.gradient_norm == pytest.approx(expected, rel=1e-6)
+
+    @CALIBRATED
+    def test_is_the_same_from_another_start(self, camera):
+        scene, likelihood, _, expected = calibrated_optimum(camera)
+        cameras = CAMERAS[camera]
+        start = disturbed_by(cameras, scene.truth, seed=2, size=0.15)
+        got = refine_joint(likelihood, start, cameras, max_iter=1000, tol=1e-7)
+        TestOptimum.check(scene, got, expected)
+
+    @CALIBRATED
+    def test_truth_is_near(self, camera):
+        scene, _, _, result = calibrated_optimum(camera)
+        assert result.state.noise == pytest.approx(DEVIATION**2, rel=0.3)
+        # Up to a rotation and, with scales, a unit of space.
+        motion = result.state.motion.transpose(2, 0, 1).reshape(-1, 3)
+        other = scene.truth.motion.transpose(2, 0, 1).reshape(-1, 3)
+        U, S, Vt = np.linalg.svd(motion.T @ other)
+        size = S.sum() / np.sum(motion**2) if camera == "weak_perspective" else 1.0
+        assert_allclose(size * motion @ (U @ Vt), other, atol=0.1)
+
+    @CALIBRATED
+    def test_rotation_of_space(self, camera):
+        scene, cameras = calibrated_scene(camera), CAMERAS[camera]
+        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        start = disturbed_by(cameras, scene.truth)
+        R = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+        turned = start._replace(
+            shapes=R @ start.shapes,
+            motion=np.einsum("rai,ba->rbi", start.motion, R),
+        )
+        got, expected = (
+            refine_joint(likelihood, each, cameras, max_iter=300, tol=1e-3)
+            for each in (turned, start)
+        )
+        assert_allclose(got.history, expected.history, rtol=1e-6)
+        assert_allclose(images(scene, got), images(scene, expected), atol=1e-4)
+
+    @CALIBRATED
+    @KINDS
+    def test_tables_without_noise_are_fitted_to_rounding_errors(self, camera, kind):
+        scene, cameras = calibrated_scene(camera, noise=0.0, kind=kind), CAMERAS[camera]
+        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
+        start = disturbed_by(cameras, scene.truth)
+        result = refine_joint(likelihood, start, cameras, max_iter=1000, tol=1e-3)
+        assert result.converged
+        assert (np.diff(result.history) <= 0).all()
+        floor = module.NOISE_FLOOR * likelihood.square / likelihood.n_seen
+        assert result.state.noise == pytest.approx(floor, rel=1e-6)
+        assert result.residual * likelihood.n_seen < 1e-12 * likelihood.square
+
+
+class TestHeldCameras:
+    @KINDS
+    def test_shapes_and_noise_are_fitted(self, kind):
+        scene = random_scene(kind=kind)
+        likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
+        start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
+        result = refine_joint(
+            likelihood, start, HeldCameras(), max_iter=1000, tol=1e-10
+        )
+        assert result.converged
+        assert_array_equal(result.state.motion, start.motion)
+        assert (np.diff(result.history) < 0).all()
+        first, last = likelihood(*start), likelihood(*result.state)
+        for name in ("shape_gradient", "noise_gradient"):
+            before, after = (
+                np.abs(getattr(each, name)).max() for each in (first, last)
+            )
+            assert after < 1e-5 * before
+
+    def test_without_noise_they_stay(self):
+        scene = random_scene(noise=0.0)
+        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
+        result = refine_joint(likelihood, start, HeldCameras(), max_iter=50, tol=1e-3)
+        assert_array_equal(result.state.motion, start.motion)
+        assert (np.diff(result.history) < 0).all()
+
+
+class TestLeastNoise:
+    @pytest.mark.parametrize("camera", CAMERAS)
+    def test_noise_stays_above(self, camera):
+        scene, cameras = calibrated_scene(camera), CAMERAS[camera]
+        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        mean_square = likelihood.square / likelihood.n_seen
+        least = 10 * DEVIATION**2 / mean_square
+        start = disturbed_by(cameras, scene.truth)
+        result = refine_joint(
+            likelihood, start, cameras, least_noise=least, max_iter=1000, tol=1e-6
+        )
+        assert result.converged
+        assert (np.diff(result.history) < 0).all()
+        assert result.state.noise == pytest.approx(10 * DEVIATION**2)
+        # It would fall further: its slope does not count.
+        assert likelihood(*result.state).noise_gradient > 0.1 * likelihood.n_seen
+        assert result.gradient_norm < 1e-3
+        assert result.left == result.state.noise > result.residual
+
+    def test_that_is_below_the_noise_changes_nothing(self):
+        scene = random_scene()
+        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        start = disturbed(scene.truth)
+        got, expected = (
+            refine_joint(
+                likelihood, start, AFFINE, least_noise=least, max_iter=100, tol=1e-3
+            )
+            for least in (1e-6, module.NOISE_FLOOR)
+        )
+        assert_array_equal(got.history, expected.history)
+
+    def test_residual_is_the_mean_square_that_is_left(self):
+        scene = random_scene()
+        result = refined(scene)
+        rest = scene.tracks.swapaxes(1, 2) - images(scene, result)
+        assert result.residual == pytest.approx(np.mean(rest**2))
+        assert result.left == max(result.residual, result.state.noise)
+
+    def test_one_refinement_after_another(self):
+        scene = random_scene()
+        first = refined(scene, max_iter=3)
+        second = refined(scene, first.state, max_iter=4)
+        both = first.followed_by(second)
+        assert_array_equal(
+            both.history, np.concatenate([first.history, second.history])
+        )
+        for got, expected in zip(both.state, second.state, strict=True):
+            assert_array_equal(got, expected)
+
+
 class TestWithoutNoise:
     @KINDS
     def test_reaches_the_floor_and_the_true_images(self, kind):
@@ -383,7 +610,7 @@ class TestWithoutNoise:
         likelihood = likelihood_of(random_scene(noise=0.0).tracks, None, 0.0)
         noises = []
 
-        def fail(blocks, shapes, motion, alpha, penalty):
+        def fail(blocks, shapes, motion, alpha, penalty, cameras):
             passed = likelihood(shapes, motion, 1e-12)
             noises.append(passed.residual / likelihood.n_seen)
 
@@ -407,7 +634,7 @@ class TestWithoutNoise:
         scene = random_scene(noise=0.0)
         likelihood = counted(scene)
         result = refine_joint(
-            likelihood, disturbed(scene.truth), max_iter=1000, tol=1e-6
+            likelihood, disturbed(scene.truth), AFFINE, max_iter=1000, tol=1e-6
         )
         assert likelihood.n_calls < 2.5 * len(result.history)
 
@@ -415,7 +642,7 @@ class TestWithoutNoise:
         scene = random_scene()
         likelihood = counted(scene)
         result = refine_joint(
-            likelihood, disturbed(scene.truth), max_iter=1000, tol=1e-6
+            likelihood, disturbed(scene.truth), AFFINE, max_iter=1000, tol=1e-6
         )
         assert likelihood.n_calls < 1.5 * len(result.history)
 
@@ -459,7 +686,7 @@ class TestDegenerate:
         else:
             getattr(start, part)[..., 3] = value
         likelihood = counted(scene)
-        refine_joint(likelihood, start, max_iter=1000, tol=1e-3)
+        refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-3)
         assert likelihood.n_calls < 100
 
     def test_has_not_converged_where_the_objective_is_not_finite(self):

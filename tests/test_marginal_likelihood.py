@@ -11,7 +11,7 @@ from scenes import random_rotation
 from isa_nrsfm._joint.likelihood import likelihood_of
 
 NOISE = 0.05
-STIFFNESS = 7.0
+PENALTY = 7.0
 
 
 class Scene(NamedTuple):
@@ -85,7 +85,7 @@ def second_moments(scene, noise, penalty):
 
 
 KINDS = pytest.mark.parametrize("kind", ["complete", "weighted", "missing"])
-STIFF = pytest.mark.parametrize("penalty", [0.0, STIFFNESS])
+PENALTIES = pytest.mark.parametrize("penalty", [0.0, PENALTY])
 
 
 class TestValue:
@@ -109,13 +109,13 @@ class TestValue:
             np.sum((root * (M @ shapes[1:])) ** 2)
             for _, shapes, root, M, _ in frame_by_frame(scene)
         )
-        added = scene.at(STIFFNESS).value - scene.at().value
-        assert added == pytest.approx(STIFFNESS * energy, rel=1e-12)
+        added = scene.at(PENALTY).value - scene.at().value
+        assert added == pytest.approx(PENALTY * energy, rel=1e-12)
 
     @KINDS
     def test_coefficients_and_residual(self, kind):
         scene = random_scene(kind)
-        passed = scene.at(STIFFNESS)
+        passed = scene.at(PENALTY)
         residual = 0.0
         for i, (points, shapes, root, M, _) in enumerate(frame_by_frame(scene)):
             alpha, _ = coefficients(points, shapes, root, M, NOISE)
@@ -164,12 +164,64 @@ class TestValue:
             for points, shapes, _, M, _ in frame_by_frame(scene)
         )
         expected = scene.tracks.size * np.log(NOISE) + energy / NOISE
-        assert rigid.at(STIFFNESS).value == pytest.approx(expected, rel=1e-12)
+        assert rigid.at(PENALTY).value == pytest.approx(expected, rel=1e-12)
+
+
+class TestPenalties:
+    """A price for each basis shape."""
+
+    PRICES = np.array([0.3, 7.0, 2.0])
+
+    @KINDS
+    def test_equal_ones_are_one(self, kind):
+        scene = random_scene(kind)
+        got, expected = scene.at(np.full(3, PENALTY)), scene.at(PENALTY)
+        for one, other in zip(got, expected, strict=True):
+            assert_allclose(one, other, rtol=1e-12)
+
+    @KINDS
+    def test_add_the_energies_of_the_images_of_each_basis_shape(self, kind):
+        scene = random_scene(kind)
+        energies = sum(
+            np.sum((root * (M @ shapes[1:])) ** 2, axis=(1, 2))
+            for _, shapes, root, M, _ in frame_by_frame(scene)
+        )
+        change = scene.at(self.PRICES).value - scene.at().value
+        assert change == pytest.approx(self.PRICES @ energies, rel=1e-10)
+
+    @KINDS
+    @pytest.mark.parametrize("name", ["shapes", "motion"])
+    def test_gradient_against_differences(self, kind, name):
+        scene = random_scene(kind)
+        field = {"shapes": "shape_gradient", "motion": "motion_gradient"}[name]
+        gradient = getattr(scene.at(self.PRICES), field)
+        rng, step = np.random.default_rng(1), 1e-6
+        for _ in range(5):
+            change = rng.normal(size=gradient.shape)
+            above, below = (
+                scene._replace(**{name: getattr(scene, name) + sign * step * change})
+                for sign in (1, -1)
+            )
+            slope = above.at(self.PRICES).value - below.at(self.PRICES).value
+            slope /= 2 * step
+            assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
+
+    @KINDS
+    def test_curvatures_have_them_on_the_diagonal(self, kind):
+        scene = random_scene(kind)
+        got = scene.at(self.PRICES).motion_curvature
+        for i, (_, shapes, root, _, _) in enumerate(frame_by_frame(scene)):
+            weighted = root * shapes[1:]
+            prior = np.einsum("k,kaj,kbj->ab", self.PRICES, weighted, weighted)
+            without = scene.at().motion_curvature[:, i]
+            xx, yy, zz, xy, xz, yz = got[:, i] - without
+            A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            assert_allclose(A, NOISE * prior, atol=1e-10)
 
 
 class TestGradient:
     @KINDS
-    @STIFF
+    @PENALTIES
     @pytest.mark.parametrize("name", ["shapes", "motion"])
     def test_against_differences(self, kind, penalty, name):
         scene = random_scene(kind)
@@ -189,7 +241,7 @@ class TestGradient:
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
 
     @KINDS
-    @STIFF
+    @PENALTIES
     def test_by_the_logarithm_of_the_noise_against_differences(self, kind, penalty):
         scene, step = random_scene(kind), 1e-5
         above, below = (
@@ -201,13 +253,13 @@ class TestGradient:
     @KINDS
     def test_leaves_shapes_centred(self, kind):
         # A shift of a shape moves all points of a frame by the same: nothing changes.
-        gradient = random_scene(kind).at(STIFFNESS).shape_gradient
+        gradient = random_scene(kind).at(PENALTY).shape_gradient
         assert_allclose(gradient.sum(axis=2), 0, atol=1e-10 * np.abs(gradient).max())
 
 
 class TestCurvature:
     @KINDS
-    @STIFF
+    @PENALTIES
     def test_of_the_shapes_at_each_point(self, kind, penalty):
         scene = random_scene(kind)
         got = scene.at(penalty).shape_curvature
@@ -223,7 +275,7 @@ class TestCurvature:
         assert_allclose(np.broadcast_to(got, expected.shape), expected, rtol=1e-10)
 
     @KINDS
-    @STIFF
+    @PENALTIES
     def test_of_the_cameras(self, kind, penalty):
         scene = random_scene(kind)
         got = scene.at(penalty).motion_curvature
@@ -237,7 +289,7 @@ class TestCurvature:
             packed = [A[0, 0], A[1, 1], A[2, 2], A[0, 1], A[0, 2], A[1, 2]]
             assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
 
-    @STIFF
+    @PENALTIES
     def test_newton_steps_with_them_are_those_of_expectation_maximisation(
         self, penalty
     ):
@@ -265,7 +317,7 @@ class TestCurvature:
         moved = scene.shapes.reshape(len(N), -1) - step
         assert_allclose(moved, np.linalg.solve(N, R), atol=1e-10)
 
-    @STIFF
+    @PENALTIES
     def test_noise_of_expectation_maximisation(self, penalty):
         # The noise gradient vanishes where s2 is the mean of the expected residual.
         scene = random_scene("missing")
@@ -292,15 +344,15 @@ class TestBlocks:
     @pytest.mark.parametrize("size", [1, 4, 11, 50])
     def test_size_makes_no_difference(self, kind, size):
         scene = random_scene(kind)
-        whole = scene.at(STIFFNESS, block_frames=len(scene.tracks))
-        assert_same(scene.at(STIFFNESS, block_frames=size), whole)
+        whole = scene.at(PENALTY, block_frames=len(scene.tracks))
+        assert_same(scene.at(PENALTY, block_frames=size), whole)
 
     def test_default_size_is_passed(self):
         # More frames than a block has: the cameras are dealt out in the right order.
         scene = random_scene("complete", n_frames=4100, n_points=4, n_components=1)
-        whole = scene.at(STIFFNESS, block_frames=4100)
+        whole = scene.at(PENALTY, block_frames=4100)
         assert len(likelihood_of(scene.tracks, None, 0.0).frames.lengths) == 3
-        assert_same(scene.at(STIFFNESS), whole)
+        assert_same(scene.at(PENALTY), whole)
 
     @KINDS
     def test_memory_order_makes_no_difference(self, kind):
@@ -312,14 +364,14 @@ class TestBlocks:
                 1, 2, 0
             ),
         )
-        assert_same(other.at(STIFFNESS), scene.at(STIFFNESS))
+        assert_same(other.at(PENALTY), scene.at(PENALTY))
 
 
 class TestWeights:
     def test_of_one_are_none(self):
         scene = random_scene("complete")
         ones = scene._replace(weights=np.ones(scene.tracks.shape[:2]))
-        got, expected = ones.at(STIFFNESS), scene.at(STIFFNESS)
+        got, expected = ones.at(PENALTY), scene.at(PENALTY)
         n_points = scene.tracks.shape[1]
         same = np.repeat(expected.shape_curvature, n_points, axis=0)
         assert_same(got, expected._replace(shape_curvature=same))
@@ -331,13 +383,13 @@ class TestWeights:
         weights, tracks = scene.weights.copy(), scene.tracks.copy()
         weights[:, 2], tracks[:, 2] = 0.0, hidden
         kept = np.arange(weights.shape[1]) != 2
-        got = scene._replace(weights=weights, tracks=tracks).at(STIFFNESS)
+        got = scene._replace(weights=weights, tracks=tracks).at(PENALTY)
         expected = Scene(
             scene.tracks[:, kept],
             scene.weights[:, kept],
             scene.shapes[:, :, kept],
             scene.motion,
-        ).at(STIFFNESS)
+        ).at(PENALTY)
         assert_allclose(got.shape_gradient[:, :, 2], 0, atol=1e-12)
         assert_allclose(got.shape_curvature[2], 0, atol=1e-12)
         got = got._replace(
@@ -371,7 +423,7 @@ class TestInvariances:
             shapes=np.einsum("ab,kbj->kaj", A, scene.shapes),
             motion=np.einsum("rbi,ba->rai", scene.motion, np.linalg.inv(A)),
         )
-        got, expected = other.at(STIFFNESS), scene.at(STIFFNESS)
+        got, expected = other.at(PENALTY), scene.at(PENALTY)
         for name in ("value", "alpha", "residual", "noise_gradient"):
             assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-8)
 
@@ -381,8 +433,8 @@ class TestInvariances:
         Q = random_rotation(1)
         shapes = scene.shapes.copy()
         shapes[1:] = np.tensordot(Q, shapes[1:], 1)
-        got = scene._replace(shapes=shapes).at(STIFFNESS)
-        expected = scene.at(STIFFNESS)
+        got = scene._replace(shapes=shapes).at(PENALTY)
+        expected = scene.at(PENALTY)
         assert_allclose(got.value, expected.value, rtol=1e-12)
         assert_allclose(got.alpha, Q @ expected.alpha, atol=1e-10)
         assert_allclose(got.motion_gradient, expected.motion_gradient, atol=1e-8)
@@ -404,18 +456,18 @@ class TestInvariances:
             tracks=np.einsum("rci,ijc->ijr", R, scene.tracks),
             motion=np.einsum("rci,cai->rai", R, scene.motion),
         )
-        turned = scene.at(STIFFNESS)
+        turned = scene.at(PENALTY)
         turned = turned._replace(
             motion_gradient=np.einsum("rci,cai->rai", R, turned.motion_gradient)
         )
-        assert_same(other.at(STIFFNESS), turned)
+        assert_same(other.at(PENALTY), turned)
 
     @KINDS
     def test_place_of_single_frames(self, kind):
         scene = random_scene(kind)
         shift = np.random.default_rng(1).normal(size=(len(scene.tracks), 1, 2))
         moved = scene._replace(tracks=scene.tracks + 3 * shift)
-        assert_same(moved.at(STIFFNESS), scene.at(STIFFNESS))
+        assert_same(moved.at(PENALTY), scene.at(PENALTY))
 
     @KINDS
     def test_order_of_frames_and_points(self, kind):
@@ -430,7 +482,7 @@ class TestInvariances:
             scene.shapes[..., points],
             scene.motion[..., frames],
         )
-        expected = scene.at(STIFFNESS)
+        expected = scene.at(PENALTY)
         curvature = expected.shape_curvature
         expected = expected._replace(
             shape_gradient=expected.shape_gradient[..., points],
@@ -439,7 +491,7 @@ class TestInvariances:
             motion_curvature=expected.motion_curvature[:, frames],
             alpha=expected.alpha[:, frames],
         )
-        assert_same(other.at(STIFFNESS), expected)
+        assert_same(other.at(PENALTY), expected)
 
     @KINDS
     def test_unit_of_the_table(self, kind):
@@ -468,7 +520,7 @@ class TestDegenerate:
             shapes[:, 2] = 0.0
         else:
             shapes[2] = shapes[1]
-        for each in scene._replace(shapes=shapes, motion=motion).at(STIFFNESS):
+        for each in scene._replace(shapes=shapes, motion=motion).at(PENALTY):
             assert np.isfinite(each).all()
 
     def test_basis_shapes_of_zero_have_coefficients_of_zero(self):

@@ -13,7 +13,9 @@ from isa_nrsfm._orthonormal_cameras import (
     _residuals,
     nearest_orthonormal,
     orthonormal_cameras,
+    orthonormal_mixture,
     orthonormality_residuals,
+    principal_columns,
 )
 from isa_nrsfm._tracks import centred_tracks, measurement_matrix
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -166,6 +168,81 @@ def test_derivatives(price):
     residuals = _residuals(Q[None], P, L)[0]
     expected = cost_of((P @ Q).reshape(-1, 2, 3)) + np.sum((L @ Q) ** 2)
     assert residuals @ residuals == pytest.approx(expected)
+
+
+class TestMixture:
+    """The search from one number of columns to more."""
+
+    def columns(self, n, noise=0.02):
+        truth = make_nonrigid_tracks(
+            60, 40, N_COMPONENTS, camera="orthographic", noise=noise, random_state=0
+        )
+        return principal_columns(measurement_matrix(centred_tracks(truth.tracks)[0]))[
+            :, :n
+        ]
+
+    @pytest.mark.parametrize("price", [0.0, 0.1])
+    def test_cost_by_its_definition_is_a_minimum(self, price):
+        P = self.columns(9)
+        L = np.sqrt(price) * np.eye(9)
+        Q, cost = orthonormal_mixture(P, np.eye(3), L)
+
+        def value(mixing):
+            return cost_of((P @ mixing).reshape(-1, 2, 3)) + np.sum((L @ mixing) ** 2)
+
+        assert cost == pytest.approx(value(Q))
+        gradient = approx_fprime(Q.ravel(), lambda q: value(q.reshape(9, 3)), 1e-7)
+        assert np.abs(gradient).max() < 1e-4
+        rng = np.random.default_rng(0)
+        assert all(
+            value(Q + size * rng.normal(size=Q.shape)) > cost
+            for size in (1e-2, 1e-1)
+            for _ in range(20)
+        )
+
+    def test_more_columns_never_cost_more(self):
+        P = self.columns(18)
+        mixing, cost = orthonormal_mixture(P[:, :3], np.eye(3))
+        for n in (6, 9, 12, 18):
+            before = cost
+            mixing, cost = orthonormal_mixture(P[:, :n], mixing)
+            assert mixing.shape == (n, 3)
+            assert cost <= before + 1e-12
+
+    def test_start_is_not_changed(self):
+        P, start = self.columns(9), np.eye(3)
+        orthonormal_mixture(P, start)
+        assert_array_equal(start, np.eye(3))
+
+
+class TestPrincipalColumns:
+    @pytest.mark.parametrize("shape", [(60, 11), (20, 50)])
+    def test_are_left_singular_vectors_as_long_as_columns_of_cameras(self, shape):
+        W = np.random.default_rng(0).normal(size=shape)
+        P = principal_columns(W)
+        n, rank = len(W), min(shape)
+        assert P.shape == (n, rank)
+        U, _, _ = np.linalg.svd(W, full_matrices=False)
+        cosines = U.T @ P / np.sqrt(n / 3)
+        assert_allclose(np.abs(cosines), np.eye(rank), atol=1e-8)
+
+    def test_columns_of_cameras_are_so_long(self):
+        cameras = Rotation.random(5000, rng=0).as_matrix()[:, :2].reshape(-1, 3)
+        lengths = np.linalg.norm(principal_columns(cameras), axis=0)
+        assert_allclose(lengths, np.linalg.norm(cameras, axis=0), rtol=0.03)
+
+    @pytest.mark.parametrize("rank", [1, 3, 9])
+    def test_of_exact_tables_are_as_many_as_their_rank(self, rank):
+        rng = np.random.default_rng(0)
+        W = rng.normal(size=(120, rank)) @ rng.normal(size=(rank, 40))
+        assert principal_columns(W).shape == (120, rank)
+
+    def test_unit_of_the_table_does_not_matter(self):
+        W = np.random.default_rng(0).normal(size=(20, 7))
+        expected = principal_columns(W)
+        for unit in (1e-9, 1e9):
+            got = principal_columns(unit * W)
+            assert_allclose(np.abs(got), np.abs(expected), atol=1e-10)
 
 
 def test_residuals_of_orthonormal_rows_are_zero():

@@ -10,7 +10,7 @@ import pytest
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import check_estimator, parametrize_with_checks
 
-from isa_nrsfm import AffineNRSfM, FastISA, _joint_fit
+from isa_nrsfm import AffineNRSfM, FastISA
 
 N_POINTS = 16
 
@@ -85,8 +85,7 @@ def widen(estimator, X, X_test=None, kernel=None):
 
 @pytest.fixture
 def landmark_tables(monkeypatch):
-    """Widen the tables of the checks, and take fewer starts, for speed."""
-    monkeypatch.setattr(_joint_fit, "N_RANDOM_STARTS", 1)
+    """Widen the tables of the checks."""
     monkeypatch.setattr(estimator_checks, "_enforce_estimator_tags_X", widen)
 
 

@@ -1,0 +1,718 @@
+"""The most probable calibrated camera of frames, and their coefficients."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import random_rotation
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._frame_products import frame_products, frame_tracks
+from isa_nrsfm._frames import calibrated_newton as module
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
+from isa_nrsfm._small_matrices import unpacked
+
+NOISE = 0.02
+BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+GAPS = pytest.mark.parametrize("gaps", [False, True])
+
+
+class Scene(NamedTuple):
+    tracks: NDArray  # (n_frames, n_points, 2)
+    shapes: NDArray  # (n_components + 1, 3, n_points)
+    motion: NDArray  # (n_frames, 2, 3)
+    translation: NDArray  # (n_frames, 2)
+    alpha: NDArray  # (n_frames, n_components)
+
+    def hidden(self, share=0.3):
+        """Return the scene with NaN at random points."""
+        where = np.random.default_rng(0).random(self.tracks.shape[:2]) < share
+        return self._replace(tracks=np.where(where[..., None], np.nan, self.tracks))
+
+
+def random_scene(camera, seed=0, noise=NOISE, n_frames=20, depth=1.0):
+    """Return a scene of 20 points and three basis shapes, with cameras of a model."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(4, 3, 20)) * np.array([1.0, 0.8, 0.6 * depth])[:, None]
+    shapes[1:] *= 0.2
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = Rotation.random(n_frames, rng=rng).as_matrix()[:, :2]
+    if camera == "weak_perspective":
+        motion = rng.uniform(0.5, 2.0, n_frames)[:, None, None] * motion
+    translation = rng.normal(size=(n_frames, 2))
+    alpha = rng.normal(size=(n_frames, 3))
+    tracks = images(shapes, motion, translation, alpha)
+    tracks = tracks + noise * rng.normal(size=tracks.shape)
+    return Scene(tracks, shapes, motion, translation, alpha)
+
+
+def images(shapes, motion, translation, alpha):
+    """Return the tracks (n_frames, n_points, 2) of a model."""
+    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    return (motion @ frames).swapaxes(1, 2) + translation[:, None]
+
+
+class Regression(NamedTuple):
+    """A frame in a known camera, ``y ~ x_0 + X a``, as dense linear algebra."""
+
+    y: NDArray
+    first: NDArray
+    X: NDArray
+
+    @classmethod
+    def of(cls, points, shapes, M):
+        seen = np.isfinite(points[:, 0])
+        points, shapes = points[seen], shapes[..., seen]
+        moved = shapes - shapes.mean(axis=2, keepdims=True)
+        columns = (M @ moved).reshape(len(shapes), -1)
+        y = (points - points.mean(axis=0)).T.ravel()
+        return cls(y, columns[0], columns[1:].T)
+
+    def precision(self, noise):
+        return self.X.T @ self.X + noise * np.eye(self.X.shape[1])
+
+    def mean(self, noise):
+        """Return the posterior mean of the coefficients."""
+        right = self.X.T @ (self.y - self.first)
+        return np.linalg.solve(self.precision(noise), right)
+
+    def square(self, alpha, noise):
+        rest = self.y - self.first - self.X @ alpha
+        return rest @ rest + noise * alpha @ alpha
+
+    def value(self, noise):
+        """Return F: minus two log marginal likelihoods, up to a constant."""
+        _, determinant = np.linalg.slogdet(self.precision(noise) / noise)
+        return self.square(self.mean(noise), noise) / noise + determinant
+
+
+def moved(M, step):
+    """Return a camera after a rotation vector and, maybe, the log of a scale."""
+    turned = M @ Rotation.from_rotvec(step[:3]).as_matrix()
+    return np.exp(step[3:].sum()) * turned
+
+
+def value(scene, i, M, noise=NOISE**2):
+    return Regression.of(scene.tracks[i], scene.shapes, M).value(noise)
+
+
+def fitted(scene, camera, noise=NOISE**2, **options):
+    return fit_posterior(scene.tracks, scene.shapes, noise, camera=camera, **options)
+
+
+def problem_of(scene, camera, noise):
+    """Return the module's inner problem, and the cameras in its coordinates."""
+    cameras = CAMERAS[camera]
+    search = CalibratedSearch(scene.shapes, cameras.scaled)
+    seen = np.isfinite(scene.tracks[..., 0])
+    weights = None if seen.all() else 1.0 * seen
+    products = frame_products(frame_tracks(scene.tracks, weights), search.shapes)
+    problem = module._problem(products, np.full(len(scene.tracks), noise), cameras)
+    axes = search.cameras(np.eye(3)[None])[0].T
+    motion = np.ascontiguousarray((scene.motion @ axes).transpose(1, 2, 0))
+    return problem, motion
+
+
+def assert_calibrated(motion, camera):
+    """Check that cameras are scaled rotations."""
+    gram = motion @ motion.swapaxes(1, 2)
+    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+    assert_allclose(gram / scale, np.broadcast_to(np.eye(2), gram.shape), atol=1e-12)
+    if camera == "orthographic":
+        assert_allclose(scale, 1.0, rtol=1e-12)
+
+
+class TestMinimum:
+    @BOTH
+    @GAPS
+    @pytest.mark.parametrize("depth", [1.0, 0.1])
+    def test_is_no_higher_than_from_many_other_starts(self, camera, gaps, depth):
+        scene = random_scene(camera, noise=0.1, n_frames=3, depth=depth)
+        scene = scene.hidden() if gaps else scene
+        noise = 0.1**2
+        fits = fitted(scene, camera, noise)
+        n = CAMERAS[camera].n_parameters
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            scale = np.linalg.norm(M) / np.sqrt(2)
+            found = value(scene, i, M, noise)
+            ends = []
+            for _ in range(8):
+                start = scale * Rotation.random(rng=rng).as_matrix()[:2]
+                result = minimize(
+                    lambda step, i=i, start=start: value(
+                        scene, i, moved(start, step), noise
+                    ),
+                    np.zeros(n),
+                )
+                ends.append(result.fun)
+            assert found <= min(ends) + 1e-6
+            assert min(ends) == pytest.approx(found, abs=1e-5)
+
+    @BOTH
+    @GAPS
+    def test_objective_rises_in_every_direction(self, camera, gaps):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        fits = fitted(scene, camera)
+        assert fits.converged.all()
+        assert_calibrated(fits.motion, camera)
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            least = value(scene, i, M)
+            for _ in range(5):
+                step = 1e-4 * rng.normal(size=CAMERAS[camera].n_parameters)
+                rises = [value(scene, i, moved(M, s * step)) - least for s in (1, -1)]
+                assert min(rises) > 0
+                # Equal on both sides: the slope is zero, not only small.
+                assert_allclose(rises[0], rises[1], rtol=1e-2)
+
+    @BOTH
+    @GAPS
+    def test_coefficients_are_the_posterior_mean(self, camera, gaps):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        fits = fitted(scene, camera)
+        for i, M in enumerate(fits.motion):
+            frame = Regression.of(scene.tracks[i], scene.shapes, M)
+            assert_allclose(fits.alpha[i], frame.mean(NOISE**2), rtol=1e-9, atol=1e-12)
+            square = frame.square(fits.alpha[i], NOISE**2)
+            assert fits.objective[i] == pytest.approx(square, rel=1e-9)
+            residual = frame.square(fits.alpha[i], 0.0)
+            assert fits.residual[i] == pytest.approx(residual, rel=1e-9)
+
+    @BOTH
+    @GAPS
+    def test_position_is_that_of_least_squares(self, camera, gaps):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        fits = fitted(scene, camera)
+        rest = scene.tracks - images(scene.shapes, *fits[:3])
+        assert_allclose(np.nanmean(rest, axis=1), 0.0, atol=1e-12)
+
+    @BOTH
+    def test_noise_of_single_frames(self, camera):
+        scene = random_scene(camera, n_frames=6)
+        noises = np.geomspace(1e-6, 1.0, 6)
+        together = fitted(scene, camera, noises)
+        for i, noise in enumerate(noises):
+            alone = fitted(scene, camera, noise)
+            for got, expected in zip(together[:6], alone[:6], strict=True):
+                assert_allclose(got[i], expected[i], rtol=1e-7, atol=1e-9)
+
+    @BOTH
+    @pytest.mark.parametrize("depth", [0.1, 0.03, 0.01, 0.0])
+    @pytest.mark.parametrize("deviation", [0.005, 0.02])
+    def test_of_thin_objects_is_no_higher_than_from_the_truth(
+        self, camera, depth, deviation
+    ):
+        # Their depth tells the affine camera little or nothing of its third column.
+        scene = random_scene(camera, noise=deviation, n_frames=12, depth=depth)
+        noise = deviation**2
+        fits = fitted(scene, camera, noise)
+        n = CAMERAS[camera].n_parameters
+        for i, start in enumerate(scene.motion):
+            end = minimize(
+                lambda step, i=i, start=start: value(
+                    scene, i, moved(start, step), noise
+                ),
+                np.zeros(n),
+            )
+            assert value(scene, i, fits.motion[i], noise) <= end.fun + 0.01
+
+    @BOTH
+    def test_large_noise(self, camera):
+        # The coefficients are zero then, and log det(I + H / s2) is tr H / s2.
+        scene = random_scene(camera, n_frames=5)
+        fits = fitted(scene, camera, 1e9)
+        assert_allclose(fits.alpha, 0.0, atol=1e-6)
+
+        def square(i, M):
+            frame = Regression.of(scene.tracks[i], scene.shapes, M)
+            return np.sum((frame.y - frame.first) ** 2) + np.sum(frame.X**2)
+
+        rng = np.random.default_rng(1)
+        for i, M in enumerate(fits.motion):
+            least = square(i, M)
+            for _ in range(5):
+                step = 1e-2 * rng.normal(size=CAMERAS[camera].n_parameters)
+                assert min(square(i, moved(M, s * step)) for s in (1, -1)) > least
+
+    @BOTH
+    def test_rough_cameras_are_near(self, camera):
+        scene = random_scene(camera)
+        rough = approximate_cameras(
+            frame_tracks(scene.tracks), scene.shapes, NOISE**2, camera=camera
+        )
+        assert_calibrated(rough, camera)
+        away = np.abs(rough - fitted(scene, camera).motion).max(axis=(1, 2))
+        assert away.max() < 0.1
+        assert np.median(away) < 1e-6
+
+
+class TestDerivatives:
+    """Away from the minimum, where the gradient is not zero."""
+
+    H = 1e-5
+
+    @staticmethod
+    def disturbed(motion, cameras, size=0.1):
+        rng = np.random.default_rng(1)
+        step = size * rng.normal(size=(cameras.n_parameters, motion.shape[2]))
+        return cameras.moved(motion, step)
+
+    def states(self, problem, motion):
+        """Yield the states above and below along each tangent."""
+        n = problem.cameras.n_parameters
+        for c in range(n):
+            step = np.zeros((n, motion.shape[2]))
+            step[c] = self.H
+            yield tuple(
+                module._evaluate(problem, problem.cameras.moved(motion, sign * step))
+                for sign in (1, -1)
+            )
+
+    @BOTH
+    @GAPS
+    def test_value_by_dense_algebra(self, camera, gaps):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        problem, motion = problem_of(scene, camera, NOISE**2)
+        got = module._evaluate(problem, motion).value
+        expected = [value(scene, i, M) for i, M in enumerate(scene.motion)]
+        assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
+
+    @BOTH
+    @GAPS
+    @pytest.mark.parametrize("noise", [1e-4, 0.1, 10.0])
+    def test_slope_by_differences(self, camera, gaps, noise):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        problem, motion = problem_of(scene, camera, noise)
+        motion = self.disturbed(motion, CAMERAS[camera])
+        slope = module._evaluate(problem, motion).slope
+        for c, (above, below) in enumerate(self.states(problem, motion)):
+            expected = -(above.value - below.value) / (4 * self.H)
+            assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-6)
+
+    def numerical_hessian(self, problem, motion):
+        """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
+        rows = [
+            (below.slope - above.slope) / (2 * self.H)
+            for above, below in self.states(problem, motion)
+        ]
+        # Differences of the slope along tangents that turn along: what is not
+        # symmetric is the commutator of two rotations.
+        hessian = np.array(rows)
+        return 0.5 * (hessian + hessian.swapaxes(0, 1))
+
+    @BOTH
+    @GAPS
+    def test_hessian_is_exact_but_for_the_determinant(self, camera, gaps):
+        # What is left falls like the noise.
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        errors = []
+        for noise in (1e-2, 1e-3, 1e-4):
+            problem, motion = problem_of(scene, camera, noise)
+            motion = self.disturbed(motion, CAMERAS[camera], 0.03)
+            got = unpacked(module._evaluate(problem, motion).hessian)
+            expected = self.numerical_hessian(problem, motion)
+            size = np.abs(expected).max(axis=(0, 1))
+            errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
+        assert errors[0] < 0.1
+        assert errors[1] < 0.15 * errors[0]
+        assert errors[2] < 0.15 * errors[1]
+
+    @BOTH
+    @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
+    def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
+        scene = random_scene(camera)
+        problem, motion = problem_of(scene, camera, noise)
+        motion = self.disturbed(motion, CAMERAS[camera])
+        got = unpacked(module._evaluate(problem, motion).hessian)
+        excess = got - self.numerical_hessian(problem, motion)
+        least = np.linalg.eigvalsh(excess.transpose(2, 0, 1))[:, 0]
+        assert (least > -1e-5).all()
+        assert np.abs(excess).max() > 1e-5
+
+    @BOTH
+    def test_of_rigid_shapes_it_is_exact(self, camera):
+        scene = random_scene(camera)
+        rigid = scene._replace(shapes=scene.shapes[:1])
+        problem, motion = problem_of(rigid, camera, 0.1)
+        motion = self.disturbed(motion, CAMERAS[camera])
+        got = unpacked(module._evaluate(problem, motion).hessian)
+        expected = self.numerical_hessian(problem, motion)
+        assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+
+
+class TestCovariance:
+    @BOTH
+    @GAPS
+    def test_is_that_of_camera_and_coefficients_together(self, camera, gaps):
+        deviation = 2e-3
+        scene = random_scene(camera, noise=deviation, n_frames=4)
+        scene = scene.hidden() if gaps else scene
+        noise = deviation**2
+        fits = fitted(scene, camera, noise)
+        n = CAMERAS[camera].n_parameters
+
+        def f(i, x):
+            M = moved(fits.motion[i], x[:n])
+            frame = Regression.of(scene.tracks[i], scene.shapes, M)
+            return frame.square(fits.alpha[i] + x[n:], noise)
+
+        h = 1e-3
+        for i in range(4):
+            hessian = np.empty((n + 3, n + 3))
+            for p in range(n + 3):
+                for q in range(n + 3):
+                    a, b = h * np.eye(n + 3)[p], h * np.eye(n + 3)[q]
+                    corners = f(i, a + b) + f(i, -a - b) - f(i, a - b) - f(i, b - a)
+                    hessian[p, q] = corners / (4 * h * h)
+            # The posterior density is exp(-f / (2 s2)).
+            expected = np.linalg.inv(hessian / (2 * noise))[n:, n:]
+            size = np.abs(expected).max()
+            assert_allclose(fits.covariance[i], expected, atol=1e-3 * size)
+
+    @BOTH
+    def test_is_the_scatter_of_the_errors(self, camera):
+        scene = random_scene(camera, n_frames=4000)
+        fits = fitted(scene, camera)
+        spread = np.linalg.inv(np.linalg.cholesky(fits.covariance))
+        scaled = np.einsum("ikl,il->ik", spread, fits.alpha - scene.alpha)
+        typical = np.median(np.sum(scaled**2, axis=1))
+        assert_allclose(typical, 2.366, rtol=0.05)  # median of chi-squared, 3
+
+    @BOTH
+    def test_known_cameras_leave_less(self, camera):
+        scene = random_scene(camera)
+        fits = fitted(scene, camera)
+        for i, M in enumerate(fits.motion):
+            frame = Regression.of(scene.tracks[i], scene.shapes, M)
+            known = NOISE**2 * np.linalg.inv(frame.precision(NOISE**2))
+            more = np.linalg.eigvalsh(fits.covariance[i] - known)
+            assert (more > -1e-12).all()
+            assert (more > 1e-9).any()
+
+
+class TestExact:
+    @BOTH
+    @GAPS
+    def test_true_cameras_are_found(self, camera, gaps):
+        scene = random_scene(camera, noise=0.0)
+        given = scene.hidden() if gaps else scene
+        fits = fitted(given, camera, 0.0)
+        for got, true in zip(fits[:3], scene[2:], strict=True):
+            assert_allclose(got, true, atol=1e-8)
+        assert fits.converged.all()
+        assert_allclose(fits.residual, 0.0, atol=1e-9)
+        assert_calibrated(fits.motion, camera)
+
+    @BOTH
+    def test_few_points_are_enough(self, camera):
+        # Six unknowns of the pose at most and three coefficients: five points.
+        scene = random_scene(camera, noise=0.0, n_frames=40)
+        shapes = scene.shapes.copy()
+        shapes[1:] *= 0.2
+        tracks = images(shapes, *scene[2:])
+        tracks[:, 6:] = np.nan
+        given = scene._replace(tracks=tracks, shapes=shapes)
+        fits = fitted(given, camera, 0.0)
+        assert_allclose(fits.residual, 0.0, atol=1e-6)
+
+    def test_scaled_cameras_of_orthographic_tables_have_the_scale_one(self):
+        scene = random_scene("orthographic", noise=0.0)
+        fits = fitted(scene, "weak_perspective", 0.0)
+        assert_allclose(fits.motion, scene.motion, atol=1e-8)
+
+
+class TestInvariance:
+    @BOTH
+    def test_frames_are_separate(self, camera):
+        scene = random_scene(camera)
+        scene.tracks[10:] = scene.hidden().tracks[10:]
+        scene.tracks[15, 3:] = np.nan
+        together = fitted(scene, camera)
+        assert np.isnan(together.alpha[15]).all()
+        for i in range(20):
+            one = scene._replace(tracks=scene.tracks[i : i + 1])
+            for got, expected in zip(fitted(one, camera), together, strict=True):
+                assert_allclose(got[0], expected[i], rtol=1e-8, atol=1e-9)
+
+    @BOTH
+    @GAPS
+    def test_rotation_and_position_of_single_images(self, camera, gaps):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        R = np.array([random_rotation(seed, 2) for seed in range(20)])
+        R[::2] = R[::2] @ np.diag([1.0, -1.0])  # some are reflected
+        turned = scene.tracks @ R.swapaxes(1, 2) + 100.0
+        expected = fitted(scene, camera)
+        got = fitted(scene._replace(tracks=turned), camera)
+        assert_allclose(got.motion, R @ expected.motion, atol=1e-8)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
+        assert_allclose(got.covariance, expected.covariance, atol=1e-8)
+
+    @BOTH
+    @GAPS
+    @pytest.mark.parametrize("mirrored", [False, True])
+    def test_rotation_and_mirror_image_of_space(self, camera, gaps, mirrored):
+        scene = random_scene(camera)
+        scene = scene.hidden() if gaps else scene
+        A = random_rotation(0) @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])
+        expected = fitted(scene, camera)
+        got = fitted(scene._replace(shapes=A @ scene.shapes), camera)
+        assert_allclose(got.motion @ A, expected.motion, atol=1e-8)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
+        assert_allclose(got.covariance, expected.covariance, atol=1e-8)
+
+    @BOTH
+    def test_rotation_of_the_coefficients(self, camera):
+        scene = random_scene(camera)
+        Q = random_rotation(0)
+        mixed = np.concatenate([scene.shapes[:1], np.tensordot(Q, scene.shapes[1:], 1)])
+        expected = fitted(scene, camera)
+        got = fitted(scene._replace(shapes=mixed), camera)
+        assert_allclose(got.motion, expected.motion, atol=1e-8)
+        assert_allclose(got.alpha @ Q, expected.alpha, atol=1e-8)
+        assert_allclose(Q.T @ got.covariance @ Q, expected.covariance, atol=1e-8)
+
+    @pytest.mark.parametrize("unit", [1e-100, 1e-6, 1e6, 1e100])
+    def test_units_of_single_images(self, unit):
+        scene = random_scene("weak_perspective")
+        units = unit ** np.random.default_rng(1).random(20)
+        tracks = units[:, None, None] * scene.tracks
+        expected = fitted(scene, "weak_perspective")
+        got = fitted(
+            scene._replace(tracks=tracks), "weak_perspective", (units * NOISE) ** 2
+        )
+        motion = got.motion / units[:, None, None]
+        assert_allclose(motion, expected.motion, atol=1e-9)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-9)
+        assert_allclose(got.covariance, expected.covariance, atol=1e-9)
+
+    @pytest.mark.parametrize("unit", [1e-100, 1e100])
+    def test_units_of_orthographic_tables_and_shapes(self, unit):
+        scene = random_scene("orthographic")
+        expected = fitted(scene, "orthographic")
+        scaled = scene._replace(tracks=unit * scene.tracks, shapes=unit * scene.shapes)
+        got = fitted(scaled, "orthographic", (unit * NOISE) ** 2)
+        assert_allclose(got.motion, expected.motion, atol=1e-9)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-9)
+
+    @BOTH
+    def test_missing_points_are_points_that_are_not_there(self, camera):
+        scene = random_scene(camera)
+        kept = np.arange(20) % 3 > 0
+        hidden = np.where(kept[:, None], scene.tracks, np.nan)
+        fewer = scene.shapes[:, :, kept]
+        fewer = fewer - fewer.mean(axis=2, keepdims=True)
+        expected = fitted(
+            scene._replace(tracks=scene.tracks[:, kept], shapes=fewer), camera
+        )
+        got = fitted(scene._replace(tracks=hidden), camera)
+        assert_allclose(got.motion, expected.motion, atol=1e-8)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
+
+    @BOTH
+    def test_weights_are_inverse_variances(self, camera):
+        scene = random_scene(camera)
+        expected = fitted(scene, camera)
+        twice = np.full(scene.tracks.shape[:2], 2.0)
+        got = fitted(scene, camera, 2 * NOISE**2, weights=twice)
+        assert_allclose(got.motion, expected.motion, atol=1e-9)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-9)
+        assert_allclose(got.covariance, expected.covariance, atol=1e-9)
+        assert_allclose(got.objective, 2 * expected.objective, rtol=1e-8)
+
+    @BOTH
+    def test_weights_count_points_so_often(self, camera):
+        scene = random_scene(camera)
+        weights = np.random.default_rng(1).integers(0, 3, size=20)
+        often = np.repeat(np.arange(20), weights)
+        shapes = scene.shapes[..., often]
+        shapes = shapes - shapes.mean(axis=2, keepdims=True)
+        repeated = scene._replace(tracks=scene.tracks[:, often], shapes=shapes)
+        expected = fitted(repeated, camera)
+        got = fitted(scene, camera, weights=np.tile(1.0 * weights, (20, 1)))
+        assert_allclose(got.motion, expected.motion, atol=1e-8)
+        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
+
+
+class TestReversal:
+    """Of a nearly flat object, whose reversed images are nearly the same."""
+
+    def scene(self, camera, deviation=0.01):
+        return random_scene(camera, noise=deviation, depth=0.1, n_frames=40)
+
+    def reversed(self, scene):
+        """Return cameras reflected at the plane of the mean shape."""
+        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
+        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
+
+    def search(self, scene, camera, noise, motion):
+        search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
+        products = frame_products(frame_tracks(scene.tracks), search.shapes)
+        return search.reversed_cameras(products, noise, motion)
+
+    @BOTH
+    def test_cameras_that_start_reversed_are_turned_back(self, camera):
+        scene = self.scene(camera)
+        found, better = self.search(scene, camera, 1e-4, self.reversed(scene))
+        expected = fitted(scene, camera, 1e-4).motion
+        assert better.mean() > 0.9
+        # A few steps lead there, not all of them to the minimum.
+        away = np.abs(found - expected).max(axis=(1, 2))[better]
+        assert away.max() < 0.2
+        assert np.median(away) < 1e-4
+        assert_calibrated(found, camera)
+
+    @BOTH
+    def test_cameras_at_the_minimum_stay(self, camera):
+        scene = self.scene(camera)
+        expected = fitted(scene, camera, 1e-4).motion
+        found, better = self.search(scene, camera, 1e-4, expected)
+        assert not better.any()
+        assert_array_equal(found, expected)
+
+    @BOTH
+    def test_input_is_not_changed(self, camera):
+        scene = self.scene(camera)
+        given = self.reversed(scene)
+        copy = given.copy()
+        self.search(scene, camera, 1e-4, given)
+        assert_array_equal(given, copy)
+
+    @BOTH
+    def test_fit_takes_the_better_of_the_two(self, camera):
+        # The depth of the object is that of the noise: the start can be reversed.
+        scene = self.scene(camera, deviation=0.05)
+        noise = 0.05**2
+        fits = fitted(scene, camera, noise)
+        turned = scene._replace(motion=fits.motion)
+        n = CAMERAS[camera].n_parameters
+        for i, start in enumerate(self.reversed(turned)[:10]):
+            end = minimize(
+                lambda step, i=i, start=start: value(
+                    scene, i, moved(start, step), noise
+                ),
+                np.zeros(n),
+            )
+            assert value(scene, i, fits.motion[i], noise) <= end.fun + 1e-6
+
+
+class TestDegenerate:
+    def shapes_of(self, kind, shapes):
+        shapes = shapes.copy()
+        if kind == "flat mean shape":
+            shapes[0, 2] = 0
+        elif kind == "flat":
+            shapes[:, 2] = 0
+        elif kind == "on a line":
+            shapes[:, 1:] = 0
+        elif kind == "no mean shape":
+            shapes[0] = 0
+        elif kind == "no basis shape":
+            shapes[2] = 0
+        elif kind == "rigid":
+            shapes[1:] = 0
+        elif kind == "a point":
+            shapes[:] = 0
+        elif kind == "equal basis shapes":
+            shapes[2] = shapes[1]
+        elif kind == "basis shape that a scale makes":
+            shapes[1] = 0.5 * shapes[0]
+        elif kind == "basis shape that a turn makes":
+            shapes[1] = 0.2 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 0]]) @ shapes[0]
+        elif kind == "huge basis shapes":
+            shapes[1:] *= 1e6
+        elif kind == "tiny basis shapes":
+            shapes[1:] *= 1e-9
+        return random_rotation(5) @ shapes
+
+    @BOTH
+    @pytest.mark.parametrize(
+        "kind",
+        [
+            "flat mean shape",
+            "flat",
+            "on a line",
+            "no mean shape",
+            "no basis shape",
+            "rigid",
+            "a point",
+            "equal basis shapes",
+            "basis shape that a scale makes",
+            "basis shape that a turn makes",
+            "huge basis shapes",
+            "tiny basis shapes",
+        ],
+    )
+    @pytest.mark.parametrize("variance", [0.0, NOISE**2])
+    def test_stays_finite(self, camera, kind, variance):
+        scene = random_scene(camera)
+        scene = scene._replace(shapes=self.shapes_of(kind, scene.shapes))
+        for given in (scene, scene.hidden()):
+            fits = fitted(given, camera, variance, starts=np.ones((2, 3)))
+            for each in fits[:6]:
+                assert np.isfinite(each).all()
+            variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
+            assert (variances >= 0).all()
+
+    @BOTH
+    def test_no_basis_shape(self, camera):
+        scene = random_scene(camera)
+        rigid = scene._replace(shapes=scene.shapes[:1])
+        fits = fitted(rigid, camera)
+        assert fits.alpha.shape == (20, 0)
+        assert fits.covariance.shape == (20, 0, 0)
+        assert fits.converged.all()
+
+    @BOTH
+    def test_basis_shape_of_zeros_has_the_prior(self, camera):
+        scene = random_scene(camera)
+        padded = np.concatenate([scene.shapes, np.zeros_like(scene.shapes[:1])])
+        expected = fitted(scene, camera)
+        fits = fitted(scene._replace(shapes=padded), camera)
+        assert_array_equal(fits.alpha[:, 3], 0.0)
+        assert_allclose(fits.covariance[:, 3, 3], 1.0)
+        assert_allclose(fits.alpha[:, :3], expected.alpha, atol=1e-8)
+
+    @BOTH
+    def test_frames_that_determine_no_camera(self, camera):
+        scene = random_scene(camera, n_frames=6)
+        scene.tracks[0] = np.nan
+        scene.tracks[1, 1:] = np.nan
+        scene.tracks[2, 3:] = np.nan
+        scene.tracks[3, 4:] = np.nan
+        fits = fitted(scene, camera, starts=np.ones((1, 3)))
+        expected = np.arange(6) >= 3
+        for each in fits[:6]:
+            finite = np.isfinite(each.reshape(6, -1))
+            assert_array_equal(finite.all(axis=1), expected)
+            assert_array_equal(finite.any(axis=1), expected)
+
+    @BOTH
+    @pytest.mark.parametrize("variance", [0.0, NOISE**2])
+    def test_all_points_of_a_frame_equal(self, camera, variance):
+        scene = random_scene(camera, n_frames=3)
+        scene.tracks[1] = scene.tracks[1, 0]
+        fits = fitted(scene, camera, variance)
+        for each in fits[:6]:
+            assert np.isfinite(each).all()
+        # The centroids are what it shows.
+        rest = scene.tracks - images(scene.shapes, *fits[:3])
+        assert_allclose(rest.mean(axis=1), 0.0, atol=1e-12)
+
+    @BOTH
+    def test_no_frames(self, camera):
+        scene = random_scene(camera)
+        fits = fitted(scene._replace(tracks=np.zeros((0, 20, 2))), camera)
+        assert fits.motion.shape == (0, 2, 3)

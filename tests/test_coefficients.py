@@ -1,0 +1,342 @@
+"""The posterior of coefficients in known cameras, against dense linear algebra."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import random_rotation
+
+from isa_nrsfm._frame_products import frame_products, frame_tracks
+from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
+from isa_nrsfm._small_matrices import unpack3, unpacked
+
+NOISE = 0.05
+
+
+class Scene(NamedTuple):
+    tracks: NDArray  # (n_frames, n_points, 2)
+    shapes: NDArray  # (n_components + 1, 3, n_points)
+    motion: NDArray  # (2, 3, n_frames)
+    weights: NDArray | None
+
+    def posterior(self, noise=NOISE, **options):
+        products = frame_products(frame_tracks(self.tracks, self.weights), self.shapes)
+        return coefficient_posterior(products, self.motion, noise, **options)
+
+
+def random_scene(kind="complete", seed=0, n_frames=6, n_points=11, n_components=3):
+    """Return tracks that the shapes do not explain, and cameras of any size."""
+    rng = np.random.default_rng(seed)
+    tracks = rng.normal(size=(n_frames, n_points, 2)) + rng.normal(size=2)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    weights = None
+    if kind != "complete":
+        weights = rng.uniform(0.1, 2.0, tracks.shape[:2])
+        weights[rng.random(weights.shape) < 0.2] = 0.0
+        tracks[weights == 0] = np.nan
+    return Scene(tracks, shapes, rng.normal(size=(2, 3, n_frames)), weights)
+
+
+class Frame(NamedTuple):
+    """A frame as a linear regression: ``y ~ x_0 + X a``, noise of variance one."""
+
+    y: NDArray
+    first: NDArray
+    X: NDArray
+
+    def objective(self, alpha, noise):
+        rest = self.y - self.first - self.X @ alpha
+        return rest @ rest + noise * alpha @ alpha
+
+
+def frames_of(scene):
+    """Yield the regressions, centred and weighted by the root of the weights."""
+    for i, points in enumerate(scene.tracks):
+        w = np.ones(len(points)) if scene.weights is None else scene.weights[i]
+        seen = w > 0
+        points, shapes, w = points[seen], scene.shapes[..., seen], w[seen]
+        points = points - w @ points / w.sum()
+        shapes = shapes - (shapes @ w / w.sum())[..., None]
+        images = np.sqrt(w) * (scene.motion[..., i] @ shapes)
+        columns = images.reshape(len(shapes), -1)
+        yield Frame((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
+
+
+KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
+
+
+class TestPosterior:
+    @KINDS
+    def test_mean_and_covariance_by_dense_algebra(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior()
+        covariance = -NOISE * unpacked(got.inverse)[1:, 1:]
+        for i, frame in enumerate(frames_of(scene)):
+            precision = frame.X.T @ frame.X / NOISE + np.eye(3)
+            right = frame.X.T @ (frame.y - frame.first) / NOISE
+            expected = np.linalg.solve(precision, right)
+            assert_allclose(got.alpha[:, i], expected, rtol=1e-10)
+            assert_allclose(covariance[..., i], np.linalg.inv(precision), rtol=1e-8)
+        assert_array_equal(got.c[0], 1.0)
+        assert_array_equal(got.c[1:], got.alpha)
+
+    @KINDS
+    def test_mean_is_the_minimum_of_the_objective(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior()
+        rng = np.random.default_rng(1)
+        for i, frame in enumerate(frames_of(scene)):
+            least = frame.objective(got.alpha[:, i], NOISE)
+            assert got.objective[i] == pytest.approx(least, rel=1e-12)
+            for _ in range(5):
+                step = 1e-3 * rng.normal(size=3)
+                rises = [
+                    frame.objective(got.alpha[:, i] + sign * step, NOISE) - least
+                    for sign in (1, -1)
+                ]
+                assert min(rises) > 0
+                assert_allclose(rises[0], rises[1], rtol=1e-6)
+
+    @KINDS
+    def test_determinant(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior().log_determinant
+        for i, frame in enumerate(frames_of(scene)):
+            _, expected = np.linalg.slogdet(np.eye(3) + frame.X.T @ frame.X / NOISE)
+            assert got[i] == pytest.approx(expected, rel=1e-12)
+
+    @KINDS
+    def test_objective_and_determinant_are_the_marginal_likelihood(self, kind):
+        # Of y ~ N(x_0, X X^T + s2 I), by its definition.
+        scene = random_scene(kind)
+        got = scene.posterior()
+        for i, frame in enumerate(frames_of(scene)):
+            covariance = frame.X @ frame.X.T + NOISE * np.eye(len(frame.y))
+            rest = frame.y - frame.first
+            expected = rest @ np.linalg.solve(covariance, rest)
+            expected += np.linalg.slogdet(covariance)[1]
+            value = got.objective[i] / NOISE + got.log_determinant[i]
+            value += len(frame.y) * np.log(NOISE)
+            assert value == pytest.approx(expected, rel=1e-12)
+
+    @KINDS
+    def test_image_energy(self, kind):
+        scene = random_scene(kind)
+        expected = [np.sum(frame.X**2, axis=0) for frame in frames_of(scene)]
+        assert_allclose(scene.posterior().image_energy.T, expected, rtol=1e-12)
+
+    @KINDS
+    def test_residual_is_that_at_the_mean(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior()
+        expected = [
+            frame.objective(alpha, 0.0)
+            for frame, alpha in zip(frames_of(scene), got.alpha.T, strict=True)
+        ]
+        assert_allclose(got.residual(NOISE), expected, rtol=1e-12)
+
+    @KINDS
+    def test_spread_is_the_expected_square_of_what_is_uncertain(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior()
+        covariance = -NOISE * unpacked(got.inverse)[1:, 1:]
+        expected = [
+            np.trace(frame.X @ covariance[..., i] @ frame.X.T)
+            for i, frame in enumerate(frames_of(scene))
+        ]
+        assert_allclose(got.spread(NOISE), expected, rtol=1e-11)
+
+    @KINDS
+    def test_second_moments(self, kind):
+        scene = random_scene(kind)
+        got = scene.posterior()
+        moments = unpacked(got.second_moments(NOISE))
+        for i, frame in enumerate(frames_of(scene)):
+            c = np.concatenate([[1.0], got.alpha[:, i]])
+            expected = np.outer(c, c)
+            precision = frame.X.T @ frame.X / NOISE + np.eye(3)
+            expected[1:, 1:] += np.linalg.inv(precision)
+            assert_allclose(moments[..., i], expected, rtol=1e-10)
+
+    def test_second_moments_leave_the_posterior_as_it_is(self):
+        got = random_scene().posterior()
+        copies = got.c.copy(), got.inverse.copy()
+        first = got.second_moments(NOISE)
+        assert_array_equal(got.second_moments(NOISE), first)
+        assert_array_equal(got.c, copies[0])
+        assert_array_equal(got.inverse, copies[1])
+
+    def test_coefficients_of_the_model_have_it(self):
+        # Draws of the model: (a - mean) is N(0, s2 Q), whatever the frame.
+        rng = np.random.default_rng(0)
+        n, noise = 4000, 0.3
+        scene = random_scene(n_frames=n, n_components=2)
+        alpha = rng.normal(size=(n, 2))
+        frames = scene.shapes[0] + np.tensordot(alpha, scene.shapes[1:], 1)
+        tracks = (scene.motion.transpose(2, 0, 1) @ frames).swapaxes(1, 2)
+        tracks += np.sqrt(noise) * rng.normal(size=tracks.shape)
+        got = scene._replace(tracks=tracks).posterior(noise)
+        covariance = -noise * unpacked(got.inverse)[1:, 1:].transpose(2, 0, 1)
+        error = alpha - got.alpha.T
+        square = np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
+        assert np.mean(square) == pytest.approx(2.0, rel=0.06)  # chi-squared
+        assert np.var(square) == pytest.approx(4.0, rel=0.2)
+
+
+class TestNoise:
+    @KINDS
+    def test_of_single_frames(self, kind):
+        scene = random_scene(kind)
+        noises = np.geomspace(1e-3, 10.0, 6)
+        together = scene.posterior(noises)
+        for i, noise in enumerate(noises):
+            alone = scene.posterior(noise)
+            for name in ("c", "inverse", "objective", "log_determinant"):
+                got, expected = (getattr(p, name) for p in (together, alone))
+                assert_allclose(got[..., i], expected[..., i], rtol=1e-12)
+            expected = alone.second_moments(noise)[:, i]
+            assert_allclose(together.second_moments(noises)[:, i], expected, rtol=1e-12)
+            expected = alone.residual(noise)[i]
+            assert together.residual(noises)[i] == pytest.approx(expected, rel=1e-12)
+            expected = alone.spread(noise)[i]
+            assert together.spread(noises)[i] == pytest.approx(expected, rel=1e-12)
+
+    def test_large_noise_leaves_the_prior(self):
+        got = random_scene().posterior(1e12)
+        assert_allclose(got.alpha, 0.0, atol=1e-9)
+        covariance = -1e12 * unpacked(got.inverse)[1:, 1:].transpose(2, 0, 1)
+        assert_allclose(covariance, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-9)
+        assert_allclose(got.log_determinant, 0.0, atol=1e-9)
+
+    @KINDS
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_refinement_changes_nothing_but_rounding(self, kind, refined):
+        scene = random_scene(kind)
+        got, expected = scene.posterior(refined=refined), scene.posterior()
+        for one, other in zip(got, expected, strict=True):
+            assert_allclose(one, other, rtol=1e-9)
+
+    @KINDS
+    def test_refinement_solves_the_equations_of_a_tiny_noise(self, kind):
+        # Basis shapes that are hard to tell from each other, tracks without noise.
+        scene = random_scene(kind)
+        shapes = scene.shapes.copy()
+        shapes[2] = shapes[1] + 1e-4 * shapes[2]
+        alpha = np.random.default_rng(1).normal(size=(6, 3))
+        frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+        tracks = (scene.motion.transpose(2, 0, 1) @ frames).swapaxes(1, 2)
+        scene = scene._replace(tracks=tracks, shapes=shapes)
+        noise = 1e-14
+
+        def left(refined):
+            found = scene.posterior(noise, refined=refined).alpha
+            rests = [
+                frame.X.T @ (frame.y - frame.first - frame.X @ a) - noise * a
+                for frame, a in zip(frames_of(scene), found.T, strict=True)
+            ]
+            return np.linalg.norm(rests)
+
+        assert left(True) < 0.1 * left(False)
+        assert left(True) < 1e-12
+
+
+class TestWeights:
+    def test_ones_are_complete_frames(self):
+        scene = random_scene()
+        expected = scene.posterior()
+        got = scene._replace(weights=np.ones((6, 11))).posterior()
+        for one, other in zip(got, expected, strict=True):
+            assert_allclose(one, other, rtol=1e-10)
+
+    def test_are_inverse_variances(self):
+        scene = random_scene("weighted")
+        expected = scene.posterior(NOISE)
+        got = scene._replace(weights=3 * scene.weights).posterior(3 * NOISE)
+        assert_allclose(got.alpha, expected.alpha, rtol=1e-10)
+        assert_allclose(got.log_determinant, expected.log_determinant, rtol=1e-10)
+        assert_allclose(got.objective, 3 * expected.objective, rtol=1e-10)
+
+    def test_points_without_weight_do_not_matter(self):
+        scene = random_scene()
+        kept = np.arange(11) % 3 > 0
+        weights = np.tile(1.0 * kept, (6, 1))
+        fewer = scene.shapes[..., kept]
+        fewer = fewer - fewer.mean(axis=2, keepdims=True)
+        expected = Scene(scene.tracks[:, kept], fewer, scene.motion, None).posterior()
+        hidden = np.where(weights[..., None] > 0, scene.tracks, np.nan)
+        got = scene._replace(tracks=hidden, weights=weights).posterior()
+        for one, other in zip(got, expected, strict=True):
+            assert_allclose(one, other, rtol=1e-9)
+
+
+class TestInvariances:
+    def test_affinity_of_space(self):
+        scene = random_scene()
+        A = np.random.default_rng(1).normal(size=(3, 3))
+        motion = np.einsum("rai,ab->rbi", scene.motion, np.linalg.inv(A))
+        got = scene._replace(shapes=A @ scene.shapes, motion=motion).posterior()
+        for one, other in zip(got, scene.posterior(), strict=True):
+            assert_allclose(one, other, rtol=1e-8, atol=1e-10)
+
+    def test_rotation_of_the_coefficients(self):
+        scene = random_scene()
+        Q = random_rotation(1)
+        mixed = np.concatenate([scene.shapes[:1], np.tensordot(Q, scene.shapes[1:], 1)])
+        got, expected = scene._replace(shapes=mixed).posterior(), scene.posterior()
+        assert_allclose(Q.T @ got.alpha, expected.alpha, rtol=1e-9)
+        assert_allclose(got.objective, expected.objective, rtol=1e-10)
+        assert_allclose(got.log_determinant, expected.log_determinant, rtol=1e-10)
+        inverse = unpacked(got.inverse)[1:, 1:]
+        inverse = np.einsum("ka,kln,lb->abn", Q, inverse, Q)
+        assert_allclose(inverse, unpacked(expected.inverse)[1:, 1:], rtol=1e-8)
+
+    def test_rotation_of_images(self):
+        scene = random_scene()
+        R = random_rotation(1, 2)
+        motion = np.einsum("sr,rai->sai", R, scene.motion)
+        got = scene._replace(tracks=scene.tracks @ R.T, motion=motion).posterior()
+        for one, other in zip(got, scene.posterior(), strict=True):
+            assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
+class TestDegenerate:
+    def test_no_basis_shape(self):
+        scene = random_scene(n_components=0)
+        got = scene.posterior()
+        assert got.alpha.shape == (0, 6)
+        expected = [frame.objective(np.zeros(0), 0.0) for frame in frames_of(scene)]
+        assert_allclose(got.objective, expected, rtol=1e-12)
+        assert_allclose(got.log_determinant, 0.0, atol=1e-15)
+
+    @pytest.mark.parametrize("refined", [False, True])
+    def test_basis_shapes_of_zeros_have_the_prior(self, refined):
+        scene = random_scene()
+        scene.shapes[2] = 0.0
+        got = scene.posterior(refined=refined)
+        assert_array_equal(got.alpha[1], 0.0)
+        moments = unpacked(got.second_moments(NOISE))
+        assert_allclose(moments[2, 2], 1.0)
+
+    def test_cameras_of_zero_leave_the_prior(self):
+        scene = random_scene()
+        got = scene._replace(motion=np.zeros((2, 3, 6))).posterior()
+        assert_array_equal(got.alpha, 0.0)
+        energy = [np.sum(frame.y**2) for frame in frames_of(scene)]
+        assert_allclose(got.objective, energy)
+
+    def test_exact_frames_have_no_negative_objective(self):
+        scene = random_scene()
+        images = (scene.motion.transpose(2, 0, 1) @ scene.shapes[0]).swapaxes(1, 2)
+        got = scene._replace(tracks=images).posterior(1e-20, refined=True)
+        assert (got.objective >= 0).all()
+        assert_allclose(got.objective, 0.0, atol=1e-12)
+
+
+def test_camera_gram():
+    motion = random_scene().motion
+    gram = unpack3(camera_gram(motion))
+    for i, M in enumerate(motion.transpose(2, 0, 1)):
+        assert_allclose(gram[..., i], M.T @ M, rtol=1e-13)

@@ -1,0 +1,372 @@
+"""Calibrated cameras to start the joint fit from, and the shapes that they see."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import permute_frames, rotate_frames
+
+from isa_nrsfm._factorisation import Factorisation, factorise
+from isa_nrsfm._frame_blocks import MemoryBlocks
+from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem, Steps
+from isa_nrsfm._joint.quasi_newton import JointState
+from isa_nrsfm._joint.starts import (
+    HELD_STEPS,
+    affine_start,
+    best_starts,
+    frames_last,
+    lifted_shapes,
+    mixed_cameras,
+    rigid_start,
+)
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+N_POINTS = 40
+BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+
+
+class Scene(NamedTuple):
+    rows: NDArray  # (n_frames, 2, n_points), centred
+    motion: NDArray  # (n_frames, 2, 3)
+    shapes: NDArray  # (n_components + 1, 3, n_points)
+
+    @property
+    def W(self):
+        return self.rows.reshape(-1, self.rows.shape[2])
+
+    @property
+    def factors(self) -> Factorisation:
+        return factorise(self.W, 2)
+
+    @property
+    def scales(self):
+        return np.linalg.norm(self.motion, axis=(1, 2)) / np.sqrt(2)
+
+
+def random_scene(camera="orthographic", seed=0, n_frames=60, n_components=2, **options):
+    truth = make_nonrigid_tracks(
+        n_frames,
+        N_POINTS,
+        n_components,
+        camera=camera,
+        random_state=seed,
+        **options,
+    )
+    tracks = truth.tracks - truth.tracks.mean(axis=1, keepdims=True)
+    shapes = np.concatenate([truth.mean_shape[None], truth.basis])
+    rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
+    return Scene(rows, truth.motion, shapes.transpose(0, 2, 1))
+
+
+def camera_error(motion, truth):
+    """Return the largest error of cameras up to a rotation or reflection of space."""
+    U, _, Vt = np.linalg.svd(motion.reshape(-1, 3).T @ truth.reshape(-1, 3))
+    return np.abs(motion @ (U @ Vt) - truth).max()
+
+
+def assert_calibrated(motion, camera):
+    gram = motion @ motion.swapaxes(1, 2)
+    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+    assert_allclose(gram, scale * np.eye(2), atol=1e-12)
+    if camera == "orthographic":
+        assert_allclose(scale, 1.0, rtol=1e-12)
+
+
+class TestRigidStart:
+    @BOTH
+    def test_of_a_rigid_object_is_the_truth(self, camera):
+        scene = random_scene(camera, n_components=0)
+        factors = scene.factors
+        paper = np.concatenate([factors.rigid_shape[None], np.zeros((2, 3, N_POINTS))])
+        scaled = camera == "weak_perspective"
+        motion, shapes = rigid_start(factors, paper, scaled)
+        assert_calibrated(motion, camera)
+        size = np.sqrt(np.mean(scene.scales**2)) if scaled else 1.0
+        assert camera_error(size * motion, scene.motion) < 1e-8
+        assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
+
+    @BOTH
+    def test_images_of_all_shapes_are_those_of_the_nearest_affine_cameras(self, camera):
+        # The metric changes neither what rigid cameras see, nor the unit of what the
+        # calibrated ones see on average.
+        scene = random_scene(camera, amplitude=0.4)
+        factors = scene.factors
+        paper = np.random.default_rng(1).normal(size=(3, 3, N_POINTS))
+        scaled = camera == "weak_perspective"
+        motion, shapes = rigid_start(factors, paper, scaled)
+        assert_calibrated(motion, camera)
+        # All shapes change alike: one Q.
+        Q = np.linalg.lstsq(shapes[0].T, paper[0].T)[0].T
+        assert_allclose(Q @ shapes, paper, atol=1e-10)
+        rows, sizes = nearest_calibrated(factors.rigid_motion.reshape(-1, 2, 3) @ Q)
+        if scaled:
+            assert_allclose(motion, sizes[:, None, None] * rows, atol=1e-10)
+        else:
+            assert_allclose(motion, rows, atol=1e-10)
+            assert sizes.mean() == pytest.approx(1.0)
+
+    def test_of_flat_objects_is_finite(self):
+        scene = random_scene()
+        flat = scene.motion @ (scene.shapes[0] * np.array([1.0, 1.0, 0.0])[:, None])
+        factors = factorise(flat.reshape(-1, N_POINTS), 2)
+        paper = np.concatenate([factors.rigid_shape[None], np.zeros((2, 3, N_POINTS))])
+        for scaled in (False, True):
+            motion, shapes = rigid_start(factors, paper, scaled)
+            assert np.isfinite(motion).all()
+            assert np.isfinite(shapes).all()
+
+
+class TestMixedCameras:
+    @pytest.mark.parametrize("seed", range(4))
+    def test_exact_cameras_are_among_them(self, seed):
+        scene = random_scene(seed=seed)
+        found = list(mixed_cameras(scene.rows, None, np.arange(60)))
+        errors = [camera_error(motion, scene.motion) for motion in found]
+        rigid = rigid_start(scene.factors, scene.shapes, False)[0]
+        # The cost is of fourth order in some directions.
+        assert min(errors) < 1e-4
+        assert camera_error(rigid, scene.motion) > 0.05
+
+    def test_known_scales_give_exact_cameras_of_weak_perspective(self):
+        scene = random_scene("weak_perspective")
+        found = mixed_cameras(scene.rows, scene.scales, np.arange(60))
+        assert min(camera_error(motion, scene.motion) for motion in found) < 1e-4
+
+    def test_of_some_frames_give_those_of_all(self):
+        scene = random_scene()
+        found = list(mixed_cameras(scene.rows, None, np.arange(0, 60, 2)))
+        assert all(motion.shape == (60, 2, 3) for motion in found)
+        assert min(camera_error(motion, scene.motion) for motion in found) < 1e-4
+
+    @BOTH
+    def test_are_calibrated(self, camera):
+        scene = random_scene(camera, noise=0.05)
+        scales = scene.scales if camera == "weak_perspective" else None
+        found = list(mixed_cameras(scene.rows, scales, np.arange(60)))
+        # Of up to 6, 9, 12, 18, 24 and 36 columns of the 39 there are.
+        assert len(found) == 6
+        for motion in found:
+            assert_calibrated(motion, camera)
+
+    @pytest.mark.parametrize(("n_points", "expected"), [(5, 1), (8, 2), (15, 3)])
+    def test_no_wider_than_the_table(self, n_points, expected):
+        rows = random_scene(noise=0.05).rows[..., :n_points]
+        rows = rows - rows.mean(axis=2, keepdims=True)
+        found = list(mixed_cameras(rows, None, np.arange(60)))
+        assert len(found) == expected
+
+    @BOTH
+    def test_turning_frames_turns_them(self, camera):
+        scene = random_scene(camera, noise=0.01)
+        scales = scene.scales if camera == "weak_perspective" else None
+        turned = rotate_frames(scene.W, 1).reshape(scene.rows.shape)
+        expected = mixed_cameras(scene.rows, scales, np.arange(60))
+        got = mixed_cameras(turned, scales, np.arange(60))
+        for one, other in zip(got, expected, strict=True):
+            back = rotate_frames(other.reshape(-1, 3), 1).reshape(one.shape)
+            assert camera_error(one, back) < 1e-4
+
+    def test_order_of_frames(self):
+        scene = random_scene(noise=0.01)
+        moved, order = permute_frames(scene.W, 1)
+        expected = mixed_cameras(scene.rows, None, np.arange(60))
+        got = mixed_cameras(moved.reshape(scene.rows.shape), None, np.arange(60))
+        for one, other in zip(got, expected, strict=True):
+            assert camera_error(one, other[order]) < 1e-4
+
+
+class TestLiftedShapes:
+    @BOTH
+    def test_mean_shape_is_that_of_least_squares(self, camera):
+        scene = random_scene(camera)
+        mean = lifted_shapes(scene.rows, scene.motion, 2)[0]
+        stacked = scene.motion.reshape(-1, 3)
+        expected = np.linalg.lstsq(stacked, scene.W)[0]
+        assert_allclose(mean, expected, atol=1e-12)
+
+    @BOTH
+    @pytest.mark.parametrize("n_frames", [60, 200])
+    def test_basis_shapes_are_principal_directions_of_what_is_left(
+        self, camera, n_frames
+    ):
+        # With more frames than coordinates, and with fewer.
+        scene = random_scene(camera, n_frames=n_frames)
+        shapes = lifted_shapes(scene.rows, scene.motion, 3)
+        lifted = [
+            (np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel()
+            for W, M in zip(scene.rows, scene.motion, strict=True)
+        ]
+        _, S, Vt = np.linalg.svd(np.array(lifted), full_matrices=False)
+        flat = shapes[1:].reshape(3, -1)
+        assert_allclose(np.linalg.norm(flat, axis=1), S[:3] / np.sqrt(n_frames))
+        cosines = flat @ Vt[:3].T / np.linalg.norm(flat, axis=1)[:, None]
+        assert_allclose(np.abs(cosines), np.eye(3), atol=1e-6)
+
+    def test_small_deformations_seen_all_round_are_nearly_the_true_ones(self):
+        # Lifting leaves out the depth of a deformation, which is random: on average a
+        # third of each. What is left is along the true directions.
+        scene = random_scene("orthographic", n_frames=3000, amplitude=0.1)
+        shapes = lifted_shapes(scene.rows, scene.motion, 2)
+        truth = np.linalg.qr(scene.shapes[1:].reshape(2, -1).T)[0]
+        flat = shapes[1:].reshape(2, -1)
+        outside = flat - flat @ truth @ truth.T
+        assert np.sum(outside**2) < 0.01 * np.sum(flat**2)
+
+    def test_a_mirror_image_of_the_cameras_mirrors_them(self):
+        scene = random_scene()
+        mirror = np.array([1.0, 1.0, -1.0])
+        expected = lifted_shapes(scene.rows, scene.motion, 2)
+        got = lifted_shapes(scene.rows, scene.motion * mirror, 2)
+        got = got * mirror[:, None]
+        assert_allclose(got[0], expected[0], atol=1e-12)
+        for one, other in zip(got[1:], expected[1:], strict=True):
+            assert min(np.abs(one - s * other).max() for s in (1, -1)) < 1e-8
+
+    def test_zeros_where_there_are_not_as_many(self):
+        scene = random_scene(n_frames=4)
+        shapes = lifted_shapes(scene.rows, scene.motion, 6)
+        assert shapes.shape == (7, 3, N_POINTS)
+        assert_array_equal(shapes[5:], 0.0)
+        assert np.isfinite(shapes).all()
+
+    def test_rigid_objects_have_none(self):
+        scene = random_scene(n_components=0)
+        shapes = lifted_shapes(scene.rows, scene.motion, 2)
+        assert_allclose(shapes[0], scene.shapes[0], atol=1e-12)
+        assert_allclose(shapes[1:], 0.0, atol=1e-7)
+
+    def test_cameras_of_zero(self):
+        scene = random_scene("weak_perspective")
+        scene.motion[3] = 0.0
+        assert np.isfinite(lifted_shapes(scene.rows, scene.motion, 2)).all()
+
+
+def problem_of(scene, to_the_end=True):
+    rows = MemoryBlocks.of(scene.rows, 64)
+    frames = JointFrames.of_points(rows, True)
+    return JointProblem(frames, Steps(1000, 0.01, to_the_end=to_the_end), 0.0)
+
+
+def paper_shapes(factors):
+    """Return the rigid shape and the first triples of signals."""
+    triples = factors.signals.reshape(-1, 3, N_POINTS)[:2]
+    return np.concatenate([factors.rigid_shape[None], triples])
+
+
+def started(scene, camera, problem=None):
+    """Return the starts."""
+    factors = scene.factors
+    problem = problem or problem_of(scene)
+    paper = paper_shapes(factors)
+    return best_starts(problem, scene.W, factors, paper, CAMERAS[camera])
+
+
+class TestBestStarts:
+    @BOTH
+    @pytest.mark.parametrize("noise", [0.0, 0.02])
+    def test_best_is_likelier_than_each_start(self, camera, noise):
+        scene = random_scene(camera, amplitude=0.4, noise=noise)
+        problem = problem_of(scene)
+        states = started(scene, camera, problem)
+        for state in states:
+            assert_calibrated(state.motion.transpose(2, 0, 1), camera)
+        value = min(problem.likelihood(*state).value for state in states)
+        scaled = camera == "weak_perspective"
+        rigid, _ = rigid_start(scene.factors, scene.shapes, scaled)
+        scales = np.linalg.norm(rigid, axis=(1, 2)) / np.sqrt(2)
+        candidates = [rigid]
+        mixed = mixed_cameras(scene.rows, scales if scaled else None, np.arange(60))
+        candidates += list(mixed)[:2]
+        n_seen, energy = problem.totals
+        for motion in candidates:
+            shapes = lifted_shapes(scene.rows, motion, 2)
+            noise_variance = 0.1 * np.mean((scene.rows - motion @ shapes[0]) ** 2)
+            noise_variance = max(noise_variance, LEAST_NOISE * energy / n_seen)
+            start = JointState(shapes, frames_last(motion), noise_variance)
+            held = problem.refined(
+                start, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS
+            )
+            assert value < held.history[-1]
+
+    @pytest.mark.parametrize("seed", range(2))
+    def test_has_nearly_the_true_cameras_where_the_rigid_ones_are_wrong(self, seed):
+        scene = random_scene(seed=seed, amplitude=0.6)
+        rigid, _ = rigid_start(scene.factors, scene.shapes, False)
+        assert camera_error(rigid, scene.motion) > 0.3
+        motion = started(scene, "orthographic")[0].motion.transpose(2, 0, 1)
+        assert camera_error(motion, scene.motion) < 0.05
+
+    @pytest.mark.parametrize("to_the_end", [False, True])
+    def test_of_many_frames_has_cameras_of_all(self, to_the_end):
+        # The comparison is of some of them.
+        scene = random_scene(n_frames=450, noise=0.01)
+        problem = problem_of(scene, to_the_end)
+        states = started(scene, "orthographic", problem)
+        assert len(states) == (3 if to_the_end else 1)
+        for state in states:
+            assert state.motion.shape == (2, 3, 450)
+            motion = state.motion.transpose(2, 0, 1)
+            assert_calibrated(motion, "orthographic")
+            assert camera_error(motion, scene.motion) < 0.2
+
+    @BOTH
+    def test_rigid_objects(self, camera):
+        scene = random_scene(camera, n_components=0)
+        for state in started(scene, camera):
+            assert all(np.isfinite(each).all() for each in state)
+            rest = scene.rows - state.motion.transpose(2, 0, 1) @ state.shapes[0]
+            assert np.mean(rest**2) < 1e-4 * np.mean(scene.rows**2)
+
+    def test_is_reproducible(self):
+        scene = random_scene(noise=0.02)
+        found, again = (started(scene, "orthographic") for _ in range(2))
+        for one, other in zip(found, again, strict=True):
+            for part, same in zip(one, other, strict=True):
+                assert_array_equal(part, same)
+
+
+class TestAffineStart:
+    def test_is_the_rigid_fit(self):
+        scene = random_scene(noise=0.02)
+        paper = paper_shapes(scene.factors)
+        state = affine_start(problem_of(scene), scene.W, paper)
+        assert_array_equal(state.shapes[0], paper[0])
+        left = 0.0
+        for i, W in enumerate(scene.rows):
+            M = W @ np.linalg.pinv(paper[0])
+            assert_allclose(state.motion[..., i], M, atol=1e-12)
+            left += np.sum((W - M @ paper[0]) ** 2)
+        assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
+
+    def test_basis_shapes_are_one_deviation_of_their_coefficients(self):
+        scene = random_scene(noise=0.02)
+        paper = paper_shapes(scene.factors)
+        state = affine_start(problem_of(scene), scene.W, paper)
+        for before, after in zip(paper[1:], state.shapes[1:], strict=True):
+            alpha = [
+                np.vdot(M @ before, W) / np.sum((M @ before) ** 2)
+                for M, W in zip(
+                    state.motion.transpose(2, 0, 1), scene.rows, strict=True
+                )
+            ]
+            assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
+
+    def test_basis_shapes_that_no_camera_sees_are_zero(self):
+        scene = random_scene()
+        paper = paper_shapes(scene.factors)
+        paper[2] = 0.0
+        state = affine_start(problem_of(scene), scene.W, paper)
+        assert_array_equal(state.shapes[2], 0.0)
+        assert np.isfinite(state.shapes).all()
+
+
+def test_frames_last():
+    motion = random_scene().motion
+    last = frames_last(motion)
+    assert last.flags.c_contiguous
+    for i, M in enumerate(motion):
+        assert_array_equal(last[..., i], M)
