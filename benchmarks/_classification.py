@@ -11,13 +11,14 @@ from sklearn.preprocessing import StandardScaler
 from benchmarks._figures import draw_bars
 from benchmarks._jobs import Job
 from benchmarks._markdown import grid, remarks, value
-from benchmarks._methods import METHOD_TITLES, METHODS
+from benchmarks._methods import CALIBRATED, METHOD_TITLES, METHODS
 from benchmarks._sets import SET_TITLES, SETS, load
 
 FOLDS = 5
 MAX_ROUNDS, SETTLED = 100, 1e-10
-# Methods without coefficients, and a method with twice as many.
-WITHOUT, MORE = ("floor", "rigid"), "joint_more"
+# Methods without coefficients, or with those of another one, and a method with twice
+# as many.
+WITHOUT, MORE = ("floor", "rigid", *CALIBRATED), "joint_more"
 FEATURES = {
     **{name: title for name, title in METHOD_TITLES.items() if name not in WITHOUT},
     MORE: "ISA, joint refinement, 2K",

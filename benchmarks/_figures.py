@@ -12,6 +12,8 @@ from isa_nrsfm.plotting._axes import is_dense
 # The palette of Okabe and Ito, one colour a method; the last one is grey.
 COLOURS = {
     "joint": "#D55E00",
+    "weak_perspective": "#F0E442",
+    "orthographic": "#000000",
     "isa1": "#56B4E9",
     "isa2": "#0072B2",
     "pi": "#CC79A7",

@@ -140,6 +140,8 @@ def found_by_ours(model, X):
     """Return what AffineNRSfM has found in its table."""
     shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
     images = tracks_to_table(project(shapes, model.motion_, model.translation_))
+    if model.camera != "affine":
+        return Found(images, shapes, shapes, model.rotations_, model.scales_)
     metric = deformation_metric(model.motion_, model.alpha_)
     frames = euclidean_frames(
         metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
@@ -184,5 +186,16 @@ METHODS = {
         True,
     ),
     "joint": Method("ISA, joint refinement", ours, found_by_ours, True),
+    "weak_perspective": Method(
+        "ISA, weak perspective",
+        partial(ours, camera="weak_perspective"),
+        found_by_ours,
+        True,
+    ),
+    "orthographic": Method(
+        "ISA, orthographic", partial(ours, camera="orthographic"), found_by_ours, True
+    ),
 }
+# Those that know something of the cameras.
+CALIBRATED = ("weak_perspective", "orthographic")
 METHOD_TITLES = {name: method.title for name, method in METHODS.items()}

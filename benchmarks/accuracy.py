@@ -2,10 +2,14 @@
 Print what fits of real tables reach: reprojection, 3D truth, unseen points.
 
 Run ``python -m benchmarks.accuracy [section ...] [--seeds N]``. Errors in 3D are
-`affine_shape_error`; inverse SNR is in percent, of frames scaled to unit size.
+`affine_shape_error`; inverse SNR is in percent, of frames scaled to unit size. Errors
+of Euclidean shapes are `mean_shape_error_3d`, of shapes in the axes of their cameras:
+"sequence", without a scale, and "frame".
 """
 
 import warnings
+from contextlib import ExitStack, contextmanager
+from unittest import mock
 
 import numpy as np
 
@@ -14,7 +18,6 @@ from benchmarks._data import (
     CASES,
     DRINK,
     FACES,
-    HANDS,
     ICT,
     MUCT,
     PICKUP,
@@ -25,11 +28,20 @@ from benchmarks._data import (
     load_arrays,
     load_table,
 )
+from benchmarks._methods import Found, found_by_ours
+from benchmarks._sets import SETS, is_present, load, shapes_in_camera
+from benchmarks.recovery import instance
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._joint import fit as joint_fit
+from isa_nrsfm._joint import problem as joint_problem
+from isa_nrsfm._joint import relevance
+from isa_nrsfm._joint import starts as joint_starts
+from isa_nrsfm._metric_upgrade import nearest_rotations
 from isa_nrsfm._tracks import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.metrics import affine_shape_error
+from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 PAPER = {
     "PooledFastICA": {},
@@ -41,6 +53,34 @@ PAPER = {
 }
 TOLERANCES = (0.5, 0.05, 1e-2, 1e-3, 1e-5, 1e-7, 1e-10)
 MOST_STEPS = 20_000
+# Sets, camera and K of calibrated fits, with frames that are not scaled where the
+# camera is orthographic.
+CALIBRATED = (
+    ("yoga", "orthographic", 12),
+    ("pickup", "orthographic", 12),
+    ("drink", "orthographic", 12),
+    ("shark", "orthographic", 1),
+    ("shark", "orthographic", 2),
+    ("flag", "weak_perspective", 12),
+    ("ict_68", "weak_perspective", 9),
+    ("yoga", "affine", 3),
+    ("pickup", "affine", 3),
+)
+# Those with 41 points, to which noise is added and of which points are hidden.
+SPOILED = CALIBRATED[:3]
+# Those with outliers, and those of which true rotations are known.
+OUTLYING = (("drink", "weak_perspective", 3), CALIBRATED[6])
+TURNED = (CALIBRATED[6], *SPOILED)
+# Of the prior: deviations of the basis shapes, least noise variances.
+BASIS_STDS = (0.007, 0.01, 0.015, 0.02)
+LEAST_NOISES = (1e-4, 5e-5, 3e-5)
+PRIOR_MODULES = (joint_problem, joint_fit, joint_starts, relevance)
+# Distances of perspective cameras, in radii of the object.
+DISTANCES = (8.0, 4.0, 2.5)
+# Sets with too few basis shapes, and one with nearly enough.
+TOO_SMALL = (("yoga", 3), ("pickup", 3), ("drink", 3), ("shark", 1), ("ict_68", 9))
+# A number of neighbouring points that a frame hides.
+RUN = 20
 
 
 def fit(case, X, seed=0, **parameters):
@@ -262,23 +302,293 @@ def tolerances(options):
         print(f"  largest over smallest {max(errors) / min(errors):.4f}", flush=True)
 
 
-def stiffness(options):
-    """Free and stiff shapes: held-out points of held-out frames, and 3D."""
-    print(f"{'':18}{'stiffness':>10}{'held out':>10}{'3D':>9}{'chosen':>8}")
-    for case in (DRINK, PICKUP, YOGA, ICT, HANDS, MUCT):
-        arrays = load_arrays(case)
-        if arrays is None:
-            continue
-        X = as_table(arrays["W2d"])
-        train, test = (X[rows] for rows in halves_of(len(X), 0))
-        for price in (0.0, 300.0, None):
-            held = held_out(fit(case, train, stiffness=price), test)
-            model = fit(case, X, stiffness=price)
+def fit_set(X, camera, n_components, **parameters):
+    """Return the fit of a table with a camera."""
+    settings = {"camera": camera, "random_state": 0, **parameters}
+    return AffineNRSfM(n_components, **settings).fit(X)
+
+
+def errors_in_camera(truth, found):
+    """Return the errors "sequence" and "frame" of shapes in their cameras' axes."""
+    shapes = found.scales[:, None, None] * found.euclidean
+    shapes = shapes @ found.rotations.transpose(0, 2, 1)
+    return np.array(
+        [
+            mean_shape_error_3d(truth, shapes, convention=convention)
+            for convention in ("sequence", "frame")
+        ]
+    )
+
+
+def found_in(model, X):
+    """Return what a calibrated model finds in a table that is new to it."""
+    rotations, scales = full_rotations(model.decompose(X).motion)
+    return Found(X, None, model.reconstruct(X), rotations, scales)
+
+
+def present(cases):
+    """Return the sets that are there, each with camera and K."""
+    return [case for case in cases if is_present(case[0])]
+
+
+def title_of(name, camera, n_components):
+    """Return what a fit of a set is called."""
+    return f"{name} K={n_components}, {camera}"
+
+
+@contextmanager
+def prior_of(basis_std, least_noise):
+    """Fit with other constants of the prior."""
+    constants = {"BASIS_STD": basis_std, "LEAST_NOISE": least_noise}
+    with ExitStack() as stack:
+        for module in PRIOR_MODULES:
+            for name, constant in constants.items():
+                if hasattr(module, name):
+                    stack.enter_context(mock.patch.object(module, name, constant))
+        # Where it is the default of an argument.
+        refined = mock.patch.object(joint_fit._refined, "__defaults__", (least_noise,))
+        stack.enter_context(refined)
+        yield
+
+
+def prior(options):
+    """Errors by the prior of basis shapes and the least noise.
+
+    With orthographic cameras that of the sequence, of ICT-68 `affine_shape_error`, and
+    elsewhere that of the frames.
+    """
+    cases = present(CALIBRATED)
+    tables = {name: load(name) for name, _, _ in cases}
+    truths = {name: shapes_in_camera(name) for name in tables}
+    titles = [f"{name} {n_components}" for name, _, n_components in cases]
+    print("   std   noise" + "".join(f"{title:>10}" for title in titles))
+    for basis_std in BASIS_STDS:
+        for least_noise in LEAST_NOISES:
+            errors = []
+            for name, camera, n_components in cases:
+                X = tables[name].X
+                with prior_of(basis_std, least_noise):
+                    found = found_by_ours(fit_set(X, camera, n_components), X)
+                if name == "ict_68":
+                    error = affine_shape_error(tables[name].shapes, found.affine)
+                else:
+                    kind = 0 if camera == "orthographic" else 1
+                    error = errors_in_camera(truths[name], found)[kind]
+                errors.append(error)
+            row = "".join(f"{error:10.4f}" for error in errors)
+            print(f"{basis_std:6g}{least_noise:8g}{row}", flush=True)
+
+
+def perspective(tracks, distance, noise, rng):
+    """
+    Return the table of perspective cameras, and the shapes in their axes.
+
+    The cameras have the rotations of the tracks, and are so many radii away, which are
+    root mean square distances of the mean shape's points from its centroid.
+    """
+    rotations = nearest_rotations(tracks.motion)[0]
+    shapes = tracks.shapes @ rotations.transpose(0, 2, 1)
+    radius = np.sqrt(np.mean(np.sum(tracks.mean_shape**2, axis=1)))
+    images = shapes[..., :2] / (1 + shapes[..., 2:] / (distance * radius))
+    size = np.sqrt(np.mean(centred_tracks(images)[0] ** 2))
+    images = images + noise * size * rng.standard_normal(images.shape)
+    return as_table(images), shapes
+
+
+def seen_by_cameras(seed):
+    """
+    Yield tables of known cameras.
+
+    Each has a title, a table, K, shapes in the axes of the cameras, and those in the
+    space of the object or None.
+    """
+    for camera, K, fitted in (
+        ("weak_perspective", 2, 2),
+        ("weak_perspective", 4, 4),
+        ("weak_perspective", 4, 2),
+        ("affine", 2, 2),
+        ("affine", 4, 4),
+    ):
+        tracks = instance(seed, 68, K, 0.02, camera=camera)
+        rotations = nearest_rotations(tracks.motion)[0]
+        shapes = tracks.shapes @ rotations.transpose(0, 2, 1)
+        title = f"{camera} K={K}, fitted with {fitted}"
+        yield title, tracks.data, fitted, shapes, tracks.shapes
+    tracks = instance(seed, 68, 3, 0.0, camera="weak_perspective")
+    for noise in (0.02, 0.0):
+        for distance in DISTANCES:
+            rng = np.random.default_rng(seed)
+            X, shapes = perspective(tracks, distance, noise, rng)
+            title = f"{distance:g} radii, K=3, {100 * noise:g} % noise"
+            yield title, X, 3, shapes, tracks.shapes
+    for name, K in TOO_SMALL if seed == 0 else ():
+        if is_present(name):
+            shapes = load(name).shapes if SETS[name].truth == "object" else None
+            title = f"{name} K={K}"
+            yield title, load(name).X, K, shapes_in_camera(name), shapes
+
+
+def cameras(options):
+    """What the noise says of the cameras, and errors with and without calibration."""
+    rows, sentences = {}, {}
+    for seed in range(options.seeds):
+        for title, X, K, truth, shapes in seen_by_cameras(seed):
+            row = []
+            for camera in ("affine", "weak_perspective"):
+                model = fit_set(X, camera, K)
+                found = found_by_ours(model, X)
+                affine = np.nan
+                if shapes is not None:
+                    affine = affine_shape_error(shapes, found.affine)
+                row += [
+                    model.camera_noise_ratio_,
+                    affine,
+                    errors_in_camera(truth, found)[1],
+                ]
+            rows.setdefault(title, []).append(row)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                meaning = model.diagnostics().camera_meaning
+            sentences.setdefault(title, []).append(meaning.partition(" (")[0])
+    print(
+        f"{'':36}{'affine: ratio':>14}{'3D':>9}{'frame':>9}"
+        f"{'weak perspective: ratio':>25}{'range':>18}{'3D':>9}{'frame':>9}"
+    )
+    for title, values in rows.items():
+        middle, ratios = np.median(values, axis=0), np.array(values)[:, 3]
+        spread = f"{ratios.min():.3f} to {ratios.max():.3f}"
+        print(
+            f"{title:36}{middle[0]:14.3f}{middle[1]:9.4f}{middle[2]:9.4f}"
+            f"{middle[3]:25.3f}{spread:>18}{middle[4]:9.4f}{middle[5]:9.4f}"
+        )
+        for sentence in dict.fromkeys(sentences[title]):
+            print(f"    {sentences[title].count(sentence)} times: {sentence}")
+
+
+def with_noise(tracks, rng):
+    """Return tracks with 2 % noise."""
+    size = np.sqrt(np.mean(centred_tracks(tracks)[0] ** 2))
+    return tracks + 0.02 * size * rng.standard_normal(tracks.shape)
+
+
+def hidden_at_random(share):
+    """Return what hides a share of the points, drawn at random."""
+
+    def hide(tracks, rng):
+        hidden = rng.random(tracks.shape[:2]) < share
+        return np.where(hidden[..., None], np.nan, tracks)
+
+    return hide
+
+
+def with_hidden_run(tracks, rng):
+    """Return tracks of which each frame hides a run of points, in their order."""
+    n_frames, n_points, _ = tracks.shape
+    first = rng.integers(n_points, size=n_frames)
+    hidden = (np.arange(n_points) - first[:, None]) % n_points < RUN
+    return np.where(hidden[..., None], np.nan, tracks)
+
+
+SPOILS = {
+    "2 % noise": with_noise,
+    "30 % missing": hidden_at_random(0.3),
+    "40 % missing": hidden_at_random(0.4),
+    f"runs of {RUN} missing": with_hidden_run,
+}
+
+
+def turn_errors(truth, rotations):
+    """
+    Return the angles in degrees between rotations after one common rotation.
+
+    Parameters
+    ----------
+    truth, rotations : ndarray of shape (n_frames, 3, 3)
+        Rotations.
+
+    Returns
+    -------
+    ndarray of shape (n_frames,)
+        Of the better of the two mirror images, by the median.
+    """
+    mirror = np.diag([1.0, 1.0, -1.0])
+    angles = []
+    for turned in (rotations, mirror @ rotations @ mirror):
+        U, _, Vt = np.linalg.svd(np.einsum("iba,ibc->ac", truth, turned))
+        common = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        cosine = (np.einsum("iba,ibc,ac->i", truth, turned, common) - 1) / 2
+        angles.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return min(angles, key=np.median)
+
+
+def calibrated(options):
+    """Calibrated cameras: errors "sequence" and "frame", rotations, new frames."""
+    cleanest = {}
+    print(f"{'complete tables':34}{'sequence':>10}{'frame':>9}")
+    for case in present(CALIBRATED):
+        name, camera, n_components = case
+        X = load(name).X
+        found = found_by_ours(fit_set(X, camera, n_components), X)
+        cleanest[case] = found
+        sequence, frame = errors_in_camera(shapes_in_camera(name), found)
+        print(f"{title_of(*case):34}{sequence:10.4f}{frame:9.4f}", flush=True)
+    print(f"\n{'rotations, degrees':34}{'median':>10}{'largest':>9}")
+    for case in present(TURNED):
+        truth = nearest_rotations(load(case[0]).cameras[:, :2])[0]
+        angles = turn_errors(truth, cleanest[case].rotations)
+        title = title_of(*case)
+        print(f"{title:34}{np.median(angles):10.2f}{angles.max():9.2f}", flush=True)
+    print(f"\n{'half of the frames':34}{'sequence':>10}{'frame':>9}{'new:':>8}")
+    for case in present(TURNED):
+        name, camera, n_components = case
+        X, truth = load(name).X, shapes_in_camera(name)
+        errors = []
+        for seed in range(options.seeds):
+            train, test = halves_of(len(X), seed)
+            model = fit_set(X[train], camera, n_components)
+            fitted = errors_in_camera(truth[train], found_by_ours(model, X[train]))
+            new = errors_in_camera(truth[test], found_in(model, X[test]))
+            errors.append([*fitted, *new])
+        row = "".join(f"{error:9.4f}" for error in np.median(errors, axis=0))
+        print(f"{title_of(*case):35}{row}", flush=True)
+    print(f"\n{'':34}{'sequence: median':>18}{'max':>8}{'frame: median':>16}{'max':>8}")
+    for case in present(SPOILED):
+        name, camera, n_components = case
+        tracks, truth = load(name).X, shapes_in_camera(name)
+        tracks = tracks.reshape(len(tracks), -1, 2)
+        for what, spoil in SPOILS.items():
+            errors = []
+            for seed in range(options.seeds):
+                X = as_table(spoil(tracks, np.random.default_rng(seed)))
+                found = found_by_ours(fit_set(X, camera, n_components), X)
+                errors.append(errors_in_camera(truth, found))
+            middle, most = np.median(errors, axis=0), np.max(errors, axis=0)
             print(
-                f"{case.title:18}{price!s:>10}{held:10.5f}"
-                f"{error_3d(arrays, model, X):9.4f}{model.stiffness_:8.0f}",
+                f"{name + ', ' + what:34}{middle[0]:18.4f}{most[0]:8.4f}"
+                f"{middle[1]:16.4f}{most[1]:8.4f}",
                 flush=True,
             )
+    print(
+        f"\n{'10 % outliers, loss cauchy':34}{'ratio of frame errors to the clean one'}"
+    )
+    for case in present(OUTLYING):
+        name, camera, n_components = case
+        X, truth = load(name).X, shapes_in_camera(name)
+        model = fit_set(X, camera, n_components, loss="cauchy")
+        clean = errors_in_camera(truth, found_by_ours(model, X))[1]
+        ratios = []
+        for seed in range(options.seeds):
+            rng = np.random.default_rng(seed)
+            moved = spoiled(X.reshape(len(X), -1, 2), "mixed", rng, 0.1)
+            Y = as_table(moved)
+            model = fit_set(Y, camera, n_components, loss="cauchy")
+            error = errors_in_camera(truth, found_by_ours(model, Y))[1]
+            ratios.append(error / clean)
+        print(
+            f"{title_of(*case):34}clean {clean:.4f}, ratios "
+            f"{np.array2string(np.array(ratios), precision=3)}",
+            flush=True,
+        )
 
 
 def starts(options):
@@ -379,7 +689,9 @@ SECTIONS = {
     "missing": missing,
     "outliers": outliers,
     "tolerances": tolerances,
-    "stiffness": stiffness,
+    "prior": prior,
+    "cameras": cameras,
+    "calibrated": calibrated,
     "starts": starts,
     "degenerate": degenerate,
     "paper": paper,

@@ -8,7 +8,16 @@ from isolated_runs import MEGABYTE, misbehave, sleep, use_memory
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
-from benchmarks import _agreement, _cost, _data, _fits, _recovered, _sets, _unseen
+from benchmarks import (
+    _agreement,
+    _cost,
+    _data,
+    _fits,
+    _recovered,
+    _sets,
+    _unseen,
+    accuracy,
+)
 from benchmarks._agreement import compare
 from benchmarks._classification import AlignedFrames
 from benchmarks._figures import draw_bars, draw_reprojections
@@ -203,12 +212,18 @@ def test_the_page_says_where_the_joint_refinement_is_not_the_lowest():
         record(method="floor", values={"inverse_snr": 0.001}),
         record(method="bmm", status="over time", message="over 9 s", values={}),
     ]
+    # That of other cameras does not count.
+    records.append(
+        records[0]._replace(method="orthographic", values={"frame_error": 0.1})
+    )
     page = _fits.truth_page(records)
     line = "- drink, K=3, frame_error: 0.300; lower are rigid mean shape 0.200\n"
     assert page.partition("not the lowest in\n\n")[2].startswith(line + "\n")
     assert "| BMM | over 9 s |" in page
     records[1] = records[1]._replace(values={"inverse_snr": 0.02, "frame_error": 0.4})
-    assert "ISA, joint refinement is the lowest" in _fits.truth_page(records)
+    page = _fits.truth_page(records)
+    assert "ISA, joint refinement is the lowest" in page
+    assert "ISA, orthographic is the lowest" in page
 
 
 def test_the_page_of_recovery_varies_one_setting_at_a_time():
@@ -351,6 +366,56 @@ def test_true_shapes_and_cameras_have_no_error(tracks, camera):
     np.testing.assert_allclose(list(errors.values()), 0.0, atol=1e-10)
 
 
+@pytest.mark.parametrize("mirror", [1.0, -1.0])
+def test_a_common_rotation_and_the_mirror_image_are_no_error(mirror):
+    truth = np.array([random_rotation(i) for i in range(5)])
+    depth = np.diag([1.0, 1.0, mirror])
+    turned = depth @ truth @ random_rotation(9) @ depth
+    np.testing.assert_allclose(accuracy.turn_errors(truth, turned), 0.0, atol=1e-5)
+    # A turn of one frame by 60 degrees.
+    half, root = 0.5, np.sqrt(0.75)
+    turned[2] = [[half, -root, 0], [root, half, 0], [0, 0, 1]] @ turned[2]
+    angles = accuracy.turn_errors(truth, turned)
+    assert angles.argmax() == 2
+    assert 45 < angles.max() < 61
+
+
+def test_far_perspective_cameras_are_orthographic(tracks):
+    X, shapes = accuracy.perspective(tracks, 1e6, 0.0, np.random.default_rng(0))
+    centred = tracks.clean - tracks.clean.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(X.reshape(centred.shape), centred, atol=1e-4)
+    np.testing.assert_allclose(shapes[..., :2], centred, atol=1e-10)
+
+
+def test_constants_of_the_prior_are_put_back():
+    before = _joint_constants()
+    with accuracy.prior_of(0.5, 0.25):
+        assert set(_joint_constants()) == {0.5, 0.25}
+    assert _joint_constants() == before
+    assert not {0.5, 0.25} & set(before)
+
+
+def _joint_constants():
+    """Return the constants of the prior in all modules of the joint fit."""
+    return [
+        value
+        for module in accuracy.PRIOR_MODULES
+        for name, value in vars(module).items()
+        if name in ("BASIS_STD", "LEAST_NOISE")
+    ]
+
+
+def test_as_many_points_are_hidden_as_is_said():
+    tracks = np.zeros((200, 41, 2))
+    for what, share in (("30 % missing", 0.3), (f"runs of {accuracy.RUN} missing", 0)):
+        hidden = np.isnan(accuracy.SPOILS[what](tracks, np.random.default_rng(0)))
+        assert (hidden[..., 0] == hidden[..., 1]).all()
+        if share:
+            assert hidden.mean() == pytest.approx(share, abs=0.02)
+        else:
+            np.testing.assert_array_equal(hidden[..., 0].sum(axis=1), accuracy.RUN)
+
+
 @pytest.mark.parametrize("scale_frames", [True, False])
 def test_rank_floor_is_that_of_a_fit(monkeypatch, scale_frames):
     tracks = make_nonrigid_tracks(60, 40, 2, noise=0.01, random_state=0)
@@ -367,7 +432,9 @@ def test_what_methods_find_explains_the_table(tracks, method):
     kind = METHODS[method]
     model = kind.make(2, True, False, 0).fit(tracks.data)
     found = kind.found(model, tracks.data)
-    error = inverse_snr(tracks.data, found.X, scale_frames=True)
+    # Frames that orthographic cameras see are not scaled.
+    scaled = getattr(model, "camera", "affine") != "orthographic"
+    error = inverse_snr(tracks.data, found.X, scale_frames=scaled)
     known = getattr(model, "inverse_snr_", error)
     np.testing.assert_allclose(error, known, rtol=1e-6)
     assert error < 0.2
