@@ -11,10 +11,10 @@ N_FRAMES, N_COMPONENTS = 150, 3
 
 
 @cache
-def faces(noise=0.005):
-    """Return artificial faces seen by weak-perspective cameras."""
+def faces(noise=0.005, camera="weak_perspective"):
+    """Return artificial faces seen by calibrated cameras."""
     return make_face_tracks(
-        N_FRAMES, n_components=N_COMPONENTS, noise=noise, random_state=0
+        N_FRAMES, n_components=N_COMPONENTS, camera=camera, noise=noise, random_state=0
     )
 
 
@@ -23,6 +23,13 @@ def face_model(noise=0.005, y_up=False, seed=0):
     """Return a model of the faces, also of images whose y points up."""
     table = faces(noise).data * (np.tile([1, -1], 68) if y_up else 1)
     return AffineNRSfM(N_COMPONENTS, random_state=seed).fit(table)
+
+
+@cache
+def calibrated_model(camera="weak_perspective"):
+    """Return a model of the faces with calibrated cameras."""
+    table = faces(camera=camera).data
+    return AffineNRSfM(N_COMPONENTS, camera=camera, random_state=0).fit(table)
 
 
 @cache

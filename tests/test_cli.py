@@ -180,6 +180,67 @@ def test_defaults_are_those_of_the_estimator(run, table, tmp_path):
     assert model.get_params() == AffineNRSfM(random_state=0).get_params()
 
 
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_calibrated_cameras(run, tmp_path, camera):
+    faces = make_face_tracks(
+        80, n_components=2, camera=camera, noise=0.01, random_state=0
+    )
+    X = pd.DataFrame(faces.data, columns=faces.feature_names)
+    path, folder = tmp_path / "faces.csv", tmp_path / "results"
+    X.to_csv(path, index=False)
+    code, out, err = run("fit", path, "-o", folder, "--camera", camera, "-k", "auto")
+    assert (code, err) == (0, "")
+    assert all(len(line) <= 120 for line in out.splitlines())
+    assert "Choice     K = 2: what the table determines\n" in out
+    assert f"Cameras    {camera.replace('_', '-')}: shapes have true proportions" in out
+    assert "calibrated cameras explain the table as well as affine ones" in out
+
+    model = load_model(folder / "model.skops")
+    assert (model.n_components, model.camera, len(model.basis_)) == ("auto", camera, 2)
+    report = json.loads((folder / "report.json").read_text())["model"]
+    assert (report["n_components"], report["camera"]) == (2, camera)
+    assert report["camera_noise_ratio"] == pytest.approx(model.camera_noise_ratio_)
+    meaning = model.diagnostics().camera_meaning
+    assert report["camera_meaning"] == meaning
+    scaled = camera == "weak_perspective"
+    assert report["frames_scaled"] == scaled
+    noise = np.sqrt(model.noise_variance_)
+    if scaled:
+        assert f"noise {100 * noise:.3g} % of the frame's size" in out
+    else:
+        assert f"noise {noise:.3g} in the units of the table" in out
+        off = np.std(faces.data - faces.clean.reshape(80, -1))
+        assert noise == pytest.approx(off, rel=0.05)
+    fitted = np.asarray(model.reproject(X))
+    expected = inverse_snr(X, fitted, scale_frames=scaled)
+    assert report["inverse_snr"] == pytest.approx(expected, rel=1e-6)
+
+    # The images of cameras.csv and shapes.npz are scaled rotations of true shapes.
+    cameras = pd.read_csv(folder / "cameras.csv")
+    M = cameras[[f"m{i}{j}" for i in range(2) for j in range(3)]].to_numpy()
+    M = M.reshape(-1, 2, 3)
+    grams = M @ M.transpose(0, 2, 1)
+    scales = model.scales_[:, None, None] ** 2
+    np.testing.assert_allclose(grams, scales * np.eye(2), atol=1e-6 * scales.max())
+    page = (folder / "viewer.html").read_text(encoding="utf-8")
+    assert f"{camera.replace('_', '-')} cameras" in page
+
+    output = tmp_path / "alpha.csv"
+    options = ["--output", output, "--std"]
+    code, out, _ = run("transform", folder / "model.skops", path, *options)
+    assert code == 0
+    report_snr = f"inverse SNR {100 * expected:.3g} %"
+    assert report_snr in out
+    alpha = pd.read_csv(output)
+    np.testing.assert_allclose(alpha["alpha_1"], model.alpha_[:, 0], atol=1e-4)
+
+
+def test_auto_is_for_the_joint_refinement(fails, table, tmp_path):
+    options = ["-o", tmp_path, "-k", "auto", "--refinement", "none"]
+    message = fails("fit", table, *options)
+    assert "--n-components auto needs --refinement joint" in message
+
+
 def test_what_the_table_hardly_determines_is_said(run, table, tmp_path, monkeypatch):
     def diagnostics(self):
         warnings.warn("the table says little", stacklevel=2)

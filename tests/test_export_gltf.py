@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from export_models import N_COMPONENTS, blob_model, face_model
+from export_models import N_COMPONENTS, blob_model, calibrated_model, face_model
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import _gltf, write_glb
@@ -118,8 +118,9 @@ def test_the_validator_would_find_something(validate, tmp_path, monkeypatch):
     assert validate(path)["numErrors"] > 0
 
 
-def test_weights_are_coefficients(written):
-    model = face_model()
+@pytest.mark.parametrize("make", [face_model, calibrated_model])
+def test_weights_are_coefficients(written, make):
+    model = make()
     read = written(model)
     surface = read.primitive(4)
     mean = read.array(surface["attributes"]["POSITION"]).astype(float)

@@ -2,7 +2,14 @@ import io
 
 import numpy as np
 import pytest
-from export_models import N_COMPONENTS, aligned, blob_model, face_model, faces
+from export_models import (
+    N_COMPONENTS,
+    aligned,
+    blob_model,
+    calibrated_model,
+    face_model,
+    faces,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat, savemat
 from scipy.linalg import subspace_angles
@@ -112,6 +119,27 @@ def test_the_principal_axes_are_those_of_the_truth():
     assert np.degrees(angles).max() < 1e-3
     expected = size**2 * values[:N_COMPONENTS] ** 2 / len(flat)
     assert_allclose(pdm.eigenvalues, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
+    truth, model = faces(camera=camera), calibrated_model(camera)
+    pdm = point_distribution_model(model)
+    again = point_distribution_model(model, camera=None)
+    for one, other in zip(pdm, again, strict=True):
+        assert_array_equal(one, other)
+    error = aligned(pdm.mean, truth.mean_shape) - truth.mean_shape
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
+    shapes = on_tangent_space(model.reconstruct(truth.data), pdm.mean)
+    scores = scores_of(pdm, shapes)
+    assert_allclose(np.mean(scores**2, axis=0), pdm.eigenvalues, rtol=1e-6)
+    rest = shapes - pdm.mean - np.tensordot(scores, pdm.modes, 1)
+    assert np.sum(rest**2) < 0.02 * np.sum((shapes - pdm.mean) ** 2)
+    if camera == "orthographic":
+        unit = np.linalg.norm(truth.motion[0, 0])  # pixels a millimetre
+        size = unit * np.linalg.norm(truth.mean_shape)
+        assert np.linalg.norm(pdm.mean) == pytest.approx(size, rel=0.01)
+    assert len(recwarn) == 0
 
 
 def test_modes_are_not_the_independent_basis(pdm):

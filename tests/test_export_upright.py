@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from export_models import aligned, blob_model, face_model, faces
+from export_models import aligned, blob_model, calibrated_model, face_model, faces
 from numpy.testing import assert_allclose
 from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
@@ -102,6 +102,54 @@ def test_affine_shapes_are_an_affinity_of_the_model():
     mean, basis = upright_basis(space, model)
     assert_allclose(mean, model.mean_shape_ @ space.transform.T)
     assert_allclose(basis, model.basis_ @ space.transform.T)
+
+
+@pytest.mark.parametrize("asked", ["weak_perspective", None])
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+class TestCalibratedCameras:
+    def test_shapes_are_those_of_the_model_turned(self, camera, asked):
+        model = calibrated_model(camera)
+        space = space_of(model, asked)
+        assert (space.camera, space.metric) == (camera, None)
+        turn = space.transform
+        assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        mean, basis = upright_basis(space, model)
+        assert_allclose(mean, model.mean_shape_ @ turn.T)
+        assert_allclose(basis, model.basis_ @ turn.T)
+        assert mean[BROW, 1] < mean[NOSE, 1] < mean[CHIN, 1]
+        assert mean[NOSE, 2] < mean[[LEFT_JAW, RIGHT_JAW], 2].min()
+
+    @pytest.mark.parametrize("mirrored", [False, True])
+    def test_frames_in_their_poses_have_the_images_of_the_model(
+        self, camera, asked, mirrored
+    ):
+        model = calibrated_model(camera)
+        space = space_of(model, asked, mirrored=mirrored)
+        frames = upright_frames(space, model, model.motion_, model.alpha_)
+        assert_allclose(np.linalg.det(frames.rotations), 1.0)
+        assert_allclose(frames.scales, model.scales_)
+        if camera == "orthographic":
+            assert_allclose(frames.scales, 1.0)
+        images = frames.shapes @ frames.rotations[:, :2].transpose(0, 2, 1)
+        shapes = model.reconstruct(faces(camera=camera).data)
+        expected = project(shapes, model.motion_, 0.0 * model.translation_)
+        images = frames.scales[:, None, None] * images
+        assert_allclose(images, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_mean_face_of_calibrated_cameras_has_its_true_proportions():
+    truth, model = faces(), calibrated_model()
+    mean, _ = upright_basis(space_of(model), model)
+    error = aligned(mean, truth.mean_shape) - truth.mean_shape
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
+
+
+def test_calibrated_cameras_that_see_one_side_only_are_no_error(recwarn):
+    table = faces().data[np.abs(faces().angles).max(axis=1) < 20]
+    model = AffineNRSfM(1, camera="weak_perspective", random_state=0).fit(table)
+    recwarn.clear()
+    upright_basis(space_of(model), model)
+    assert len(recwarn) == 0
 
 
 def test_what_is_refused():

@@ -7,7 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from browser import Browser, find_browser
-from export_models import N_COMPONENTS, N_FRAMES, blob_model, face_model, faces
+from export_models import (
+    N_COMPONENTS,
+    N_FRAMES,
+    blob_model,
+    calibrated_model,
+    face_model,
+    faces,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import write_viewer
@@ -96,14 +103,20 @@ def test_frames_are_those_of_the_fit(written):
     assert data["labels"] == data["categories"] == []
 
 
-def test_rotations_show_the_shapes_as_the_images_do(written):
-    data = written(face_model(noise=0.0))
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+def test_rotations_show_the_shapes_as_the_images_do(written, camera):
+    truth, model = faces(noise=0.0), face_model(noise=0.0)
+    if camera != "affine":
+        truth, model = faces(camera=camera), calibrated_model(camera)
+    data = written(model)
+    told = "weak_perspective" if camera == "affine" else camera
+    assert f"{told.replace('_', '-')} cameras" in data["about"]
     shapes = numbers(data["shapes"]).reshape(1 + N_COMPONENTS, -1).astype(float)
     alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
     rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
     frames = (shapes[0] + alpha @ shapes[1:]).reshape(-1, 68, 3)
     seen = (frames @ rotations.transpose(0, 2, 1))[:, :, :2] * [1, -1]
-    images = faces(noise=0.0).clean
+    images = truth.clean
     images = images - images.mean(axis=1, keepdims=True)
     seen = seen - seen.mean(axis=1, keepdims=True)
     scale = np.sum(seen * images, axis=(1, 2)) / np.sum(seen**2, axis=(1, 2))

@@ -98,6 +98,29 @@ def test_another_affinity_of_space_changes_nothing(faces):
                     faces.mean_shape @ faces.mean_shape.T, atol=1e-6)  # fmt: skip
 
 
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_shapes_of_calibrated_cameras_are_only_turned(camera):
+    faces = make_face_tracks(
+        n_frames=120, n_components=2, camera=camera, random_state=0
+    )
+    model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+    display = BasisShapeDisplay.from_estimator(model)
+    scale = np.median(model.scales_)
+    for drawn, shape in zip(
+        [display.mean_shape, *display.basis],
+        [model.mean_shape_, *model.basis_],
+        strict=True,
+    ):
+        size = scale * np.linalg.norm(shape)
+        assert_allclose(drawn @ drawn.T / size**2,
+                        scale**2 * shape @ shape.T / size**2, atol=1e-6)  # fmt: skip
+    # The front view is the mean camera's.
+    seen = model.reference_motion_ @ model.mean_shape_.T
+    front = display.mean_shape[:, :2].T
+    unit = np.linalg.norm(model.reference_motion_[0]) / scale
+    assert_allclose(unit * front, seen, atol=1e-6 * np.abs(seen).max())
+
+
 def test_artists_are_the_numbers(estimator):
     display = BasisShapeDisplay.from_estimator(estimator, n_std=1.5)
     assert display.axes_.shape == (3, 2)

@@ -45,6 +45,20 @@ def test_summary_of_the_joint_refinement(model):
     assert shown["Noise"].endswith(" of a frame&#x27;s size")
     assert shown["Energy of each"].count(" %") == 2
     assert shown["Diagnostics"] == "no warning"
+    assert shown["Cameras"].startswith("affine; calibrated cameras explain the table")
+
+
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+def test_summary_of_calibrated_cameras(camera):
+    table = make_nonrigid_tracks(
+        60, 16, 2, camera=camera, noise=0.02, random_state=0
+    ).data
+    shown = summary(estimator(camera=camera).fit(table))
+    assert shown["Cameras"].startswith(f"{camera.replace('_', ' ')}; ")
+    unit = "in the units of the table" if camera == "orthographic" else "s size"
+    assert shown["Noise"].endswith(unit)
+    shown = summary(estimator(camera=camera, refinement=None).fit(table))
+    assert shown["Cameras"] == camera.replace("_", " ")
 
 
 def test_rows_without_points_are_told():
