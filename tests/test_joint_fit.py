@@ -1,8 +1,12 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
+from functools import cache
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
 from scenes import measurements, rotate_frames
 
 from isa_nrsfm._completion import complete_tracks
@@ -12,7 +16,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint import reweighting
-from isa_nrsfm._joint.fit import count_components, fit_jointly
+from isa_nrsfm._joint.fit import JointFit, count_components, fit_jointly
 from isa_nrsfm._joint.problem import BASIS_STD
 from isa_nrsfm._sampling import Sample
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -182,40 +186,201 @@ class TestFit:
             assert affine_shape_error(truth, frames_of(result, tracks)[1]) < 0.02
 
 
+EACH = pytest.mark.parametrize("camera", CAMERAS)
+CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+GAPS = pytest.mark.parametrize("gaps", [False, True])
+
+
+def table_of(camera, seed=0, gaps=False, **options):
+    """Return a table of a camera model, as `random_table` does."""
+    unit = camera == "orthographic"  # one size for all frames
+    tracks, truth = random_table(seed, camera=camera, unit=unit, **options)
+    return with_gaps(tracks) if gaps else tracks, truth
+
+
+def similarity_error(truth, shapes, scaled):
+    """
+    Return how far shapes are from true ones, after one rotation or reflection and unit.
+
+    With `scaled` each frame has a unit of its own.
+    """
+    truth, shapes = (
+        each - each.mean(axis=1, keepdims=True) for each in (truth, shapes)
+    )
+    size = np.linalg.norm(truth, axis=(1, 2), keepdims=True)
+    if scaled:
+        shapes = shapes * size / np.linalg.norm(shapes, axis=(1, 2), keepdims=True)
+    U, S, Vt = np.linalg.svd(shapes.reshape(-1, 3).T @ truth.reshape(-1, 3))
+    nearest = S.sum() / np.sum(shapes**2) * shapes @ (U @ Vt)
+    return np.mean(np.linalg.norm(truth - nearest, axis=(1, 2)) / size[:, 0, 0])
+
+
+class Fit(NamedTuple):
+    tracks: NDArray
+    truth: NDArray  # (n_frames, n_points, 3)
+    result: JointFit
+
+
+@cache
+def fit_of(camera, kind=None, seed=0, gaps=False, deviation=DEVIATION):
+    """Return a table of a camera model, by default that of the fit, and its fit."""
+    tracks, truth = table_of(kind or camera, seed, gaps, deviation=deviation)
+    return Fit(tracks, truth, fitted(tracks, camera=camera))
+
+
+class TestCameras:
+    """Tables of each camera model, fitted with it."""
+
+    @EACH
+    @GAPS
+    @pytest.mark.parametrize("seed", range(2))
+    def test_without_noise_shapes_are_exact(self, camera, gaps, seed):
+        tracks, truth, result = fit_of(camera, None, seed, gaps, 0.0)
+        assert result.converged
+        shapes = frames_of(result, tracks, camera)[1]
+        assert affine_shape_error(truth, shapes) < 1e-7
+        mean_square = np.nanmean(tracks**2)
+        assert result.noise_variance < 1e-9 * mean_square
+
+    @CALIBRATED
+    @pytest.mark.parametrize(("deviation", "largest"), [(0.0, 1e-7), (0.01, 0.01)])
+    def test_calibrated_cameras_show_true_shapes(self, camera, deviation, largest):
+        # Also where the object deforms as much as it is large: the mirror image of
+        # space is all that is free.
+        tracks, truth = table_of(
+            camera, deviation=deviation, amplitude=1.0, n_components=3
+        )
+        result = fitted(tracks, 3, camera=camera)
+        shapes = frames_of(result, tracks, camera)[1]
+        assert similarity_error(truth, shapes, camera == "weak_perspective") < largest
+
+    @EACH
+    @GAPS
+    def test_history_never_rises(self, camera, gaps):
+        for deviation in (0.0, DEVIATION):
+            result = fit_of(camera, None, 0, gaps, deviation).result
+            assert len(result.history) > 3
+            assert (np.diff(result.history) <= 0).all()
+
+    @CALIBRATED
+    @GAPS
+    def test_motion_is_calibrated(self, camera, gaps):
+        tracks, _, result = fit_of(camera, None, 0, gaps)
+        motion = frames_of(result, tracks, camera)[0].motion
+        gram = motion @ motion.swapaxes(1, 2)
+        scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+        unit = np.broadcast_to(np.eye(2), gram.shape)
+        assert_allclose(gram / scale, unit, atol=1e-11)
+        if camera == "orthographic":
+            assert_allclose(scale, 1.0, rtol=1e-11)
+
+    @CALIBRATED
+    def test_calibrated_cameras_tell_shapes_better_than_affine_ones(self, camera):
+        errors = []
+        for model in (camera, "affine"):
+            tracks, truth, result = fit_of(model, camera)
+            shapes = frames_of(result, tracks, model)[1]
+            errors.append(affine_shape_error(truth, shapes))
+        assert errors[0] < 0.9 * errors[1]
+
+    @EACH
+    @GAPS
+    @pytest.mark.parametrize("seed", range(2))
+    def test_noise_is_the_true_one_within_the_error_of_sampling(
+        self, camera, gaps, seed
+    ):
+        tracks, _, result = fit_of(camera, None, seed, gaps)
+        got, pose = result.noise_variance, 2 + CAMERAS[camera].n_parameters
+        freedom = np.isfinite(tracks).sum() - pose * 60 - 3 * 3 * 39
+        assert abs(got / DEVIATION**2 - 1) < 3.5 * np.sqrt(2 / freedom)
+
+    @CALIBRATED
+    def test_no_frame_stays_reversed(self, camera):
+        # Of a thin object reversed cameras are nearly as good.
+        truth = make_nonrigid_tracks(60, 40, 2, camera=camera, random_state=0)
+        frames = truth.shapes * [1.0, 1.0, 0.3]
+        tracks = frames @ truth.motion.swapaxes(1, 2)
+        tracks = tracks / np.sqrt(np.mean(tracks**2))
+        tracks += 0.01 * np.random.default_rng(0).normal(size=tracks.shape)
+        tracks -= tracks.mean(axis=1, keepdims=True)
+        result = fitted(tracks, camera=camera)
+        shapes = frames_of(result, tracks, camera)[1]
+        scaled = camera == "weak_perspective"
+        assert similarity_error(frames, shapes, scaled) < 0.02
+
+
+class TestCameraNoiseRatio:
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    @pytest.mark.parametrize("kind", ["weak_perspective", "orthographic"])
+    @pytest.mark.parametrize("deviation", [0.01, DEVIATION])
+    def test_is_one_for_calibrated_cameras(self, camera, kind, deviation):
+        result = fit_of(camera, kind, 0, False, deviation).result
+        assert 1.0 <= result.camera_noise_ratio < 1.1
+
+    @EACH
+    def test_is_large_for_affine_cameras(self, camera):
+        assert fit_of(camera, "affine").result.camera_noise_ratio > 10
+
+    def test_is_large_where_scales_differ_for_orthographic_ones(self):
+        tracks, _ = random_table(deviation=0.01, unit=True)
+        assert fitted(tracks, camera="orthographic").camera_noise_ratio > 10
+
+    @EACH
+    def test_of_tables_without_noise(self, camera):
+        ratio = fit_of(camera, None, 0, False, 0.0).result.camera_noise_ratio
+        assert ratio > 10 if camera == "affine" else 1.0 <= ratio < 1.1
+
+
+class TestNumberOfComponents:
+    @EACH
+    @pytest.mark.parametrize("n_components", [1, 3])
+    def test_is_the_true_one(self, camera, n_components):
+        tracks, _ = table_of(
+            camera, n_frames=120, deviation=0.02, n_components=n_components
+        )
+        assert fitted(tracks, 5, camera=camera, count=True) == n_components
+
+    def test_is_one_at_least(self):
+        tracks, _ = table_of("weak_perspective", n_components=0)
+        assert fitted(tracks, 3, count=True) == 1
+
+
 class TestEquivariance:
     """With a tolerance at which the path to the optimum does not matter."""
 
-    def fit(self, tracks, **options):
-        return fitted(tracks, tol=1e-4, **options)
+    def fit(self, tracks, camera):
+        return fitted(tracks, tol=1e-4, camera=camera)
 
-    @pytest.mark.parametrize("gaps", [False, True])
-    def test_order_of_frames_and_points(self, gaps):
-        tracks, _ = random_table(n_frames=40, n_points=30)
-        tracks = with_gaps(tracks) if gaps else tracks
+    @EACH
+    @GAPS
+    def test_order_of_frames_and_points(self, gaps, camera):
+        kind = "weak_perspective" if camera == "affine" else camera
+        tracks, _ = table_of(kind, gaps=gaps, n_frames=40, n_points=30)
         rng = np.random.default_rng(1)
         frames, points = rng.permutation(40), rng.permutation(30)
-        expected = self.fit(tracks)
-        got = self.fit(tracks[frames][:, points])
+        expected = self.fit(tracks, camera)
+        got = self.fit(tracks[frames][:, points], camera)
         assert got.history[-1] == pytest.approx(expected.history[-1], abs=1e-2)
         assert got.noise_variance == pytest.approx(expected.noise_variance, rel=1e-3)
         assert_allclose(
-            images(got, tracks[frames][:, points]),
-            images(expected, tracks)[frames][:, points],
+            images(got, tracks[frames][:, points], camera),
+            images(expected, tracks, camera)[frames][:, points],
             atol=2e-3,
         )
 
-    @pytest.mark.parametrize("gaps", [False, True])
-    def test_rotation_of_single_frames(self, gaps):
-        tracks, _ = random_table(n_frames=40, n_points=30)
-        tracks = with_gaps(tracks) if gaps else tracks
+    @EACH
+    @GAPS
+    def test_rotation_of_single_frames(self, gaps, camera):
+        kind = "weak_perspective" if camera == "affine" else camera
+        tracks, _ = table_of(kind, gaps=gaps, n_frames=40, n_points=30)
         turned = rotate_frames(tracks.transpose(0, 2, 1).reshape(80, 30), 1)
         turned = turned.reshape(40, 2, 30).transpose(0, 2, 1)
-        expected, got = self.fit(tracks), self.fit(turned)
+        expected, got = self.fit(tracks, camera), self.fit(turned, camera)
         assert got.history[-1] == pytest.approx(expected.history[-1], abs=1e-2)
         assert got.noise_variance == pytest.approx(expected.noise_variance, rel=1e-3)
         assert_allclose(
-            np.linalg.norm(images(got, turned), axis=2),
-            np.linalg.norm(images(expected, tracks), axis=2),
+            np.linalg.norm(images(got, turned, camera), axis=2),
+            np.linalg.norm(images(expected, tracks, camera), axis=2),
             atol=2e-3,
         )
 
@@ -255,8 +420,8 @@ class TestNoiseVariance:
 
 
 class TestLargeTables:
-    @pytest.mark.parametrize("camera", CAMERAS)
-    @pytest.mark.parametrize("gaps", [False, True])
+    @EACH
+    @GAPS
     def test_end_where_small_ones_do(self, gaps, camera):
         kind = "orthographic" if camera == "orthographic" else "weak_perspective"
         tracks, truth = random_table(
@@ -374,6 +539,37 @@ class TestRobustLoss:
 
 
 class TestDegenerate:
+    @CALIBRATED
+    @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
+    def test_flat_objects_seen_by_calibrated_cameras(self, camera, deviation):
+        truth = make_nonrigid_tracks(60, 40, 2, camera=camera, random_state=0)
+        flat = truth.shapes * [1.0, 1.0, 0.0]
+        tracks = flat @ truth.motion.swapaxes(1, 2)
+        tracks /= np.sqrt(np.mean(tracks**2))
+        tracks += deviation * np.random.default_rng(0).normal(size=tracks.shape)
+        tracks -= tracks.mean(axis=1, keepdims=True)
+        result = fitted(tracks, camera=camera)
+        assert np.isfinite(result.shapes).all()
+        assert np.isfinite(result.alpha).all()
+        rest = images(result, tracks, camera) - tracks
+        assert np.mean(rest**2) < max(1.5 * deviation**2, 1e-7)
+
+    @CALIBRATED
+    @pytest.mark.parametrize("deviation", [0.0, DEVIATION])
+    def test_rigid_objects_seen_by_calibrated_cameras(self, camera, deviation):
+        tracks, truth = table_of(camera, deviation=deviation, n_components=0)
+        result = fitted(tracks, 2, camera=camera)
+        assert np.isfinite(result.alpha).all()
+        shapes = frames_of(result, tracks, camera)[1]
+        assert affine_shape_error(truth, shapes) < max(3 * deviation, 1e-4)
+
+    @CALIBRATED
+    def test_few_frames_seen_by_calibrated_cameras(self, camera):
+        tracks, _ = table_of(camera, n_frames=8, n_points=13, n_components=3)
+        result = fitted(tracks, 3, camera=camera)
+        assert np.isfinite(result.shapes).all()
+        assert 0 < result.noise_variance < 1
+
     @pytest.mark.parametrize("n_components", [1, 3])
     def test_rigid_objects(self, n_components):
         for deviation in (0.0, DEVIATION):
