@@ -61,7 +61,7 @@ from isa_nrsfm._independent_gauge import (
     FrameMap,
     independent_gauge,
 )
-from isa_nrsfm._joint.fit import count_components, fit_jointly
+from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._metric_equations import CAMERA_MODELS
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
@@ -502,8 +502,11 @@ class AffineNRSfM(
         self.rank_floor_ = triplets.rest_share
         self._n_features_out = n_components
         if joint:
+            spectrum = Spectrum.from_singular_values(
+                triplets.values, triplets.rest_share, n_components, table.n_points
+            )
             frames = self._refine_jointly(
-                table, outliers, sample, factors, result, progress
+                table, outliers, sample, factors, result, spectrum, progress
             )
         else:
             frames = self._keep(table, sample.W, factors, result)
@@ -978,6 +981,7 @@ class AffineNRSfM(
         sample: Sample,
         factors: Factorisation,
         result: PaperResult,
+        spectrum: Spectrum,
         progress: FitProgress,
     ) -> FrameFit:
         """Set the shapes of the joint refinement and return the fit of the frames."""
@@ -987,7 +991,7 @@ class AffineNRSfM(
             sample,
             factors,
             _stacked_shapes(result),
-            rank_floor=self.rank_floor_,
+            spectrum=spectrum,
             camera=self.camera,
             outliers=outliers,
             loss=self.loss,

@@ -18,7 +18,7 @@ from isa_nrsfm._joint.quasi_newton import JointResult, JointState, refine_joint
 # Standard deviation, as a share of the frame size, of the coordinates of the image of a
 # basis shape, one deviation of its coefficient: the prior of the basis shapes.
 # (``python -m benchmarks.accuracy prior``)
-BASIS_STD = 0.015
+BASIS_STD = 0.008
 # The noise variance is at least this share of the mean square: what K basis shapes
 # leave of the object is not noise, and does not tell its depth.
 # (``python -m benchmarks.accuracy prior``)
