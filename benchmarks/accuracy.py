@@ -4,7 +4,7 @@ Print what fits of real tables reach: reprojection, 3D truth, unseen points.
 Run ``python -m benchmarks.accuracy [section ...] [--seeds N]``. Errors in 3D are
 `affine_shape_error`; inverse SNR is in percent, of frames scaled to unit size. Errors
 of Euclidean shapes are `mean_shape_error_3d`, of shapes in the axes of their cameras:
-"sequence", without a scale, and "frame".
+"sequence", without a scale unless cameras have unknown ones, and "frame".
 """
 
 import warnings
@@ -72,9 +72,19 @@ SPOILED = CALIBRATED[:3]
 OUTLYING = (("drink", "weak_perspective", 3), CALIBRATED[6])
 TURNED = (CALIBRATED[6], *SPOILED)
 # Of the prior: deviations of the basis shapes, least noise variances.
-BASIS_STDS = (0.007, 0.01, 0.015, 0.02)
+BASIS_STDS = (0.005, 0.008, 0.01, 0.015, 0.02)
 LEAST_NOISES = (1e-4, 5e-5, 3e-5)
 PRIOR_MODULES = (joint_problem, joint_fit, joint_starts, relevance)
+# Sets and K that cut a full spectrum off, and factors of what is left.
+CUT = {
+    "yoga": (3, 6, 12),
+    "pickup": (3, 6, 12),
+    "drink": (3, 6, 12),
+    "shark": (1, 2),
+    "flag": (5, 12),
+    "ict_68": (5, 9),
+}
+CUT_OFFS = (0.0, 1.0, 3.0, 10.0)
 # Distances of perspective cameras, in radii of the object.
 DISTANCES = (8.0, 4.0, 2.5)
 # Sets with too few basis shapes, and one with nearly enough.
@@ -308,14 +318,19 @@ def fit_set(X, camera, n_components, **parameters):
     return AffineNRSfM(n_components, **settings).fit(X)
 
 
-def errors_in_camera(truth, found):
-    """Return the errors "sequence" and "frame" of shapes in their cameras' axes."""
+def errors_in_camera(truth, found, scale=False):
+    """
+    Return the errors "sequence" and "frame" of shapes in their cameras' axes.
+
+    For "sequence" a common scale may be fitted, where images do not have that of the
+    truth.
+    """
     shapes = found.scales[:, None, None] * found.euclidean
     shapes = shapes @ found.rotations.transpose(0, 2, 1)
     return np.array(
         [
-            mean_shape_error_3d(truth, shapes, convention=convention)
-            for convention in ("sequence", "frame")
+            mean_shape_error_3d(truth, shapes, scale=scale),
+            mean_shape_error_3d(truth, shapes, convention="frame"),
         ]
     )
 
@@ -338,16 +353,22 @@ def title_of(name, camera, n_components):
 
 @contextmanager
 def prior_of(basis_std, least_noise):
-    """Fit with other constants of the prior."""
+    """Fit with other constants of the prior, also where they are defaults."""
+    old = joint_problem.LEAST_NOISE
     constants = {"BASIS_STD": basis_std, "LEAST_NOISE": least_noise}
     with ExitStack() as stack:
         for module in PRIOR_MODULES:
-            for name, constant in constants.items():
-                if hasattr(module, name):
-                    stack.enter_context(mock.patch.object(module, name, constant))
-        # Where it is the default of an argument.
-        refined = mock.patch.object(joint_fit._refined, "__defaults__", (least_noise,))
-        stack.enter_context(refined)
+            for name, known in list(vars(module).items()):
+                if name in constants:
+                    change = mock.patch.object(module, name, constants[name])
+                    stack.enter_context(change)
+                elif old in (getattr(known, "__defaults__", None) or ()):
+                    defaults = tuple(
+                        least_noise if default == old else default
+                        for default in known.__defaults__
+                    )
+                    change = mock.patch.object(known, "__defaults__", defaults)
+                    stack.enter_context(change)
         yield
 
 
@@ -358,25 +379,83 @@ def prior(options):
     elsewhere that of the frames.
     """
     cases = present(CALIBRATED)
-    tables = {name: load(name) for name, _, _ in cases}
-    truths = {name: shapes_in_camera(name) for name in tables}
-    titles = [f"{name} {n_components}" for name, _, n_components in cases]
-    print("   std   noise" + "".join(f"{title:>10}" for title in titles))
+    print("   std   noise" + headings_of(cases))
     for basis_std in BASIS_STDS:
         for least_noise in LEAST_NOISES:
-            errors = []
-            for name, camera, n_components in cases:
-                X = tables[name].X
-                with prior_of(basis_std, least_noise):
-                    found = found_by_ours(fit_set(X, camera, n_components), X)
-                if name == "ict_68":
-                    error = affine_shape_error(tables[name].shapes, found.affine)
-                else:
-                    kind = 0 if camera == "orthographic" else 1
-                    error = errors_in_camera(truths[name], found)[kind]
-                errors.append(error)
+            with prior_of(basis_std, least_noise):
+                errors = [chosen_error(*case) for case in cases]
             row = "".join(f"{error:10.4f}" for error in errors)
             print(f"{basis_std:6g}{least_noise:8g}{row}", flush=True)
+
+
+def noise(options):
+    """Noise of fits without a floor, to that of the spectrum; errors by the cut-off.
+
+    Models are right up to a ratio of `RIGHT`; the errors are those of `prior`.
+    """
+    for kind in ("weak_perspective", "affine"):
+        for K, fitted in ((2, 2), (2, 4), (4, 4), (4, 6), (4, 3), (4, 2)):
+            ratios = [
+                noise_ratio(
+                    instance(seed, 68, K, level, camera=kind).data, kind, fitted
+                )
+                for seed in range(options.seeds)
+                for level in (0.005, 0.02)
+            ]
+            title = f"{kind} K={K}, fitted with {fitted}"
+            print(f"{title:40}{min(ratios):8.3f} to {max(ratios):.3f}", flush=True)
+    for name, numbers in CUT.items():
+        if is_present(name):
+            X = load(name).X
+            ratios = [noise_ratio(X, "weak_perspective", K) for K in numbers]
+            listed = ", ".join(
+                f"K={K} {ratio:.3g}" for K, ratio in zip(numbers, ratios, strict=True)
+            )
+            print(f"{name:12}{listed}", flush=True)
+    cases = present(
+        [
+            (name, "weak_perspective" if name == "flag" else "orthographic", K)
+            for name, numbers in CUT.items()
+            for K in numbers
+            if name != "ict_68"
+        ]
+    )
+    print("cut-off" + headings_of(cases))
+    for cut_off in CUT_OFFS:
+        with mock.patch.object(joint_fit, "CUT_OFF", cut_off):
+            row = "".join(f"{chosen_error(*case):10.4f}" for case in cases)
+        print(f"{cut_off:7g}{row}", flush=True)
+
+
+def noise_ratio(X, camera, n_components):
+    """Return the noise without a floor, divided by that of the spectrum."""
+    ratios, original = [], joint_fit._with_its_noise
+
+    def recorded(problem, result, cameras, spectrum):
+        n_seen, energy = problem.totals
+        free = joint_fit._without_floor(problem, result, cameras, np.inf)
+        known = max(spectrum.noise, joint_fit.EXACT)
+        ratios.append(free.state.noise * n_seen / energy / known)
+        return original(problem, result, cameras, spectrum)
+
+    with mock.patch.object(joint_fit, "_with_its_noise", recorded):
+        fit_set(X, camera, n_components)
+    return ratios[0]
+
+
+def headings_of(cases):
+    """Return the headings of a table with a column a case."""
+    return "".join(f"{f'{name} {K}':>10}" for name, _, K in cases)
+
+
+def chosen_error(name, camera, n_components):
+    """Return the error of a fit of a set that suits its camera, as of `prior`."""
+    table = load(name)
+    found = found_by_ours(fit_set(table.X, camera, n_components), table.X)
+    if name == "ict_68":
+        return affine_shape_error(table.shapes, found.affine)
+    sequence, frame = errors_in_camera(shapes_in_camera(name), found)
+    return sequence if camera == "orthographic" else frame
 
 
 def perspective(tracks, distance, noise, rng):
@@ -530,7 +609,8 @@ def calibrated(options):
         X = load(name).X
         found = found_by_ours(fit_set(X, camera, n_components), X)
         cleanest[case] = found
-        sequence, frame = errors_in_camera(shapes_in_camera(name), found)
+        scale = SETS[name].camera != "orthographic"
+        sequence, frame = errors_in_camera(shapes_in_camera(name), found, scale)
         print(f"{title_of(*case):34}{sequence:10.4f}{frame:9.4f}", flush=True)
     print(f"\n{'rotations, degrees':34}{'median':>10}{'largest':>9}")
     for case in present(TURNED):
@@ -690,6 +770,7 @@ SECTIONS = {
     "outliers": outliers,
     "tolerances": tolerances,
     "prior": prior,
+    "noise": noise,
     "cameras": cameras,
     "calibrated": calibrated,
     "starts": starts,
