@@ -3,6 +3,7 @@
 import os
 import warnings
 from collections.abc import Callable
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -488,10 +489,17 @@ class AffineNRSfM(
         source = self._opened(X, reset=True)
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
+        ready = partial(
+            scaled_table,
+            layout=self.layout,
+            names=names,
+            scale_frames=self._scales_frames,
+            robust=self.loss != "linear",
+        )
         n_components = self.n_components
         if n_components == "auto":
-            n_components = self._count_components(source, names)
-        table = self._scaled_table(source, n_components, names)
+            n_components = self._count_components(ready, source)
+        table = ready(source, n_components)
         self._unit = 1.0 if self._scales_frames else float(table.sizes[0])
         outliers, used = self._completed(table, n_components)
         progress("table")
@@ -810,14 +818,18 @@ class AffineNRSfM(
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
-    def _count_components(self, source: Table, names: NDArray | None) -> int:
+    def _count_components(
+        self, ready: Callable[[Table, int], ScaledTable], source: Table
+    ) -> int:
         """Return the number of basis shapes that a table supports."""
         if self.refinement != "joint":
             raise ValueError(
                 "n_components='auto' needs refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
-        table = self._scaled_table(source, 1, names)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the fit will say the same
+            table = ready(source, 1)
         most = largest_n_components(table.n_points)
         most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
         outliers, used = self._completed(table, most)
@@ -842,19 +854,6 @@ class AffineNRSfM(
                 stacklevel=4,
             )
         return found
-
-    def _scaled_table(
-        self, source: Table, n_components: int, names: NDArray | None
-    ) -> ScaledTable:
-        """Return a table checked and made ready for the fit."""
-        return scaled_table(
-            source,
-            n_components,
-            layout=self.layout,
-            names=names,
-            scale_frames=self._scales_frames,
-            robust=self.loss != "linear",
-        )
 
     def _completed(
         self, table: ScaledTable, n_components: int

@@ -308,6 +308,8 @@ class PosteriorFrames(NamedTuple):
 
     def posterior(self, tracks: NDArray) -> FramePosterior:
         """Return the fit of frames of size one, before the gauge."""
+        # Sums over other strides are rounded otherwise.
+        tracks = np.ascontiguousarray(tracks)
         fitted = partial(
             fit_posterior,
             shapes=self.shapes,

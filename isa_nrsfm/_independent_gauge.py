@@ -130,7 +130,7 @@ def independent_gauge(
     IndependentGauge
         The basis, and the map of the frames to it.
     """
-    shift, motion, alpha = _centred(shapes, motion, alpha, camera != "orthographic")
+    shift, motion, alpha = _centred(shapes, motion, alpha, camera)
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
     white = shapes[1:].transpose(0, 2, 1) @ space.T
@@ -155,26 +155,29 @@ def independent_gauge(
 
 
 def _centred(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, scaled: bool
+    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the mixing of B_0, ..., B_K to centred coefficients and pure basis shapes.
 
     The coefficients get mean zero by ``B_0 + sum_k u_k B_k``, and the basis shapes
     ``tr(B_k B_0^+) = 0`` by ``B_k + v_k B_0``, which is ``<T B_k, T B_0> = 0`` where T
-    whitens B_0. The one undoes the other a little: they alternate. Where that would
-    turn a frame inside out, or has no end, or where cameras have no scales that absorb
-    it, the basis shapes stay as they are. Cameras and coefficients for the new shapes
-    are returned, too.
+    whitens B_0; with weak-perspective cameras ``<B_k, B_0> = 0``. The one undoes the
+    other a little: they alternate. Where that would turn a frame inside out, or has no
+    end, or where cameras have no scales that absorb it, the basis shapes stay as they
+    are. Cameras and coefficients for the new shapes are returned, too.
     """
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=1e-9), 1)
     first = total = _mean_shift(alpha)
     moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
-    for _ in range(MAX_SHIFTS if scaled else 0):
+    for _ in range(0 if camera == "orthographic" else MAX_SHIFTS):
         current = np.tensordot(total, shapes, 1)
-        inverse = np.linalg.pinv(current[0], rcond=1e-9)
+        if camera == "affine":
+            dual = np.linalg.pinv(current[0], rcond=1e-9).T / rank
+        else:
+            dual = current[0] / (np.vdot(current[0], current[0]) or 1.0)
         along = np.eye(len(shapes))
-        along[1:, 0] = -np.einsum("kcj,jc->k", current[1:], inverse) / rank
+        along[1:, 0] = -np.einsum("kcj,cj->k", current[1:], dual)
         factor = 1 - moved @ along[1:, 0]
         if not (factor > 0).all():
             break

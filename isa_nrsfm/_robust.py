@@ -83,6 +83,7 @@ def distant_points(tracks: NDArray) -> NDArray:
 
 def _squares(tracks: NDArray) -> NDArray:
     """Return the squared distances of points from the median of their frame."""
+    tracks = np.ascontiguousarray(tracks)  # other strides are rounded otherwise
     return np.sum((tracks - spatial_median(tracks)[:, None]) ** 2, axis=2)
 
 

@@ -23,7 +23,7 @@ from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm._robust import robust_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
-from isa_nrsfm.metrics import affine_shape_error
+from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
@@ -90,6 +90,11 @@ def frame_weights(tracks, scale_frames):
     )
 
 
+def scales_frames(model):
+    """Return whether frames count alike; those of orthographic cameras never do."""
+    return model.scale_frames and model.camera != "orthographic"
+
+
 def size_weights(model, table):
     """Return one over the square of the sizes of frames, those of the loss."""
     tracks = tracks_of(table, model.layout)
@@ -99,7 +104,7 @@ def size_weights(model, table):
         weights = robust_sizes(tracks) ** -2
     return (
         weights
-        if model.scale_frames
+        if scales_frames(model)
         else np.full_like(weights, 1 / np.mean(1 / weights))
     )
 
@@ -121,7 +126,6 @@ def model():
         {"camera": "weak_perspective"},
         {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
         {"camera": "orthographic"},
-        {"camera": "orthographic", "refinement": "alternating"},
         {"camera": "weak_perspective", "refinement": None},
         {"n_components": 1},
         {"n_components": 6},
@@ -220,7 +224,7 @@ def scaled_matrix(model, table):
     """Return the centred tracks of a table, scaled as in the fit, (2I, J)."""
     tracks = tracks_of(table, model.layout)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
-    weights = frame_weights(tracks, model.scale_frames)
+    weights = frame_weights(tracks, scales_frames(model))
     return np.vstack(
         list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1))
     )
@@ -238,7 +242,7 @@ def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(vari
     rank = 3 * model.n_components + 3
     assert_allclose(model.rank_floor_, np.sum(S[rank:] ** 2) / np.sum(S**2), rtol=1e-9)
     assert 0 < model.rank_floor_ < model.inverse_snr_ < 1
-    if model.scale_frames:
+    if scales_frames(model):
         assert_allclose(model.singular_values_, S[:rank], rtol=1e-9)
     else:  # in the unit of the table or as a ratio: their proportions are the same
         ratio = model.singular_values_ / S[:rank]
@@ -262,7 +266,7 @@ def test_mode_covariance(variant):
                         model.alpha_, model.motion_ / sizes[:, None, None], strict=True
                     )
                 ) / (2 * N_FRAMES)
-                if not model.scale_frames:  # in the units of the table
+                if not scales_frames(model):  # in the units of the table
                     expected = expected * sizes[0] ** 2
                 tolerance = 1e-10 * np.abs(C).max()
                 assert_allclose(C[rows, columns], expected, atol=tolerance)
@@ -277,16 +281,17 @@ def test_mode_covariance(variant):
 
 
 def test_shapes_are_centred_and_pure(variant):
-    # The joint refinement's basis shapes have no part along the mean shape, which is
-    # white: tr(B_k^T B_0) = 0, and the mean of the coefficients is zero. The paper's
-    # are orthogonal: B_k B_l^T = 0 for k != l, the mean shape included.
+    # The joint refinement's basis shapes have no part along the mean shape (white with
+    # affine cameras), tr(B_k^T B_0) = 0, where scales of cameras would absorb it, and
+    # the mean of the coefficients is zero. The paper's are orthogonal: B_k B_l^T = 0
+    # for k != l, the mean shape included.
     model, *_ = variant
     shapes = np.concatenate([model.mean_shape_[None], model.basis_])
     assert_allclose(shapes.mean(axis=1), 0, atol=1e-12)
     if is_joint(model):
-        assert_allclose(
-            np.sum(model.basis_ * model.mean_shape_, axis=(1, 2)), 0, atol=1e-9
-        )
+        if model.camera != "orthographic":
+            along = np.sum(model.basis_ * model.mean_shape_, axis=(1, 2))
+            assert_allclose(along, 0, atol=1e-9)
         assert_allclose(model.alpha_.mean(axis=0), 0, atol=1e-10)
         return
     for k, one in enumerate(shapes):
@@ -387,6 +392,10 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
         assert_allclose(translation[i], tracks[i].mean(axis=0), rtol=1e-12)
         centred = tracks[i] - tracks[i].mean(axis=0)
         M = np.linalg.lstsq(model.mean_shape_, centred)[0].T
+        if model.camera != "affine":  # the nearest scaled rotation
+            U, values, Vt = np.linalg.svd(M, full_matrices=False)
+            scale = 1.0 if model.camera == "orthographic" else values.mean()
+            M = scale * U @ Vt
         assert_allclose(motion[i], M, atol=1e-10 * np.abs(M).max())
         design = (model.basis_ @ M.T).reshape(len(model.basis_), -1).T
         rest = (centred - model.mean_shape_ @ M.T).ravel()
@@ -398,8 +407,8 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
 def test_cameras_of_the_joint_refinement_are_best_for_the_coefficients(variant, which):
     # They are the least squares fit to the shape of the frame, position included.
     model, table, new = variant
-    if not is_joint(model) or model.loss != "linear":
-        pytest.skip("cameras are those of the rigid fit, or points have weights")
+    if not is_joint(model) or model.loss != "linear" or model.camera != "affine":
+        pytest.skip("cameras are not those of least squares, or points have weights")
     table = table if which == "fitted" else new
     motion, translation, _ = model.decompose(table)
     tracks, shapes = tracks_of(table, model.layout), model.reconstruct(table)
@@ -1109,3 +1118,137 @@ def test_another_refinement_leaves_nothing_of_the_joint_one():
     assert not hasattr(model, "noise_variance_")
     with pytest.raises(ValueError, match="joint"):
         model.diagnostics()
+
+
+# --- calibrated cameras --------------------------------------------------------------
+
+CALIBRATED = ("weak_perspective", "orthographic")
+
+
+@cache
+def calibrated(camera, refinement="joint"):
+    """Return a model with calibrated cameras, to be left as it is, and its table."""
+    truth = make_nonrigid_tracks(
+        80, 40, 2, camera=camera, noise=0.01, missing=0.05, random_state=0
+    )
+    model = AffineNRSfM(2, camera=camera, refinement=refinement, random_state=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return model.fit(truth.data), truth
+
+
+@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@pytest.mark.parametrize("camera", CALIBRATED)
+def test_images_are_those_of_scaled_rotations(camera, refinement):
+    model, truth = calibrated(camera, refinement)
+    S, R, s = model.reconstruct(truth.data), model.rotations_, model.scales_
+    assert_allclose(R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (80, 1, 1)), atol=1e-9)
+    assert_allclose(np.linalg.det(R), 1)
+    assert_allclose(s[:, None, None] * R[:, :2], model.motion_, rtol=1e-9, atol=1e-12)
+    images = s[:, None, None] * S @ R[:, :2].transpose(0, 2, 1)
+    images += model.translation_[:, None]
+    reprojected = tracks_of(model.reproject(truth.data))
+    assert_allclose(images, reprojected, atol=1e-9 * np.abs(reprojected).max())
+    if camera == "orthographic":
+        assert_allclose(s, 1, rtol=1e-9)
+    decomposed = model.decompose(truth.data)
+    assert_allclose(decomposed.motion, model.motion_, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("camera", CALIBRATED)
+def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
+    model, truth = calibrated(camera)
+    S = model.reconstruct(truth.data)
+    errors = []
+    for fitted in (model, clone(model).fit(truth.data).mirror()):
+        convention = "sequence" if camera == "orthographic" else "frame"
+        errors.append(
+            mean_shape_error_3d(
+                truth.shapes, fitted.reconstruct(truth.data), convention=convention
+            )
+        )
+    # Both mirror images are as good, for an alignment that may reflect.
+    assert errors[0] < 0.01
+    assert errors[1] == pytest.approx(errors[0], rel=1e-6)
+    true_rows = truth.motion / np.linalg.norm(truth.motion, axis=2, keepdims=True)
+    rows = model.rotations_[:, :2]
+    U, _, Vt = np.linalg.svd(np.einsum("irc,ird->cd", rows, true_rows))
+    angle = np.abs(rows @ (U @ Vt) - true_rows).max()
+    assert np.degrees(angle) < 2
+    assert S.shape == truth.shapes.shape
+
+
+@pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
+def test_mirror_images_fit_as_well(camera, refinement):
+    model, truth = calibrated(camera, refinement)
+    mirrored = copy.deepcopy(model).mirror()
+    depth = np.array([1.0, 1.0, -1.0])
+    assert_array_equal(mirrored.mean_shape_, model.mean_shape_ * depth)
+    assert_array_equal(mirrored.motion_, model.motion_ * depth)
+    assert_array_equal(mirrored.transform(truth.data), model.transform(truth.data))
+    assert_allclose(mirrored.reproject(truth.data), model.reproject(truth.data))
+    assert mirrored.score(truth.data) == pytest.approx(model.score(truth.data))
+    shapes = model.reconstruct(truth.data) * depth
+    assert_allclose(mirrored.reconstruct(truth.data), shapes, atol=1e-9)
+    if camera != "affine":
+        assert_allclose(np.linalg.det(mirrored.rotations_), 1)
+        assert_allclose(mirrored.rotations_, depth[:, None] * model.rotations_ * depth)
+    again = mirrored.mirror()
+    assert_array_equal(again.basis_, model.basis_)
+    assert_array_equal(again.mode_covariance_, model.mode_covariance_)
+
+
+@pytest.mark.parametrize("camera", CALIBRATED)
+def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
+    model, truth = calibrated(camera)
+    assert_array_equal(
+        model.reconstruct(truth.data, camera=camera), model.reconstruct(truth.data)
+    )
+    other = "orthographic" if camera == "weak_perspective" else "weak_perspective"
+    with pytest.raises(ValueError, match=f"fitted with camera='{camera}'"):
+        model.reconstruct(truth.data, camera=other)
+
+
+@pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
+def test_the_number_of_components_is_found(camera):
+    truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)
+    model = AffineNRSfM("auto", camera=camera, random_state=0).fit(truth.data)
+    assert len(model.basis_) == 2
+    assert model.get_feature_names_out().tolist() == ["affinenrsfm0", "affinenrsfm1"]
+    given = AffineNRSfM(2, camera=camera, random_state=0).fit(truth.data)
+    assert_array_equal(model.alpha_, given.alpha_)
+
+
+def test_a_table_that_asks_for_more_components_says_so():
+    truth = make_nonrigid_tracks(120, 19, 5, noise=0.005, random_state=0)
+    with pytest.warns(UserWarning, match="may ask for more than n_components=5"):
+        AffineNRSfM("auto", random_state=0).fit(truth.data)
+
+
+def test_the_number_of_components_is_found_by_the_joint_refinement_only():
+    with pytest.raises(ValueError, match="'auto' needs refinement='joint'; got"):
+        estimator("auto", refinement=None).fit(TABLE)
+
+
+@pytest.mark.parametrize(
+    ("truth", "n_components", "least", "most", "meaning"),
+    [
+        ("weak_perspective", 2, 1.0, 1.1, "as well as affine ones"),
+        ("affine", 2, 10.0, np.inf, "not calibrated ones"),
+    ],
+)
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+def test_diagnostics_say_what_the_cameras_are(
+    camera, truth, n_components, least, most, meaning
+):
+    table = make_nonrigid_tracks(
+        150, 40, 2, camera=truth, noise=0.02, random_state=0
+    ).data
+    model = AffineNRSfM(n_components, camera=camera, random_state=0).fit(table)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = model.diagnostics()
+    assert found.camera_noise_ratio == model.camera_noise_ratio_
+    assert least <= found.camera_noise_ratio < most
+    assert meaning in found.camera_meaning

@@ -373,8 +373,7 @@ def _calibrated_fit(
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
             break
-        again = _refined(problem, state, cameras, least_noise)
-        result = result.followed_by(again)
+        result = _refined(problem, state, cameras, least_noise)
     return result
 
 
@@ -424,14 +423,11 @@ def _without_floor(
     """Return the fit without a floor of the noise, None if it ends above a level."""
     steps = {"max_iter": min(RELEASED_STEPS, problem.steps.max_iter)}
     for _ in range(problem.steps.max_iter // steps["max_iter"]):
-        before = result
-        state = before.state
+        before, state = result.state.noise, result.state
         if cameras.calibrated:
             state, _ = problem.reversed_back(state, cameras)
-        result = before.followed_by(
-            _refined(problem, state, cameras, NOISE_FLOOR, **steps)
-        )
-        if result.state.noise > FALLING * before.state.noise:
+        result = _refined(problem, state, cameras, NOISE_FLOOR, **steps)
+        if result.state.noise > FALLING * before:
             break
     return result if result.state.noise < right else None
 

@@ -87,7 +87,8 @@ def in_all_points(
         problem = problem.of(frames)
         shapes = frames.coordinates(after.reshape(before.shape))
         further = refined(problem, state._replace(shapes=shapes))
-        result = result.followed_by(further)
+        history = np.concatenate([result.history, further.history])
+        result = further._replace(history=history)
     return result, problem
 
 

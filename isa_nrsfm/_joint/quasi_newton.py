@@ -92,10 +92,6 @@ class JointResult(NamedTuple):
     residual: float
     left: float
 
-    def followed_by(self, other: "JointResult") -> "JointResult":
-        """Return the result of another refinement of the same objective after this."""
-        return other._replace(history=np.concatenate([self.history, other.history]))
-
 
 def refine_joint(
     likelihood: MarginalLikelihood,
