@@ -71,6 +71,7 @@ sphinx_gallery_conf = {
     "within_subsection_order": ExplicitOrder(
         [
             "plot_method.py",
+            "plot_cameras.py",
             "plot_choosing_k.py",
             "plot_missing_and_outliers.py",
             "plot_pose_and_units.py",
