@@ -53,6 +53,17 @@ print("held-out errors, %:", -100 * search.cv_results_["mean_test_score"].round(
 # rows belong to persons, and new persons are what matters, hold persons out:
 # ``GridSearchCV(..., cv=GroupKFold()).fit(X, groups=person)``.
 #
+# Without a search
+# ----------------
+#
+# ``n_components="auto"`` fits twelve basis shapes, or as many as the table allows, and
+# takes those that the table determines: a few fits less, and it does not need frames to
+# be held out.
+
+auto = AffineNRSfM("auto", random_state=0).fit(tracks.data)
+print('"auto" finds', len(auto.basis_))
+
+# %%
 # Diagnostics
 # -----------
 #
@@ -81,9 +92,12 @@ for k in (3, 5):
 #   frames may be an outlier, such as a single bad detection.
 # - ``weak_deviations``: standard deviations of those parts of the basis shapes that
 #   cameras can absorb.
+# - ``camera_noise_ratio`` and ``camera_meaning``: whether the table agrees with
+#   calibrated cameras (:doc:`plot_cameras`).
 
 for name, figures in models[3].diagnostics()._asdict().items():
-    print(f"{name:22}", np.round(figures, 4))
+    shown = figures if isinstance(figures, str) else np.round(figures, 4)
+    print(f"{name:22}", shown)
 
 # %%
 # Real faces

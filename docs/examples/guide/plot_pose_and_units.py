@@ -5,15 +5,16 @@ Units, true proportions and head pose
 What are the units of the shapes? Where is the metric size? How is the head turned?
 Images alone do not say how large a thing is, nor, in affine cameras, what its angles
 and proportions in depth are: see :doc:`/conventions`. This page shows what can be had,
-and what for.
+and what for; :doc:`plot_cameras` says which camera to choose.
 
 In short:
 
 - ``motion_`` and ``translation_`` are in the units of the table, pixels for instance.
-- ``mean_shape_`` and ``basis_`` have no unit: the mean shape is white. Only together
-  with the cameras they are images.
+- ``mean_shape_`` and ``basis_`` have no unit. With affine cameras the mean shape is
+  white, and only together with the cameras they are images.
 - With cameras taken for weak-perspective ones (photos from afar, square pixels) shapes
   have true proportions, rotations are poses, and only the unit of length is free.
+- With orthographic cameras, which have one scale, shapes are in the units of the table.
 - One known length, such as the distance of the pupils, gives the unit.
 - What remains is the mirror image in depth.
 """
@@ -33,8 +34,8 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 faces = make_face_tracks(n_frames=300, random_state=0)
-model = AffineNRSfM(4, random_state=0).fit(faces.data)
-M = model.mean_shape_
+affine = AffineNRSfM(4, random_state=0).fit(faces.data)
+M = affine.mean_shape_
 print("mean of b b^T over the points of the mean shape:")
 print((M.T @ M / len(M)).round(6))
 
@@ -42,15 +43,25 @@ print((M.T @ M / len(M)).round(6))
 # True proportions
 # ----------------
 #
-# `AffineNRSfM.reconstruct` with ``camera="weak_perspective"`` returns them in one step.
-# The functions that it uses give rotations and scales, too.
+# A fit with weak-perspective cameras has them, and rotations and scales.
 
-metric = deformation_metric(model.motion_, model.alpha_)
+model = AffineNRSfM(4, camera="weak_perspective", random_state=0).fit(faces.data)
+shapes = model.reconstruct(faces.data)
+error = mean_shape_error_3d(faces.shapes, shapes, convention="frame")
+print(f"error of the 3D shapes {error:.2%} of their size")
+print(f"noise variance {model.camera_noise_ratio_:.2f} times that of affine cameras")
+
+# %%
+# A model with affine cameras gets them afterwards: `AffineNRSfM.reconstruct` with
+# ``camera="weak_perspective"`` finds the metric of space in which its cameras are
+# scaled rotations. The functions that it uses give rotations and scales.
+
+metric = deformation_metric(affine.motion_, affine.alpha_)
 frames = euclidean_frames(
-    metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
+    metric, affine.motion_, affine.alpha_, affine.mean_shape_, affine.basis_
 )
 error = mean_shape_error_3d(faces.shapes, frames.shapes, convention="frame")
-print(f"error of the 3D shapes {error:.2%} of their size")
+print(f"error of the 3D shapes of affine cameras {error:.2%} of their size")
 
 # %%
 # Upright and frontal
@@ -60,7 +71,7 @@ print(f"error of the 3D shapes {error:.2%} of their size")
 # order of iBUG the scheme says it; else give pairs of points, such as
 # ``left_right=[(right_eye, left_eye)], up=[(chin, nose)], front=[(ears, nose)]``.
 
-pose = canonical_pose(frames.shapes.mean(axis=0), scheme="ibug-68")
+pose = canonical_pose(shapes.mean(axis=0), scheme="ibug-68")
 before = M - M.mean(axis=0)
 _, axes = plt.subplots(1, 4, figsize=(9, 3), layout="constrained")
 for shape, (front, side), what in (
@@ -85,7 +96,7 @@ for axis in axes:
 
 turn = pose.rotation
 mirror = np.diag([1.0, 1.0, np.linalg.det(turn)])
-found = Rotation.from_matrix(mirror @ frames.rotations @ turn.T)
+found = Rotation.from_matrix(mirror @ model.rotations_ @ turn.T)
 
 # The true rotations, of the true face in the same upright position.
 upright = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
@@ -119,10 +130,10 @@ true_width = np.ptp(faces.mean_shape[:, 0])
 print(f"width of the face: {width:.1f} mm, in truth {true_width:.1f} mm")
 
 # %%
-# How large each frame is in the image, the scale of its camera, is ``frames.scales``
-# times that: pixels a millimetre. It says how far the camera was, if its focal length
+# How large each frame is in the image, the scale of its camera, is ``scales_`` over
+# that: pixels a millimetre. It says how far the camera was, if its focal length
 # is known.
 
-scales = frames.scales / millimetres
+scales = model.scales_ / millimetres
 print("pixels a millimetre:", scales[:4].round(3))
 print("in truth:           ", np.linalg.norm(faces.motion[:4, 0], axis=1).round(3))
