@@ -268,7 +268,7 @@ class TestCameras:
     def test_history_never_rises(self, camera, gaps):
         for deviation in (0.0, DEVIATION):
             result = fit_of(camera, None, 0, gaps, deviation).result
-            assert len(result.history) > 3
+            assert len(result.history) > 1
             assert (np.diff(result.history) <= 0).all()
 
     @CALIBRATED

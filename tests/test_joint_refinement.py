@@ -549,17 +549,6 @@ class TestLeastNoise:
         assert result.residual == pytest.approx(np.mean(rest**2))
         assert result.left == max(result.residual, result.state.noise)
 
-    def test_one_refinement_after_another(self):
-        scene = random_scene()
-        first = refined(scene, max_iter=3)
-        second = refined(scene, first.state, max_iter=4)
-        both = first.followed_by(second)
-        assert_array_equal(
-            both.history, np.concatenate([first.history, second.history])
-        )
-        for got, expected in zip(both.state, second.state, strict=True):
-            assert_array_equal(got, expected)
-
 
 class TestWithoutNoise:
     @KINDS
