@@ -4,7 +4,9 @@ A factorisation into affine cameras and shapes is known up to one 3x3 affinity o
 its lengths and angles mean nothing. If the cameras are known to be orthographic or
 scaled orthographic (weak perspective) ones, as those of objects that are small
 compared with their distance, and with square pixels, the space can be upgraded to one
-with true angles and proportions:
+with true angles and proportions. ``AffineNRSfM(camera="weak_perspective")`` and
+``"orthographic"`` fit such cameras, and their shapes need no upgrade. For affine ones,
+and cameras of other programs:
 
 - `metric_upgrade` finds the affinity from the cameras, `euclidean_shapes` applies it;
 - `deformation_metric` and `euclidean_frames` do the same for shapes that deform. They

@@ -59,6 +59,8 @@ FIRST_DAMPING = 0.1
 RAISED, EASED = 8.0, 0.1
 SMALLEST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e8
+# A search that has so many times as far to go as a step promises leads nowhere better.
+PROMISED = 10.0
 # No step turns a camera by more than that, in radians.
 LARGEST_TURN = 1.0
 ROUGH_STEPS = 3
@@ -127,9 +129,7 @@ class CalibratedSearch:
         problem = _problem(products, variance, self._models)
         motion = _first_cameras(problem, initial)
         motion, converged = _descend(problem, motion, max_steps)
-        other, reached = _descend(problem, _reversed(motion), max_steps)
-        better = _better(problem, motion, other)
-        motion[:, :, better] = other[:, :, better]
+        motion, better, reached = _better_reversed(problem, motion, max_steps)
         converged[better] = reached[better]
         return _found(problem, motion, converged)
 
@@ -159,8 +159,7 @@ class CalibratedSearch:
         problem = _problem(products, np.full(len(motion), noise), self._models)
         # Cameras may not be at their minimum yet: that of both sides is compared.
         turned, _ = _descend(problem, turned, REVERSED_STEPS)
-        other, _ = _descend(problem, _reversed(turned), REVERSED_STEPS)
-        better = _better(problem, turned, other)
+        other, better, _ = _better_reversed(problem, turned, REVERSED_STEPS)
         motion = motion.copy()
         motion[better] = self.cameras(other[:, :, better].transpose(2, 0, 1))
         return motion, better
@@ -173,10 +172,7 @@ class CalibratedSearch:
         zero = np.zeros((len(self.shapes) - 1, len(variance)))
         motion = _first_cameras(problem, zero)
         motion, _ = _descend(problem, motion, ROUGH_STEPS)
-        other, _ = _descend(problem, _reversed(motion), ROUGH_STEPS)
-        better = _better(problem, motion, other)
-        motion[:, :, better] = other[:, :, better]
-        return motion
+        return _better_reversed(problem, motion, ROUGH_STEPS)[0]
 
 
 class _Problem(NamedTuple):
@@ -226,13 +222,15 @@ def _reversed(motion: NDArray) -> NDArray:
     return motion * np.array([1.0, 1.0, -1.0])[:, None]
 
 
-def _better(problem: _Problem, motion: NDArray, other: NDArray) -> NDArray:
-    """Return which frames have a lower objective with other cameras."""
-    values = [
-        posterior.objective + problem.noise * posterior.log_determinant
-        for posterior in (_posterior(problem, motion), _posterior(problem, other))
-    ]
-    return values[1] < values[0] - EQUAL * (problem.products.energy + problem.noise)
+def _better_reversed(
+    problem: _Problem, motion: NDArray, max_steps: int
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the better ones of cameras and the reversed ones' minima, and which."""
+    value = _value(problem, _posterior(problem, motion))
+    limit = value - EQUAL * (problem.products.energy + problem.noise)
+    other, converged = _descend(problem, _reversed(motion), max_steps, limit)
+    better = _value(problem, _posterior(problem, other)) < limit
+    return np.where(better, other, motion), better, converged
 
 
 def _packed3(full: NDArray) -> NDArray:
@@ -258,6 +256,11 @@ class _State(NamedTuple):
         """Set the state of some of the frames."""
         for each, given in zip(self, other, strict=True):
             each[..., frames] = given
+
+
+def _value(problem: _Problem, posterior: CoefficientPosterior) -> NDArray:
+    """Return the objective F times s2."""
+    return posterior.objective + problem.noise * posterior.log_determinant
 
 
 def _posterior(problem: _Problem, motion: NDArray) -> CoefficientPosterior:
@@ -326,17 +329,23 @@ def _evaluate(problem: _Problem, motion: NDArray) -> _State:
     hessian = known + bent
     rows, columns = np.triu_indices(cameras.n_parameters)
     hessian -= np.einsum("pki,pki->pi", through[rows], coupling[columns])
-    value = posterior.objective + noise * posterior.log_determinant
+    value = _value(problem, posterior)
     slope = -cameras.gradient(motion, G)
     return _State(motion, value, slope, known, hessian)
 
 
 def _descend(
-    problem: _Problem, motion: NDArray, max_steps: int
+    problem: _Problem, motion: NDArray, max_steps: int, limit: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
-    """Return the minima reached from cameras, and whether they are reached."""
+    """
+    Return the minima reached from cameras, and whether they are reached.
+
+    Frames whose objective will not fall below their limit, by what a step promises, are
+    left where they are.
+    """
     found, converged = motion.copy(), np.zeros(motion.shape[2], dtype=bool)
     running, damping = np.arange(motion.shape[2]), np.zeros(motion.shape[2])
+    limit = np.full(len(running), np.inf) if limit is None else limit
     state = _evaluate(problem, motion)
     for _ in range(max_steps):
         step, damping = _newton_step(state, damping)
@@ -344,6 +353,7 @@ def _descend(
         gain = np.einsum("ci,ci->i", state.slope, step)
         small = (damping == 0) & (gain <= TOLERANCE * energy)
         leaving = small | (damping >= LARGEST_DAMPING)
+        leaving |= state.value - PROMISED * gain > limit
         if leaving.any():
             last = problem.cameras.moved(state.motion, np.where(small, step, 0.0))
             found[:, :, running[leaving]] = last[:, :, leaving]
@@ -352,6 +362,7 @@ def _descend(
             if not len(left):
                 return found, converged
             running, damping, step = running[left], damping[left], step[:, left]
+            limit = limit[left]
             problem, state = problem.take(left), state.take(left)
             energy = energy[left]
         trial = _evaluate(problem, problem.cameras.moved(state.motion, step))

@@ -68,8 +68,10 @@ FALLING = 0.7
 CUT_OFF = 3.0
 # Rounds in which frames that are reversed in depth are turned.
 REVERSALS = 5
-# Steps of the fit that is only compared.
+# Steps of the fit that is only compared, and of those of a sample among which one is
+# chosen.
 COMPARED_STEPS = 60
+RACE_STEPS = 5
 
 
 class Spectrum(NamedTuple):
@@ -341,17 +343,18 @@ def _first_fit(
     result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
     # Free cameras, from there and from the paper's result: the fit itself, or only to
     # be compared.
+    states = [
+        problem.aligned(result.state, "affine"),
+        affine_start(problem, sample.W, paper_shapes),
+    ]
+    refined = partial(_refined, problem, cameras=CAMERAS["affine"])
     max_iter = problem.steps.max_iter
     if camera != "affine":
         max_iter = min(max_iter, COMPARED_STEPS)
-    states = (
-        problem.aligned(result.state, "affine"),
-        affine_start(problem, sample.W, paper_shapes),
-    )
-    free = _least(
-        _refined(problem, state, CAMERAS["affine"], max_iter=max_iter)
-        for state in states
-    )
+    if not problem.steps.to_the_end:
+        first = _least(refined(s, max_iter=min(max_iter, RACE_STEPS)) for s in states)
+        states = [first.state]
+    free = _least(refined(state, max_iter=max_iter) for state in states)
     ratio = result.left / min(free.left, result.left)
     return free if camera == "affine" else result, ratio
 
@@ -369,7 +372,8 @@ def _calibrated_fit(
 ) -> JointResult:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
     result = _refined(problem, state, cameras, least_noise)
-    for _ in range(REVERSALS):
+    # Samples lead to a start for all frames, which is looked at from both sides.
+    for _ in range(REVERSALS if problem.steps.to_the_end else 0):
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
             break
@@ -398,22 +402,22 @@ def _with_its_noise(
     Return the fit of a sample with the noise that its table has, and the least noise.
 
     A model is right if it leaves no more than any table of its rank does. Then what is
-    left is noise, however little, and needs no floor. Otherwise it is what the basis
-    shapes that are missing would explain, and calibrated cameras are told how much
-    that is.
+    left is noise, however little, and needs no floor. If a model that is not right
+    leaves less than the floor, something else takes the place of the basis shapes that
+    are missing: calibrated cameras are told how much these would explain.
     """
     n_seen, energy = problem.totals
     mean_square = energy / n_seen
+    if result.state.noise > (1 + SLACK) * LEAST_NOISE * mean_square:
+        return result, LEAST_NOISE
     right = max(RIGHT * spectrum.noise, EXACT) * mean_square
-    if result.state.noise < (1 + SLACK) * LEAST_NOISE * mean_square:
-        free = _without_floor(problem, result, cameras, right)
-        if free is not None:
-            return free, NOISE_FLOOR
+    free = _without_floor(problem, result, cameras, right)
+    if free is not None:
+        return free, NOISE_FLOOR
     least_noise = LEAST_NOISE
-    if cameras.calibrated and result.state.noise > right:
+    if cameras.calibrated:
         least_noise = max(LEAST_NOISE, CUT_OFF * spectrum.missing)
-        if result.state.noise < least_noise * mean_square:
-            result = _calibrated_fit(problem, result.state, cameras, least_noise)
+        result = _calibrated_fit(problem, result.state, cameras, least_noise)
     return result, least_noise
 
 

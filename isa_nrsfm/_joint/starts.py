@@ -27,6 +27,8 @@ from isa_nrsfm._sampling import rigid_energy, spread
 
 # Columns of the mixtures: three for the rigid object and as many for each basis shape.
 WIDTHS = (6, 9, 12, 18, 24, 36)
+# Most Levenberg-Marquardt steps of each mixture.
+MIXING_STEPS = 20
 # Steps of all starts with their cameras held, and of the best with cameras that move.
 HELD_STEPS = 6
 FREED_STEPS = 30
@@ -113,10 +115,10 @@ def mixed_cameras(
     unit = rows if scales is None else rows / scales[:, None, None]
     P = principal_columns(unit.reshape(2 * len(unit), -1)).reshape(len(unit), 2, -1)
     few = P[chosen].reshape(2 * len(chosen), -1)
-    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3))
+    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=MIXING_STEPS)
     rank = P.shape[2]
     for n in sorted({min(n, rank) for n in WIDTHS if n < rank + 3}):
-        mixing, _ = orthonormal_mixture(few[:, :n], mixing)
+        mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=MIXING_STEPS)
         found, sizes = nearest_calibrated(P[..., :n] @ mixing)
         yield found if scales is None else (scales * sizes)[:, None, None] * found
 
