@@ -6,14 +6,15 @@ from numpy.testing import assert_allclose
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import calibration
+from isa_nrsfm import AffineNRSfM, calibration
 from isa_nrsfm.calibration import (
+    canonical_pose,
     deformation_metric,
     euclidean_frames,
     euclidean_shapes,
     metric_upgrade,
 )
-from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 CAMERAS = ["orthographic", "weak_perspective"]
@@ -530,3 +531,42 @@ class TestEuclideanFrames:
 
 def test_public_names():
     assert all(hasattr(calibration, name) for name in calibration.__all__)
+
+
+@both_cameras
+class TestModelsWithCalibratedCameras:
+    @pytest.fixture
+    def faces(self, camera):
+        return make_face_tracks(
+            120, n_components=2, camera=camera, noise=0.005, random_state=0
+        )
+
+    @pytest.fixture
+    def model(self, faces, camera):
+        return AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+
+    def test_the_metric_is_the_identity_up_to_scale(self, model, recwarn):
+        metric = deformation_metric(model.motion_, model.alpha_)
+        scale = np.trace(metric.Q) / 3
+        assert_allclose(metric.Q, scale * np.eye(3), atol=1e-6 * scale)
+        assert_allclose(metric.strain, 0.0, atol=1e-6)
+        assert metric.residual < 1e-10
+        assert len(recwarn) == 0
+
+    def test_the_upgrade_gives_the_shapes_of_the_model_turned(self, model, faces):
+        metric = deformation_metric(model.motion_, model.alpha_)
+        frames = euclidean_frames(
+            metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
+        )
+        shapes = model.reconstruct(faces.data)
+        assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6
+
+    def test_rotations_are_the_pose_of_the_head(self, model, faces):
+        turn = canonical_pose(model.mean_shape_, scheme="ibug-68").rotation
+        true = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
+        mirror = np.diag([1.0, 1.0, np.linalg.det(turn)])
+        found = Rotation.from_matrix(mirror @ model.rotations_ @ turn.T)
+        expected = Rotation.from_euler("yxz", faces.angles, degrees=True)
+        expected *= Rotation.from_matrix(true).inv()
+        apart = np.rad2deg((found * expected.inv()).magnitude())
+        assert apart.mean() < 1.0

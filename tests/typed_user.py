@@ -41,6 +41,13 @@ def of_attributes(model: AffineNRSfM) -> Floats:
     return upright * model.noise_variance_ * model.n_iter_
 
 
+def of_calibrated_cameras(table: Floats) -> tuple[Floats, str]:
+    model = AffineNRSfM("auto", camera="weak_perspective").fit(table).mirror()
+    poses: Floats = model.rotations_ * model.scales_[:, None, None]
+    ratio: float = model.camera_noise_ratio_
+    return poses * ratio, model.diagnostics().camera_meaning
+
+
 def main(folder: Path) -> float:
     faces = make_face_tracks(n_frames=100, random_state=0)
     points, _ = landmark_table(pd.read_csv(folder / "faces.csv"))
@@ -48,6 +55,7 @@ def main(folder: Path) -> float:
     fitted(make_nonrigid_tracks(60, 20, 2).data).fit(open_table(folder / "faces.npy"))
     of_methods(model, faces.data, folder)
     of_attributes(model)
+    of_calibrated_cameras(faces.data)
     alpha: Floats = BlockMatrixNRSfM(n_components=2).fit_transform(faces.data)
     BasisShapeDisplay.from_estimator(model).plot()
     error: float = affine_shape_error(faces.shapes, model.reconstruct(faces.data))
