@@ -22,13 +22,17 @@ if TYPE_CHECKING:
 _N_FRAMES = 400
 _N_COMPONENTS = 3
 _TRIED = "1-5"
+# The cameras by which the faces are made.
+_CAMERA = "weak_perspective"
 _SEED = 0
 
 
 def run_demo(args: Namespace, warned: list[str]) -> str:
     """Fit a table of artificial faces, and return the report with the truth."""
     pd = import_optional("pandas", extra="io")
-    faces = make_face_tracks(_N_FRAMES, n_components=_N_COMPONENTS, random_state=_SEED)
+    faces = make_face_tracks(
+        _N_FRAMES, n_components=_N_COMPONENTS, camera=_CAMERA, random_state=_SEED
+    )
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
     table.insert(0, "frame", [f"face{i:03d}" for i in range(_N_FRAMES)])
     folder = Path(args.output)
@@ -39,6 +43,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
     options = [
         *("fit", str(path)),
         *("--n-components", _TRIED),
+        *("--camera", _CAMERA),
         *("--output", str(folder)),
         *(["--no-figures"] if args.no_figures else []),
     ]
