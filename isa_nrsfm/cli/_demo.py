@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -23,7 +23,7 @@ _N_FRAMES = 400
 _N_COMPONENTS = 3
 _TRIED = "1-5"
 # The cameras by which the faces are made.
-_CAMERA = "weak_perspective"
+_CAMERA: Final = "weak_perspective"
 _SEED = 0
 
 
