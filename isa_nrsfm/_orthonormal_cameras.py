@@ -12,6 +12,8 @@ from sklearn.utils import check_array
 STEP = 3
 # A column that the ones before it determine up to this share of it is left out.
 DEPENDENT = 1e-10
+# Share of the largest squared singular value that is rounding errors.
+NO_ENERGY = 1e-13
 # Steps after which starts can be compared: the best of the twenty then leads to the
 # least cost, or close to it.
 ROUGH_STEPS = 8
@@ -321,5 +323,5 @@ def principal_columns(W: NDArray) -> NDArray:
         as columns of cameras are on average.
     """
     square, V = np.linalg.eigh(W.T @ W)
-    kept = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
+    kept = np.flatnonzero(square > NO_ENERGY * square[-1])[::-1]
     return W @ (V[:, kept] * np.sqrt(len(W) / 3 / square[kept]))

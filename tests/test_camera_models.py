@@ -234,11 +234,23 @@ class TestLargestLength:
         assert turned.max() == pytest.approx(1.0)
 
     @CALIBRATED
-    def test_scales_do_not_count(self, name):
+    def test_scales_count_by_their_logarithm(self, name):
         cameras = CAMERAS[name]
         step = np.zeros((cameras.n_parameters, N))
         step[3:] = 100.0
-        assert cameras.largest_length(step) == np.inf
+        expected = 0.01 if cameras.scaled else np.inf
+        assert cameras.largest_length(step) == pytest.approx(expected)
+
+    @CALIBRATED
+    def test_limited_steps_are_shortened_one_by_one(self, name):
+        cameras = CAMERAS[name]
+        rng = np.random.default_rng(0)
+        step = rng.normal(size=(cameras.n_parameters, N)) * np.linspace(0.1, 3, N)
+        for before, after in zip(step.T, cameras.limited(step).T, strict=True):
+            size = np.linalg.norm(before[:3])
+            if cameras.scaled:
+                size = max(size, abs(before[3]))
+            assert_allclose(after, before / max(size, 1.0))
 
     def test_other_cameras_have_none(self):
         assert AffineCameras().largest_length(np.full((6, N), 1e9)) == np.inf

@@ -455,7 +455,7 @@ class TestDegenerate:
 @pytest.fixture(scope="module")
 def mocap(load_data):
     """Return the tracks of a moving body, and shapes that explain them."""
-    return fitted_shapes(load_data("akhter_yoga")["W2d"], 4)
+    return fitted_shapes(load_data("akhter_yoga")["W2d"], 2)
 
 
 def fitted_shapes(tracks, n_components):

@@ -14,8 +14,8 @@ from sklearn.base import BaseEstimator
 
 from isa_nrsfm import FastISA, PooledFastICA
 from isa_nrsfm._block_structure import BLOCK_RECOVERIES
-from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._factorisation import factorise, leading_triplets
+from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._paper import SIGNAL_DECIMALS, run_paper_pipeline
 
 OPTIONS = {

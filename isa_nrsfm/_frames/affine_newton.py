@@ -69,6 +69,8 @@ class AffineSearch:
         The shapes in the space of `whitened`, where the search takes place.
     """
 
+    first_steps = 5
+
     def __init__(self, shapes: NDArray):
         self.shapes, self._space = whitened(np.ascontiguousarray(shapes))
 

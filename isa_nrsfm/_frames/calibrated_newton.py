@@ -34,7 +34,7 @@ from isa_nrsfm._frames.coefficients import (
     CoefficientPosterior,
     coefficient_posterior,
 )
-from isa_nrsfm._frames.search import FoundFrames
+from isa_nrsfm._frames.search import MAX_STEPS, FoundFrames
 from isa_nrsfm._small_matrices import (
     COLUMNS,
     ROWS,
@@ -61,8 +61,6 @@ SMALLEST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e8
 # A search that has so many times as far to go as a step promises leads nowhere better.
 PROMISED = 10.0
-# No step turns a camera by more than that, in radians.
-LARGEST_TURN = 1.0
 ROUGH_STEPS = 3
 REVERSED_STEPS = 6
 
@@ -84,6 +82,8 @@ class CalibratedSearch:
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         The shapes, turned to the principal axes of the mean shape.
     """
+
+    first_steps = MAX_STEPS  # frames that have converged do not take part
 
     def __init__(self, shapes: NDArray, scaled: bool):
         self._models = CalibratedCameras(scaled)
@@ -171,8 +171,7 @@ class CalibratedSearch:
         problem = _problem(products, variance, self._models)
         zero = np.zeros((len(self.shapes) - 1, len(variance)))
         motion = _first_cameras(problem, zero)
-        motion, _ = _descend(problem, motion, ROUGH_STEPS)
-        return _better_reversed(problem, motion, ROUGH_STEPS)[0]
+        return _descend(problem, motion, ROUGH_STEPS)[0]
 
 
 class _Problem(NamedTuple):
@@ -204,11 +203,34 @@ def _first_cameras(problem: _Problem, alpha: NDArray) -> NDArray:
     seen = np.einsum("ki,kari->rai", c, products.cross)  # W S^T
     T = products.gram.products(c)
     inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, _packed3(T)))
-    affine = np.einsum("rbi,bai->rai", seen, inverse)
-    rows, scales = nearest_calibrated(affine.transpose(2, 0, 1))
-    if problem.cameras.scaled:
-        rows = scales[:, None, None] * rows
-    return np.ascontiguousarray(rows.transpose(1, 2, 0))
+    affine = np.einsum("rbi,bai->rai", seen, inverse).transpose(2, 0, 1)
+    starts = [nearest_calibrated(affine), _completed(affine)]
+    if not problem.cameras.scaled:
+        starts = [(rows, np.ones(len(rows))) for rows, _ in starts]
+    first, other = (
+        np.ascontiguousarray((scales[:, None, None] * rows).transpose(1, 2, 0))
+        for rows, scales in starts
+    )
+    values = [_value(problem, _posterior(problem, each)) for each in (first, other)]
+    return np.where(values[1] < values[0], other, first)
+
+
+def _completed(affine: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return orthonormal rows, and scales, by what is seen of the two widest axes.
+
+    Of thin objects the third column of an affine camera is not determined. The first
+    two, ``A = U diag(s_1, s_2) V^T``, are those of a scaled rotation whose third column
+    is ``sqrt(s_1^2 - s_2^2) u_2``.
+    """
+    U, values, Vt = np.linalg.svd(affine[:, :, :2])
+    scale = np.where(values[:, 0] > 0, values[:, 0], 1.0)
+    cosine = values[:, 1] / scale
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    depth = sine[:, None] * U[:, :, 1]
+    sign = np.where(np.einsum("ir,ir->i", depth, affine[:, :, 2]) < 0, -1.0, 1.0)
+    block = (U * np.stack([np.ones_like(cosine), cosine], axis=1)[:, None]) @ Vt
+    return np.concatenate([block, (sign[:, None] * depth)[..., None]], axis=2), scale
 
 
 def _reversed(motion: NDArray) -> NDArray:
@@ -349,6 +371,7 @@ def _descend(
     state = _evaluate(problem, motion)
     for _ in range(max_steps):
         step, damping = _newton_step(state, damping)
+        step = problem.cameras.limited(step)
         energy = problem.products.energy + problem.noise
         gain = np.einsum("ci,ci->i", state.slope, step)
         small = (damping == 0) & (gain <= TOLERANCE * energy)
@@ -388,8 +411,7 @@ def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
         matrix = part.hessian + damping[failing] * part.known
         step[:, failing], positive = solve_positive(matrix, part.slope)
         failing = failing[~positive & (damping[failing] < LARGEST_DAMPING)]
-    angle = np.sqrt(np.einsum("ci,ci->i", step[:3], step[:3]))
-    return step * np.minimum(1.0, LARGEST_TURN / np.maximum(angle, 1e-300)), damping
+    return step, damping
 
 
 def _found(problem: _Problem, motion: NDArray, converged: NDArray) -> FoundFrames:

@@ -24,7 +24,8 @@ from isa_nrsfm._small_matrices import COLUMNS, ROWS, inverse3, unpack3
 
 # Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
 RIDGE = 1e-9
-# No camera turns by more than that, in radians, in one step.
+# No camera turns by more than that, in radians, in one step, and no logarithm of a
+# scale changes by more.
 LARGEST_TURN = 1.0
 
 
@@ -64,6 +65,9 @@ class CameraModel(Protocol):
     def largest_length(self, step: NDArray) -> float:
         """Return how many times a step may be made at once."""
 
+    def limited(self, step: NDArray) -> NDArray:
+        """Return steps (n_parameters, n), shortened to what may be made at once."""
+
 
 class AffineCameras:
     """Free 2x3 matrices; the parameters are their entries, row by row."""
@@ -98,6 +102,10 @@ class AffineCameras:
         """Return infinity: any matrix is a camera."""
         return np.inf
 
+    def limited(self, step: NDArray) -> NDArray:
+        """Return the steps: any matrix is a camera."""
+        return step
+
 
 class HeldCameras:
     """Cameras that are known."""
@@ -129,6 +137,10 @@ class HeldCameras:
     def largest_length(self, step: NDArray) -> float:
         """Return infinity."""
         return np.inf
+
+    def limited(self, step: NDArray) -> NDArray:
+        """Return the steps, of no parameters."""
+        return step
 
 
 class CalibratedCameras:
@@ -193,9 +205,18 @@ class CalibratedCameras:
         return np.einsum("abn,bn->an", inverse, vector)
 
     def largest_length(self, step: NDArray) -> float:
-        """Return what turns no camera by more than a radian."""
-        angle = np.sqrt(np.einsum("an,an->n", step[:3], step[:3]).max(initial=0.0))
-        return LARGEST_TURN / angle if angle > 0 else np.inf
+        """Return what moves no camera by more than a radian or a factor of e."""
+        size = self._sizes(step).max(initial=0.0)
+        return LARGEST_TURN / size if size > 0 else np.inf
+
+    def limited(self, step: NDArray) -> NDArray:
+        """Return steps that move no camera by more than a radian or a factor of e."""
+        return step * (LARGEST_TURN / np.maximum(self._sizes(step), LARGEST_TURN))
+
+    def _sizes(self, step: NDArray) -> NDArray:
+        """Return the angles of steps, or the logarithms of scales where larger."""
+        angle = np.sqrt(np.einsum("an,an->n", step[:3], step[:3]))
+        return np.maximum(angle, np.abs(step[3])) if self.scaled else angle
 
 
 CAMERAS: dict[str, CameraModel] = {

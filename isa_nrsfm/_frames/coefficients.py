@@ -65,8 +65,10 @@ class CoefficientPosterior(NamedTuple):
 
     def second_moments(self, noise: NDArray | float) -> NDArray:
         """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
-        moments = self.inverse * -noise
-        moments[: len(self.c)] = 0.0
+        n_shapes = len(self.c)
+        moments = np.empty_like(self.inverse)
+        moments[:n_shapes] = 0.0
+        np.multiply(self.inverse[n_shapes:], -noise, out=moments[n_shapes:])
         for k, row in enumerate(packed_rows(moments)):
             row += self.c[k] * self.c[k:]
         return moments

@@ -21,16 +21,13 @@ from isa_nrsfm._frame_products import (
 )
 from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
-from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch
 from isa_nrsfm._small_matrices import unpacked
 
 # Frames in a block: enough to be worth the calls, few enough for the cache. Frames
 # with missing points have a Gram matrix each.
 COMPLETE_BLOCK = 2048
 WEIGHTED_BLOCK = 512
-MAX_STEPS = 60
-# Steps after which the frames that have not converged are brought together.
-FIRST_STEPS = 5
 # Objectives that differ by less than this share of them are equal.
 EQUAL = 1e-10
 # An objective so many times what the noise explains may be a minimum too high.
@@ -298,7 +295,7 @@ def _best_fits(
         part = frames if every else frames.take(chosen)
         return _fit(part, search, variance[chosen], initial, max_steps)
 
-    fits = fit(np.arange(n_frames), first, FIRST_STEPS)
+    fits = fit(np.arange(n_frames), first, search.first_steps)
     # The few frames that take longer are brought together: short rows are slow.
     slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
     if len(slow):

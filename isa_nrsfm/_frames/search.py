@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frame_products import FrameProducts
 
+# The most steps of a search.
+MAX_STEPS = 60
+
 
 class FoundFrames(NamedTuple):
     """
@@ -36,9 +39,20 @@ class FoundFrames(NamedTuple):
 
 
 class FrameSearch(Protocol):
-    """A search for the cameras of one model that see given shapes."""
+    """
+    A search for the cameras of one model that see given shapes.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        The shapes in the coordinates of the search.
+    first_steps : int
+        Steps after which frames of all blocks that have not converged are better
+        brought together.
+    """
 
     shapes: NDArray
+    first_steps: int
 
     def cameras(self, motion: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) for the shapes as they were given."""

@@ -37,7 +37,7 @@ from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
-from isa_nrsfm._joint.starts import affine_start, best_starts
+from isa_nrsfm._joint.starts import affine_start, best_starts, settled
 from isa_nrsfm._robust import ROUNDING
 from isa_nrsfm._sampling import Sample
 from isa_nrsfm._tracks import seen_points
@@ -45,11 +45,8 @@ from isa_nrsfm._tracks import seen_points
 # The steps on a sample end at this share of what its shapes explain by chance alone, a
 # unit of the objective for each number, if it is above the tolerance.
 BY_CHANCE = 0.03
-# Tables of few frames are refined to this share of the tolerance, with affine and with
-# calibrated cameras: it costs little, and the noise of many points can be small enough
-# to need it.
-POLISH = 0.01
-CALIBRATED_POLISH = 0.1
+# Tables of few frames are refined to this share of the tolerance: it costs little.
+POLISH = 0.1
 FEW_FRAMES = 2000
 # A model is right if its noise is at most so many times that of the table's spectrum.
 # Artificial tables with the true K or more have 0.8 to 1.0, motion capture and cloth,
@@ -62,10 +59,12 @@ EXACT = 1e-10
 SLACK = 1e-3
 # Steps without the floor, as long as they lower the noise to this share of it.
 RELEASED_STEPS = 60
-FALLING = 0.7
+FALLING = 0.85
 # Noise variance for what K basis shapes leave of a table that has more, per share of
 # the energy beyond K + 3 singular values (``python -m benchmarks.accuracy noise``).
+# It is at most the second number: the spectrum is that of motion that is large, too.
 CUT_OFF = 3.0
+MOST_NOISE = 5e-4
 # Rounds in which frames that are reversed in depth are turned.
 REVERSALS = 5
 # Steps of the fit that is only compared, and of those of a sample among which one is
@@ -343,9 +342,10 @@ def _first_fit(
     result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
     # Free cameras, from there and from the paper's result: the fit itself, or only to
     # be compared.
+    rigid = affine_start(problem, sample.W, paper_shapes)
     states = [
         problem.aligned(result.state, "affine"),
-        affine_start(problem, sample.W, paper_shapes),
+        settled(problem, rigid, CAMERAS["affine"]),
     ]
     refined = partial(_refined, problem, cameras=CAMERAS["affine"])
     max_iter = problem.steps.max_iter
@@ -372,7 +372,7 @@ def _calibrated_fit(
 ) -> JointResult:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
     result = _refined(problem, state, cameras, least_noise)
-    # Samples lead to a start for all frames, which is looked at from both sides.
+    # What is found of a sample is only a start.
     for _ in range(REVERSALS if problem.steps.to_the_end else 0):
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
@@ -390,8 +390,7 @@ def _refined(
 ) -> JointResult:
     """Return a refinement of all frames of a problem."""
     if problem.steps.to_the_end:
-        polish = CALIBRATED_POLISH if cameras.calibrated else POLISH
-        steps = {"tol": problem.steps.tol * polish, **steps}
+        steps = {"tol": problem.steps.tol * POLISH, **steps}
     return problem.refined(state, cameras, least_noise, **steps)
 
 
@@ -415,8 +414,8 @@ def _with_its_noise(
     if free is not None:
         return free, NOISE_FLOOR
     least_noise = LEAST_NOISE
-    if cameras.calibrated:
-        least_noise = max(LEAST_NOISE, CUT_OFF * spectrum.missing)
+    if cameras.calibrated and spectrum.noise > 0:
+        least_noise = np.clip(CUT_OFF * spectrum.missing, LEAST_NOISE, MOST_NOISE)
         result = _calibrated_fit(problem, result.state, cameras, least_noise)
     return result, least_noise
 

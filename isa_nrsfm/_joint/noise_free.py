@@ -351,7 +351,8 @@ class _Frames(NamedTuple):
         along = self.tangent.swapaxes(1, 2) @ rest[..., None]
         step = np.linalg.solve(self.factor, along)[..., 0]
         n = self.cameras.n_parameters
-        motion = self.cameras.moved(state.motion.transpose(1, 2, 0), step[:, :n].T)
+        turns = self.cameras.limited(step[:, :n].T)
+        motion = self.cameras.moved(state.motion.transpose(1, 2, 0), turns)
         alpha = state.alpha + step[:, n:]
         return FramesAndShapes(state.shapes, motion.transpose(2, 0, 1), alpha)
 

@@ -16,9 +16,11 @@ from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
     CalibratedCameras,
+    CameraModel,
     HeldCameras,
     nearest_calibrated,
 )
+from isa_nrsfm._joint.noise_free import likely_basis
 from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._metric_upgrade import best_metric
@@ -193,6 +195,33 @@ def affine_start(
     return _first_state(problem, rows, motion, _scaled(rows, motion, shapes))
 
 
+def settled(
+    problem: JointProblem, state: JointState, cameras: CameraModel
+) -> JointState:
+    """
+    Return a start after some steps without the prior of the basis shapes.
+
+    With the large noise of a start the prior would make them vanish.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        The frames to be fitted.
+    state : JointState
+        The start.
+    cameras : CameraModel
+        How its cameras may move.
+
+    Returns
+    -------
+    JointState
+        Where the steps lead, in the basis that the prior makes likeliest.
+    """
+    free = problem.with_penalty(0.0)
+    state = free.refined(state, cameras, LEAST_NOISE, max_iter=HELD_STEPS).state
+    return _with_prior(problem, state)
+
+
 def best_starts(
     problem: JointProblem,
     W: NDArray,
@@ -227,7 +256,8 @@ def best_starts(
     )
     comparison = SMALL if problem.steps.to_the_end else LARGE
     few = np.sort(spread(order, min(comparison.n_frames, len(order))))
-    part = problem.part(few, tol=COMPARED_TOL)
+    # With the noise of a start the prior would make basis shapes vanish.
+    part = problem.part(few, tol=COMPARED_TOL).with_penalty(0.0)
     motion, shapes = rigid_start(
         factors, problem.frames.coordinates(paper_shapes), cameras.scaled
     )
@@ -244,9 +274,9 @@ def best_starts(
         if len(trials) > 3 and trials[-1].value > trials[-2].value:
             break
     trials.sort(key=lambda trial: trial.value)
-    return [
-        _freed(part, trial, few, cameras) for trial in trials[: comparison.n_finalists]
-    ]
+    finalists = trials[: comparison.n_finalists]
+    starts = [_freed(part, trial, few, cameras) for trial in finalists]
+    return [_with_prior(problem, state) for state in starts]
 
 
 class _Trial(NamedTuple):
@@ -284,6 +314,14 @@ def _first_state(
     n_seen, energy = problem.totals
     noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
     return JointState(shapes, frames_last(motion), noise)
+
+
+def _with_prior(problem: JointProblem, state: JointState) -> JointState:
+    """Return a state found without the prior in the basis that it makes likeliest."""
+    shapes, motion, _ = state
+    alpha = problem.coefficients(state).T
+    shapes = likely_basis(shapes, motion, alpha, problem.penalty)
+    return state._replace(shapes=shapes)
 
 
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
