@@ -370,6 +370,7 @@ class AffineNRSfM(
     reference_translation_: NDArray
     isa_: Any
     n_iter_: int
+    _frames: RigidFrames | PosteriorFrames
     n_features_in_: int
     feature_names_in_: NDArray
 
@@ -952,9 +953,7 @@ class AffineNRSfM(
         self.mode_covariance_ = self._unit**2 * covariance
         self._converged(result.converged, result.n_iter)
         # The coefficients are those that transform gives, from the stored shapes.
-        self._frames: RigidFrames | PosteriorFrames = RigidFrames(
-            self.mean_shape_, self.basis_, self.camera
-        )
+        self._frames = RigidFrames(self.mean_shape_, self.basis_, self.camera)
         return self._model.decompose(table.source)
 
     def _upgraded(

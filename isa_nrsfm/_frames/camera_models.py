@@ -41,11 +41,14 @@ class CameraModel(Protocol):
         Of a camera.
     calibrated : bool
         Whether cameras are scaled rotations.
+    scaled : bool
+        Whether each camera has a scale of its own.
     """
 
     name: str
     n_parameters: int
     calibrated: bool
+    scaled: bool
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (n_parameters, n)."""
@@ -75,6 +78,7 @@ class AffineCameras:
     name = "affine"
     n_parameters = 6
     calibrated = False
+    scaled = True
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (6, n)."""
@@ -113,6 +117,7 @@ class HeldCameras:
     name = "held"
     n_parameters = 0
     calibrated = False
+    scaled = False
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
         """Return the cameras."""

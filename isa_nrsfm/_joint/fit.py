@@ -23,7 +23,6 @@ from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    CalibratedCameras,
     CameraModel,
 )
 from isa_nrsfm._joint.frames import JointFrames
@@ -367,7 +366,7 @@ def _least(results: Iterable[JointResult]) -> JointResult:
 def _calibrated_fit(
     problem: JointProblem,
     state: JointState,
-    cameras: CalibratedCameras,
+    cameras: CameraModel,
     least_noise: float = LEAST_NOISE,
 ) -> JointResult:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""

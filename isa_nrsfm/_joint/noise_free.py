@@ -92,7 +92,7 @@ def fit_without_noise(
     shapes: NDArray,
     motion: NDArray,
     alpha: NDArray,
-    penalty: float,
+    penalty: NDArray | float,
     cameras: CameraModel,
 ) -> tuple[NDArray, NDArray] | None:
     """
@@ -505,7 +505,7 @@ def _fitted(
 
 
 def likely_basis(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: float
+    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: NDArray | float
 ) -> NDArray:
     """
     Return the same shapes in the basis of greatest marginal likelihood.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frame_products import FrameTracks, frame_products
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
-from isa_nrsfm._frames.camera_models import CalibratedCameras, CameraModel
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
@@ -78,8 +78,8 @@ class JointProblem:
         """Return the problem of the same frames in other coordinates or weights."""
         return type(self)(frames, self.steps, self.penalty)
 
-    def with_penalty(self, penalty: NDArray) -> Self:
-        """Return the problem with a penalty for each basis shape."""
+    def with_penalty(self, penalty: NDArray | float) -> Self:
+        """Return the problem with another penalty, or one for each basis shape."""
         return type(self)(self.frames, self.steps, penalty)
 
     @property
@@ -113,7 +113,7 @@ class JointProblem:
         return JointState(shapes, motion.transpose(1, 2, 0), state.noise)
 
     def reversed_back(
-        self, state: JointState, cameras: CalibratedCameras
+        self, state: JointState, cameras: CameraModel
     ) -> tuple[JointState, int]:
         """
         Return a state without frames that are reversed in depth, and how many were.
@@ -122,7 +122,7 @@ class JointProblem:
         ----------
         state : JointState
             Shapes and calibrated cameras.
-        cameras : CalibratedCameras
+        cameras : CameraModel
             Their model.
 
         Returns

@@ -54,8 +54,8 @@ def relevant_components(
     determined = np.ones(len(penalty))
     for _ in range(ROUNDS):
         part = problem.with_penalty(penalty)
-        state = part.refined(_orthogonal(state), cameras, LEAST_NOISE, max_iter=STEPS)
-        state = state.state
+        start = _orthogonal(state)
+        state = part.refined(start, cameras, LEAST_NOISE, max_iter=STEPS).state
         energy, uncertain = _image_energies(part, state)
         determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
         determined = np.clip(determined, SMALLEST, 1.0)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
-    CalibratedCameras,
     CameraModel,
     HeldCameras,
     nearest_calibrated,
@@ -227,7 +226,7 @@ def best_starts(
     W: NDArray,
     factors: Factorisation,
     paper_shapes: NDArray,
-    cameras: CalibratedCameras,
+    cameras: CameraModel,
 ) -> list[JointState]:
     """
     Return the starts of greatest likelihood, the best one first.
@@ -242,7 +241,7 @@ def best_starts(
         Of W.
     paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes of the paper's pipeline.
-    cameras : CalibratedCameras
+    cameras : CameraModel
         Calibrated cameras.
 
     Returns
@@ -297,7 +296,7 @@ def _trial(
 
 
 def _freed(
-    part: JointProblem, trial: _Trial, few: NDArray, cameras: CalibratedCameras
+    part: JointProblem, trial: _Trial, few: NDArray, cameras: CameraModel
 ) -> JointState:
     """Return a start after some steps of the cameras of the compared frames."""
     result = part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS)
