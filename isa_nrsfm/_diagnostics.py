@@ -161,13 +161,14 @@ def camera_meaning(ratio: float) -> str:
         what = "calibrated cameras explain the table as well as affine ones"
     elif ratio < OTHER_CAMERAS:
         what = (
-            "affine cameras explain somewhat more than calibrated ones: there may be "
-            "too few basis shapes, whose part the cameras take over, or perspective"
+            "affine cameras explain more than calibrated ones: there may be too few "
+            "basis shapes, whose part the cameras take over, perspective, or images "
+            "that were stretched a little"
         )
     else:
         what = (
-            "the cameras are affine but not calibrated ones: pixels that are not "
-            "square, or images that were stretched"
+            "the cameras are hardly calibrated ones: images were stretched, or there "
+            "are far too few basis shapes"
         )
     return f"{what} (noise variance {ratio:.3g} times that of affine cameras)"
 

@@ -98,8 +98,10 @@ START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
 MOST_COMPONENTS = 12
 # Coefficients of frames from which the fit of a frame starts besides zero.
 N_STARTS = 8
-# What a fit may keep of the frames, and what only the joint refinement tells.
-OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_", "rotations_", "scales_")
+# What a fit may keep of the frames, what of calibrated cameras, and what only the joint
+# refinement tells.
+OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+OF_CALIBRATED = ("rotations_", "scales_")
 OF_JOINT_FIT = (
     "noise_variance_",
     "camera_noise_ratio_",
@@ -472,7 +474,7 @@ class AffineNRSfM(
         joint = self.refinement == "joint"
         stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
         progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
-        for name in (*OF_FRAMES, *OF_JOINT_FIT):
+        for name in (*OF_FRAMES, *OF_CALIBRATED, *OF_JOINT_FIT):
             self.__dict__.pop(name, None)
         if not joint and self.loss != "linear":
             raise ValueError(

@@ -112,7 +112,7 @@ class TestCluster:
     def sampled(self, monkeypatch):
         """Take the first steps on few frames, as of large tables."""
         monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
-        monkeypatch.setattr("isa_nrsfm._joint.fit.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
         monkeypatch.setattr("isa_nrsfm._sampling.SAMPLE_FRAMES", 40)
 
     def test_fit_is_that_in_memory(self, cluster):

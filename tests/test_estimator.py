@@ -1235,7 +1235,7 @@ def test_the_number_of_components_is_found_by_the_joint_refinement_only():
     ("truth", "n_components", "least", "most", "meaning"),
     [
         ("weak_perspective", 2, 1.0, 1.1, "as well as affine ones"),
-        ("affine", 2, 10.0, np.inf, "not calibrated ones"),
+        ("affine", 2, 10.0, np.inf, "hardly calibrated ones"),
     ],
 )
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])

@@ -429,8 +429,10 @@ def test_joint_refinement_of_smallest_tables(n_components, dtype):
     n_frames = -(-8 * (n_components + 2) // 5)
     tracks = rng.normal(size=(n_frames, 3 * n_components + 4, 2)).astype(dtype)
     model = jointly(tracks, n_components, repeat=n_components == 1)
+    # Random points have no common shape: the prior may leave basis shapes out.
+    deviation = model.alpha_.std(axis=0)
     if dtype == np.float64:
-        assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
+        assert_allclose(deviation[model.basis_.any(axis=(1, 2))], 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("n_frames", "n_components"), [(60, 7), (200, 4), (400, 4)])

@@ -329,8 +329,9 @@ def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
     scales = np.sqrt(np.einsum("irc,irc->i", motion, motion) / 2)
     size = np.where(scales > 0, scales, 1.0)
     rows = motion / size[:, None, None]
-    depth = np.cross(rows[:, 0], rows[:, 1])
-    return np.concatenate([rows, depth[:, None]], axis=1), scales
+    (x1, y1, z1), (x2, y2, z2) = rows[:, 0].T, rows[:, 1].T
+    depth = [y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2]
+    return np.concatenate([rows, np.stack(depth, axis=1)[:, None]], axis=1), scales
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:

@@ -36,7 +36,7 @@ from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
-from isa_nrsfm._joint.starts import affine_start, best_starts, settled
+from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
 from isa_nrsfm._robust import ROUNDING
 from isa_nrsfm._sampling import Sample
 from isa_nrsfm._tracks import seen_points
@@ -44,7 +44,8 @@ from isa_nrsfm._tracks import seen_points
 # The steps on a sample end at this share of what its shapes explain by chance alone, a
 # unit of the objective for each number, if it is above the tolerance.
 BY_CHANCE = 0.03
-# Tables of few frames are refined to this share of the tolerance: it costs little.
+# Tables of few frames are refined to this share of the tolerance, and to its square
+# where the model is right: it costs little.
 POLISH = 0.1
 FEW_FRAMES = 2000
 # A model is right if its noise is at most so many times that of the table's spectrum.
@@ -56,9 +57,9 @@ RIGHT = 1.4
 EXACT = 1e-10
 # Noise within this share of the least counts as that.
 SLACK = 1e-3
-# Steps without the floor, as long as they lower the noise to this share of it.
+# Steps without floor and prior, as long as they lower the noise to this share of it.
 RELEASED_STEPS = 60
-FALLING = 0.85
+FALLING = 0.95
 # Noise variance for what K basis shapes leave of a table that has more, per share of
 # the energy beyond K + 3 singular values (``python -m benchmarks.accuracy noise``).
 # It is at most the second number: the spectrum is that of motion that is large, too.
@@ -214,10 +215,17 @@ def fit_jointly(
     steps = Steps(max_iter, tol, on_step)
     ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
-    result, ratio = _first_fit(first, sample, factors, paper_shapes, camera)
-    result, least_noise = _with_its_noise(first, result, cameras, spectrum)
+    result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
+    result, least_noise, right = _judged(first, result, start, cameras, spectrum)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
-    for larger in ready.problems[1:]:
+    problems = ready.problems
+    if right:
+        problems = [each.with_penalty(0.0) for each in problems]
+        problem = problems[-1]
+    if right and first is ready.problems[-1]:  # to the end, now that it is safe
+        tol = POLISH**2 * problem.steps.tol
+        result = refined(problem, result.state, tol=tol)
+    for larger in problems[1:]:
         result = refined(larger, larger.aligned(result.state, camera))
     if ready.wide:
         result, problem = in_all_points(result, problem, rows, refined)
@@ -277,7 +285,7 @@ def count_components(
     steps = Steps(max_iter, tol)
     ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
     first = ready.problems[0]
-    result, _ = _first_fit(first, sample, factors, paper_shapes, camera)
+    result, *_ = _first_fit(first, sample, factors, paper_shapes, camera)
     return max(relevant_components(first, result.state, CAMERAS[camera]), 1)
 
 
@@ -334,8 +342,8 @@ def _first_fit(
     factors: Factorisation,
     paper_shapes: NDArray,
     camera: str,
-) -> tuple[JointResult, float]:
-    """Return the fit of the sample, and the ratio of noises of `JointFit`."""
+) -> tuple[JointResult, float, JointState]:
+    """Return the fit of the sample, the ratio of noises of `JointFit`, and a start."""
     calibrated = CAMERAS["weak_perspective" if camera == "affine" else camera]
     starts = best_starts(problem, sample.W, factors, paper_shapes, calibrated)
     result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
@@ -355,7 +363,9 @@ def _first_fit(
         states = [first.state]
     free = _least(refined(state, max_iter=max_iter) for state in states)
     ratio = result.left / min(free.left, result.left)
-    return free if camera == "affine" else result, ratio
+    if camera == "affine":
+        return free, ratio, rigid
+    return result, ratio, starts[0]
 
 
 def _least(results: Iterable[JointResult]) -> JointResult:
@@ -393,45 +403,57 @@ def _refined(
     return problem.refined(state, cameras, least_noise, **steps)
 
 
-def _with_its_noise(
-    problem: JointProblem, result: JointResult, cameras: CameraModel, spectrum: Spectrum
-) -> tuple[JointResult, float]:
+def _judged(
+    problem: JointProblem,
+    result: JointResult,
+    start: JointState,
+    cameras: CameraModel,
+    spectrum: Spectrum,
+) -> tuple[JointResult, float, bool]:
     """
-    Return the fit of a sample with the noise that its table has, and the least noise.
+    Return the fit of a sample for what its model is: right, or with shapes missing.
 
     A model is right if it leaves no more than any table of its rank does. Then what is
-    left is noise, however little, and needs no floor. If a model that is not right
-    leaves less than the floor, something else takes the place of the basis shapes that
-    are missing: calibrated cameras are told how much these would explain.
+    left is noise, however little, and greatest likelihood needs neither a floor of the
+    noise nor a prior of the basis shapes. If a model that is not right leaves less than
+    the floor, something else takes the place of the basis shapes that are missing:
+    calibrated cameras are told how much these would explain. Deformations below the
+    floor vanish there: they are looked for from the start.
+
+    The least noise and whether the model is right are returned, too.
     """
     n_seen, energy = problem.totals
     mean_square = energy / n_seen
-    if result.state.noise > (1 + SLACK) * LEAST_NOISE * mean_square:
-        return result, LEAST_NOISE
     right = max(RIGHT * spectrum.noise, EXACT) * mean_square
-    free = _without_floor(problem, result, cameras, right)
-    if free is not None:
-        return free, NOISE_FLOOR
+    at_floor = result.state.noise < (1 + SLACK) * LEAST_NOISE * mean_square
+    if at_floor or result.state.noise < right:
+        for state in (result.state, start):
+            free = _unregularised(problem, state, cameras)
+            if free.state.noise < right:
+                return free, NOISE_FLOOR, True
     least_noise = LEAST_NOISE
-    if cameras.calibrated and spectrum.noise > 0:
+    if at_floor and cameras.calibrated and spectrum.noise > 0:
         least_noise = np.clip(CUT_OFF * spectrum.missing, LEAST_NOISE, MOST_NOISE)
         result = _calibrated_fit(problem, result.state, cameras, least_noise)
-    return result, least_noise
+    return result, least_noise, False
 
 
-def _without_floor(
-    problem: JointProblem, result: JointResult, cameras: CameraModel, right: float
-) -> JointResult | None:
-    """Return the fit without a floor of the noise, None if it ends above a level."""
-    steps = {"max_iter": min(RELEASED_STEPS, problem.steps.max_iter)}
-    for _ in range(problem.steps.max_iter // steps["max_iter"]):
-        before, state = result.state.noise, result.state
+def _unregularised(
+    problem: JointProblem, state: JointState, cameras: CameraModel
+) -> JointResult:
+    """Return the fit without prior and floor, as long as the noise falls."""
+    problem = problem.with_penalty(0.0)
+    state = with_prior(problem, state)
+    steps = min(RELEASED_STEPS, problem.steps.max_iter)
+    for _ in range(problem.steps.max_iter // steps):
+        before = state.noise
+        result = _refined(problem, state, cameras, NOISE_FLOOR, max_iter=steps)
+        state = result.state
+        if state.noise > FALLING * before:
+            break
         if cameras.calibrated:
             state, _ = problem.reversed_back(state, cameras)
-        result = _refined(problem, state, cameras, NOISE_FLOOR, **steps)
-        if result.state.noise > FALLING * before:
-            break
-    return result if result.state.noise < right else None
+    return result
 
 
 def _freedom_correction(

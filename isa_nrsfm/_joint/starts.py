@@ -115,6 +115,8 @@ def mixed_cameras(
     """
     unit = rows if scales is None else rows / scales[:, None, None]
     P = principal_columns(unit.reshape(2 * len(unit), -1)).reshape(len(unit), 2, -1)
+    if P.shape[2] < 3:
+        return
     few = P[chosen].reshape(2 * len(chosen), -1)
     mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=MIXING_STEPS)
     rank = P.shape[2]
@@ -218,7 +220,7 @@ def settled(
     """
     free = problem.with_penalty(0.0)
     state = free.refined(state, cameras, LEAST_NOISE, max_iter=HELD_STEPS).state
-    return _with_prior(problem, state)
+    return with_prior(problem, state)
 
 
 def best_starts(
@@ -275,7 +277,7 @@ def best_starts(
     trials.sort(key=lambda trial: trial.value)
     finalists = trials[: comparison.n_finalists]
     starts = [_freed(part, trial, few, cameras) for trial in finalists]
-    return [_with_prior(problem, state) for state in starts]
+    return [with_prior(problem, state) for state in starts]
 
 
 class _Trial(NamedTuple):
@@ -315,8 +317,22 @@ def _first_state(
     return JointState(shapes, frames_last(motion), noise)
 
 
-def _with_prior(problem: JointProblem, state: JointState) -> JointState:
-    """Return a state found without the prior in the basis that it makes likeliest."""
+def with_prior(problem: JointProblem, state: JointState) -> JointState:
+    """
+    Return a state in the basis that the prior of a problem makes likeliest.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        The frames, and the penalty of their basis shapes.
+    state : JointState
+        A fit with another penalty.
+
+    Returns
+    -------
+    JointState
+        With basis shapes that are mixed and scaled.
+    """
     shapes, motion, _ = state
     alpha = problem.coefficients(state).T
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
