@@ -514,7 +514,11 @@ class AffineNRSfM(
         self._n_features_out = n_components
         if joint:
             spectrum = Spectrum.from_singular_values(
-                triplets.values, triplets.rest_share, n_components, table.n_points
+                triplets.values,
+                triplets.rest_share,
+                n_components,
+                table.n_points,
+                table.n_seen,
             )
             frames = self._refine_jointly(
                 table, outliers, sample, factors, result, spectrum, progress

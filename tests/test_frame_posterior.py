@@ -508,7 +508,7 @@ class TestStarts:
         problem = problem_of(tracks, shapes, variance)
         rng = np.random.default_rng(0)
         for size in (0.0, 1.0, 3.0):
-            start = size * rng.normal(size=(4, len(tracks)))
+            start = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
             before = affine_newton._evaluate(problem, start).explained
             found, there = affine_newton._descend(problem, start, posterior.MAX_STEPS)
             state = affine_newton._evaluate(problem, found)

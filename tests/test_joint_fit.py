@@ -106,7 +106,7 @@ def fitted(
     if count:
         return count_components(*before, outliers=outliers, **options)
     spectrum = Spectrum.from_singular_values(
-        triplets.values, triplets.rest_share, n_components, n_points
+        triplets.values, triplets.rest_share, n_components, n_points, n_seen
     )
     return fit_jointly(*before, outliers=outliers, spectrum=spectrum, **options)
 

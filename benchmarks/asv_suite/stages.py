@@ -18,7 +18,7 @@ from isa_nrsfm._block_structure import (
 from isa_nrsfm._completion import complete_tracks
 from isa_nrsfm._factorisation import Factorisation, factorise
 from isa_nrsfm._independent_gauge import independent_gauge
-from isa_nrsfm._joint.fit import fit_jointly
+from isa_nrsfm._joint.fit import Spectrum, fit_jointly
 from isa_nrsfm._paper import PaperResult, run_paper_pipeline
 from isa_nrsfm._refinement import refine_alternating
 from isa_nrsfm._sampling import sample_frames
@@ -234,9 +234,15 @@ class JointRefinement(Stage):
             self.sample,
             self.of_sample,
             self.shapes.transpose(0, 2, 1),
+            spectrum=Spectrum.from_singular_values(
+                np.linalg.svd(self.W, compute_uv=False)[: 3 * self.K + 3],
+                self.model.rank_floor_,
+                self.K,
+                self.W.shape[1],
+                self.n_seen,
+            ),
+            camera="affine",
             loss="linear",
-            penalty=None,
-            random_state=np.random.RandomState(0),
             max_iter=1000,
             tol=0.05,
         )

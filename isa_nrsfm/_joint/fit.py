@@ -95,7 +95,12 @@ class Spectrum(NamedTuple):
 
     @classmethod
     def from_singular_values(
-        cls, values: NDArray, rest_share: float, n_components: int, n_points: int
+        cls,
+        values: NDArray,
+        rest_share: float,
+        n_components: int,
+        n_points: int,
+        n_seen: NDArray,
     ) -> "Spectrum":
         """
         Return what the 3K + 3 largest singular values and the rest say.
@@ -110,14 +115,18 @@ class Spectrum(NamedTuple):
             K.
         n_points : int
             Number of points.
+        n_seen : ndarray of int, shape (n_frames,)
+            How many points each frame shows; the others were filled in.
 
         Returns
         -------
         Spectrum
             Of the table.
         """
-        n_others = n_points - 1 - (3 * n_components + 3)
-        noise = rest_share * (n_points - 1) / n_others if n_others > 0 else 0.0
+        seen = float(np.mean(n_seen))
+        n_others = seen - 1 - (3 * n_components + 3)
+        noise = rest_share * (seen - 1) / n_others if n_others > 0 else 0.0
+        noise *= n_points / seen
         energy = np.sum(values**2)
         beyond = np.sum(values[n_components + 3 :] ** 2) / (energy or 1.0)
         return cls(noise, float(rest_share + (1 - rest_share) * beyond))
