@@ -222,7 +222,7 @@ def test_default_strategies_are_invariant(load_data, name, n_components, refinem
         # The valley of the objective is flat: along it rounding errors grow in the
         # hundreds of steps, which end by the tolerance, at the same objective.
         ends = [model.objective_history_[-1] / len(frames) for model in (first, other)]
-        assert abs(ends[0] - ends[1]) < 0.01
+        assert abs(ends[0] - ends[1]) < 2 * 0.025  # the tolerance, for each frame
         assert_allclose(other.alpha_, expected, atol=0.1, rtol=0)
         return
     assert_allclose(other.alpha_, expected, atol=ALPHA_TOLERANCE, rtol=0)
