@@ -3,10 +3,11 @@
 1. Calibrated cameras to start from (`starts`), the choice of them by the objective.
 2. The fit of calibrated cameras, shapes and noise, from the best starts. While the
    model may be wrong the noise has a floor: what a few basis shapes leave of an object
-   is not noise, and would be explained by depths and cameras that are not there. Tables
-   without noise tell that they are by what is left at the floor.
+   is not noise, and would be explained by depths and cameras that are not there.
 3. For affine cameras, the same with cameras that are free, from there or from the
    paper's result, whichever leads to the lower objective.
+4. A model that leaves no more than any table of its rank is right: floor and prior are
+   left away.
 
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
@@ -21,10 +22,7 @@ from sklearn.utils.parallel import _threadpool_controller_decorator
 
 from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    CameraModel,
-)
+from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import totals
 from isa_nrsfm._joint.many_points import (
@@ -231,7 +229,7 @@ def fit_jointly(
     if right:
         problems = [each.with_penalty(0.0) for each in problems]
         problem = problems[-1]
-    if right and first is ready.problems[-1]:  # to the end, now that it is safe
+    if right and not sample.parts:  # to the end, now that it is safe
         tol = POLISH**2 * problem.steps.tol
         result = refined(problem, result.state, tol=tol)
     for larger in problems[1:]:
@@ -302,7 +300,6 @@ class _Ready(NamedTuple):
     """A table that is ready for the joint fit."""
 
     problems: list[JointProblem]  # of the samples and of all frames
-    complete: bool  # whether all points are seen
     wide: bool  # whether frames are given by directions
     used: NDArray | None  # points that count at first, with a robust loss
 
@@ -342,7 +339,7 @@ def _ready(
         problem.part(part, tol=max(steps.tol, by_chance / len(part)), to_the_end=False)
         for part in sample.parts
     ]
-    return _Ready([*problems, problem], complete, wide, used)
+    return _Ready([*problems, problem], wide, used)
 
 
 def _first_fit(
