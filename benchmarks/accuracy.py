@@ -389,7 +389,7 @@ def prior(options):
 
 
 def noise(options):
-    """Noise of fits without a floor, to that of the spectrum; errors by the cut-off.
+    """Noise without floor and prior, to that of the spectrum; errors by the cut-off.
 
     Models are right up to a ratio of `RIGHT`; the errors are those of `prior`.
     """
@@ -428,17 +428,17 @@ def noise(options):
 
 
 def noise_ratio(X, camera, n_components):
-    """Return the noise without a floor, divided by that of the spectrum."""
-    ratios, original = [], joint_fit._with_its_noise
+    """Return the noise without floor and prior, divided by that of the spectrum."""
+    ratios, original = [], joint_fit._judged
 
-    def recorded(problem, result, cameras, spectrum):
+    def recorded(problem, result, start, cameras, spectrum):
         n_seen, energy = problem.totals
-        free = joint_fit._without_floor(problem, result, cameras, np.inf)
+        free = joint_fit._unregularised(problem, result.state, cameras)
         known = max(spectrum.noise, joint_fit.EXACT)
         ratios.append(free.state.noise * n_seen / energy / known)
-        return original(problem, result, cameras, spectrum)
+        return original(problem, result, start, cameras, spectrum)
 
-    with mock.patch.object(joint_fit, "_with_its_noise", recorded):
+    with mock.patch.object(joint_fit, "_judged", recorded):
         fit_set(X, camera, n_components)
     return ratios[0]
 
