@@ -15,10 +15,10 @@ NO_VARIANCE = 1e-14
 # Standard deviation of a number of V_k, from which on it counts as not determined.
 LARGEST_DEVIATION = 0.1
 # Ratios of noise variances, calibrated to affine, up to which cameras are calibrated
-# ones as far as the table tells, and from which on they are not. Artificial tables:
-# weak-perspective cameras have 1.02, perspective ones at 8, 4 and 2.5 radii (to be seen
-# by ``python -m benchmarks.accuracy cameras``) and K too small lie between, cameras
-# that stretch the image by 15 percent and more have 20 to 50.
+# ones as far as the table tells, and from which on they hardly are. Artificial tables:
+# weak-perspective cameras have 1.02, perspective ones at 8 to 2.5 radii up to 1.2,
+# cameras that stretch the image 22 to 48; motion capture with too few basis shapes 1.1
+# to 4 (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 
 
