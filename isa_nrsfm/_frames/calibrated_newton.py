@@ -24,7 +24,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FrameProducts
+from isa_nrsfm._frame_products import FLAT, FrameProducts
 from isa_nrsfm._frames.camera_models import (
     CalibratedCameras,
     nearest_calibrated,
@@ -90,7 +90,7 @@ class CalibratedSearch:
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         self._axes = axes
         self.shapes = np.ascontiguousarray(axes.T @ shapes)
-        self.shapes[0, size <= 1e-10 * size[0]] = 0.0
+        self.shapes[0, size <= FLAT * size[0]] = 0.0
 
     def cameras(self, motion: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) for the shapes as they were given."""
@@ -303,28 +303,21 @@ def _coupling(
 
 
 def _curvature(
-    motion: NDArray, A: NDArray, slope: NDArray, scaled: bool
+    motion: NDArray, A: NDArray, G: NDArray, gradient: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return ``tr(D_c A D_d^T)`` and ``<G, D_cd>``, packed, with G the slope."""
+    """Return ``tr(D_c A D_d^T)`` and ``<G, D_cd>``, packed; the gradient: <G, D_c>."""
     turns, across, scale = tangent_curvature(motion, A)
     # D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd for rotations, row by row.
-    mixed = np.einsum("rai,rbi->abi", slope, motion)
+    mixed = np.einsum("rai,rbi->abi", G, motion)
     trace = np.einsum("aai->i", mixed)
     bent = 0.5 * (mixed + mixed.swapaxes(0, 1)) - trace * np.eye(3)[:, :, None]
     xx, yy, zz, xy, xz, yz = turns
-    if not scaled:
+    if len(gradient) == 3:  # no scales
         first = np.stack([xx, xy, xz, yy, yz, zz])
         second = np.stack(
             [bent[0, 0], bent[0, 1], bent[0, 2], bent[1, 1], bent[1, 2], bent[2, 2]]
         )
         return first, second
-    gradient = np.stack(
-        [
-            (slope[:, 1] * motion[:, 2] - slope[:, 2] * motion[:, 1]).sum(axis=0),
-            (slope[:, 2] * motion[:, 0] - slope[:, 0] * motion[:, 2]).sum(axis=0),
-            (slope[:, 0] * motion[:, 1] - slope[:, 1] * motion[:, 0]).sum(axis=0),
-        ]
-    )
     first = np.stack([xx, xy, xz, across[0], yy, yz, across[1], zz, across[2], scale])
     second = np.stack(
         [
@@ -339,12 +332,19 @@ def _curvature(
 
 def _evaluate(problem: _Problem, motion: NDArray) -> _State:
     """Return the objective and its derivatives, as in the head of this module."""
+    return _state(problem, motion, _posterior(problem, motion))
+
+
+def _state(
+    problem: _Problem, motion: NDArray, posterior: CoefficientPosterior
+) -> _State:
+    """Return the objective and its derivatives where the posterior is known."""
     noise, cameras = problem.noise, problem.cameras
-    posterior = _posterior(problem, motion)
     A = problem.products.gram.moments(posterior.second_moments(noise))
     G = np.einsum("rbi,bai->rai", motion, unpack3(A))
     G -= np.einsum("ki,kari->rai", posterior.c, problem.products.cross)
-    known, bent = _curvature(motion, A, G, cameras.scaled)
+    gradient = cameras.gradient(motion, G)
+    known, bent = _curvature(motion, A, G, gradient)
     Q = -unpacked(posterior.inverse)[1:, 1:]
     coupling = _coupling(problem, motion, posterior)
     through = np.einsum("kli,cli->cki", Q, coupling)
@@ -352,8 +352,7 @@ def _evaluate(problem: _Problem, motion: NDArray) -> _State:
     rows, columns = np.triu_indices(cameras.n_parameters)
     hessian -= np.einsum("pki,pki->pi", through[rows], coupling[columns])
     value = _value(problem, posterior)
-    slope = -cameras.gradient(motion, G)
-    return _State(motion, value, slope, known, hessian)
+    return _State(motion, value, -gradient, known, hessian)
 
 
 def _descend(
@@ -418,7 +417,7 @@ def _found(problem: _Problem, motion: NDArray, converged: NDArray) -> FoundFrame
     """Return what follows from the cameras of frames."""
     noise = problem.noise
     posterior = _posterior(problem, motion)
-    state = _evaluate(problem, motion)
+    state = _state(problem, motion, posterior)
     # The covariance of the coefficients, the camera being unknown: s2 times the inverse
     # of H + s2 I - C^T X^-1 C is s2 (Q + Q C^T Y^-1 C Q), Y the Hessian by the camera.
     Q = -unpacked(posterior.inverse)[1:, 1:]

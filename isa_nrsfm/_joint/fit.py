@@ -24,7 +24,6 @@ from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import totals
 from isa_nrsfm._joint.many_points import (
     has_many_points,
     in_all_points,
@@ -330,10 +329,10 @@ def _ready(
             used &= ~outliers
         weights = None if used.all() else used * 1.0
         frames = JointFrames.of_points(rows, complete, weights)
-    n_numbers, energy = totals(frames.blocks)
-    penalty = n_numbers / (BASIS_STD**2 * energy * n_frames)
     steps = steps._replace(to_the_end=n_frames <= FEW_FRAMES)
-    problem = JointProblem(frames, steps, penalty)
+    problem = JointProblem(frames, steps, 0.0)
+    n_numbers, energy = problem.totals
+    problem = problem.with_penalty(n_numbers / (BASIS_STD**2 * energy * n_frames))
     by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
     problems = [
         problem.part(part, tol=max(steps.tol, by_chance / len(part)), to_the_end=False)

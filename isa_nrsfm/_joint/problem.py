@@ -80,7 +80,9 @@ class JointProblem:
 
     def with_penalty(self, penalty: NDArray | float) -> Self:
         """Return the problem with another penalty, or one for each basis shape."""
-        return type(self)(self.frames, self.steps, penalty)
+        problem = type(self)(self.frames, self.steps, penalty)
+        problem.totals = self.totals  # a pass over all frames
+        return problem
 
     @property
     def n_frames(self) -> int:
