@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._markdown import ROUNDING, found, number, select
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.plotting import ReprojectionDisplay
 from isa_nrsfm.plotting._axes import is_dense
 

@@ -8,10 +8,10 @@ import numpy as np
 from sklearn.base import BaseEstimator
 
 from isa_nrsfm import AffineNRSfM, FastISA, baselines
-from isa_nrsfm._factorisation import leading_triplets
-from isa_nrsfm._frame_fit import compose, project
-from isa_nrsfm._metric_upgrade import nearest_rotations
-from isa_nrsfm._tracks import (
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
+from isa_nrsfm._paper.svd import leading_triplets
+from isa_nrsfm._tables.layout import (
     centred_tracks,
     measurement_matrix,
     table_to_tracks,

@@ -23,7 +23,7 @@ from benchmarks._data import (
     load_arrays,
 )
 from benchmarks.recovery import instance
-from isa_nrsfm._metric_upgrade import nearest_rotations
+from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 
 
 class Set(NamedTuple):

@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._factorisation import factorise
 from isa_nrsfm._frames.posterior import fit_posterior
-from isa_nrsfm._tracks import (
+from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._tables.layout import (
     centred_tracks,
     measurement_matrix,
     table_to_tracks,

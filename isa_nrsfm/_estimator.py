@@ -20,36 +20,21 @@ from sklearn.utils import check_array, check_random_state, estimator_html_repr
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._block_structure import BLOCK_RECOVERIES
-from isa_nrsfm._callbacks import CallbackSupportMixin, FitProgress
-from isa_nrsfm._completion import complete_rows
-from isa_nrsfm._deformation_metric import deformation_metric
+from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
+from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
-from isa_nrsfm._factorisation import (
-    Factorisation,
-    Triplets,
-    block_triplets,
-    factorise,
-)
-from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frame_fit import (
-    FrameFit,
-    PosteriorFrames,
-    RigidFrames,
-    compose,
-    posterior_blocks,
-    posterior_moments,
-    project,
-    reprojection_error,
-)
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     full_rotations,
     nearest_calibrated,
 )
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import spread_starts
-from isa_nrsfm._gauge import (
+from isa_nrsfm._frames.projection import compose, project, reprojection_error
+from isa_nrsfm._gauge.canonical import (
     canonical_gauge,
     canonical_space,
     euclidean_space,
@@ -57,35 +42,32 @@ from isa_nrsfm._gauge import (
     mode_covariance,
     reorder_blocks,
 )
-from isa_nrsfm._independent_gauge import (
-    INDEPENDENCE,
-    FrameMap,
-    independent_gauge,
-)
+from isa_nrsfm._gauge.independent import INDEPENDENCE, independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
+from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
-from isa_nrsfm._metric_equations import CAMERA_MODELS
-from isa_nrsfm._paper import PaperResult, run_paper_pipeline
-from isa_nrsfm._parameter_checks import fit_context
-from isa_nrsfm._robust import LOSSES, gross_outliers
-from isa_nrsfm._sampling import Sample, sample_frames
-from isa_nrsfm._scaled_table import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._stored_table import StoredTable
+from isa_nrsfm._metric_upgrade.deforming import deformation_metric
+from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
+from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
+from isa_nrsfm._paper.sample import Sample, sample_frames
+from isa_nrsfm._paper.svd import Triplets, block_triplets
+from isa_nrsfm._prepare.checks import check_names, largest_n_components, most_for_frames
+from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.robust import LOSSES, gross_outliers
+from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._table_checks import (
-    check_names,
-    largest_n_components,
-    most_for_frames,
-)
-from isa_nrsfm._table_model import TableModel
-from isa_nrsfm._table_sources import (
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.layout import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm._tables.sources import (
     CHECKS,
+    StoredTable,
     Table,
     column_sample,
     is_on_dask,
     is_stored,
 )
-from isa_nrsfm._tracks import LAYOUTS, Layout, tracks_to_table
 from isa_nrsfm.isa import PooledFastICA
 
 # Tolerances where none is given: for each frame, of minus twice the log likelihood, and
@@ -1139,3 +1121,11 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
+
+
+def check_class(estimator: object, where: str) -> None:
+    """Raise if an object is not the estimator of this package."""
+    if not isinstance(estimator, AffineNRSfM):
+        raise ValueError(
+            f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
+        )

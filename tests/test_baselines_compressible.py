@@ -13,8 +13,8 @@ from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.estimator_checks import parametrize_with_checks
 from test_sklearn_contract import widen
 
-from isa_nrsfm._metric import LARGEST_STRETCH
-from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM, _block_dictionary, _compressible
 from isa_nrsfm.baselines._block_dictionary import (
     BlockCode,

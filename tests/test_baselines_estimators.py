@@ -16,7 +16,7 @@ from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 from test_sklearn_contract import EXTRA_CHECKS, NARROW_TABLE_CHECKS, widen
 
-from isa_nrsfm._tracks import table_to_tracks, tracks_to_table
+from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm.baselines import BlockMatrixNRSfM, PseudoInverseNRSfM
 from isa_nrsfm.metrics import inverse_snr
 

@@ -7,7 +7,7 @@ from scenes import random_rotation
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frame_fit import compose
+from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.baselines import _orthographic_frames
 from isa_nrsfm.baselines._orthographic_frames import OrthographicFrames
 

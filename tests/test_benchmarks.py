@@ -28,7 +28,8 @@ from benchmarks._methods import METHODS, Found, TruncatedTable
 from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
-from isa_nrsfm import AffineNRSfM, _factorisation
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._paper import svd as _factorisation
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 

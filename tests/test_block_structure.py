@@ -11,7 +11,7 @@ from scenes import (
     structured_motion,
 )
 
-from isa_nrsfm._block_structure import (
+from isa_nrsfm._paper.block_structure import (
     BLOCK_RECOVERIES,
     LIFT_RIDGE,
     frame_products,
@@ -24,7 +24,7 @@ from isa_nrsfm._block_structure import (
     structure_energies,
     unpack,
 )
-from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._paper.factors import factorise
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
 

@@ -10,12 +10,12 @@ from scenes import random_rotation
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frame_products import frame_products, frame_tracks
 from isa_nrsfm._frames import calibrated_newton as module
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.point_sums import frame_products, frame_tracks
 from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
-from isa_nrsfm._small_matrices import unpacked
+from isa_nrsfm._linalg.packed_symmetric import unpacked
 
 NOISE = 0.02
 BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])

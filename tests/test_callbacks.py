@@ -12,7 +12,8 @@ from sklearn.decomposition import PCA
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 
-from isa_nrsfm import AffineNRSfM, _callbacks
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat import callbacks as _callbacks
 from isa_nrsfm._estimator import JOINT_STAGE, STAGES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model

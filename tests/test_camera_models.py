@@ -15,7 +15,7 @@ from isa_nrsfm._frames.camera_models import (
     rotated,
     tangent_curvature,
 )
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, unpack3
+from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, unpack3
 
 N = 7
 CALIBRATED = pytest.mark.parametrize("name", ["weak_perspective", "orthographic"])

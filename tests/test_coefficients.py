@@ -8,9 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._frame_products import frame_products, frame_tracks
 from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
-from isa_nrsfm._small_matrices import unpack3, unpacked
+from isa_nrsfm._frames.point_sums import frame_products, frame_tracks
+from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
 
 NOISE = 0.05
 

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
-import isa_nrsfm._completion as completion
-from isa_nrsfm._completion import (
+import isa_nrsfm._prepare.completion as completion
+from isa_nrsfm._prepare.completion import (
     CompletionModel,
     _by_pattern,
     _em_step,
@@ -17,7 +17,7 @@ from isa_nrsfm._completion import (
     complete_tracks,
     rigid_noise,
 )
-from isa_nrsfm._tracks import centred_tracks, weighting_sizes
+from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 

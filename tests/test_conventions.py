@@ -3,7 +3,9 @@
 import ast
 import importlib
 import inspect
+import os
 import pkgutil
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +28,7 @@ OPTIONAL = [
     "pyarrow",
     "skops",
 ]
+LINT_IMPORTS = "from importlinter.cli import lint_imports_command as run; run()"
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [
     "isa_nrsfm",
@@ -207,6 +210,54 @@ def test_every_module_can_be_imported_without_optional_libraries():
     )
     status, output = run("-W", "error", "-c", code)
     assert status == 0, output
+
+
+def linted_imports(folder):
+    """Return the exit status of import-linter and what it says."""
+    done = subprocess.run(
+        [sys.executable, "-c", LINT_IMPORTS, "--no-cache", "--no-logo"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(folder), "PYTHONIOENCODING": "utf-8"},
+    )
+    return done.returncode, done.stdout
+
+
+def test_imports_go_down():
+    status, output = linted_imports(ROOT)
+    assert status == 0, output
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("_tables/layout.py", "import isa_nrsfm.cli"),
+        ("_frames/camera.py", "from isa_nrsfm._joint import fit"),
+        ("_linalg/vectors.py", "from isa_nrsfm._linalg import packed_symmetric"),
+    ],
+)
+def test_an_import_that_goes_up_is_found(tmp_path, file, line):
+    shutil.copytree(PACKAGE, tmp_path / "isa_nrsfm")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    with (tmp_path / "isa_nrsfm" / file).open("a") as changed:
+        changed.write(f"{line}\n")
+    if "packed_symmetric" in line:  # and back
+        with (tmp_path / "isa_nrsfm/_linalg/packed_symmetric.py").open("a") as changed:
+            changed.write("from isa_nrsfm._linalg import vectors\n")
+    status, output = linted_imports(tmp_path)
+    assert status != 0
+    assert "BROKEN" in output
+
+
+def test_the_top_of_the_package_is_short():
+    assert len([path for path in PACKAGE.iterdir() if path.is_file()]) <= 10
+
+
+@pytest.mark.parametrize("file", source_files())
+def test_no_module_is_long(file):
+    if file != "isa_nrsfm/_estimator.py":
+        assert len((ROOT / file).read_text(encoding="utf-8").splitlines()) <= 600
 
 
 def test_version():

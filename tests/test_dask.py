@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._dask_blocks import DaskBlocks
+from isa_nrsfm._tables.dask_blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 array = pytest.importorskip("dask.array")
@@ -111,9 +111,9 @@ class TestCluster:
     @pytest.fixture(autouse=True)
     def sampled(self, monkeypatch):
         """Take the first steps on few frames, as of large tables."""
-        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
-        monkeypatch.setattr("isa_nrsfm._sampling.SMALL_TABLE", 1000)
-        monkeypatch.setattr("isa_nrsfm._sampling.SAMPLE_FRAMES", 40)
+        monkeypatch.setattr("isa_nrsfm._paper.sample.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._paper.sample.SMALL_TABLE", 1000)
+        monkeypatch.setattr("isa_nrsfm._paper.sample.SAMPLE_FRAMES", 40)
 
     def test_fit_is_that_in_memory(self, cluster):
         X = table(0.1)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm._landmark_names import names_layout
-from isa_nrsfm._tracks import table_to_tracks
+from isa_nrsfm._tables.landmark_columns import names_layout
+from isa_nrsfm._tables.layout import table_to_tracks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,

@@ -20,7 +20,7 @@ from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
-from isa_nrsfm._robust import robust_sizes
+from isa_nrsfm._prepare.robust import robust_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d

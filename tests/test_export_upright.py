@@ -6,7 +6,7 @@ from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm.export import _upright
 from isa_nrsfm.export._upright import upright_basis, upright_frames, upright_space
 

@@ -5,14 +5,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames, rotate_frames
 
-import isa_nrsfm._factorisation as module
-from isa_nrsfm._factorisation import (
-    block_triplets,
-    factorise,
-    leading_triplets,
-    orientations,
-)
-from isa_nrsfm._frame_blocks import MemoryBlocks
+import isa_nrsfm._paper.svd as module
+from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.svd import block_triplets, leading_triplets
+from isa_nrsfm._tables.blocks import MemoryBlocks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
 

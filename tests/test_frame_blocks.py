@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from isa_nrsfm._frame_blocks import MemoryBlocks, StoredBlocks
+from isa_nrsfm._tables.blocks import MemoryBlocks, StoredBlocks
 
 N_FRAMES = 23
 

@@ -5,19 +5,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
-from isa_nrsfm._frame_fit import (
-    FrameFit,
-    PosteriorFrames,
-    RigidFrames,
-    compose,
-    distances,
-    project,
-)
+from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import fit_posterior
-from isa_nrsfm._independent_gauge import FrameMap
-from isa_nrsfm._robust import robust_weights
-from isa_nrsfm._tracks import centred_tracks, measurement_matrix
+from isa_nrsfm._frames.projection import compose, distances, project
+from isa_nrsfm._prepare.robust import robust_weights
+from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
 
 
 def orthogonal_shapes(seed, n_components=2, n_points=20):

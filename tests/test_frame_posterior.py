@@ -6,10 +6,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frame_products import frame_products, frame_tracks, whitened
 from isa_nrsfm._frames import affine_newton, posterior
+from isa_nrsfm._frames.point_sums import frame_products, frame_tracks, whitened
 from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
-from isa_nrsfm._small_matrices import unpacked
+from isa_nrsfm._linalg.packed_symmetric import unpacked
 
 NOISE = 0.02
 

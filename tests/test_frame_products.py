@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm._frame_products import (
+from isa_nrsfm._frames.point_sums import (
     FrameGram,
     SharedGram,
     determines_camera,
@@ -12,7 +12,13 @@ from isa_nrsfm._frame_products import (
     frame_tracks,
     whitened,
 )
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, pair_indices, unpack3, unpacked
+from isa_nrsfm._linalg.packed_symmetric import (
+    COLUMNS,
+    ROWS,
+    pair_indices,
+    unpack3,
+    unpacked,
+)
 
 
 def random_problem(seed, n_frames=6, n_points=11, n_components=2):

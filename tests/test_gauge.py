@@ -6,9 +6,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import permute_frames, random_rotation, rotate_frames
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frame_fit import RigidFrames, compose, project
 from isa_nrsfm._frames.camera import mean_view
-from isa_nrsfm._gauge import (
+from isa_nrsfm._frames.models import RigidFrames
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._gauge.canonical import (
     canonical_gauge,
     canonical_rotation,
     canonical_space,

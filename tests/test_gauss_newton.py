@@ -8,9 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frame_blocks import MemoryBlocks
-from isa_nrsfm._frame_products import frame_tracks
 from isa_nrsfm._frames.camera_models import CAMERAS, nearest_calibrated
+from isa_nrsfm._frames.point_sums import frame_tracks
 from isa_nrsfm._joint import noise_free as module
 from isa_nrsfm._joint.noise_free import (
     FramesAndShapes,
@@ -23,6 +22,7 @@ from isa_nrsfm._joint.noise_free import (
     motion_rows,
     normal_equations,
 )
+from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 

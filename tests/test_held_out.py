@@ -6,9 +6,10 @@ from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frame_fit import PosteriorFrames, RigidFrames, compose, project
-from isa_nrsfm._held_out import FOLD_SEED, N_FOLDS, held_out_energies
-from isa_nrsfm._independent_gauge import FrameMap
+from isa_nrsfm._fitted_model import FOLD_SEED, N_FOLDS, held_out_energies
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 NOISE = 0.02

@@ -8,11 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._independent_gauge import (
-    INDEPENDENCE,
-    FrameMap,
-    independent_gauge,
-)
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._gauge.independent import INDEPENDENCE, independent_gauge
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 ALL = [*INDEPENDENCE, None]

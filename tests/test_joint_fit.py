@@ -9,9 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import measurements, rotate_frames
 
-from isa_nrsfm._completion import complete_tracks
-from isa_nrsfm._factorisation import factorise, leading_triplets
-from isa_nrsfm._frame_blocks import MemoryBlocks
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._joint import problem as problem_module
@@ -22,7 +19,11 @@ from isa_nrsfm._joint.fit import (
     count_components,
     fit_jointly,
 )
-from isa_nrsfm._sampling import Sample
+from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.sample import Sample
+from isa_nrsfm._paper.svd import leading_triplets
+from isa_nrsfm._prepare.completion import complete_tracks
+from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 

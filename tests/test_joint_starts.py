@@ -8,8 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import permute_frames, rotate_frames
 
-from isa_nrsfm._factorisation import Factorisation, factorise
-from isa_nrsfm._frame_blocks import MemoryBlocks
 from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem, Steps
@@ -23,6 +21,8 @@ from isa_nrsfm._joint.starts import (
     mixed_cameras,
     rigid_start,
 )
+from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 N_POINTS = 40

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from isa_nrsfm._landmark_names import (
+from isa_nrsfm._tables.landmark_columns import (
     MIN_POINTS,
     find_landmark_columns,
     landmark_sets,

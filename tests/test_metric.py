@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._metric import (
+from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
     anisotropy,
     mean_gram,

@@ -7,8 +7,15 @@ from scipy.linalg import expm
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._metric import metric_quadric
-from isa_nrsfm._metric_equations import (
+from isa_nrsfm._metric_upgrade.minimisation import (
+    STRETCH_OF_START,
+    exponential,
+    refine_fit,
+    refine_metric,
+    safe_start,
+)
+from isa_nrsfm._metric_upgrade.quadric import metric_quadric
+from isa_nrsfm._metric_upgrade.residuals import (
     BLOCK_FRAMES,
     CAMERA_MODELS,
     _linearised,
@@ -17,13 +24,6 @@ from isa_nrsfm._metric_equations import (
     frame_blocks,
     orthonormality,
     strain_basis,
-)
-from isa_nrsfm._metric_refinement import (
-    STRETCH_OF_START,
-    exponential,
-    refine_fit,
-    refine_metric,
-    safe_start,
 )
 
 both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)
@@ -221,7 +221,7 @@ class TestRefineMetric:
 
     def test_converges_where_residuals_are_large(self, monkeypatch):
         # Gauss-Newton steps alone leave a hundred times as much.
-        monkeypatch.setattr("isa_nrsfm._metric_refinement.MAX_STEPS", 16)
+        monkeypatch.setattr("isa_nrsfm._metric_upgrade.minimisation.MAX_STEPS", 16)
         motion = noisy_cameras(0, "weak_perspective")
         fit = refine_metric(motion, np.eye(3), "weak_perspective")
         assert fit.cost > 0.1

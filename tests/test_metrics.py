@@ -10,12 +10,7 @@ from scipy.optimize import check_grad, minimize
 from scipy.stats import ortho_group
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._affine_alignment import (
-    _squared_cosines,
-    best_affinity,
-    unit_shapes,
-)
-from isa_nrsfm._tracks import tracks_to_table
+from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import (
     affine_shape_error,
@@ -23,6 +18,7 @@ from isa_nrsfm.metrics import (
     inverse_snr,
     subspace_distance,
 )
+from isa_nrsfm.metrics._alignment import _squared_cosines, best_affinity, unit_shapes
 
 AFFINITIES = [
     np.diag([1.0, -1.0, 1.0]),

@@ -7,7 +7,7 @@ from scenes import permute_frames, random_rotation, rotate_frames
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._orthonormal_cameras import (
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     NOISE_PRICE,
     _derivatives,
     _residuals,
@@ -17,7 +17,7 @@ from isa_nrsfm._orthonormal_cameras import (
     orthonormality_residuals,
     principal_columns,
 )
-from isa_nrsfm._tracks import centred_tracks, measurement_matrix
+from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 N_COMPONENTS = 2

@@ -10,7 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 from test_grouping import GROUPINGS, energy_inside
 
 from isa_nrsfm import PooledFastICA
-from isa_nrsfm._factorisation import factorise
+from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm.metrics import subspace_distance
 
 IN_ORDER = np.arange(9) // 3

@@ -11,14 +11,14 @@ from scenes import (
     structured_motion,
 )
 
-from isa_nrsfm._block_structure import (
+from isa_nrsfm._paper.alternating import _state, _steps, refine_alternating
+from isa_nrsfm._paper.block_structure import (
     frame_products,
     leading_blocks,
     lifted_moments,
     recover_blocks,
 )
-from isa_nrsfm._factorisation import factorise
-from isa_nrsfm._refinement import _state, _steps, refine_alternating
+from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm.isa import PooledFastICA
 
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
-from isa_nrsfm._robust import (
+from isa_nrsfm._prepare.robust import (
     DISTANT,
     LARGEST_SHARE,
     LOSSES,

@@ -5,10 +5,11 @@ import pytest
 from numpy.testing import assert_array_equal
 from scenes import measurements, permute_frames
 
-from isa_nrsfm import _sampling as module
-from isa_nrsfm._factorisation import factorise
-from isa_nrsfm._frame_blocks import MemoryBlocks
-from isa_nrsfm._sampling import rigid_energy, sample_frames, spread
+from isa_nrsfm._paper import sample as module
+from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.sample import rigid_energy, sample_frames
+from isa_nrsfm._tables.blocks import MemoryBlocks
+from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm._small_matrices import (
+from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
     FEW,
     ROWS,

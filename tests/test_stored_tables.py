@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-import isa_nrsfm._completion as completion
-import isa_nrsfm._sampling as sampling
+import isa_nrsfm._paper.sample as sampling
+import isa_nrsfm._prepare.completion as completion
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._estimator import OF_FRAMES
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -108,7 +108,7 @@ class TestFit:
     @pytest.mark.parametrize("n_points", [100, 400])
     def test_of_many_points(self, monkeypatch, tmp_path, n_points):
         # Shapes along directions, and with the more points a Krylov method, too.
-        monkeypatch.setattr("isa_nrsfm._factorisation.DENSE", 300)
+        monkeypatch.setattr("isa_nrsfm._paper.svd.DENSE", 300)
         X = table(n_points=n_points, n_frames=160)
         expected = estimator().fit(X)
         got = estimator(working_memory=1).fit(memmap(X, tmp_path))

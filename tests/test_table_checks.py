@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from isa_nrsfm._table_checks import (
-    LAYOUT_SAMPLE,
+from isa_nrsfm._prepare.checks import (
     PointReport,
     check_names,
     check_points,
@@ -15,12 +14,9 @@ from isa_nrsfm._table_checks import (
     clean_tracks,
     largest_n_components,
     smallest_n_frames,
-    warn_if_other_layout,
 )
-from isa_nrsfm._tracks import (
-    LAYOUTS,
-    tracks_to_table,
-)
+from isa_nrsfm._prepare.layout_check import LAYOUT_SAMPLE, warn_if_other_layout
+from isa_nrsfm._tables.layout import LAYOUTS, tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 

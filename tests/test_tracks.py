@@ -7,24 +7,22 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
-from isa_nrsfm._table_checks import (
-    PointReport,
-    check_points,
-    clean_tracks,
-)
-from isa_nrsfm._tracks import (
-    FEWEST_POINTS,
+from isa_nrsfm._prepare.checks import PointReport, check_points, clean_tracks
+from isa_nrsfm._tables.layout import (
     LAYOUTS,
     centred_tracks,
-    check_frames,
     measurement_matrix,
     relative_precision,
-    report_frames,
-    seen_points,
     table_to_tracks,
     tracks_to_table,
-    usable_frames,
     weighting_sizes,
+)
+from isa_nrsfm._tables.visibility import (
+    FEWEST_POINTS,
+    check_frames,
+    report_frames,
+    seen_points,
+    usable_frames,
 )
 
 UNITS = [1e-9, 1.0, 1e9]

@@ -9,27 +9,27 @@ from benchmarks.asv_suite._measured import TABLES, Measured, Table, load
 from benchmarks.speed import measured as measurement_matrix
 from benchmarks.speed import with_holes
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._block_structure import (
+from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._joint.fit import Spectrum, fit_jointly
+from isa_nrsfm._paper.alternating import refine_alternating
+from isa_nrsfm._paper.block_structure import (
     frame_products,
     lifted_moments,
     recover_blocks,
     structure_energies,
 )
-from isa_nrsfm._completion import complete_tracks
-from isa_nrsfm._factorisation import Factorisation, factorise
-from isa_nrsfm._independent_gauge import independent_gauge
-from isa_nrsfm._joint.fit import Spectrum, fit_jointly
-from isa_nrsfm._paper import PaperResult, run_paper_pipeline
-from isa_nrsfm._refinement import refine_alternating
-from isa_nrsfm._sampling import sample_frames
-from isa_nrsfm._scaled_table import scaled_table
-from isa_nrsfm._table_sources import Table as Source
-from isa_nrsfm._tracks import (
+from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
+from isa_nrsfm._paper.sample import sample_frames
+from isa_nrsfm._prepare.completion import complete_tracks
+from isa_nrsfm._prepare.scaling import scaled_table
+from isa_nrsfm._tables.layout import (
     centred_tracks,
     table_to_tracks,
     tracks_to_table,
     weighting_sizes,
 )
+from isa_nrsfm._tables.sources import Table as Source
 from isa_nrsfm.metrics import basis_similarity, inverse_snr
 
 # Share of the points that are missing where some are.

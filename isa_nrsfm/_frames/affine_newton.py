@@ -26,9 +26,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FrameGram, FrameProducts, SharedGram, whitened
+from isa_nrsfm._frames.point_sums import FrameGram, FrameProducts, SharedGram, whitened
 from isa_nrsfm._frames.search import FoundFrames
-from isa_nrsfm._small_matrices import (
+from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
     ROWS,
     SMALLEST_PIVOT,

@@ -24,7 +24,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FLAT, FrameProducts
 from isa_nrsfm._frames.camera_models import (
     CalibratedCameras,
     nearest_calibrated,
@@ -34,8 +33,9 @@ from isa_nrsfm._frames.coefficients import (
     CoefficientPosterior,
     coefficient_posterior,
 )
+from isa_nrsfm._frames.point_sums import FLAT, FrameProducts
 from isa_nrsfm._frames.search import MAX_STEPS, FoundFrames
-from isa_nrsfm._small_matrices import (
+from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
     ROWS,
     inverse3,

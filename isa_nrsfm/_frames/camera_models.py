@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._small_matrices import COLUMNS, ROWS, inverse3, unpack3
+from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, inverse3, unpack3
 
 # Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
 RIDGE = 1e-9

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FrameProducts
-from isa_nrsfm._small_matrices import (
+from isa_nrsfm._frames.point_sums import FrameProducts
+from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
     ROWS,
     diagonal_of,

@@ -12,17 +12,17 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import (
+from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.point_sums import (
     FrameProducts,
     FrameTracks,
     determines_camera,
     frame_products,
     frame_tracks,
 )
-from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch
-from isa_nrsfm._small_matrices import unpacked
+from isa_nrsfm._linalg.packed_symmetric import unpacked
 
 # Frames in a block: enough to be worth the calls, few enough for the cache. Frames
 # with missing points have a Gram matrix each.

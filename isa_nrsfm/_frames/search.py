@@ -4,7 +4,7 @@ from typing import NamedTuple, Protocol
 
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FrameProducts
+from isa_nrsfm._frames.point_sums import FrameProducts
 
 # The most steps of a search.
 MAX_STEPS = 60

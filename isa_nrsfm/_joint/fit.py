@@ -20,8 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils.parallel import _threadpool_controller_decorator
 
-from isa_nrsfm._factorisation import Factorisation
-from isa_nrsfm._frame_blocks import FrameBlocks
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.many_points import (
@@ -34,9 +32,11 @@ from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
 from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
-from isa_nrsfm._robust import ROUNDING
-from isa_nrsfm._sampling import Sample
-from isa_nrsfm._tracks import seen_points
+from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._paper.sample import Sample
+from isa_nrsfm._prepare.robust import ROUNDING
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.visibility import seen_points
 
 # The steps on a sample end at this share of what its shapes explain by chance alone, a
 # unit of the objective for each number, if it is above the tolerance.

@@ -12,10 +12,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
-from isa_nrsfm._frame_products import FrameTracks, joined_frames
+from isa_nrsfm._frames.point_sums import FrameTracks, joined_frames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, prepared_frames
-from isa_nrsfm._tracks import energies, seen_points
+from isa_nrsfm._linalg.vectors import energies
+from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._tables.visibility import seen_points
 
 
 class JointFrames(NamedTuple):

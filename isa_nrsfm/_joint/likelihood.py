@@ -26,16 +26,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import FrameBlocks, MemoryBlocks
-from isa_nrsfm._frame_products import (
+from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
+from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     SharedGram,
     frame_products,
     frame_tracks,
     shared_gram,
 )
-from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
-from isa_nrsfm._small_matrices import diagonal_of, unpack3, unpacked
+from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
+from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048

@@ -11,12 +11,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._factorisation import Factorisation
-from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frame_fit import stacked_motion
+from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState, regular
+from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Frames with more points than that, and than so many times the rows of all shapes, are
 # given by directions.

@@ -37,11 +37,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frame_fit import stacked_motion
-from isa_nrsfm._frame_products import FrameTracks
 from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
+from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Multiplications of a step: it takes a part of a second.
 STEP_COST = 2e9

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_products import FrameTracks, frame_products
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.point_sums import FrameTracks, frame_products
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals

@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import FrameBlocks
-from isa_nrsfm._frame_fit import compose, project
+from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState
-from isa_nrsfm._robust import ROUNDING, median_noise, robust_weights
-from isa_nrsfm._tracks import seen_points
+from isa_nrsfm._prepare.robust import ROUNDING, median_noise, robust_weights
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.visibility import seen_points
 
 # Rounds of reweighting, and the change of the weights that ends them.
 ROUNDS = 20

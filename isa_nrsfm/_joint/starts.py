@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._factorisation import Factorisation
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
     CameraModel,
@@ -22,9 +21,14 @@ from isa_nrsfm._frames.camera_models import (
 from isa_nrsfm._joint.noise_free import likely_basis
 from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
-from isa_nrsfm._metric_upgrade import best_metric
-from isa_nrsfm._orthonormal_cameras import orthonormal_mixture, principal_columns
-from isa_nrsfm._sampling import rigid_energy, spread
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+    orthonormal_mixture,
+    principal_columns,
+)
+from isa_nrsfm._metric_upgrade.rigid import best_metric
+from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._paper.sample import rigid_energy
+from isa_nrsfm._tables.ordering import spread
 
 # Columns of the mixtures: three for the rigid object and as many for each basis shape.
 WIDTHS = (6, 9, 12, 18, 24, 36)

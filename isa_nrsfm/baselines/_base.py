@@ -19,12 +19,13 @@ from sklearn.base import (
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm._estimator import Decomposition
-from isa_nrsfm._frame_fit import compose, project
-from isa_nrsfm._gauge import canonical_rotation
-from isa_nrsfm._parameter_checks import fit_context
-from isa_nrsfm._table_checks import check_names, check_size, warn_if_other_layout
-from isa_nrsfm._tracks import (
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._gauge.canonical import canonical_rotation
+from isa_nrsfm._prepare.checks import check_names, check_size
+from isa_nrsfm._prepare.layout_check import warn_if_other_layout
+from isa_nrsfm._tables.layout import (
     LAYOUTS,
     Layout,
     centred_tracks,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils._param_validation import Interval
 
-from isa_nrsfm._tracks import Layout
+from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._pseudo_inverse import (
     least_norm_shapes,

@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval
 
-from isa_nrsfm._factorisation import NULL_DIRECTION
-from isa_nrsfm._metric import LARGEST_STRETCH, conformal_equations, symmetric_matrix
-from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
-from isa_nrsfm._tracks import Layout
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._metric_upgrade.quadric import (
+    LARGEST_STRETCH,
+    conformal_equations,
+    symmetric_matrix,
+)
+from isa_nrsfm._paper.factors import NULL_DIRECTION
+from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
     BlockCode,

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frame_fit import compose
 from isa_nrsfm._frames.camera import rigid_cameras
-from isa_nrsfm._orthonormal_cameras import nearest_orthonormal
-from isa_nrsfm._tracks import measurement_matrix
+from isa_nrsfm._frames.projection import compose
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._tables.layout import measurement_matrix
 
 # Frames that are fitted at a time: their equations need little memory.
 BATCH = 2000

@@ -3,9 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._factorisation import NULL_DIRECTION, leading_triplets
-from isa_nrsfm._orthonormal_cameras import nearest_orthonormal, orthonormal_cameras
-from isa_nrsfm._tracks import Layout
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+    nearest_orthonormal,
+    orthonormal_cameras,
+)
+from isa_nrsfm._paper.factors import NULL_DIRECTION
+from isa_nrsfm._paper.svd import leading_triplets
+from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._shape_sequence import ShapeSequence
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._factorisation import orientations
+from isa_nrsfm._linalg.vectors import orientations
 
 # Rounds of `shape_signs`; a few are enough, and each raises the sum.
 MAX_ROUNDS = 100

@@ -9,7 +9,7 @@ import numpy as np
 from sklearn.model_selection import KFold, cross_val_score
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._table_checks import check_size
+from isa_nrsfm._prepare.checks import check_size
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
-from isa_nrsfm._frame_fit import FrameFit
-from isa_nrsfm._landmark_names import (
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._frames.models import FrameFit
+from isa_nrsfm._tables.landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
     parse_coordinate,
     point_names,
 )
-from isa_nrsfm._optional import import_optional
 from isa_nrsfm.cli._choice import choose_n_components
 from isa_nrsfm.cli._frames import Frames, choose_frames
 from isa_nrsfm.cli._outputs import (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.cli._commands import fit_table
 from isa_nrsfm.cli._outputs import component_names
 from isa_nrsfm.cli._parser import PROGRAM, build_parser

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._landmark_names import LandmarkColumns, landmark_sets
-from isa_nrsfm._optional import import_optional
-from isa_nrsfm._table_checks import clean_tracks
-from isa_nrsfm._tracks import (
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._prepare.checks import clean_tracks
+from isa_nrsfm._tables.landmark_columns import LandmarkColumns, landmark_sets
+from isa_nrsfm._tables.visibility import (
     FEWEST_POINTS,
     report_frames,
     seen_points,

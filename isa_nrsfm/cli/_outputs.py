@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frame_fit import FrameFit
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.export import write_shapes, write_viewer
 from isa_nrsfm.export._shape_arrays import names_of_components

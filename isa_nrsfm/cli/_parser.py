@@ -5,10 +5,10 @@ import re
 from typing import Any, NamedTuple
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
-from isa_nrsfm._block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._independent_gauge import INDEPENDENCE
-from isa_nrsfm._robust import LOSSES
+from isa_nrsfm._gauge.independent import INDEPENDENCE
+from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._prepare.robust import LOSSES
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
 from isa_nrsfm.io import FORMATS
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._diagnostics import camera_meaning
-from isa_nrsfm._frame_fit import FrameFit
+from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
 from isa_nrsfm.cli._parser import AUTO

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from isa_nrsfm._parameter_checks import checked_parameters
-from isa_nrsfm._tracks import LAYOUTS, Layout
+from isa_nrsfm._compat.parameters import checked_parameters
+from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,
     SIGNED_COMPONENTS,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from sklearn.datasets import get_data_home
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 
 # Subfolder of scikit-learn's data home for what this package downloads.
 FOLDER = "isa_nrsfm"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch
 
-from isa_nrsfm._tracks import Layout, tracks_to_table
+from isa_nrsfm._tables.layout import Layout, tracks_to_table
 
 Camera = Literal["weak_perspective", "affine", "orthographic"]
 CAMERAS: tuple[Camera, ...] = ("weak_perspective", "affine", "orthographic")

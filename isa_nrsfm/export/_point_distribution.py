@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
-from isa_nrsfm._frame_fit import compose
+from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._edges import Origin
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._landmark_names import point_names
-from isa_nrsfm._model_class import check_class
+from isa_nrsfm._estimator import check_class
+from isa_nrsfm._tables.landmark_columns import point_names
 
 SUFFIXES = (".npz", ".mat")
 

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._canonical_pose import canonical_pose
-from isa_nrsfm._deformation_metric import (
+from isa_nrsfm._estimator import check_class
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.projection import compose
+from isa_nrsfm._metric_upgrade.deforming import (
     DeformationMetric,
     EuclideanFrames,
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm._frame_fit import compose
-from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._metric import unit_cameras
-from isa_nrsfm._metric_upgrade import usable_cameras
-from isa_nrsfm._model_class import check_class
+from isa_nrsfm._metric_upgrade.quadric import unit_cameras
+from isa_nrsfm._metric_upgrade.rigid import usable_cameras
+from isa_nrsfm.calibration._canonical_pose import canonical_pose
 from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
 from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
 from isa_nrsfm.io._separated_values import first_lines
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
 
 # What is said of an instance, beside its image and its points.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
 from isa_nrsfm.io._landmarks import (
     Landmarks,

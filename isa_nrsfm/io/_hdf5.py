@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

@@ -5,17 +5,16 @@ from pathlib import Path
 
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._callbacks import without_callbacks
-from isa_nrsfm._model_class import check_class
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.callbacks import without_callbacks
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._estimator import AffineNRSfM, check_class
 
 #: The types beside those that skops trusts by itself that a model file may contain.
 TRUSTED_TYPES = (
     "isa_nrsfm._estimator.AffineNRSfM",
-    "isa_nrsfm._frame_fit.PosteriorFrames",
-    "isa_nrsfm._frame_fit.RigidFrames",
-    "isa_nrsfm._independent_gauge.FrameMap",
+    "isa_nrsfm._frames.models.PosteriorFrames",
+    "isa_nrsfm._frames.models.RigidFrames",
+    "isa_nrsfm._frames.basis_change.FrameMap",
     "isa_nrsfm.isa._density.SqrtDensity",
     "isa_nrsfm.isa._fastisa.FastISA",
     "isa_nrsfm.isa._pooled_fastica.PooledFastICA",
@@ -53,8 +52,7 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> from isa_nrsfm import AffineNRSfM
-    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>>     >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.io import load_model, save_model
     >>> table = make_face_tracks(n_frames=50, random_state=0).data
     >>> model = AffineNRSfM(n_components=2, random_state=0).fit(table)

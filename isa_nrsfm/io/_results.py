@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._landmark_names import find_landmark_columns
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.landmark_columns import find_landmark_columns
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
 from isa_nrsfm.io._landmarks import (
     Landmarks,

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frame_blocks import read_rows
-from isa_nrsfm._optional import import_optional
-from isa_nrsfm._stored_table import StoredTable
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.blocks import read_rows
+from isa_nrsfm._tables.sources import StoredTable
 
 if TYPE_CHECKING:
     import os

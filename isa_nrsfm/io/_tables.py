@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._landmark_names import find_landmark_columns, parse_coordinate
-from isa_nrsfm._optional import import_optional
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.landmark_columns import find_landmark_columns, parse_coordinate
 
 if TYPE_CHECKING:
     import os

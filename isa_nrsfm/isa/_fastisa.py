@@ -12,7 +12,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import HasMethods, Interval
 from sklearn.utils.parallel import Parallel, delayed
 
-from isa_nrsfm._parameter_checks import fit_context
+from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
 from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise

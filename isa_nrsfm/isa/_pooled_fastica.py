@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from isa_nrsfm._parameter_checks import fit_context
+from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity
 from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise

@@ -14,8 +14,8 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
 from sklearn.utils.parallel import _threadpool_controller_decorator
 
-from isa_nrsfm._factorisation import orientations
-from isa_nrsfm._sampling import spread
+from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
 
 # A direction whose singular value is below this share of the first is null.

@@ -5,7 +5,7 @@ from typing import Literal, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._affine_alignment import (
+from isa_nrsfm.metrics._alignment import (
     best_affinity,
     match_basis,
     match_basis_up_to_affinity,

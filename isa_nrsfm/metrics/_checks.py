@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._affine_alignment import unit_shapes
+from isa_nrsfm.metrics._alignment import unit_shapes
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._affine_alignment import ROUNDING
+from isa_nrsfm.metrics._alignment import ROUNDING
 from isa_nrsfm.metrics._checks import as_shapes, check_same_shape
 
 CONVENTIONS = ("sequence", "frame")

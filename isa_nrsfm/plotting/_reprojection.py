@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import _safe_indexing, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._optional import import_optional
-from isa_nrsfm._tracks import table_to_tracks, tracks_to_table
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
     OBSERVED_COLOUR,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera import DEGENERATE_MEAN
-from isa_nrsfm._metric import (
+from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,
     metric_quadric,
     symmetric_power,

@@ -25,11 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.calibration import (
-    canonical_pose,
-    deformation_metric,
-    euclidean_frames,
-)
+from isa_nrsfm.calibration import canonical_pose, deformation_metric, euclidean_frames
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 

@@ -1,0 +1,1 @@
+"""Optional dependencies, and private names of scikit-learn."""

@@ -1,0 +1,214 @@
+"""The fitted model as a function of the rows of a table, one block at a time."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
+from isa_nrsfm._prepare.checks import clean_tracks
+from isa_nrsfm._prepare.robust import robust_sizes
+from isa_nrsfm._tables.layout import (
+    Layout,
+    centred_tracks,
+    table_to_tracks,
+    tracks_to_table,
+    weighting_sizes,
+)
+from isa_nrsfm._tables.sources import Table
+from isa_nrsfm._tables.visibility import seen_points, usable_frames
+
+
+class TableModel(NamedTuple):
+    """
+    All that the fit of the frames of a new table depends on.
+
+    Attributes
+    ----------
+    frames : RigidFrames or PosteriorFrames
+        The model of a frame of size one.
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape in the gauge.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes in the gauge.
+    layout : {"interleaved", "planar"}
+        Order of the columns.
+    names : ndarray of shape (2 * n_points,) or None
+        Names of the columns.
+    unit : float or None
+        The one size of all frames of a table; None where each has its own.
+    """
+
+    frames: RigidFrames | PosteriorFrames
+    mean_shape: NDArray
+    basis: NDArray
+    layout: Layout
+    names: NDArray | None
+    unit: float | None
+
+    def decompose(self, table: Table) -> FrameFit:
+        """Return cameras, positions and coefficients of the frames of a table."""
+        K = len(self.basis)
+        shapes = ((2, 3), (2,), (K,), (K,))
+        fit = partial(_fit, model=self, dtype=table.dtype)
+        return FrameFit(*table.blocks.gather(fit, shapes, table.dtype))
+
+    def reconstruct(
+        self, table: Table, metric: DeformationMetric | None, scaled: bool
+    ) -> NDArray:
+        """
+        Return the shapes of the frames of a table.
+
+        Parameters
+        ----------
+        table : Table
+            The table.
+        metric : DeformationMetric or None
+            The metric of space in which shapes are Euclidean; None for affine shapes.
+        scaled : bool
+            Whether Euclidean shapes have the sizes that an orthographic camera shows.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_points, 3)
+            The shapes.
+        """
+        shape = partial(
+            _shapes, model=self, metric=metric, scaled=scaled, dtype=table.dtype
+        )
+        return table.blocks.gather(shape, (self.mean_shape.shape,), table.dtype)[0]
+
+    def reproject(self, table: Table) -> NDArray:
+        """Return a table as the model sees it."""
+        image = partial(_images, model=self, dtype=table.dtype)
+        return table.blocks.gather(image, ((table.n_columns,),), table.dtype)[0]
+
+    def held_out_error(self, table: Table) -> float:
+        """Return the inverse SNR of points held out of the fit of their frame."""
+        energies = table.blocks.map(partial(_held_out, model=self))
+        noise, signal = np.sum(list(energies), axis=0)
+        return float(noise / signal) if signal > 0 else float("nan")
+
+    def usable(self, rows: NDArray) -> tuple[NDArray, NDArray]:
+        """Return the tracks of some rows, and which of their frames are usable."""
+        tracks = table_to_tracks(rows, self.layout)
+        tracks = clean_tracks(tracks, self.layout, self.names)
+        return tracks, usable_frames(tracks)
+
+    def sizes(self, centred: NDArray) -> NDArray:
+        """Return the sizes of frames."""
+        if self.unit is not None or not len(centred):
+            return np.full(len(centred), self.unit)
+        if isinstance(self.frames, PosteriorFrames) and self.frames.loss != "linear":
+            return robust_sizes(centred)
+        return weighting_sizes(centred, scale_frames=True)
+
+
+def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
+    """Return the fit of some rows of a table."""
+    tracks, usable = model.usable(rows)
+    frames = FrameFit.unknown(len(tracks), len(model.basis))
+    if usable.any():
+        centred, translation = centred_tracks(tracks[usable])
+        fit = model.frames.fit(centred, model.sizes(centred))
+        fit = fit._replace(translation=fit.translation + translation)
+        for whole, part in zip(frames, fit, strict=True):
+            whole[usable] = part
+    return frames.astype(dtype)
+
+
+def _shapes(
+    rows: NDArray,
+    model: TableModel,
+    metric: DeformationMetric | None,
+    scaled: bool,
+    dtype: Any,
+) -> tuple[NDArray]:
+    """Return the shapes of some rows of a table."""
+    motion, _, alpha, _ = _fit(rows, model, dtype)
+    if metric is None:
+        return (compose(model.mean_shape, model.basis, alpha),)
+    frames = euclidean_frames(metric, motion, alpha, model.mean_shape, model.basis)
+    shapes = frames.shapes
+    if scaled:
+        shapes = frames.scales[:, None, None] * shapes
+    return (shapes.astype(dtype, copy=False),)
+
+
+def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
+    """Return some rows of a table as the model sees them."""
+    motion, translation, alpha, _ = _fit(rows, model, dtype)
+    shapes = compose(model.mean_shape, model.basis, alpha)
+    return (tracks_to_table(project(shapes, motion, translation), model.layout),)
+
+
+def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
+    """Return what the error of points held out adds up for some rows of a table."""
+    tracks, usable = model.usable(rows)
+    tracks = tracks[usable]
+    sizes = model.sizes(centred_tracks(tracks)[0])
+    return held_out_energies(model.frames, model.mean_shape, model.basis, tracks, sizes)
+
+
+# Parts of the points that are held out in turn, and what draws them: always the same.
+N_FOLDS = 5
+FOLD_SEED = 0
+
+
+def held_out_energies(
+    frames: RigidFrames | PosteriorFrames,
+    mean_shape: NDArray,
+    basis: NDArray,
+    tracks: NDArray,
+    sizes: NDArray,
+) -> tuple[float, float]:
+    """
+    Return the energy of the error, and of the signal, of points that are held out.
+
+    The points are divided into five parts, the same for all frames and tables. Each
+    part is predicted from the others, frame by frame: camera, position and coefficients
+    are fitted without it.
+
+    Parameters
+    ----------
+    frames : RigidFrames or PosteriorFrames
+        The model of a frame.
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape in the gauge of `frames`.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes in the gauge of `frames`.
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks, NaN where a point is missing.
+    sizes : ndarray of shape (n_frames,)
+        Sizes of the frames.
+
+    Returns
+    -------
+    noise, signal : float
+        ``sum ||m - mhat||^2`` and ``sum ||m - centroid_i||^2`` over the points, in
+        units of the sizes. Points whose frame is not determined by the others are left
+        out.
+    """
+    n_points = tracks.shape[1]
+    folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
+    seen = seen_points(tracks)
+    noise = signal = 0.0
+    for fold in range(N_FOLDS):
+        held = folds == fold
+        visible = np.where(held[:, None], np.nan, tracks)
+        usable = np.flatnonzero(usable_frames(visible) & seen[:, held].any(axis=1))
+        if not len(usable):
+            continue
+        fit = frames.fit(visible[usable], sizes[usable])
+        shapes = compose(mean_shape[held], basis[:, held], fit.alpha)
+        model = project(shapes, fit.motion, fit.translation)
+        part = tracks[usable]
+        centre = np.nanmean(part, axis=1, keepdims=True)
+        weight = sizes[usable, None, None] ** -2.0
+        counted = seen[np.ix_(usable, held)] & np.isfinite(model).all(axis=2)
+        noise += np.sum((weight * (part[:, held] - model) ** 2)[counted])
+        signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
+    return float(noise), float(signal)

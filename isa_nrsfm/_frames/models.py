@@ -1,0 +1,348 @@
+"""Camera, position and coefficients of single frames for given shapes.
+
+Each frame is fitted by itself: the result of a frame does not depend on the others.
+There are two models of a frame: `RigidFrames`, the paper's, takes the camera of the
+rigid fit, `PosteriorFrames` the most probable camera and coefficients.
+"""
+
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.camera import rigid_cameras
+from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.point_sums import FrameTracks
+from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
+from isa_nrsfm._frames.projection import distances
+from isa_nrsfm._prepare.robust import distant_points, robust_weights
+from isa_nrsfm._tables.layout import measurement_matrix
+from isa_nrsfm._tables.visibility import seen_points
+
+if TYPE_CHECKING:
+    import os
+
+# A basis shape whose image has less than this share of the energy that the camera could
+# show of it is seen end on: its image is rounding errors.
+UNSEEN = 1e-28
+# What mirrors shapes and cameras in depth.
+MIRROR = np.array([1.0, 1.0, -1.0])
+# Rounds of a robust fit, and the change of the weights that ends them.
+REWEIGHTINGS = 50
+SETTLED = 1e-4
+
+
+class FrameFit(NamedTuple):
+    """
+    Cameras, positions and coefficients of frames; NaN where a frame shows too little.
+
+    Attributes
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, in the units of the table per unit of the shapes.
+    translation : ndarray of shape (n_frames, 2)
+        Image of the origin, which is the centroid of the points of the mean shape.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients of the basis shapes.
+    alpha_std : ndarray of shape (n_frames, n_components)
+        Their standard deviations; NaN where the model of the frames knows no noise.
+    """
+
+    motion: NDArray
+    translation: NDArray
+    alpha: NDArray
+    alpha_std: NDArray
+
+    def astype(self, dtype: Any) -> "FrameFit":
+        """Return the fit in another type of numbers."""
+        return type(self)(*(part.astype(dtype, copy=False) for part in self))
+
+    @classmethod
+    def of_blocks(cls, parts: "Iterable[FrameFit]") -> "FrameFit":
+        """Return the fits of consecutive blocks of frames as one."""
+        parts = list(parts)
+        if len(parts) == 1:
+            return parts[0]
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def in_files(self, folder: "str | os.PathLike[str]") -> "FrameFit":
+        """Return the fit as memory maps of files in a folder, named like the parts."""
+        path = Path(folder)
+        path.mkdir(parents=True, exist_ok=True)
+        for name, part in self._asdict().items():
+            np.save(path / f"{name}.npy", part)
+        return type(self)(
+            *(np.load(path / f"{name}.npy", mmap_mode="r") for name in self._fields)
+        )
+
+    @classmethod
+    def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":
+        """Return a fit that is NaN."""
+        return cls(
+            np.full((n_frames, 2, 3), np.nan),
+            np.full((n_frames, 2), np.nan),
+            np.full((n_frames, n_components), np.nan),
+            np.full((n_frames, n_components), np.nan),
+        )
+
+
+class RigidFrames(NamedTuple):
+    """
+    The paper's model of a frame: rigid camera, coefficients by least squares.
+
+    Attributes
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Centred.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Centred basis shapes, orthogonal to each other and to the mean shape as the
+        paper's are: ``B_k B_l^T = 0`` (3x3) for different k and l. The least squares
+        then separate where no point is missing.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras may be: the nearest ones to the affine cameras of the rigid fit.
+        Orthographic ones have the scale one.
+    """
+
+    mean_shape: NDArray
+    basis: NDArray
+    camera: str = "affine"
+
+    def mirrored(self) -> "RigidFrames":
+        """Return the model with shapes mirrored in depth."""
+        return self._replace(
+            mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
+        )
+
+    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+        """
+        Return the camera of the rigid fit and the coefficients of least squares.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks, in any place; NaN where a point is missing.
+        sizes : ndarray of shape (n_frames,)
+            Not used: the fit does not depend on the unit of a frame.
+
+        Returns
+        -------
+        FrameFit
+            ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or
+            zero where camera i does not see basis shape k at all; the least squares
+            solution of least norm otherwise.
+        """
+        fit = FrameFit.unknown(len(tracks), len(self.basis))
+        seen = seen_points(tracks)
+        complete = np.asarray(seen.all(axis=1))
+        _fill(fit, complete, self._separately(tracks[complete]))
+        for i in np.flatnonzero(~complete):
+            _fill(fit, np.array([i]), self._together(tracks[i, seen[i]], seen[i]))
+        return fit
+
+    def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of complete frames."""
+        translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
+        W = measurement_matrix(tracks - translation[:, None])
+        motion, alpha = self.of_rows(W)
+        return motion, translation, alpha
+
+    def of_rows(self, W: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return cameras and coefficients of complete frames.
+
+        Parameters
+        ----------
+        W : ndarray of shape (2 * n_frames, n_points)
+            Measurement matrix, rows centred, or its products and those of the shapes
+            with orthonormal directions that the shapes are made of.
+
+        Returns
+        -------
+        motion : ndarray of shape (n_frames, 2, 3)
+            Cameras.
+        alpha : ndarray of shape (n_frames, n_components)
+            Coefficients.
+        """
+        motion = self._cameras(W, self.mean_shape)
+        n_components, n_points, _ = self.basis.shape
+        stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
+        P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
+        along = np.einsum("irkc,irc->ik", P, motion)
+        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
+        R = np.linalg.qr(self.basis, mode="r")
+        images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
+        energy = np.einsum("ikrd,ikrd->ik", images, images)
+        largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
+        visible = energy > UNSEEN * largest
+        return motion, np.divide(along, energy, where=visible, out=np.zeros_like(along))
+
+    def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
+        """Return cameras (n_frames, 2, 3) that see a rigid shape best."""
+        motion = rigid_cameras(W, mean_shape)
+        if self.camera == "affine":
+            return motion
+        rows, scales = nearest_calibrated(motion)
+        return rows if self.camera == "orthographic" else scales[:, None, None] * rows
+
+    def _together(
+        self, points: NDArray, seen: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of a frame of which some points are seen."""
+        centre, centroid = points.mean(axis=0), self.mean_shape[seen].mean(axis=0)
+        W = (points - centre).T
+        motion = self._cameras(W, self.mean_shape[seen] - centroid)
+        basis = self.basis[:, seen]
+        middles = basis.mean(axis=1)
+        images = (basis - middles[:, None]) @ motion[0].T
+        rest = W.T - (self.mean_shape[seen] - centroid) @ motion[0].T
+        alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
+        translation = centre - motion[0] @ (centroid + alpha @ middles)
+        return motion, translation[None], alpha[None]
+
+
+class PosteriorFrames(NamedTuple):
+    """
+    The joint refinement's model of a frame: all of it at once, with a prior.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Shapes with coefficients that are drawn from N(0, I), rows centred.
+    noise_variance : float
+        Variance of a coordinate of a frame of size one.
+    starts : ndarray of shape (n_starts, n_components)
+        Coefficients to start from where zero leads nowhere.
+    loss : {"linear", "huber", "cauchy"}
+        How points count that are far from the model.
+    gauge : FrameMap
+        Takes the coefficients to the basis that is shown.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras may be; orthographic ones have the scale one.
+    """
+
+    shapes: NDArray
+    noise_variance: float
+    starts: NDArray
+    loss: str
+    gauge: FrameMap
+    camera: str = "affine"
+
+    def mirrored(self) -> "PosteriorFrames":
+        """Return the model with shapes that are shown mirrored in depth."""
+        space = MIRROR[:, None] * self.gauge.space
+        return self._replace(gauge=self.gauge._replace(space=space))
+
+    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+        """
+        Return the most probable camera, position and coefficients.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks, in any place; NaN where a point is missing.
+        sizes : ndarray of shape (n_frames,)
+            Sizes of the frames.
+
+        Returns
+        -------
+        FrameFit
+            As of `fit_posterior`, in the gauge; with a robust loss the weights agree
+            with the fit.
+        """
+        return self.shown(self.posterior(tracks / sizes[:, None, None]), sizes)
+
+    def shown(self, posterior: FramePosterior, sizes: NDArray) -> FrameFit:
+        """
+        Return a fit of frames of size one in their sizes and in the gauge.
+
+        Parameters
+        ----------
+        posterior : FramePosterior
+            The fit.
+        sizes : ndarray of shape (n_frames,)
+            Sizes of the frames.
+
+        Returns
+        -------
+        FrameFit
+            The same fit.
+        """
+        motion, alpha, deviation = self.gauge.apply(
+            posterior.motion, posterior.alpha, posterior.covariance
+        )
+        translation = posterior.translation * sizes[:, None]
+        return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
+
+    def prepared_posterior(self, block: list[FrameTracks]) -> FramePosterior:
+        """
+        Return the fit of frames that are ready for products, before the gauge.
+
+        Parameters
+        ----------
+        block : list of FrameTracks
+            Frames of size one, in the coordinates of the shapes, of which each point
+            counts alike.
+
+        Returns
+        -------
+        FramePosterior
+            The fit, that of `posterior`.
+        """
+        fits = [
+            fit_prepared(
+                part,
+                self.shapes,
+                self.noise_variance,
+                camera=self.camera,
+                starts=self.starts,
+            )
+            for part in block
+        ]
+        if len(fits) == 1:
+            return fits[0]
+        return FramePosterior(*map(np.concatenate, zip(*fits, strict=True)))
+
+    def posterior(self, tracks: NDArray) -> FramePosterior:
+        """Return the fit of frames of size one, before the gauge."""
+        # Sums over other strides are rounded otherwise.
+        tracks = np.ascontiguousarray(tracks)
+        fitted = partial(
+            fit_posterior,
+            shapes=self.shapes,
+            noise_variance=self.noise_variance,
+            camera=self.camera,
+        )
+        if self.loss == "linear":
+            return fitted(tracks, starts=self.starts)
+        weights = np.where(distant_points(tracks), 0.0, 1.0)
+        fit = fitted(tracks, weights=weights, starts=self.starts)
+        seen = seen_points(tracks)
+        changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
+        for _ in range(REWEIGHTINGS):
+            part = tracks[changing]
+            distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
+            distance = np.where(seen[changing], distance, np.inf)
+            new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
+            unsettled = np.abs(new - weights[changing]).max(axis=1) > SETTLED
+            weights[changing] = new
+            changing = changing[unsettled]
+            if not len(changing):
+                break
+            refit = fitted(
+                tracks[changing],
+                weights=weights[changing],
+                initial=fit.alpha[changing],
+            )
+            for whole, values in zip(fit, refit, strict=True):
+                whole[changing] = values
+        return fit
+
+
+def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:
+    """Set camera, position and coefficients of some frames."""
+    for whole, part in zip(fit, values, strict=False):
+        whole[frames] = part

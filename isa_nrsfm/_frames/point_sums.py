@@ -1,0 +1,379 @@
+"""Sums over the points of each frame: all that a fit of given shapes needs to know.
+
+Frames enter the fit of cameras and coefficients to given shapes ``B_k`` (3, J) only
+through ``P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T`` and through the Gram matrices
+``G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T`` with the weighted means of a
+frame's points. The index of the frame is the last one of all arrays, so that each sum
+is one matrix product for all frames.
+"""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._linalg.packed_symmetric import (
+    COLUMNS,
+    ROWS,
+    UNPACKED,
+    pair_indices,
+    unpack3,
+    unpacked,
+)
+
+# <S, Q> of packed symmetric matrices counts the entries beside the diagonal twice.
+TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+# Directions in which shapes are thinner than this share of their width are flat.
+FLAT = 1e-10
+# Frames whose points cover less than this share of the variance of the mean shape
+# along some direction do not determine a camera.
+LEAST_COVER = 1e-10
+
+
+def _pair_index(n_pairs: int) -> tuple[NDArray, NDArray]:
+    """Return where each (k, l) is among the pairs, and how often each pair counts."""
+    index = unpacked(np.arange(n_pairs)).astype(np.intp)
+    first, second = pair_indices(len(index))
+    return index, np.where(first == second, 1.0, 2.0)
+
+
+class SharedGram:
+    """
+    The Gram matrix of shapes of which all frames see all points.
+
+    Parameters
+    ----------
+    pairs : ndarray of shape (n_pairs, 6)
+        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`: what is not
+        symmetric in a G_kl has no part in the fit.
+    """
+
+    def __init__(self, pairs: NDArray) -> None:
+        self.pairs = pairs
+        index, multiplicity = _pair_index(len(pairs))
+        full = pairs[index]  # (n, n, 6)
+        self._n_shapes = len(index)
+        self._moments = multiplicity * pairs.T
+        self._energies = pairs * TWICE
+        doubled = 2.0 * full.transpose(0, 2, 1)[:, UNPACKED]  # (n, 3, 3, n)
+        self._products = doubled.reshape(-1, self._n_shapes)
+
+    def products(self, c: NDArray) -> NDArray:
+        """
+        Return ``sum_l c_l (G_kl + G_kl^T)``, the products with the shapes of frames.
+
+        Parameters
+        ----------
+        c : ndarray of shape (n_shapes, n_frames)
+            Coefficients of all shapes.
+
+        Returns
+        -------
+        ndarray of shape (n_shapes, 3, 3, n_frames)
+            ``B_k S_i^T + S_i B_k^T`` with ``S_i = sum_l c_il B_l``.
+        """
+        return (self._products @ c).reshape(-1, 3, 3, c.shape[-1])
+
+    def moments(self, C: NDArray) -> NDArray:
+        """
+        Return ``sum_kl C_kl G_kl``, the second moments of the shapes of frames.
+
+        Parameters
+        ----------
+        C : ndarray of shape (n_pairs, n_frames)
+            Symmetric matrices (moments of the coefficients), packed as `pair_indices`.
+
+        Returns
+        -------
+        ndarray of shape (6, n_frames)
+            Symmetric 3x3 matrices, packed.
+        """
+        return self._moments @ C
+
+    def energies(self, Q: NDArray) -> NDArray:
+        """
+        Return ``H_kl = <G_kl, Q>``, the inner products of the images of shapes.
+
+        Parameters
+        ----------
+        Q : ndarray of shape (6, n_frames)
+            ``M_i^T M_i``, packed.
+
+        Returns
+        -------
+        ndarray of shape (n_pairs, n_frames)
+            ``<M_i B_k, M_i B_l>`` for the pairs of `pair_indices`.
+        """
+        return self._energies @ Q
+
+    def take(self, frames: NDArray) -> Self:
+        """Return the Gram matrix of some of the frames."""
+        return self
+
+
+class FrameGram:
+    """
+    The Gram matrices of shapes of which each frame sees its own points.
+
+    The methods are those of `SharedGram`.
+
+    Parameters
+    ----------
+    pairs : ndarray of shape (n_pairs, 6, n_frames)
+        ``(G_i,kl + G_i,kl^T) / 2``, packed, for the pairs of `pair_indices`.
+    """
+
+    def __init__(self, pairs: NDArray) -> None:
+        self.pairs = pairs
+        self._index, self._multiplicity = _pair_index(len(pairs))
+
+    def products(self, c: NDArray) -> NDArray:
+        """Return ``sum_l c_l (G_kl + G_kl^T)``."""
+        half = np.einsum("klai,li->kai", self.pairs[self._index], c)
+        return (2.0 * half)[:, UNPACKED]
+
+    def moments(self, C: NDArray) -> NDArray:
+        """Return ``sum_kl C_kl G_kl``."""
+        return np.einsum("pai,pi->ai", self.pairs, self._multiplicity[:, None] * C)
+
+    def energies(self, Q: NDArray) -> NDArray:
+        """Return ``H_kl = <G_kl, Q>``."""
+        return np.einsum("pai,ai->pi", self.pairs, TWICE[:, None] * Q)
+
+    def take(self, frames: NDArray) -> "FrameGram":
+        """Return the Gram matrices of some of the frames."""
+        return FrameGram(self.pairs[..., frames])
+
+
+class FrameTracks(NamedTuple):
+    """
+    Tracks with the frame index last, ready for products with any shapes.
+
+    Attributes
+    ----------
+    weighted : ndarray of shape (n_points, 2, n_frames)
+        ``w_ij (m_ij - mean_i)``; zero for points that are missing.
+    weights : ndarray of shape (n_points, n_frames) or None
+        w_ij; None where all are 1.
+    centroid : ndarray of shape (2, n_frames)
+        ``mean_i``, the weighted mean of the points; zero for frames without any.
+    weight : ndarray of shape (n_frames,)
+        ``sum_j w_ij``.
+    energy : ndarray of shape (n_frames,)
+        ``sum_j w_ij ||m_ij - mean_i||^2``.
+    """
+
+    weighted: NDArray
+    weights: NDArray | None
+    centroid: NDArray
+    weight: NDArray
+    energy: NDArray
+
+    def take(self, frames: NDArray | slice) -> Self:
+        """Return some of the frames."""
+        return type(self)(
+            self.weighted[..., frames],
+            None if self.weights is None else self.weights[..., frames],
+            self.centroid[:, frames],
+            self.weight[frames],
+            self.energy[frames],
+        )
+
+
+class FrameProducts(NamedTuple):
+    """
+    Sums over the points of frames, with weights w_ij.
+
+    Attributes
+    ----------
+    cross : ndarray of shape (n_shapes, 3, 2, n_frames)
+        ``P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T``.
+    gram : SharedGram or FrameGram
+        ``G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T``.
+    shape_centroid : ndarray of shape (n_shapes, 3, n_frames)
+        ``mean_ik``, weighted means of the points of the shapes.
+    centroid, weight, energy : ndarray
+        As in `FrameTracks`.
+    """
+
+    cross: NDArray
+    gram: SharedGram | FrameGram
+    shape_centroid: NDArray
+    centroid: NDArray
+    weight: NDArray
+    energy: NDArray
+
+    def take(self, frames: NDArray) -> Self:
+        """Return the sums of some of the frames."""
+        return self._replace(
+            cross=self.cross[..., frames],
+            gram=self.gram.take(frames),
+            shape_centroid=self.shape_centroid[..., frames],
+            centroid=self.centroid[:, frames],
+            weight=self.weight[frames],
+            energy=self.energy[frames],
+        )
+
+
+def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks:
+    """
+    Return tracks with the frame index last, centred over the points of each frame.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks, in any place. What they hold where the weight is zero, NaN for
+        instance, does not matter.
+    weights : ndarray of shape (n_frames, n_points), optional
+        Not negative, zero for points that are missing; by default all are 1.
+
+    Returns
+    -------
+    FrameTracks
+        The tracks.
+    """
+    n_frames, n_points, _ = tracks.shape
+    centred = np.array(tracks.transpose(1, 2, 0), dtype=np.float64, order="C")
+    if weights is None:
+        centroid = centred.mean(axis=0)
+        centred -= centroid
+        energy = np.einsum("jri,jri->i", centred, centred)
+        weight = np.full(n_frames, float(n_points))
+        return FrameTracks(centred, None, centroid, weight, energy)
+    W = np.array(weights.T, dtype=np.float64, order="C")
+    np.copyto(centred, 0.0, where=(W == 0)[:, None])
+    weight = W.sum(axis=0)
+    centroid = np.einsum("ji,jri->ri", W * _share(weight), centred)
+    centred -= centroid
+    weighted = centred * W[:, None]
+    energy = np.einsum("jri,jri->i", weighted, centred)
+    return FrameTracks(weighted, W, centroid, weight, energy)
+
+
+def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
+    """Return frames of several blocks, all with weights or none, as one block."""
+    if len(parts) == 1:
+        return parts[0]
+    weighted, weights, centroid, weight, energy = zip(*parts, strict=True)
+    return FrameTracks(
+        np.concatenate(weighted, axis=-1),
+        None if weights[0] is None else np.concatenate(weights, axis=-1),
+        np.concatenate(centroid, axis=-1),
+        np.concatenate(weight),
+        np.concatenate(energy),
+    )
+
+
+def _share(weight: NDArray) -> NDArray:
+    """Return the inverse of sums of weights, and zero for frames without points."""
+    return np.divide(1.0, weight, where=weight > 0, out=np.zeros_like(weight))
+
+
+def shared_gram(shapes: NDArray) -> SharedGram:
+    """Return the Gram matrix of shapes (n_shapes, 3, n_points) with centred rows."""
+    n_shapes, _, n_points = shapes.shape
+    rows = shapes.reshape(-1, n_points)
+    blocks = (rows @ rows.T).reshape(n_shapes, 3, n_shapes, 3).transpose(0, 2, 1, 3)
+    pairs = blocks[pair_indices(n_shapes)]
+    return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
+
+
+def frame_products(
+    tracks: FrameTracks, shapes: NDArray, gram: SharedGram | None = None
+) -> FrameProducts:
+    """
+    Return the sums over the points of frames.
+
+    Parameters
+    ----------
+    tracks : FrameTracks
+        The frames.
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes, rows centred.
+    gram : SharedGram, optional
+        That of the shapes, where it is at hand already.
+
+    Returns
+    -------
+    FrameProducts
+        With a `SharedGram` where all weights are 1, a `FrameGram` otherwise.
+    """
+    weighted, W, centroid, weight, energy = tracks
+    n_shapes, _, n_points = shapes.shape
+    rows = np.ascontiguousarray(shapes, dtype=np.float64).reshape(-1, n_points)
+    cross = (rows @ weighted.reshape(n_points, -1)).reshape(n_shapes, 3, 2, -1)
+    if W is None:
+        means = np.zeros((n_shapes, 3, len(weight)))
+        shared = shared_gram(shapes) if gram is None else gram
+        return FrameProducts(cross, shared, means, centroid, weight, energy)
+    means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
+    products = _pair_products(rows.reshape(shapes.shape))
+    pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
+    # The rows are centred over all points, so that little is subtracted.
+    pairs -= _pair_products(means * np.sqrt(weight))
+    return FrameProducts(cross, FrameGram(pairs), means, centroid, weight, energy)
+
+
+def _pair_products(rows: NDArray) -> NDArray:
+    """Return the symmetric parts of ``x_k x_l^T`` of (n, 3, m) as (n_pairs, 6, m)."""
+    first, second = (rows[index] for index in pair_indices(len(rows)))
+    products = first[:, ROWS] * second[:, COLUMNS]
+    products += first[:, COLUMNS] * second[:, ROWS]
+    products *= 0.5
+    return products
+
+
+def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return shapes in the space in which they are as wide in all directions.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes, rows centred.
+
+    Returns
+    -------
+    white : ndarray of shape (n_shapes, 3, n_points)
+        ``T B_k``, with rows of zeros for directions in which all shapes are flat, and
+        in the mean shape also for those in which it is flat itself.
+    space : ndarray of shape (3, 3)
+        T such that ``sum_k T B_k B_k^T T^T`` (the second moment of a shape whose
+        coefficients are N(0, I)) is the identity, or has zeros on the diagonal. The
+        axes are the principal axes of the white mean shape.
+    """
+    across = np.concatenate(list(shapes), axis=1)
+    U, size, _ = np.linalg.svd(across, full_matrices=False)
+    kept = size > FLAT * size[0]
+    space = (kept / np.where(kept, size, 1.0))[:, None] * U.T
+    axes, width, _ = np.linalg.svd(space @ shapes[0], full_matrices=False)
+    space = axes.T @ space
+    white = space @ shapes
+    white[0, width <= FLAT] = 0.0
+    return white, space
+
+
+def determines_camera(products: FrameProducts, mean_shape: NDArray) -> NDArray:
+    """
+    Return for each frame whether the points that it sees determine a camera.
+
+    Parameters
+    ----------
+    products : FrameProducts
+        Sums of the frames for `whitened` shapes, with a `FrameGram`.
+    mean_shape : ndarray of shape (3, n_points)
+        B_0 of these shapes.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_frames,)
+        Whether the frame has points and the mean shape is, among them, not flat along
+        a direction in which it is not flat as a whole.
+    """
+    variance = np.einsum("aj,aj->a", mean_shape, mean_shape) / mean_shape.shape[1]
+    inside = variance > 0
+    scale = 1.0 / np.sqrt(variance[inside])
+    weight = np.where(products.weight > 0, products.weight, 1.0)
+    seen = unpack3(products.gram.pairs[0] / weight)[inside][:, inside]
+    cover = np.linalg.eigvalsh((seen.T * scale).swapaxes(1, 2) * scale)
+    return (products.weight > 0) & (cover > LEAST_COVER).all(axis=1)

@@ -1,0 +1,1 @@
+"""The coordinates in which shapes and coefficients are given."""

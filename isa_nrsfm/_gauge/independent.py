@@ -1,0 +1,159 @@
+"""The independent basis among all bases that fit a table equally well.
+
+A fit determines the shapes of the frames, up to one affinity of space and one scale a
+frame, but not their basis: ``B_0 + sum_k u_k B_k``, ``B_k + v_k B_0`` (absorbed by the
+scales of the cameras) and any invertible mixing of the basis shapes fit equally well.
+Here u, v and the mixing are fixed: by coefficients with mean zero, basis shapes
+without a part along the mean shape, and independence (Brandt, Ackermann, Grasshof
+2018, whose assumption this is, but with one mixing for all three coordinates).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
+from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
+
+INDEPENDENCE = ("shapes", "coefficients")
+# The alternation of the two shifts ends when they are below this, or after so many.
+SHIFTED = 1e-12
+MAX_SHIFTS = 200
+# The scale of a frame does not get below this share of the mean.
+SMALLEST_SCALE = 0.1
+
+
+class IndependentGauge(NamedTuple):
+    """
+    Canonical shapes with an independent basis.
+
+    Attributes
+    ----------
+    mean_shape : ndarray of shape (n_points, 3)
+        Mean shape in the space of `canonical_space`.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes, ordered, scaled and signed as by `canonical_gauge`.
+    frames : FrameMap
+        What happens to cameras and coefficients.
+    """
+
+    mean_shape: NDArray
+    basis: NDArray
+    frames: FrameMap
+
+
+def independent_gauge(
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    independence: str | None,
+    camera: str = "affine",
+    unit: float | None = None,
+) -> IndependentGauge:
+    """
+    Return the independent basis of a fit.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes, centred.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, each divided by the size of its frame.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    independence : {"shapes", "coefficients", None}
+        Whether the basis shapes are to be independent over the points or their
+        coefficients over the frames; None takes the principal axes of the deformation.
+    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
+        What cameras are: affinities of space, or with calibrated ones only rotations,
+        fit equally well. Scales of orthographic cameras absorb nothing.
+    unit : float, optional
+        What a unit of the shapes becomes with calibrated cameras, as of
+        `euclidean_space`.
+
+    Returns
+    -------
+    IndependentGauge
+        The basis, and the map of the frames to it.
+    """
+    shift, motion, alpha = _centred(shapes, motion, alpha, camera)
+    shapes = np.tensordot(shift, shapes, 1)
+    space = canonical_space(shapes[0].T, motion)
+    white = shapes[1:].transpose(0, 2, 1) @ space.T
+    if camera != "affine":
+        space = euclidean_space(shapes[0].T, motion, unit)
+    if independence == "shapes":
+        mixing = shared_mixing(white)
+    elif independence == "coefficients":
+        mixing = np.linalg.inv(independent_coefficients(alpha)).T
+    else:
+        mixing = _principal_axes(white, alpha)
+    basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
+    unmixing = np.linalg.inv(mixing).T
+    gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
+    factors = gauge.factors
+    scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
+    coefficients = np.linalg.inv(shift).T
+    coefficients[1:] = scale[:, None] * (unmixing @ coefficients[1:])[gauge.order]
+    return IndependentGauge(
+        gauge.mean_shape, gauge.basis, FrameMap(coefficients, space)
+    )
+
+
+def _centred(
+    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
+) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return the mixing of B_0, ..., B_K to centred coefficients and pure basis shapes.
+
+    The coefficients get mean zero by ``B_0 + sum_k u_k B_k``, and the basis shapes
+    ``tr(B_k B_0^+) = 0`` by ``B_k + v_k B_0``, which is ``<T B_k, T B_0> = 0`` where T
+    whitens B_0; with weak-perspective cameras ``<B_k, B_0> = 0``. The one undoes the
+    other a little: they alternate. Where that would turn a frame inside out, or has no
+    end, or where cameras have no scales that absorb it, the basis shapes stay as they
+    are. Cameras and coefficients for the new shapes are returned, too.
+    """
+    rank = max(np.linalg.matrix_rank(shapes[0], rtol=1e-9), 1)
+    first = total = _mean_shift(alpha)
+    moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
+    for _ in range(0 if camera == "orthographic" else MAX_SHIFTS):
+        current = np.tensordot(total, shapes, 1)
+        if camera == "affine":
+            dual = np.linalg.pinv(current[0], rcond=1e-9).T / rank
+        else:
+            dual = current[0] / (np.vdot(current[0], current[0]) or 1.0)
+        along = np.eye(len(shapes))
+        along[1:, 0] = -np.einsum("kcj,cj->k", current[1:], dual)
+        factor = 1 - moved @ along[1:, 0]
+        if not (factor > 0).all():
+            break
+        scale = scale * factor
+        moved = moved / factor[:, None]
+        mean = _mean_shift(moved)
+        moved = moved - mean[0, 1:]
+        total = mean @ along @ total
+        change = np.abs(mean[0, 1:]) + np.abs(along[1:, 0])
+        if np.max(change, initial=0.0) <= SHIFTED * max(1.0, np.abs(moved).max()):
+            if scale.min() < SMALLEST_SCALE * scale.mean():
+                break
+            return total, motion * scale[:, None, None], moved
+    return first, motion, alpha - first[0, 1:]
+
+
+def _mean_shift(alpha: NDArray) -> NDArray:
+    """Return the mixing that takes the mean of the coefficients into B_0."""
+    mixing = np.eye(alpha.shape[1] + 1)
+    mixing[0, 1:] = alpha.mean(axis=0)
+    return mixing
+
+
+def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
+    """Return the mixing to uncorrelated coefficients and orthogonal basis shapes."""
+    variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
+    variance = np.where(variance > 1e-20 * max(variance[-1], 1e-300), variance, 1.0)
+    root = (axes * np.sqrt(variance)) @ axes.T
+    flat = root @ basis.reshape(len(basis), -1)
+    _, directions = np.linalg.eigh(flat @ flat.T)
+    return directions[:, ::-1].T @ root

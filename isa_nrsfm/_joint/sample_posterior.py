@@ -1,0 +1,70 @@
+"""The posterior of the frames that were fitted, in their blocks."""
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.posterior import FramePosterior
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._tables.blocks import FrameBlocks
+
+
+def posterior_blocks(
+    model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
+) -> FrameBlocks:
+    """
+    Return the fits of all frames of a table, before the gauge.
+
+    Parameters
+    ----------
+    model : PosteriorFrames
+        The model of a frame.
+    frames : JointFrames
+        The frames as the joint refinement took them.
+    rows : FrameBlocks
+        The frames themselves (n_frames, 2, n_points), NaN where a point is missing.
+
+    Returns
+    -------
+    FrameBlocks
+        Blocks of FramePosterior.
+    """
+    if model.loss != "linear":
+        return rows.derive(partial(_row_posterior, model=model))
+    shapes = frames.coordinates(model.shapes)
+    return frames.blocks.derive(model._replace(shapes=shapes).prepared_posterior)
+
+
+def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
+    """Return the fit of frames (n_frames, 2, n_points) of size one."""
+    return model.posterior(rows.transpose(0, 2, 1))
+
+
+def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return what a gauge needs to know of the fits of frames.
+
+    Parameters
+    ----------
+    posteriors : FrameBlocks
+        Blocks of FramePosterior.
+
+    Returns
+    -------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    covariance : ndarray of shape (n_components, n_components)
+        Mean of their covariances.
+    """
+    motion, alpha, covariance = zip(*posteriors.map(_moments), strict=True)
+    total = np.sum(covariance, axis=0) / posteriors.n_frames
+    return np.concatenate(motion), np.concatenate(alpha), total
+
+
+def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
+    """Return cameras, coefficients and the sum of their covariances of a block."""
+    return posterior.motion, posterior.alpha, posterior.covariance.sum(axis=0)

@@ -1,0 +1,35 @@
+"""Rows of numbers: their energies, and signs that they are given."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def energies(rows: NDArray) -> NDArray[np.float64]:
+    """Return the sums of the squares of arrays (n_frames, ...), in double precision."""
+    flat = rows.reshape(len(rows), -1).astype(np.float64, copy=False)
+    return np.vecdot(flat, flat)
+
+
+def orientations(rows: NDArray) -> NDArray:
+    """
+    Return a sign for each row: that of its third moment.
+
+    The sign does not depend on the order of the entries. Where the third moment
+    vanishes the entry of largest magnitude decides, in the order of the entries.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_rows, n_entries)
+        Rows, each known up to its sign.
+
+    Returns
+    -------
+    ndarray of shape (n_rows,)
+        1.0 or -1.0.
+    """
+    largest = np.abs(rows).max(axis=1, keepdims=True)
+    scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
+    moment = np.sum(scaled**3, axis=1)
+    decisive = np.abs(moment) > 1e-9 * np.sum(np.abs(scaled) ** 3, axis=1)
+    extreme = scaled[np.arange(len(rows)), np.abs(scaled).argmax(axis=1)]
+    return np.where(np.where(decisive, moment, extreme) < 0, -1.0, 1.0)

@@ -1,0 +1,1 @@
+"""The Euclidean metric of space that cameras tell."""

@@ -1,0 +1,288 @@
+"""How far cameras are from scaled rotations in a metric, and how that changes with it.
+
+A metric is a symmetric positive definite 3x3 matrix ``G = Q Q^T``: the rows of the
+camera M_i are orthogonal and of equal length in it where ``M_i Q = s_i R_i``, the first
+two rows of a scaled rotation. It may change with the deformation of the object, as
+``G_i = Q exp(sum_k alpha_ik E_k) Q^T`` with symmetric strains E_k.
+
+What is left of orthonormality is linearised along geodesics, ``Q <- Q exp(E_0 / 2)``,
+and in the strains. The derivative of the exponential is that of Daleckii and Krein
+(Higham, "Functions of matrices", 2008, theorem 3.11). A frame has few numbers of its
+own, and its derivatives by E_k are those by its strain times alpha_ik: the derivatives
+by all unknowns are never made, only the sums over frames of their products.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, eigh3
+
+CameraModel = Literal["orthographic", "weak_perspective"]
+CAMERA_MODELS = ("orthographic", "weak_perspective")
+Block = tuple[NDArray, NDArray]
+
+# A share of the largest curvature that is rounding errors.
+ROUNDING = 1e-14
+# Frames taken at a time, for which all that a step needs stays in the cache.
+BLOCK_FRAMES = 2048
+
+
+class MetricFit(NamedTuple):
+    """
+    A metric of least squares.
+
+    Attributes
+    ----------
+    Q : ndarray of shape (3, 3)
+        Of the metric of frames without deformation.
+    strain : ndarray of shape (n_components, 3, 3)
+        E_k, symmetric and without trace.
+    n_frames : int
+        Number of cameras.
+    cost : float
+        Sum of the squared residuals, those of `orthonormality`.
+    curvature : ndarray of shape (n_unknowns, n_unknowns)
+        ``J^T J`` with J the derivatives of the residuals by the numbers of E_0, E_1,
+        ..., the coefficients of `strain_basis`, in this order.
+    gradient : ndarray of shape (n_unknowns,)
+        ``J^T r`` with r the residuals.
+    """
+
+    Q: NDArray
+    strain: NDArray
+    n_frames: int
+    cost: float
+    curvature: NDArray
+    gradient: NDArray
+
+    @property
+    def residual(self) -> float:
+        """Root mean square over the frames of the norm of the residuals."""
+        return float(np.sqrt(self.cost / self.n_frames))
+
+    @property
+    def condition_number(self) -> float:
+        """Condition number of the residuals as functions of the common metric."""
+        size = len(self.gradient) // (len(self.strain) + 1)
+        values = np.linalg.eigvalsh(self.curvature[:size, :size])
+        if values[0] <= ROUNDING * values[-1]:
+            return np.inf
+        return float(np.sqrt(values[-1] / values[0]))
+
+
+def strain_basis(camera: CameraModel) -> NDArray:
+    """
+    Return an orthonormal basis of the strains that cameras tell from none.
+
+    Parameters
+    ----------
+    camera : {"orthographic", "weak_perspective"}
+        With a scale of its own for each frame no strain has a trace.
+
+    Returns
+    -------
+    ndarray of shape (n_numbers, 3, 3)
+        Six symmetric matrices, or five without trace.
+    """
+    basis = np.zeros((6, 3, 3))
+    diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
+    basis[[[0], [1], [5]], [0, 1, 2], [0, 1, 2]] = diagonal
+    first, second = [0, 0, 1], [1, 2, 2]
+    basis[[2, 3, 4], first, second] = basis[[2, 3, 4], second, first] = np.sqrt(0.5)
+    return basis if camera == "orthographic" else basis[:5]
+
+
+def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
+    """
+    Return how far the rows of cameras are from those of rotations.
+
+    Parameters
+    ----------
+    gram : ndarray of shape (2, 2, n_frames)
+        ``M_i G M_i^T``, the products of the rows in the metric, the frame last.
+    camera : {"orthographic", "weak_perspective"}
+        Whether the rows should be those of a rotation or of a scaled rotation.
+
+    Returns
+    -------
+    ndarray of shape (3, n_frames) or (2, n_frames)
+        ``(xx - 1, sqrt(2) xy, yy - 1)``, of the norm ``||M_i G M_i^T - I||_F``, for
+        orthographic cameras, and ``(xx - yy, 2 xy) / (xx + yy)``, of the norm ``(s1^2 -
+        s2^2) / (s1^2 + s2^2)`` with s1, s2 the singular values of ``M_i Q``, for
+        weak-perspective ones: neither roll nor scale of a frame changes that.
+    """
+    entries = np.tensordot(_patterns(camera), gram, 2)
+    if camera == "orthographic":
+        return entries - [[1.0], [0.0], [1.0]]
+    return entries / (gram[0, 0] + gram[1, 1])
+
+
+def _patterns(camera: CameraModel) -> NDArray:
+    """Return the symmetric matrices whose products with a Gram matrix count."""
+    if camera == "orthographic":
+        across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
+        return np.stack([np.diag([1.0, 0.0]), across, np.diag([0.0, 1.0])])
+    return np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+
+
+def frame_blocks(motion: NDArray, alpha: NDArray) -> list[Block]:
+    """
+    Return cameras and coefficients in blocks, the frame last.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras, finite and not zero.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients of the strains.
+
+    Returns
+    -------
+    list of tuple of ndarray
+        Cameras (2, 3, n) and coefficients (n_components, n) of n frames each.
+    """
+    parts = [
+        slice(start, start + BLOCK_FRAMES)
+        for start in range(0, len(motion), BLOCK_FRAMES)
+    ]
+    return [
+        (
+            np.ascontiguousarray(motion[part].transpose(1, 2, 0)),
+            np.ascontiguousarray(alpha[part].T),
+        )
+        for part in parts
+    ]
+
+
+def fit_at(
+    blocks: list[Block], Q: NDArray, strain: NDArray, camera: CameraModel
+) -> MetricFit:
+    """
+    Return how well a metric fits cameras.
+
+    Parameters
+    ----------
+    blocks : list of tuple of ndarray
+        Of `frame_blocks`.
+    Q : ndarray of shape (3, 3)
+        Of the metric of frames without deformation.
+    strain : ndarray of shape (n_components, 3, 3)
+        E_k.
+    camera : {"orthographic", "weak_perspective"}
+        What the cameras should be.
+
+    Returns
+    -------
+    MetricFit
+        Cost, curvature and gradient there.
+    """
+    parts = [
+        _normal_equations(alpha, *_linearised(Q.T @ cameras, strain, alpha, camera))
+        for cameras, alpha in blocks
+    ]
+    costs, curvatures, gradients = zip(*parts, strict=True)
+    return MetricFit(
+        Q,
+        strain,
+        sum(alpha.shape[1] for _, alpha in blocks),
+        float(np.sum(costs)),
+        np.sum(curvatures, axis=0),
+        np.sum(gradients, axis=0),
+    )
+
+
+def _linearised(
+    cameras: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
+) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return residuals of cameras and their derivatives.
+
+    Parameters
+    ----------
+    cameras : ndarray of shape (2, 3, n_frames)
+        ``M_i Q``, the frame last.
+    strain : ndarray of shape (n_components, 3, 3)
+        E_k.
+    alpha : ndarray of shape (n_components, n_frames)
+        Coefficients.
+    camera : {"orthographic", "weak_perspective"}
+        What the cameras should be.
+
+    Returns
+    -------
+    residuals : ndarray of shape (n, n_frames)
+        As of `orthonormality`.
+    slopes : ndarray of shape (n_numbers, n, n_frames)
+        Derivatives by the numbers of E_0.
+    own_slopes : ndarray of shape (n_numbers, n, n_frames)
+        Derivatives by the numbers of the strain ``sum_k alpha_ik E_k`` of the frame:
+        those by the numbers of E_k are alpha_ik times as large.
+    """
+    numbers = strain_basis(camera)
+    grown = cameras
+    if len(strain):
+        stretch, axes = eigh3(strain[:, ROWS, COLUMNS].T @ alpha)
+        seen = np.einsum("abn,pan->pbn", axes, cameras)
+        grown = np.einsum("abn,pbn->pan", axes, np.exp(stretch) * seen)
+    gram = np.einsum("pan,qan->pqn", grown, cameras)
+    residuals = orthonormality(gram, camera)
+    # Residual c changes by tr(F_c d(M_i G_i M_i^T)).
+    F = np.broadcast_to(
+        _patterns(camera)[..., None], (len(residuals), 2, 2, cameras.shape[-1])
+    )
+    if camera == "weak_perspective":
+        F = F - residuals[:, None, None] * np.eye(2)[:, :, None]
+        F /= gram[0, 0] + gram[1, 1]
+
+    # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes by the mean of E_0 exp(E), exp(E) E_0.
+    turned = np.einsum("cpqn,qan->cpan", F, cameras)
+    by_common = np.einsum("cpan,pbn->abcn", turned, grown)
+    slopes = np.tensordot(numbers, by_common, 2)
+    if not len(strain):
+        return residuals, slopes, slopes
+    # In the axes of the strain exp(E) changes by divided differences of exp times dE.
+    half_gap = (stretch[:, None] - stretch) / 2
+    equal = half_gap == 0
+    divided = np.where(equal, 1.0, np.sinh(half_gap) / np.where(equal, 1.0, half_gap))
+    root = np.exp(stretch / 2)
+    divided *= root[:, None] * root
+    turned = np.einsum("cpqn,qan->cpan", F, seen)
+    by_own = np.einsum("cpan,pbn->abcn", turned, seen) * divided[:, :, None]
+    by_own = np.einsum("xan,abcn->xbcn", axes, by_own)
+    by_own = np.einsum("ybn,xbcn->xycn", axes, by_own)
+    return residuals, slopes, np.tensordot(numbers, by_own, 2)
+
+
+def _normal_equations(
+    alpha: NDArray, residuals: NDArray, slopes: NDArray, own_slopes: NDArray
+) -> tuple[float, NDArray, NDArray]:
+    """Return cost, curvature and gradient, as in `MetricFit`, of `_linearised`."""
+    n_components, size = len(alpha), len(slopes)
+    rows = slopes.reshape(size, -1)
+    curvature = np.empty((1 + n_components, size, 1 + n_components, size))
+    curvature[0, :, 0] = rows @ rows.T
+    gradient = np.empty((1 + n_components, size))
+    gradient[0] = rows @ residuals.ravel()
+    if n_components:
+        gradient[1:] = alpha @ np.einsum("acn,cn->na", own_slopes, residuals)
+        mixed = np.einsum("acn,bcn->abn", slopes, own_slopes) @ alpha.T
+        curvature[0, :, 1:] = mixed.transpose(0, 2, 1)
+        curvature[1:, :, 0] = mixed.transpose(2, 1, 0)
+        # Sums over the frames of products of two numbers and of two coefficients.
+        (a, b), numbers = _pairs(size)
+        (k, m), components = _pairs(n_components)
+        products = np.einsum("pcn,pcn->pn", own_slopes[a], own_slopes[b])
+        sums = products @ (alpha[k] * alpha[m]).T
+        curvature[1:, :, 1:] = sums[numbers[:, None], components[:, None, :, None]]
+    cost = float(np.vdot(residuals, residuals))
+    return cost, curvature.reshape(gradient.size, gradient.size), gradient.ravel()
+
+
+def _pairs(n: int) -> tuple[tuple[NDArray, NDArray], NDArray]:
+    """Return the pairs (a, b) with a <= b < n, and a table of where each of them is."""
+    a, b = np.triu_indices(n)
+    where = np.empty((n, n), dtype=int)
+    where[a, b] = where[b, a] = np.arange(len(a))
+    return (a, b), where

@@ -1,0 +1,299 @@
+"""Metric upgrade: the affinity of space that makes affine cameras Euclidean ones."""
+
+import warnings
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
+from isa_nrsfm._metric_upgrade.quadric import (
+    SMALLEST_EIGENVALUE,
+    mean_gram,
+    metric_quadric,
+    symmetric_power,
+    unit_cameras,
+)
+from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS, CameraModel, MetricFit
+
+# A condition number from which on the cameras hardly show the metric: rotations by
+# about five degrees have it.
+LARGEST_CONDITION = 50.0
+
+
+class MetricUpgrade(NamedTuple):
+    """
+    The upgrade of affine cameras to orthographic or weak-perspective ones.
+
+    Attributes
+    ----------
+    Q : ndarray of shape (3, 3)
+        ``motion_i @ Q`` is nearly ``scales_i * rotations_i[:2]``. Symmetric and
+        positive definite: of all matrices ``Q O`` with O orthogonal, which fit as well,
+        the one that leaves the coordinate axes as near as possible to where they are,
+        and does not change the handedness of the space. The root mean square of the
+        scales is one, so that Euclidean shapes are in units of the images.
+    rotations : ndarray of shape (n_frames, 3, 3)
+        Rotations, of determinant one: the rows are the axes of the image, x, y and z.
+        NaN for frames without camera.
+    scales : ndarray of shape (n_frames,)
+        Scales of the cameras, not negative; all equal to one for orthographic cameras.
+        NaN for frames without camera.
+    residual : float
+        How far the cameras are from what they should be, zero for perfect ones: the
+        root mean square over the frames of ``(s1^2 - s2^2) / (s1^2 + s2^2)``, with s1
+        and s2 the singular values of ``motion_i @ Q``, for weak-perspective cameras,
+        and of ``||M_i Q Q^T M_i^T - I||_F`` for orthographic ones, at the Q that
+        minimises it.
+    condition_number : float
+        How well the cameras determine Q: by how much errors of the cameras are
+        magnified in the direction of space that suffers most relative to the one that
+        suffers least. It is about one for cameras all round the object, 2.5 for a full
+        turn about an axis in the image, 4 for rotations of about 20 degrees, 14 for 10,
+        54 for 5, about twice as much where they are about one axis, and infinite where
+        Q is not determined, as for rotations about the viewing direction alone.
+    """
+
+    Q: NDArray
+    rotations: NDArray
+    scales: NDArray
+    residual: float
+    condition_number: float
+
+    def mirrored(self) -> Self:
+        """
+        Return the other upgrade, which fits as well: that to the mirror image.
+
+        Returns
+        -------
+        MetricUpgrade
+            With ``Q @ diag(1, 1, -1)``; Euclidean shapes become their mirror images
+            with the opposite sign of z, and rotations ``D R D`` with ``D = diag(1, 1,
+            -1)``.
+        """
+        depth = np.array([1.0, 1.0, -1.0])
+        rotations = depth[:, None] * self.rotations * depth
+        return self._replace(Q=self.Q * depth, rotations=rotations)
+
+
+def metric_upgrade(
+    motion: ArrayLike, camera: CameraModel = "weak_perspective"
+) -> MetricUpgrade:
+    """
+    Find the coordinates of space in which affine cameras are Euclidean ones.
+
+    That is the 3x3 matrix Q with ``M_i Q = s_i R_i``, the first two rows of a rotation
+    times a scale, as far as there is one.
+
+    Parameters
+    ----------
+    motion : array-like of shape (n_frames, 2, 3)
+        Affine cameras, such as `AffineNRSfM.motion_`. Those that are zero or NaN are
+        left out.
+    camera : {"weak_perspective", "orthographic"}, default="weak_perspective"
+        Whether each camera has a scale of its own or all have the same. The scales of
+        the cameras of a shape that deforms are a matter of convention: their common
+        scale can only be asked of cameras of a rigid shape.
+
+    Returns
+    -------
+    MetricUpgrade
+        Named tuple of Q, rotations, scales, residual and condition_number. The cameras
+        do not tell Q from ``Q @ diag(1, 1, -1)``: the Q that is returned has a positive
+        determinant, `MetricUpgrade.mirrored` gives the other one.
+
+    Raises
+    ------
+    ValueError
+        If `motion` is not of the shape above, has infinite entries, if `camera` is
+        none of the two, or if the cameras together see less than three directions of
+        space.
+
+    Warns
+    -----
+    UserWarning
+        If the condition number is above 50: the cameras turn too little, or there are
+        too few, to say how deep the object is.
+
+    See Also
+    --------
+    euclidean_shapes : Take shapes to the new coordinates.
+    deformation_metric : The same for a shape that deforms.
+
+    Notes
+    -----
+    ``G = Q Q^T`` solves ``M_i G M_i^T = s_i^2 I``, equations that are linear in G
+    (Tomasi, Kanade 1992; Poelman, Kanade 1997). Their solution minimises the wrong
+    thing where there is no exact one and may not be positive definite. It is where the
+    sum of squares of `residual` is minimised from, over positive definite matrices
+    only; another start is the metric in which the cameras see all directions alike, and
+    the better result is taken.
+
+    References
+    ----------
+    C. Tomasi, T. Kanade, "Shape and motion from image streams under orthography: a
+    factorization method", International Journal of Computer Vision 9, 1992.
+
+    C. Poelman, T. Kanade, "A paraperspective factorization method for shape and motion
+    recovery", IEEE Transactions on Pattern Analysis and Machine Intelligence 19, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.calibration import euclidean_shapes, metric_upgrade
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> faces = make_face_tracks(n_frames=50, random_state=0)
+    >>> affinity = np.array([[1.0, 0.5, 0.0], [0.0, 2.0, 0.0], [0.3, 0.0, 0.4]])
+    >>> upgrade = metric_upgrade(faces.motion @ affinity)
+    >>> upgrade.residual < 1e-10, round(upgrade.condition_number, 1)
+    (True, 3.8)
+
+    The face has true proportions again: distances between its points are those of the
+    truth up to one factor.
+
+    >>> affine = faces.mean_shape @ np.linalg.inv(affinity).T
+    >>> shape = euclidean_shapes(affine, upgrade.Q)
+    >>> ratio = [np.linalg.norm(s[36] - s[45]) / np.linalg.norm(s[8] - s[27])
+    ...          for s in (affine, shape, faces.mean_shape)]
+    >>> np.round(ratio, 3)
+    array([1.502, 0.781, 0.781])
+    """
+    cameras, usable = usable_cameras(motion)
+    if camera not in CAMERA_MODELS:
+        raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
+    fit = fit_metric(cameras[usable], camera)
+    Q = scaled(symmetric_power(fit.Q @ fit.Q.T, 0.5), cameras[usable])
+    rotations = np.full((len(cameras), 3, 3), np.nan)
+    scales = np.full(len(cameras), np.nan)
+    rotations[usable], stretches = nearest_rotations(cameras[usable] @ Q)
+    scales[usable] = (
+        1.0 if camera == "orthographic" else np.trace(stretches, axis1=1, axis2=2) / 2
+    )
+    warn_if_degenerate(fit.condition_number)
+    return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
+
+
+def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
+    """
+    Take shapes to the coordinates in which the cameras are Euclidean ones.
+
+    Parameters
+    ----------
+    shapes : array-like of shape (..., n_points, 3)
+        A mean shape (n_points, 3), basis shapes (n_components, n_points, 3) or the
+        shapes of frames (n_frames, n_points, 3), in the coordinates of the affine
+        cameras.
+    Q : array-like of shape (3, 3)
+        Of `metric_upgrade`.
+
+    Returns
+    -------
+    ndarray of shape (..., n_points, 3)
+        ``Q^-1 b`` for each point b. Cameras go with ``M Q``, so that the images stay
+        what they are.
+
+    Raises
+    ------
+    ValueError
+        If the arrays are not of the shapes above, or Q is singular.
+    """
+    points = np.asarray(shapes, dtype=np.float64)
+    if points.ndim < 2 or points.shape[-1] != 3:
+        raise ValueError(
+            f"shapes must be of the shape (..., n_points, 3); got {points.shape}"
+        )
+    matrix = np.asarray(Q, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.linalg.matrix_rank(matrix) == 3:
+        raise ValueError(
+            "Q must be a 3x3 matrix that is not singular; got "
+            f"{'a singular one' if matrix.shape == (3, 3) else matrix.shape}"
+        )
+    return points @ np.linalg.inv(matrix).T
+
+
+def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
+    """Return cameras as an array, and which of them are neither NaN nor zero."""
+    cameras = np.asarray(motion, dtype=np.float64)
+    if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
+        raise ValueError(
+            f"motion must be of the shape (n_frames, 2, 3); got {cameras.shape}"
+        )
+    if np.isinf(cameras).any():
+        raise ValueError(
+            f"motion must not be infinite; {np.isinf(cameras).sum()} entries are"
+        )
+    usable = np.isfinite(cameras).all(axis=(1, 2)) & cameras.any(axis=(1, 2))
+    return cameras, np.asarray(usable)
+
+
+def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
+    """Return the best metric of usable cameras, from two starts."""
+    eigenvalues = np.zeros(3)
+    if len(cameras):
+        gram = mean_gram(unit_cameras(cameras))
+        eigenvalues = np.linalg.eigvalsh(gram)
+    seen = eigenvalues > SMALLEST_EIGENVALUE * eigenvalues[-1]
+    if not seen.all():
+        raise ValueError(
+            "a metric upgrade needs cameras that together see three directions of "
+            f"space; the {len(cameras)} usable cameras see {seen.sum()}"
+        )
+    starts = [np.linalg.inv(gram), metric_quadric(cameras)]
+    fits = [
+        refine_metric(cameras, safe_start(cameras, start, camera), camera)
+        for start in starts
+        if start is not None
+    ]
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def best_metric(motion: NDArray) -> NDArray:
+    """
+    Return Q with which cameras are most nearly scaled rotations.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        That of `metric_upgrade`, or the identity where the cameras do not see three
+        directions of space.
+    """
+    cameras, usable = usable_cameras(motion)
+    try:
+        fit = fit_metric(cameras[usable], "weak_perspective")
+    except ValueError:
+        return np.eye(3)
+    return scaled(symmetric_power(fit.Q @ fit.Q.T, 0.5), cameras[usable])
+
+
+def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
+    """Return Q with a scale such that that of the cameras has mean square one."""
+    # A scale is the mean of the two singular values, the product of which is the area.
+    rows = cameras @ Q
+    area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
+    return Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
+
+
+def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
+    """Return rotations (I, 3, 3) and stretches P (I, 2, 2): cameras are ``P R[:2]``."""
+    left, values, right = np.linalg.svd(cameras, full_matrices=False)
+    across = left @ right
+    depth = np.cross(across[:, 0], across[:, 1])
+    stretches = (left * values[:, None]) @ left.transpose(0, 2, 1)
+    return np.concatenate([across, depth[:, None]], axis=1), stretches
+
+
+def warn_if_degenerate(condition_number: float) -> None:
+    """Warn where the cameras hardly determine the metric."""
+    if condition_number > LARGEST_CONDITION:
+        warnings.warn(
+            f"the cameras hardly determine the metric of space: its condition number "
+            f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
+            "may have wrong depth and angles. Take frames that are seen from more "
+            "sides, or more frames, or affine shapes (camera=None)",
+            stacklevel=3,
+        )

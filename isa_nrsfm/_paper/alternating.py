@@ -1,0 +1,190 @@
+"""The paper's refinement: basis blocks and coefficients by alternating least squares.
+
+The cameras and the subspaces stay as they are. For each subspace the cost
+``sum_i ||M_ik - alpha_ik M_0^i E_k||_F^2`` (Brandt et al. 2018, section 3.5) is
+minimised; with alpha eliminated that is to maximise
+
+    f(E) = sum_i <M_ik, M_0^i E>^2 / ||M_0^i E||^2
+
+over nine numbers. Its alternation is ``E = A^-1 R`` with ``A = sum_i alpha_i^2 M_0^iT
+M_0^i`` and ``R = sum_i alpha_i M_0^iT M_ik``; a Newton step in the metric of A gets
+there in few steps, and the alternation step, which never lowers f, stands in for it
+where it fails.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._paper.block_structure import FrameProducts, packed_inner, unpack
+
+# Alternations from every start before the best one is taken on.
+N_TRIAL_STEPS = 6
+# A Newton step is at most this many times the alternation step along any direction.
+LARGEST_GAIN = 1e4
+
+
+class Refinement(NamedTuple):
+    """
+    Result of the alternating refinement.
+
+    Attributes
+    ----------
+    E : ndarray of shape (n_blocks, 3, 3)
+        Blocks of unit norm, of any sign: ``M_ik ~ alpha_ik M_0^i E_k``; the zero
+        matrix for a subspace without motion.
+    energy : ndarray of shape (n_blocks,)
+        ``sum_i ||alpha_ik M_0^i E_k||^2``.
+    n_iter : int
+        Steps of the subspace that took most.
+    converged : bool
+        Whether all subspaces have converged.
+    """
+
+    E: NDArray
+    energy: NDArray
+    n_iter: int
+    converged: bool
+
+
+class _State(NamedTuple):
+    """Coefficients and sums over the frames at some E (3, 3) of unit norm."""
+
+    E: NDArray
+    energy: float  # f(E)
+    alpha: NDArray  # (n_frames,)
+    q: NDArray  # ||M_0^i E||^2
+    A: NDArray
+    R: NDArray
+
+
+def refine_alternating(
+    products: FrameProducts, starts: NDArray, *, max_iter: int, tol: float
+) -> Refinement:
+    """
+    Return the blocks that explain most of the motion, each from several starts.
+
+    Parameters
+    ----------
+    products : FrameProducts
+        Products of the frames after ISA; consecutive signals form a subspace.
+    starts : ndarray of shape (n_blocks, n_starts, 3, 3)
+        Where to start each block; the best after a few alternations is taken on.
+    max_iter : int
+        The most steps of a block.
+    tol : float
+        A block has converged when a step would gain less than this share of its
+        energy.
+
+    Returns
+    -------
+    Refinement
+        The blocks.
+    """
+    n_blocks = len(starts)
+    E = np.zeros((n_blocks, 3, 3))
+    energy = np.zeros(n_blocks)
+    n_iter = np.ones(n_blocks, dtype=int)
+    converged = np.ones(n_blocks, dtype=bool)
+    for k, P in enumerate(products.blocks()):
+        best = _best_start(P, products.rigid, starts[k])
+        if best is not None:
+            E[k], energy[k], n_iter[k], converged[k] = _maximise(
+                P, products.rigid, best, max_iter, tol
+            )
+    return Refinement(E, energy, int(n_iter.max()), bool(converged.all()))
+
+
+def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
+    """Return the start of highest energy after some alternations, if it has any."""
+    norms = np.linalg.norm(starts, axis=(1, 2), keepdims=True)
+    E = (starts / np.where(norms > 0, norms, 1.0))[norms.ravel() > 0]
+    if not len(E) or not P.any():
+        return None
+    for _ in range(N_TRIAL_STEPS):
+        _, _, alpha = _coefficients(P, rigid, E)
+        A, R = unpack((alpha**2).T @ rigid), (alpha.T @ P).reshape(-1, 3, 3)
+        E = np.linalg.pinv(A, hermitian=True) @ R
+        norm = np.linalg.norm(E, axis=(1, 2), keepdims=True)
+        E = np.divide(E, norm, where=norm > 0, out=np.zeros_like(E))
+    a, _, alpha = _coefficients(P, rigid, E)
+    energy = np.sum(alpha * a, axis=0)
+    best = np.argmax(energy)
+    return E[best] if energy[best] > 0 else None
+
+
+def _coefficients(
+    P: NDArray, rigid: NDArray, E: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return ``<M_ik, M_0^i E>``, ``||M_0^i E||^2`` and their ratio for each E."""
+    a, q = P @ E.reshape(-1, 9).T, packed_inner(rigid, E @ E.swapaxes(1, 2))
+    return a, q, np.divide(a, q, where=q > 0, out=np.zeros_like(a))
+
+
+def _maximise(
+    P: NDArray, rigid: NDArray, E: NDArray, max_iter: int, tol: float
+) -> tuple[NDArray, float, int, bool]:
+    """Return the local maximum of f that is reached from E, and how."""
+    state = _state(P, rigid, E)
+    for n_iter in range(1, max_iter + 1):
+        plain, newton, gain = _steps(P, rigid, state)
+        converged = gain <= tol * state.energy
+        tried = _state(P, rigid, state.E + newton)
+        if not tried.energy > state.energy:
+            tried = _state(P, rigid, state.E + plain)
+        if not tried.energy > state.energy:  # rounding errors only
+            return state.E, state.energy, n_iter, True
+        state = tried
+        if converged:
+            return state.E, state.energy, n_iter, True
+    return state.E, state.energy, max_iter, False
+
+
+def _state(P: NDArray, rigid: NDArray, E: NDArray) -> _State:
+    """Return the coefficients that are best for E, and their sums."""
+    E = E / np.linalg.norm(E)
+    a, q, alpha = (each[:, 0] for each in _coefficients(P, rigid, E[None]))
+    A, R = unpack(alpha**2 @ rigid), (alpha @ P).reshape(3, 3)
+    return _State(E, float(alpha @ a), alpha, q, A, R)
+
+
+def _steps(P: NDArray, rigid: NDArray, state: _State) -> tuple[NDArray, NDArray, float]:
+    """
+    Return the alternation step, the Newton step and the gain the latter promises.
+
+    Half the gradient is ``R - A E`` and half the negative Hessian ``A (x) I - sum_i
+    w_i w_i^T / q_i`` with ``w_i = vec(M_0^iT M_ik - 2 alpha_i M_0^iT M_0^i E)``. In
+    coordinates where A is the identity the alternation step is the gradient, and
+    the eigenvalues of the sum say how much longer the Newton step is.
+    """
+    E, _, alpha, q, A, R = state
+    values, axes = np.linalg.eigh(A)
+    inside = values > np.finfo(float).eps * 3 * values[-1]
+    root = np.where(inside, 1.0 / np.sqrt(np.where(inside, values, 1.0)), 0.0)
+    whitening = (axes * root) @ axes.T
+    gradient = whitening @ (R - A @ E)
+
+    Q_E = np.empty((len(alpha), 3, 3))  # M_0^iT M_0^i E
+    for column in range(3):
+        Q_E[:, :, column] = rigid @ _symmetric_times(E[:, column])
+    w = P - 2.0 * alpha[:, None] * Q_E.reshape(-1, 9)
+    weighted = np.divide(w, q[:, None], where=q[:, None] > 0, out=np.zeros_like(w))
+    lengthen = np.kron(whitening, np.eye(3))
+    # f does not depend on the scale of E, which is left alone.
+    scale = (whitening @ A @ E).ravel()
+    across = np.eye(9) - np.outer(scale, scale) / (scale @ scale)
+    shorten = lengthen @ across
+    curvature, modes = np.linalg.eigh(shorten.T @ (w.T @ weighted) @ shorten)
+    gains = 1.0 / np.maximum(np.abs(1.0 - curvature), 1.0 / LARGEST_GAIN)
+    along = modes.T @ gradient.ravel()
+    newton = (modes @ (gains * along)).reshape(3, 3)
+    return whitening @ gradient, whitening @ newton, float(gains @ along**2)
+
+
+def _symmetric_times(v: NDArray) -> NDArray:
+    """Return the (6, 3) matrix T with ``q @ T = Q v`` for a packed symmetric Q."""
+    x, y, z = v
+    return np.array(
+        [[x, 0, 0], [0, y, 0], [0, 0, z], [y, x, 0], [z, 0, x], [0, z, y]], dtype=float
+    )

@@ -1,0 +1,1 @@
+"""Tables made ready for a fit: checked, scaled, completed, robust."""

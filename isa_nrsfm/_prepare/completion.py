@@ -1,0 +1,467 @@
+"""Completion of tracks with missing points by a low-rank model of the table.
+
+Each row of the measurement matrix is modelled as ``w = B^T z + t 1 + noise`` over its
+seen points, with coefficients z ~ N(0, I), any translation t, and noise of one variance
+everywhere: probabilistic principal components (Tipping and Bishop 1999) with missing
+values (Ilin and Raiko 2010). B has the rank of the factorisation, 3K + 3.
+
+EM finds B, the rank growing from that of a rigid object. A frame sees its
+points in both of its rows, so everything quadratic is computed once for every
+distinct set of seen points.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.ordering import order_by_halves, spread
+from isa_nrsfm._tables.visibility import seen_points
+
+RIGID_RANK = 3
+# A step that lowers the noise variance by less than this share is the last one. Further
+# steps fit the noise more than they improve the missing points.
+TOL = 0.05
+# Steps at each rank below the last one. They only have to lead to its start.
+STEPS_WHILE_GROWING = 10
+# Share of its weight below which a direction of the start is lifted, so that it can
+# grow: EM leaves a direction without weight where it is.
+LEAST_WEIGHT = 1e-3
+# The noise variance counts as at least this much of a frame's mean square coordinate
+# where a matrix is inverted: frames with fewer points than unknowns have singular ones.
+LEAST_NOISE = 1e-13
+# Added to the mean square coefficient, which is 1, where a point's row is solved for.
+LEAST_RIDGE = 1e-12
+# A mean square residual of this size is that of a table without noise, fitted exactly.
+EXACT = 1e-20
+# Least number of degrees of freedom left to the noise, relative to the numbers seen.
+LEAST_FREEDOM = 0.02
+# Numbers in the largest array of a block of frames.
+BLOCK_NUMBERS = 2**20
+# With more frames the model is found from so many of them, and from as many that show
+# each point, if there are.
+MODEL_FRAMES = 10_000
+FEWEST_SHOWN = 200
+
+
+class Completion(NamedTuple):
+    """
+    Complete tracks.
+
+    Attributes
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks without missing points, each frame centred over all of them. Seen
+        points are those that came, moved by minus the shift.
+    shift : ndarray of shape (n_frames, 2)
+        Centroid of all points of a frame relative to that of its seen points.
+    """
+
+    centred: NDArray
+    shift: NDArray
+
+
+class _Frames(NamedTuple):
+    """Frames in the order of their patterns, the distinct sets of seen points.
+
+    ``rows`` (n_frames, 2, n_points) are zero where not seen and centred over the seen
+    points, ``pattern`` (n_frames,) is the number of each frame's pattern, and
+    ``patterns`` (n_patterns, n_points) are 1.0 where seen.
+    """
+
+    rows: NDArray
+    pattern: NDArray
+    patterns: NDArray
+
+
+class _Posterior(NamedTuple):
+    """Coefficients of a block of frames given the model.
+
+    ``z`` (n_frames, 2, rank) and ``t`` (n_frames, 2, 1) are the expected coefficients
+    and translations. For each pattern of the block, ``covariance`` (n_patterns, rank,
+    rank) is that of z and ``cross`` (n_patterns, rank) that of z with minus t, both
+    divided by the noise variance.
+    """
+
+    z: NDArray
+    t: NDArray
+    covariance: NDArray
+    cross: NDArray
+
+
+class CompletionModel(NamedTuple):
+    """
+    Low-rank model of the rows of a measurement matrix.
+
+    Attributes
+    ----------
+    B : ndarray of shape (rank, n_points)
+        Directions, rows centred.
+    noise : float
+        Noise variance of a coordinate.
+    """
+
+    B: NDArray
+    noise: float
+
+    @property
+    def ridge(self) -> float:
+        """The noise variance that matrices are inverted with."""
+        return max(self.noise, LEAST_NOISE)
+
+
+def complete_tracks(
+    centred: NDArray,
+    sizes: NDArray,
+    n_components: int,
+    *,
+    tol: float = TOL,
+    max_iter: int = 200,
+) -> Completion:
+    """
+    Return tracks with their missing points filled in, as a start for the factorisation.
+
+    Missing points are the expectation of a model of rank 3K + 3 given the seen points
+    of their frame. It is exact where the table has that rank and no noise and each
+    frame sees at least 3K + 4 points. In other frames what the seen points do not
+    determine is most probable rather than true, and nothing fails.
+
+    Parameters
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks, centred over the seen points of each frame, NaN where not seen. Each
+        frame must see at least one point and each point must be seen in some frame.
+    sizes : ndarray of shape (n_frames,)
+        What each frame is divided by before frames are compared.
+    n_components : int
+        K, the number of basis shapes.
+    tol : float, default=0.05
+        A step that lowers the noise variance by less than this share is the last one
+        at its rank.
+    max_iter : int, default=200
+        The most steps at the final rank.
+
+    Returns
+    -------
+    Completion
+        Complete tracks. Tracks without missing points are returned as they are.
+    """
+    seen = seen_points(centred)
+    if seen.all():
+        return Completion(centred, np.zeros((len(centred), 2)))
+    model = completion_model(centred, sizes, n_components, tol=tol, max_iter=max_iter)
+    return filled_in(centred, sizes, model)
+
+
+def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameBlocks:
+    """
+    Return the frames of a table with their missing points filled in.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points) of size one, centred over the points
+        that are seen; NaN where a point is not seen.
+    n_points : int
+        Number of points.
+    n_components : int
+        K, the number of basis shapes.
+
+    Returns
+    -------
+    FrameBlocks
+        The frames, centred over all points, as of `complete_tracks`. The model of a
+        table with many frames is that of some of them.
+    """
+    n_frames = rows.n_frames
+    frames = np.arange(n_frames)
+    if n_frames > MODEL_FRAMES:
+        frames = _telling_frames(rows, n_points)
+    tracks = rows.take(frames).transpose(0, 2, 1)
+    model = completion_model(tracks, np.ones(len(tracks)), n_components)
+    return rows.derive(partial(_filled_rows, model=model))
+
+
+def _telling_frames(rows: FrameBlocks, n_points: int) -> NDArray:
+    """
+    Return frames that show all points, whatever the order of the table.
+
+    They are spread evenly over the shares of the energy that the frames have in x, and
+    so are those that are added for points that they hardly show.
+    """
+    order = order_by_halves(rows)
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[spread(order, MODEL_FRAMES)] = True
+    shown = np.zeros(n_points)
+    for block in rows.map(_seen_rows, chosen):
+        shown += block.sum(axis=0)
+    for point in map(int, np.flatnonzero(shown < FEWEST_SHOWN)):
+        seen = rows.joined(partial(_sees, point=point))
+        showing = order[seen[order]]
+        chosen[spread(showing, min(FEWEST_SHOWN, len(showing)))] = True
+    return np.flatnonzero(chosen)
+
+
+def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:
+    """Return which points the chosen frames of a block show."""
+    return ~np.isnan(rows[chosen, 0])
+
+
+def _sees(rows: NDArray, point: int) -> NDArray:
+    """Return which frames of a block show a point."""
+    return ~np.isnan(rows[:, 0, point])
+
+
+def _filled_rows(rows: NDArray, model: CompletionModel) -> NDArray:
+    """Return frames (n_frames, 2, n_points) with their missing points filled in."""
+    tracks = rows.transpose(0, 2, 1)
+    centred = filled_in(tracks, np.ones(len(tracks)), model).centred
+    return np.ascontiguousarray(centred.transpose(0, 2, 1))
+
+
+def completion_model(
+    centred: NDArray,
+    sizes: NDArray,
+    n_components: int,
+    *,
+    tol: float = TOL,
+    max_iter: int = 200,
+) -> CompletionModel:
+    """
+    Return the low-rank model that `complete_tracks` fills missing points in with.
+
+    Parameters
+    ----------
+    centred, sizes, n_components, tol, max_iter
+        As there.
+
+    Returns
+    -------
+    CompletionModel
+        The model.
+    """
+    rank = _possible_rank(3 * n_components + 3, centred.shape[1])
+    frames, _ = _by_pattern(centred, seen_points(centred), sizes)
+    return _fit(frames, rank, tol, max_iter)
+
+
+def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Completion:
+    """
+    Return tracks with their missing points as a low-rank model expects them.
+
+    Parameters
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks, centred over the seen points of each frame, NaN where not seen.
+    sizes : ndarray of shape (n_frames,)
+        What each frame is divided by.
+    model : CompletionModel
+        The model of frames of size one.
+
+    Returns
+    -------
+    Completion
+        Complete tracks.
+    """
+    seen = seen_points(centred)
+    frames, order = _by_pattern(centred, seen, sizes)
+    fitted = np.empty_like(frames.rows)
+    for block, posterior, _ in _posteriors(frames, model):
+        fitted[block] = posterior.z @ model.B + posterior.t
+    expected = np.empty(centred.shape)
+    expected[order] = fitted.transpose(0, 2, 1)
+    expected *= sizes[:, None, None]
+    tracks = np.where(seen[..., None], centred, expected)
+    shift = tracks.mean(axis=1)
+    return Completion(tracks - shift[:, None], shift)
+
+
+def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
+    """
+    Return the mean square of what no rigid object explains of tracks.
+
+    Parameters
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks, centred over the seen points of each frame, NaN where not seen.
+    sizes : ndarray of shape (n_frames,)
+        What each frame is divided by.
+
+    Returns
+    -------
+    float
+        Noise variance of one coordinate in the model of rank 3, relative to the
+        squared sizes.
+    """
+    seen = seen_points(centred)
+    frames, _ = _by_pattern(centred, seen, sizes)
+    return _fit(frames, _possible_rank(RIGID_RANK, seen.shape[1]), TOL, 50).noise
+
+
+def _possible_rank(rank: int, n_points: int) -> int:
+    """Return a rank that leaves one of n_points - 1 directions to the noise."""
+    return max(1, min(rank, n_points - 2))
+
+
+def _by_pattern(
+    centred: NDArray, seen: NDArray, sizes: NDArray
+) -> tuple[_Frames, NDArray]:
+    """Return frames ordered by their sets of seen points, and that order."""
+    _, first, pattern = np.unique(
+        np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    pattern = pattern.reshape(-1)
+    order = np.argsort(pattern, kind="stable")
+    scaled = np.where(seen[..., None], centred, 0.0) / sizes[:, None, None]
+    rows = np.ascontiguousarray(scaled[order].transpose(0, 2, 1))
+    return _Frames(rows, pattern[order], seen[first].astype(np.float64)), order
+
+
+def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionModel:
+    """Return the model of frames, grown from the rank of a rigid object."""
+    ranks = [rank]
+    while ranks[0] > RIGID_RANK:
+        ranks.insert(0, max(RIGID_RANK, (ranks[0] + 1) // 2))
+    rows = frames.rows
+    model = CompletionModel(np.zeros((0, rows.shape[2])), np.inf)
+    for wanted in ranks:
+        model = _grown(model, wanted, rows, frames)
+        for step in range(max_iter if wanted == rank else STEPS_WHILE_GROWING):
+            before = model.noise
+            model, rows, mean_square = _em_step(model, frames)
+            stands_still = step > 0 and model.noise > (1.0 - tol) * before
+            if stands_still or mean_square < EXACT:
+                break
+    return model
+
+
+def _grown(
+    model: CompletionModel, rank: int, residual: NDArray, frames: _Frames
+) -> CompletionModel:
+    """Return the model with the principal axes of its residual as further rows of B."""
+    is_first = not len(model.B)
+    moment = _second_moment(residual, frames, is_first)
+    n_points = len(moment)
+    n_new = rank - len(model.B)
+    values, axes = eigh(moment, subset_by_index=[n_points - n_new, n_points - 1])
+    weights = np.maximum(values, LEAST_WEIGHT * max(values[-1], LEAST_NOISE))
+    noise = model.noise
+    if is_first:
+        rest = (np.trace(moment) - values.sum()) / n_points
+        noise = max(rest, LEAST_WEIGHT**2 * values[-1], LEAST_NOISE)
+    return CompletionModel(np.vstack([model.B, (axes * np.sqrt(weights)).T]), noise)
+
+
+def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
+    """
+    Return the second moment of centred rows (n_points, n_points) from pairs of points.
+
+    The distance of two points in a row does not depend on its translation, so every
+    row that sees both tells it, and the mean squared distances give the second moment
+    (classical scaling, Torgerson 1952). Of points that no frame sees together those of
+    an object are likely to be far from each other, and residuals to be uncorrelated.
+    """
+    seen = frames.patterns[frames.pattern]
+    counts = 2.0 * seen.T @ seen
+    flat = rows.reshape(-1, rows.shape[2])
+    square = np.einsum("icj,icj->ij", rows, rows).T @ seen
+    distances = square + square.T - 2.0 * flat.T @ flat
+    together = counts > 0
+    distances = np.divide(distances, counts, where=together, out=np.zeros_like(counts))
+    if is_object:
+        distances[~together] = distances.max()
+    else:
+        energy = np.diag(square) / np.maximum(np.diag(counts), 1.0)
+        distances[~together] = np.add.outer(energy, energy)[~together]
+    distances -= distances.mean(axis=0)
+    distances -= distances.mean(axis=1, keepdims=True)
+    return -0.5 * distances
+
+
+def _posteriors(
+    frames: _Frames, model: CompletionModel
+) -> Iterator[tuple[slice, _Posterior, NDArray]]:
+    """Yield blocks of frames, what the model says of them, and their seen points."""
+    B, ridge = model.B, model.ridge
+    rank = len(B)
+    upper = np.triu_indices(rank)
+    products = (B[upper[0]] * B[upper[1]]).T
+    n_frames = len(frames.rows)
+    length = max(1, BLOCK_NUMBERS // max(rank**2, 2 * B.shape[1]))
+    for start in range(0, n_frames, length):
+        block = slice(start, min(start + length, n_frames))
+        pattern = frames.pattern[block]
+        seen = frames.patterns[pattern[0] : pattern[-1] + 1]
+        pattern = pattern - pattern[0]
+        n_seen = seen.sum(axis=1)
+        # B B^T over the seen points, each row of B centred over them: that takes
+        # account of the translation.
+        sums = seen @ B.T
+        means = sums / n_seen[:, None]
+        gram = _symmetric(seen @ products, rank, upper)
+        gram -= sums[:, :, None] * means[:, None]
+        gram[:, range(rank), range(rank)] += ridge
+        covariance = np.linalg.inv(gram)
+        cross = (covariance @ means[:, :, None])[:, :, 0]
+        z = (frames.rows[block] @ B.T) @ covariance[pattern]
+        t = -(z @ means[pattern][:, :, None])
+        yield block, _Posterior(z, t, covariance, cross), seen[pattern]
+
+
+def _em_step(
+    model: CompletionModel, frames: _Frames
+) -> tuple[CompletionModel, NDArray, float]:
+    """Return the model after one step, the residual of the old one, its mean square."""
+    rows, ridge = frames.rows, model.ridge
+    rank, n_points = model.B.shape
+    upper = np.triu_indices(rank)
+    residual = np.empty_like(rows)
+    moments = np.zeros((n_points, len(upper[0])))
+    products = np.zeros((n_points, rank))
+    moment = np.zeros(len(upper[0]))
+    energy = n_fitted = 0.0
+    for block, (z, t, covariance, cross), seen in _posteriors(frames, model):
+        moved = (rows[block] - t) * seen[:, None]
+        residual[block] = moved - (z @ model.B) * seen[:, None]
+        energy += float(np.vdot(residual[block], residual[block]))
+        pattern = frames.pattern[block]
+        first = np.flatnonzero(np.diff(pattern, prepend=-1))
+        n_rows = 2.0 * np.diff(first, append=len(pattern))
+        # Each row fits its translation and as many coefficients as the prior leaves it.
+        left = rank - ridge * np.trace(covariance, axis1=1, axis2=2)
+        n_fitted += float(n_rows @ (left + 1.0))
+
+        noise = ridge * n_rows[:, None]
+        squares = (z.swapaxes(1, 2) @ z)[:, upper[0], upper[1]]
+        squares = np.add.reduceat(squares, first)
+        squares += noise * covariance[:, upper[0], upper[1]]
+        moment += squares.sum(axis=0)
+        of_pattern = seen[first]
+        moments += of_pattern.T @ squares
+        products += moved.reshape(-1, n_points).T @ z.reshape(-1, rank)
+        products += of_pattern.T @ (noise * cross)
+    n_numbers = 2.0 * np.bincount(frames.pattern) @ frames.patterns.sum(axis=1)
+
+    mean_moment = _symmetric(moment[None], rank, upper)[0] / (2 * len(rows))
+    # Points seen in fewer frames than the rank need a trace of a ridge.
+    per_point = _symmetric(moments, rank, upper)
+    per_point[:, range(rank), range(rank)] += LEAST_RIDGE * len(rows)
+    B = np.linalg.solve(per_point, products[..., None])[..., 0].T
+    B -= B.mean(axis=1, keepdims=True)  # the translation takes what is common
+    # z gets unit variance again, the prior's (Liu, Rubin and Wu 1998: this is faster).
+    B = np.linalg.cholesky(mean_moment).T @ B
+    # The fixed point of EM's step for the variance, in one step (MacKay 1992).
+    freedom = max(n_numbers - n_fitted, LEAST_FREEDOM * n_numbers)
+    return CompletionModel(B, energy / freedom), residual, energy / n_numbers
+
+
+def _symmetric(packed: NDArray, size: int, upper: tuple[NDArray, ...]) -> NDArray:
+    """Return symmetric matrices from the rows of their upper triangles."""
+    full = np.empty((len(packed), size, size))
+    full[:, upper[0], upper[1]] = packed
+    full[:, upper[1], upper[0]] = packed
+    return full

@@ -1,0 +1,234 @@
+"""A table made ready for the fit: checked, each frame centred and of size one."""
+
+import warnings
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._prepare.checks import (
+    HalfPoints,
+    PointReport,
+    check_points,
+    check_size,
+    without_half_points,
+)
+from isa_nrsfm._prepare.layout_check import layout_sample, warn_if_other_layout
+from isa_nrsfm._prepare.robust import robust_sizes
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.layout import (
+    Layout,
+    refuse_odd,
+    relative_precision,
+    table_to_tracks,
+)
+from isa_nrsfm._tables.sources import Table
+from isa_nrsfm._tables.visibility import (
+    FrameReport,
+    check_frames,
+    check_places,
+    report_frames,
+    seen_points,
+)
+
+# Tables with fewer points have no large products.
+MANY_POINTS = 200
+
+
+class ScaledTable(NamedTuple):
+    """
+    A table made ready for the fit.
+
+    Attributes
+    ----------
+    shown : ndarray of bool, shape (n_rows,)
+        Which rows of the table show any point: they are the frames.
+    source : Table
+        These rows as they came.
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), x above y, centred over the points
+        that are seen and divided by their sizes; NaN where a point is not seen. Single
+        precision where the table is large, complete and in single precision.
+    sizes : ndarray of shape (n_frames,)
+        What the frames were divided by.
+    translation : ndarray of shape (n_frames, 2)
+        What was subtracted, the centroids of the seen points.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that are seen.
+    n_points : int
+        Number of points.
+    precision : float
+        As of `relative_precision`.
+    dtype : dtype
+        Type of the numbers of the table as it came.
+    """
+
+    shown: NDArray
+    source: Table
+    rows: FrameBlocks
+    sizes: NDArray
+    translation: NDArray
+    n_seen: NDArray
+    n_points: int
+    precision: float
+    dtype: Any
+
+    @property
+    def complete(self) -> bool:
+        """Whether all points are seen."""
+        return bool((self.n_seen == self.n_points).all())
+
+    def of_all_rows(self, values: NDArray) -> NDArray:
+        """Return an array with a row for each frame with NaN for the other rows."""
+        if self.shown.all():
+            return values
+        every = np.full((len(self.shown), *values.shape[1:]), np.nan, values.dtype)
+        every[self.shown] = values
+        return every
+
+
+def scaled_table(
+    table: Table,
+    n_components: int,
+    *,
+    layout: Layout,
+    names: NDArray | None,
+    scale_frames: bool,
+    robust: bool,
+) -> ScaledTable:
+    """
+    Check a table and make it ready for the fit.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+    n_components : int
+        K, the number of basis shapes.
+    layout : {"interleaved", "planar"}
+        Order of the columns.
+    names : ndarray of shape (2 * n_points,) or None
+        Names of the columns.
+    scale_frames : bool
+        Whether each frame gets size one, or the table as a whole.
+    robust : bool
+        Whether sizes are those of `robust_sizes`, or root mean squares.
+
+    Returns
+    -------
+    ScaledTable
+        The table.
+
+    Raises
+    ------
+    ValueError
+        If the table is too small, or frames or points of it show too little.
+
+    Warns
+    -----
+    UserWarning
+        If points have only one coordinate, if rows without any point are left out, or
+        if the columns seem to be in another order.
+    """
+    blocks, n_columns, dtype = table
+    n_points = n_columns // 2
+    refuse_odd(n_columns)
+    check_size(blocks.n_frames, n_points, n_components)
+    found = list(blocks.map(partial(_examine, layout=layout)))
+    frames, points, half = zip(*found, strict=True)
+    HalfPoints.merged(half, blocks.lengths).warn(layout, names, stacklevel=4)
+    report = FrameReport(*map(np.concatenate, zip(*frames, strict=True)))
+    check_frames(report, n_points)
+    shown = report.n_seen > 0
+    if not shown.all():
+        _warn_of_empty(shown)
+        check_size(int(shown.sum()), n_points, n_components)
+        blocks, report = blocks.kept(shown), report.of_frames(shown)
+    check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
+    check_places(report, n_points)
+    n_frames = blocks.n_frames
+    every = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
+    warn_if_other_layout(blocks.take(every), layout, scale_frames, stacklevel=5)
+    size = np.sqrt(report.square / (2 * report.n_seen))
+    if robust:
+        robust_size = partial(_robust_sizes, layout=layout)
+        size = blocks.joined(robust_size, report.translation)
+    if not scale_frames:
+        size = np.full_like(size, np.sqrt(np.mean(size**2)))
+    # Of large tables, what takes most is the memory and the search for the subspace.
+    single = dtype == np.float32 and n_points >= MANY_POINTS and not robust
+    single = single and bool((report.n_seen == n_points).all())
+    unit_rows = partial(
+        _unit_rows, layout=layout, dtype=np.float32 if single else np.float64
+    )
+    rows = blocks.derive(unit_rows, report.translation, size)
+    precision = relative_precision(report, dtype, size)
+    return ScaledTable(
+        shown,
+        table._replace(blocks=blocks),
+        rows,
+        size,
+        report.translation,
+        report.n_seen,
+        n_points,
+        precision,
+        dtype,
+    )
+
+
+def _warn_of_empty(shown: NDArray) -> None:
+    """Warn of rows that show no point, or refuse a table without any."""
+    if not shown.any():
+        raise ValueError(f"X shows no point: all of its {len(shown)} row(s) are NaN")
+    empty = ~shown
+    warnings.warn(
+        f"{empty.sum()} of {len(empty)} row(s) show no point and are left out of the "
+        f"fit, the first is row {empty.argmax()}",
+        stacklevel=5,
+    )
+
+
+def _examine(
+    rows: NDArray, layout: Layout
+) -> tuple[FrameReport, PointReport, HalfPoints]:
+    """Return what is to be known of all rows of a table before any is scaled."""
+    tracks, half = without_half_points(table_to_tracks(rows, layout))
+    return report_frames(tracks), PointReport.of(seen_points(tracks)), half
+
+
+def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArray:
+    """Return the robust sizes of some rows of a table."""
+    tracks, _ = without_half_points(table_to_tracks(rows, layout))
+    return robust_sizes(tracks - translation[:, None])
+
+
+def _unit_rows(
+    rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout, dtype: Any
+) -> NDArray:
+    """Return frames, (n_frames, 2, n_points), centred and of size one."""
+    tracks, _ = without_half_points(table_to_tracks(rows, layout))
+    centred = np.array(tracks.transpose(0, 2, 1), dtype=np.float64, order="C")
+    centred -= translation[:, :, None]
+    centred /= sizes[:, None, None]
+    return centred.astype(dtype, copy=False)
+
+
+def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
+    """
+    Return frames without some of their points.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Frames.
+    left_out : ndarray of bool, shape (n_frames, n_points)
+        The points.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 2, n_points)
+        Frames centred over the other points that are seen, NaN elsewhere.
+    """
+    kept = np.where(left_out[:, None], np.nan, rows)
+    return kept - np.nanmean(kept, axis=2, keepdims=True)

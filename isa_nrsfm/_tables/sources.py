@@ -1,0 +1,178 @@
+"""What a table may come as: an array, or something that is read block by block."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import effective_n_jobs
+from numpy.typing import NDArray
+from sklearn import get_config
+from sklearn.utils import check_array
+
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks, StoredBlocks
+from isa_nrsfm._tables.dask_blocks import DaskBlocks
+
+# Numbers and frames of a block of a table in memory: products of large blocks are fast.
+BLOCK_NUMBERS = 2**21
+BLOCK_FRAMES = 2048
+# Numbers that are in memory, at most, for each number of a block that is read.
+COPIES = 8
+MEGABYTE = 2**20
+# What a table has to be, besides that its numbers are float32 or float64.
+CHECKS: dict[str, Any] = {
+    "dtype": [np.float64, np.float32],
+    "ensure_all_finite": "allow-nan",
+}
+
+
+class Table(NamedTuple):
+    """
+    A table in blocks of its rows.
+
+    Attributes
+    ----------
+    blocks : FrameBlocks
+        Blocks (n_frames, 2 * n_points) of float32 or float64.
+    n_columns : int
+        Number of columns.
+    dtype : dtype
+        Type of the numbers.
+    """
+
+    blocks: FrameBlocks
+    n_columns: int
+    dtype: Any
+
+    @classmethod
+    def in_memory(
+        cls, X: NDArray, n_jobs: int | None = 1, whole: bool = False
+    ) -> "Table":
+        """Return an array, as one block or as many that threads may work on."""
+        length = min(max(BLOCK_NUMBERS // max(X.shape[1], 1), 1), BLOCK_FRAMES)
+        length = max(len(X), 1) if whole else length
+        blocks = MemoryBlocks.of(X, length, effective_n_jobs(n_jobs))
+        return cls(blocks, X.shape[1], X.dtype)
+
+    @classmethod
+    def stored(cls, X: Any, working_memory: float | None) -> "Table":
+        """Return a table that is read in blocks, with so many megabytes at a time."""
+        _check_dimensions(X)
+        if working_memory is None:
+            working_memory = get_config()["working_memory"]
+        numbers = MEGABYTE * working_memory / (np.dtype(float).itemsize * COPIES)
+        length = max(int(numbers // max(X.shape[1], 1)), 1)
+        blocks = StoredBlocks.of(X, length).derive(checked_rows)
+        return cls(blocks, X.shape[1], _floating(X.dtype))
+
+    @classmethod
+    def on_dask(cls, X: Any) -> "Table":
+        """Return a dask array, computed where dask does it."""
+        _check_dimensions(X)
+        blocks = DaskBlocks.of(X).derive(checked_rows)
+        return cls(blocks, X.shape[1], _floating(X.dtype))
+
+
+def _check_dimensions(X: Any) -> None:
+    """Refuse what is not a table."""
+    if X.ndim != 2:
+        raise ValueError(
+            f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
+            "a frame and two columns a point"
+        )
+
+
+def _floating(dtype: Any) -> np.dtype:
+    """Return the type of numbers that a table of a type is read as."""
+    single = np.dtype(dtype) == np.float32
+    return np.dtype(np.float32 if single else np.float64)
+
+
+def is_stored(X: Any) -> bool:
+    """Tell whether a table is to be read block by block."""
+    return isinstance(X, np.memmap | StoredTable)
+
+
+def is_on_dask(X: Any) -> bool:
+    """Tell whether a table is a dask array."""
+    return type(X).__module__.startswith("dask.array")
+
+
+def checked_rows(rows: Any) -> NDArray:
+    """Return rows of a table as float32 or float64, without infinite values."""
+    return check_array(rows, input_name="X", ensure_min_features=0, **CHECKS)
+
+
+def column_sample(X: Any) -> Any:
+    """Return a table without rows that has the columns, and their names, of another."""
+    empty = np.empty((0, X.shape[1] if X.ndim == 2 else 0))
+    if getattr(X, "columns", None) is None:
+        return empty
+    return import_optional("pandas", extra="io").DataFrame(empty, columns=X.columns)
+
+
+class StoredTable:
+    """
+    A table whose rows are read from files when they are needed.
+
+    `isa_nrsfm.io.open_table` makes one. It can be given to `AffineNRSfM.fit`,
+    `transform`, `score` and the other methods that take a table, and is then read block
+    by block.
+
+    Parameters
+    ----------
+    parts : sequence of tuple
+        For each file, in order, its number of rows and a function that returns the rows
+        from one number to another (exclusive) as an array.
+    n_columns : int
+        Number of columns.
+    dtype : dtype
+        Type of the numbers.
+    columns : ndarray of shape (n_columns,), optional
+        Names of the columns.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Numbers of rows and columns.
+    ndim : int
+        2.
+    dtype : dtype
+        Type of the numbers.
+    columns : ndarray of shape (n_columns,) or None
+        Names of the columns.
+    """
+
+    ndim = 2
+
+    def __init__(
+        self,
+        parts: Sequence[tuple[int, Callable[[int, int], NDArray]]],
+        n_columns: int,
+        dtype: Any,
+        columns: NDArray | None = None,
+    ):
+        self._ends = np.cumsum([n_rows for n_rows, _ in parts], dtype=int)
+        self._read = [read for _, read in parts]
+        self.shape = (int(self._ends[-1]), n_columns)
+        self.dtype = np.dtype(dtype)
+        self.columns = columns
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.shape[0]
+
+    def __getitem__(self, rows: slice) -> NDArray:
+        """Return consecutive rows."""
+        if not isinstance(rows, slice) or rows.step not in (None, 1):
+            raise TypeError(f"rows must be a slice without steps; got {rows!r}")
+        start, stop, _ = rows.indices(len(self))
+        found = []
+        begins = np.concatenate([[0], self._ends[:-1]])
+        for begin, end, read in zip(begins, self._ends, self._read, strict=True):
+            first, last = max(start, begin), min(stop, end)
+            if first < last:
+                found.append(read(int(first - begin), int(last - begin)))
+        if not found:
+            return np.empty((0, self.shape[1]), dtype=self.dtype)
+        return np.concatenate(found).astype(self.dtype, copy=False)

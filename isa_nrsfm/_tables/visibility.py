@@ -1,0 +1,228 @@
+"""Which points the frames of a table show, and which frames show enough."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Points that a frame must show: each gives two equations, an affine camera has eight
+# unknowns. The coefficients need no more, their prior determines what is left.
+FEWEST_POINTS = 4
+# Coordinates that differ by so many units in the last place of the largest are equal.
+EQUAL = 4
+
+
+class FrameReport(NamedTuple):
+    """
+    What frames show.
+
+    Attributes
+    ----------
+    translation : ndarray of shape (n_frames, 2)
+        Centroids of the seen points, NaN for frames without any.
+    square : ndarray of shape (n_frames,)
+        Sum of the squares of the coordinates relative to these.
+    largest : ndarray of shape (n_frames,)
+        Largest magnitude of a coordinate as it came, zero for frames without any.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that are seen.
+    in_one_place : ndarray of bool, shape (n_frames,)
+        Whether the root mean square distance of the seen points from their centroid is
+        within rounding errors of its coordinates; False for frames without any point.
+    on_line : ndarray of bool, shape (n_frames,)
+        Whether points are missing and the others on one line, up to rounding.
+    """
+
+    translation: NDArray
+    square: NDArray
+    largest: NDArray
+    n_seen: NDArray
+    in_one_place: NDArray
+    on_line: NDArray
+
+    def of_frames(self, frames: NDArray) -> Self:
+        """Return the report of some frames."""
+        return type(self)(*(part[frames] for part in self))
+
+
+def seen_points(tracks: NDArray) -> NDArray:
+    """
+    Tell which points are seen.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        The tracks.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_frames, n_points)
+        Whether both coordinates are there.
+    """
+    if not np.isnan(tracks.sum()):  # faster than to look at each
+        return np.ones(tracks.shape[:2], dtype=bool)
+    missing = np.isnan(tracks)
+    return ~(missing[..., 0] | missing[..., 1])
+
+
+def report_frames(tracks: NDArray) -> FrameReport:
+    """
+    Return what frames show.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        The tracks, NaN where a point is not seen.
+
+    Returns
+    -------
+    FrameReport
+        The report.
+    """
+    centred, translation, seen = _centre(tracks)
+    square = np.einsum("ijc,ijc->i", centred, centred)
+    n_seen = seen.sum(axis=1)
+    filled = _zero_where_unseen(tracks, seen)
+    return FrameReport(
+        translation,
+        square,
+        np.maximum(filled.max(axis=(1, 2)), -filled.min(axis=(1, 2))),
+        n_seen,
+        _coincide(square, translation, n_seen, tracks.dtype),
+        _collinear(centred, translation, seen, tracks.dtype),
+    )
+
+
+def usable_frames(tracks: NDArray) -> NDArray:
+    """
+    Tell which frames show enough to determine their camera.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        The tracks, NaN where a point is not seen.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_frames,)
+        Whether a frame shows at least four points that are not all in one place and,
+        if some are missing, not all on one line. A complete frame may show its points
+        on a line: that is a flat object seen edge on. Where only some points are seen,
+        it is rather that they lie on a line of the object, which leaves the camera
+        free to turn around it.
+    """
+    report = report_frames(tracks)
+    enough = report.n_seen >= FEWEST_POINTS
+    return enough & ~report.in_one_place & ~report.on_line
+
+
+def check_frames(report: FrameReport, n_points: int) -> None:
+    """
+    Refuse frames that do not show enough to determine their camera.
+
+    Parameters
+    ----------
+    report : FrameReport
+        What the frames show.
+    n_points : int
+        Number of points of a frame.
+
+    Raises
+    ------
+    ValueError
+        If a frame shows fewer than four points, or has missing points and shows the
+        others on one line (see `usable_frames`). Those with all points in one place
+        are left to `check_places`, those without any point are not looked at.
+    """
+    n_seen, n_frames = report.n_seen, len(report.n_seen)
+    few = (n_seen > 0) & (n_seen < FEWEST_POINTS) & (n_seen < n_points)
+    if few.any():
+        row = few.argmax()
+        raise ValueError(
+            f"each frame must show at least {FEWEST_POINTS} points to determine its "
+            f"camera; {few.sum()} of {n_frames} frame(s) show fewer (the others are "
+            f"NaN), the first is row {row} with {n_seen[row]} point(s): leave such "
+            "rows out"
+        )
+    line = report.on_line & ~report.in_one_place
+    if line.any():
+        raise ValueError(
+            "the points that a frame shows must not all lie on one line where others "
+            f"are missing (NaN); they do in {line.sum()} of {n_frames} frame(s), "
+            f"the first is row {line.argmax()}: leave such rows out"
+        )
+
+
+def check_places(report: FrameReport, n_points: int) -> None:
+    """
+    Refuse frames whose seen points are all equal, up to rounding.
+
+    Parameters
+    ----------
+    report : FrameReport
+        What the frames show.
+    n_points : int
+        Number of points of a frame.
+
+    Raises
+    ------
+    ValueError
+        If there are such frames.
+    """
+    _refuse_one_place(report.in_one_place, report.n_seen < n_points)
+
+
+def _refuse_one_place(coincide: NDArray, incomplete: NDArray) -> None:
+    """Refuse frames with all seen points in one place."""
+    if coincide.any():
+        which = "seen points" if incomplete[coincide].any() else "points"
+        raise ValueError(
+            f"each frame must have at least two different points; all {which} are "
+            f"equal in {coincide.sum()} frame(s), the first is row {coincide.argmax()}"
+        )
+
+
+def _zero_where_unseen(tracks: NDArray, seen: NDArray) -> NDArray:
+    """Return tracks with zeros where points are not seen."""
+    if seen.all():
+        return tracks
+    return np.where(seen[..., None], tracks, tracks.dtype.type(0))
+
+
+def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return centred tracks, zero where not seen, centroids and the mask of seen."""
+    # The same memory order, so that sums are the same to the last bit.
+    tracks = np.ascontiguousarray(tracks, dtype=np.float64)
+    seen = seen_points(tracks)
+    n_seen = seen.sum(axis=1)[:, None]
+    filled = _zero_where_unseen(tracks, seen)
+    translation = np.full((len(tracks), 2), np.nan)
+    total = np.einsum("ijc->ic", filled)
+    np.divide(total, n_seen, where=n_seen > 0, out=translation)
+    return _zero_where_unseen(tracks - translation[:, None], seen), translation, seen
+
+
+def _coincide(
+    square: NDArray, translation: NDArray, n_seen: NDArray, dtype: np.dtype
+) -> NDArray:
+    """Tell in which frames all seen points are equal, up to rounding."""
+    rounding = EQUAL * np.finfo(dtype).eps * np.linalg.norm(translation, axis=1)
+    return (n_seen > 0) & (square <= n_seen * rounding**2)
+
+
+def _collinear(
+    centred: NDArray, translation: NDArray, seen: NDArray, dtype: np.dtype
+) -> NDArray:
+    """Tell which frames miss points and show the others on a line, up to rounding."""
+    on_line = np.asarray(~seen.all(axis=1))
+    centred, translation = centred[on_line], translation[on_line]
+    n_seen = seen[on_line].sum(axis=1)
+    x, y = centred[..., 0], centred[..., 1]
+    # The angle of the principal axis; what is left across it is not squared before.
+    angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
+    across = np.cos(angle)[:, None] * y - np.sin(angle)[:, None] * x
+    extent = np.linalg.norm(translation, axis=1) + np.abs(centred).max(axis=(1, 2))
+    rounding = EQUAL * np.finfo(dtype).eps * extent
+    thin = np.vecdot(across, across) <= n_seen * rounding**2
+    on_line[on_line] = thin & (n_seen > 0)
+    return on_line
