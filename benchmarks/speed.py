@@ -143,7 +143,7 @@ def found_by_search(model, tracks, seed):
 
     Both are in units of the noise variance: minus twice the log posterior.
     """
-    frames = model._frames
+    frames = model._model.frames
     fit = frames.posterior(tracks).objective
     found = np.full(len(tracks), np.inf)
     rng = np.random.default_rng(seed)

@@ -1,6 +1,7 @@
 """Non-rigid structure from motion by independent subspace analysis."""
 
-from isa_nrsfm._estimator import AffineNRSfM, Decomposition
+from isa_nrsfm._estimator import AffineNRSfM
+from isa_nrsfm._transformer import Decomposition
 from isa_nrsfm.isa import FastISA, PooledFastICA
 
 __version__ = "0.1.0"

@@ -1,10 +1,11 @@
 """How far a table determines what was fitted to it."""
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from isa_nrsfm._compat.caller import warn_caller
 
 # Frames of which the information on the weak directions is computed.
 INFORMATIVE_FRAMES = 400
@@ -126,19 +127,17 @@ def diagnose(
     )
     unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
     if unsupported:
-        warnings.warn(
+        warn_caller(
             f"the table does not support n_components={len(basis)}: {unsupported} "
             "direction(s) of the coefficients may well be noise; take at most "
             f"n_components={len(basis) - unsupported}",
-            stacklevel=3,
         )
     elif found.weak_deviations[-1] > LARGEST_DEVIATION:
-        warnings.warn(
+        warn_caller(
             "the table hardly determines the part of the basis shapes that cameras "
             "absorb: its largest standard deviation is "
             f"{found.weak_deviations[-1]:.2g} of the mean shape; take more frames or "
             "fewer basis shapes",
-            stacklevel=3,
         )
     return found
 

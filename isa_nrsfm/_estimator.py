@@ -1,133 +1,45 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
 import os
-import warnings
-from collections.abc import Callable
-from functools import partial
 from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import (
-    BaseEstimator,
-    ClassNamePrefixFeaturesOutMixin,
-    TransformerMixin,
     clone,
 )
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_array, check_random_state, estimator_html_repr
+from sklearn.utils import check_random_state, estimator_html_repr
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.parameters import fit_context
-from isa_nrsfm._diagnostics import Diagnostics, diagnose, reliabilities
+from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, fit_table
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.basis_change import FrameMap
-from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     full_rotations,
-    nearest_calibrated,
 )
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.posterior import spread_starts
-from isa_nrsfm._frames.projection import compose, project, reprojection_error
-from isa_nrsfm._gauge.canonical import (
-    canonical_gauge,
-    canonical_space,
-    euclidean_space,
-    image_energies,
-    mode_covariance,
-    reorder_blocks,
-)
-from isa_nrsfm._gauge.independent import INDEPENDENCE, independent_gauge
-from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
-from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
-from isa_nrsfm._joint.starts import rigid_start
-from isa_nrsfm._metric_upgrade.deforming import deformation_metric
-from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
+from isa_nrsfm._frames.models import FrameFit
+from isa_nrsfm._gauge.independent import INDEPENDENCE
 from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
-from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
-from isa_nrsfm._paper.sample import Sample, sample_frames
-from isa_nrsfm._paper.svd import Triplets, block_triplets
-from isa_nrsfm._prepare.checks import check_names, largest_n_components, most_for_frames
-from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import LOSSES, gross_outliers
-from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
+from isa_nrsfm._prepare.checks import check_names
+from isa_nrsfm._prepare.robust import LOSSES
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm._tables.sources import (
-    CHECKS,
     StoredTable,
     Table,
-    column_sample,
     is_on_dask,
-    is_stored,
 )
+from isa_nrsfm._transformer import TableTransformer
 from isa_nrsfm.isa import PooledFastICA
 
-# Tolerances where none is given: for each frame, of minus twice the log likelihood, and
-# for the paper's refinement, of the energy that it explains.
-JOINT_TOL, PAPER_TOL = 0.025, 1e-10
-# Runs of FastICA, and steps and tolerance of the paper's refinement, where the result
-# is only a start.
-START_RUNS, START_STEPS, START_TOL = 2, 200, 1e-5
-# Basis shapes of which "auto" takes the relevant ones.
-MOST_COMPONENTS = 12
-# Coefficients of frames from which the fit of a frame starts besides zero.
-N_STARTS = 8
-# What a fit may keep of the frames, what of calibrated cameras, and what only the joint
-# refinement tells.
-OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
-OF_CALIBRATED = ("rotations_", "scales_")
-OF_JOINT_FIT = (
-    "noise_variance_",
-    "camera_noise_ratio_",
-    "reliability_",
-    "objective_history_",
-    "gradient_norm_",
-)
-# Stages of a fit, the joint refinement only where it is wanted.
-JOINT_STAGE = "joint refinement"
-STAGES = (
-    "table",
-    "factorisation",
-    "independent subspaces",
-    "block structure and refinement",
-    JOINT_STAGE,
-    "gauge and coefficients",
-)
+# Runs of FastICA where the result of the paper's pipeline is only a start.
+START_RUNS = 2
 
 
-class Decomposition(NamedTuple):
-    """
-    Camera and coefficients of each frame of a table.
-
-    Attributes
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Affine cameras.
-    translation : ndarray of shape (n_frames, 2)
-        Images of the shapes' centroid.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients of the basis shapes.
-    """
-
-    motion: NDArray
-    translation: NDArray
-    alpha: NDArray
-
-
-class AffineNRSfM(
-    CallbackSupportMixin,
-    ClassNamePrefixFeaturesOutMixin,
-    TransformerMixin,
-    BaseEstimator,
-):
+class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -284,6 +196,11 @@ class AffineNRSfM(
         Its translation, the mean centroid.
     isa_ : object
         The fitted strategy, of the paper's pipeline.
+    camera_ : str
+        The camera model of the fit.
+    frames_scaled_ : bool
+        Whether each frame was divided by a size of its own; never with orthographic
+        cameras.
     n_iter_ : int
         Steps of the refinement; of a large table those with all of its frames.
     n_features_in_ : int
@@ -354,7 +271,9 @@ class AffineNRSfM(
     reference_translation_: NDArray
     isa_: Any
     n_iter_: int
-    _frames: RigidFrames | PosteriorFrames
+    camera_: str
+    frames_scaled_: bool
+    _model: TableModel
     n_features_in_: int
     feature_names_in_: NDArray
 
@@ -453,64 +372,12 @@ class AffineNRSfM(
             the other layout explains the table much better, or if a refinement has not
             converged.
         """
-        joint = self.refinement == "joint"
-        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
-        progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
-        for name in (*OF_FRAMES, *OF_CALIBRATED, *OF_JOINT_FIT):
-            self.__dict__.pop(name, None)
-        if not joint and self.loss != "linear":
-            raise ValueError(
-                f"loss={self.loss!r} needs refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
-        if not joint or self.loss != "linear":
-            if is_on_dask(X) or isinstance(X, StoredTable):
-                raise ValueError(
-                    "tables that are not in memory need refinement='joint' and "
-                    f"loss='linear'; got refinement={self.refinement!r} and "
-                    f"loss={self.loss!r}"
-                )
-            X = np.asarray(X) if isinstance(X, np.memmap) else X
-        source = self._opened(X, reset=True)
-        names = getattr(self, "feature_names_in_", None)
-        check_names(names, self.layout)
-        ready = partial(
-            scaled_table,
-            layout=self.layout,
-            names=names,
-            scale_frames=self._scales_frames,
-            robust=self.loss != "linear",
-        )
-        n_components = self.n_components
-        if n_components == "auto":
-            n_components = self._count_components(ready, source)
-        table = ready(source, n_components)
-        self._unit = 1.0 if self._scales_frames else float(table.sizes[0])
-        outliers, used = self._completed(table, n_components)
-        progress("table")
-        triplets, sample, factors = self._factors(table, used, n_components)
-        progress("factorisation")
-        self.isa_, result = self._paper_result(factors, n_components, progress)
-        self.singular_values_ = self._unit * triplets.values
-        self.rank_floor_ = triplets.rest_share
-        self._n_features_out = n_components
-        if joint:
-            spectrum = Spectrum.from_singular_values(
-                triplets.values,
-                triplets.rest_share,
-                n_components,
-                table.n_points,
-                table.n_seen,
-            )
-            frames = self._refine_jointly(
-                table, outliers, sample, factors, result, spectrum, progress
-            )
-        else:
-            frames = self._keep(table, sample.W, factors, result)
-        self._describe(table, frames)
-        self._keep_frames(source, table, frames)
-        progress("gauge and coefficients")
-        progress.end()
+        self._forget()
+        try:
+            self._fit(X, y)
+        except BaseException:
+            self._forget()
+            raise
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -532,269 +399,6 @@ class AffineNRSfM(
         self.fit(X)
         return self.alpha_.copy() if self.keep_frames else self.transform(X)
 
-    def transform(self, X: Any) -> NDArray:
-        """
-        Return the coefficients of the frames of a table.
-
-        Each frame is fitted by itself: its result does not depend on the others.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_components)
-            Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
-            too little is seen.
-        """
-        return self.decompose(X).alpha
-
-    def decompose(self, X: Any) -> Decomposition:
-        """
-        Return camera and coefficients of each frame of a table.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        Decomposition
-            Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2) and
-            alpha (n_frames, n_components).
-        """
-        table = self._opened(X)
-        return Decomposition(*self._model.decompose(table)[:3])
-
-    def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
-        """
-        Return the 3D shape of each frame of a table.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-        camera : {"orthographic", "weak_perspective"} or None, default=None
-            What is known of the cameras, for a model with affine ones. None returns the
-            affine shapes, in the space of `mean_shape_`: angles and proportions in
-            depth are not those of the object. Otherwise shapes are Euclidean, up to
-            rotation and mirror image, which are the same for all frames.
-            "weak_perspective" lets each camera have a scale of its own, so that the
-            sizes of the shapes mean nothing; "orthographic" has one scale for all, so
-            that shapes are in the units of the table.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_points, 3)
-            Shapes, without camera; NaN for rows of which too little is seen. Euclidean
-            ones are turned to be as near as possible to the mean shape.
-
-        Raises
-        ------
-        ValueError
-            If `camera` is something else, if the cameras of the fitted table see less
-            than three directions of space, or if the model has other calibrated cameras
-            than those that are asked for.
-
-        Warns
-        -----
-        UserWarning
-            If the cameras of the fitted table turn too little to tell its metric.
-
-        See Also
-        --------
-        isa_nrsfm.calibration.euclidean_frames : Rotations and scales, too.
-
-        Notes
-        -----
-        The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
-        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is. Models
-        that were fitted with calibrated cameras have Euclidean shapes as they are: no
-        shape is turned, and `scales_` and `rotations_` belong to them.
-        """
-        if camera is not None and camera not in CAMERA_MODELS:
-            raise ValueError(
-                f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
-            )
-        table = self._opened(X)
-        fitted, metric = self._frames.camera, None
-        if fitted != "affine" and camera not in (None, fitted):
-            raise ValueError(
-                f"the model was fitted with camera={fitted!r}, whose shapes are "
-                f"Euclidean as they are; got camera={camera!r}"
-            )
-        if camera is not None and fitted == "affine":
-            self._need_frames("reconstruct with a camera")
-            metric = deformation_metric(self.motion_, self.alpha_)
-        scaled = metric is not None and camera == "orthographic"
-        return self._model.reconstruct(table, metric, scaled)
-
-    def mirror(self) -> Self:
-        """
-        Turn the model into its mirror image in depth, which fits as well.
-
-        Neither affine nor calibrated cameras tell an object from its mirror image: the
-        fit takes the one of which the mean shape has a depth of positive third moment.
-        Where it is the wrong one, for instance a face whose nose points away, this
-        takes the other one. Coefficients, reprojection and score stay as they are.
-
-        Returns
-        -------
-        AffineNRSfM
-            The same estimator: the signs of z of its shapes and of the third column of
-            its cameras are changed, and rotations are ``D R D`` with ``D = diag(1, 1,
-            -1)``.
-
-        Examples
-        --------
-        >>> from isa_nrsfm import AffineNRSfM
-        >>> from isa_nrsfm.datasets import make_face_tracks
-        >>> faces = make_face_tracks(n_frames=100, random_state=0)
-        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
-        >>> depth = model.mean_shape_[:, 2].copy()
-        >>> bool((model.mirror().mean_shape_[:, 2] == -depth).all())
-        True
-        """
-        check_is_fitted(self)
-        depth = np.array([1.0, 1.0, -1.0])
-        dtype = self.mean_shape_.dtype
-        for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
-            if hasattr(self, name):
-                setattr(self, name, getattr(self, name) * depth.astype(dtype))
-        if hasattr(self, "rotations_"):
-            turned = depth[:, None] * self.rotations_ * depth
-            self.rotations_ = turned.astype(dtype, copy=False)
-        signs = np.tile(depth, len(self.basis_))
-        self.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
-        self._frames = self._frames.mirrored()
-        return self
-
-    def reproject(self, X: Any) -> NDArray:
-        """
-        Return a table as the model sees it, missing points filled in.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, 2 * n_points)
-            Points of the fitted shapes in the fitted cameras. NaN for rows of which too
-            little is seen.
-        """
-        table = self._opened(X)
-        return self._model.reproject(table)
-
-    def inverse_transform(
-        self, alpha: Any, motion: Any = None, translation: Any = None
-    ) -> NDArray:
-        """
-        Return the table of shapes with given coefficients.
-
-        Parameters
-        ----------
-        alpha : array-like of shape (n_frames, n_components)
-            Coefficients.
-        motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
-            Cameras; None is `reference_motion_`, the mean view of the fitted table.
-        translation : array-like of shape (n_frames, 2) or (2,), default=None
-            Positions; None is `reference_translation_`, the mean centroid of the
-            fitted table.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, 2 * n_points)
-            The table, in the order of `layout`.
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not fit the model or each other.
-        """
-        check_is_fitted(self)
-        alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
-        if motion is None:
-            motion = self.reference_motion_
-        if translation is None:
-            translation = self.reference_translation_
-        n_frames, n_components = len(alpha), len(self.basis_)
-        alpha = checked("alpha", alpha, (n_frames, n_components))
-        motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
-        translation = checked("translation", translation, (n_frames, 2), (2,))
-        shapes = compose(self.mean_shape_, self.basis_, alpha)
-        return tracks_to_table(project(shapes, motion, translation), self.layout)
-
-    def score(self, X: Any, y: Any = None) -> float:
-        """
-        Return minus the inverse SNR of points held out of the fit of their frame.
-
-        The points are divided into five parts, always the same. Each is predicted from
-        the others, frame by frame. Unlike the reprojection of the points that are
-        fitted, this gets worse with too many basis shapes, and so it serves to choose
-        `n_components`.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
-        y : None
-            Ignored.
-
-        Returns
-        -------
-        float
-            ``-sum ||m - mhat||^2 / sum ||m - centroid_i||^2`` over all points, frames
-            scaled as in the fit; larger is better. Points whose frame the others do not
-            determine are left out.
-        """
-        table = self._opened(X)
-        return -self._model.held_out_error(table)
-
-    def diagnostics(self) -> Diagnostics:
-        """
-        Tell how far the fitted table determines the answer.
-
-        Returns
-        -------
-        Diagnostics
-            Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames, weak_deviations, camera_noise_ratio and camera_meaning.
-
-        Raises
-        ------
-        ValueError
-            If the model was not refined jointly: the paper's pipeline knows no noise.
-
-        Warns
-        -----
-        UserWarning
-            If the table does not support so many basis shapes, or hardly determines
-            the part of them that cameras absorb.
-        """
-        check_is_fitted(self)
-        if not hasattr(self, "noise_variance_"):
-            raise ValueError(
-                "diagnostics needs a model with refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
-        self._need_frames("diagnostics")
-        fitted = np.isfinite(self._frame_sizes)
-        motion = np.asarray(self.motion_)[fitted]
-        return diagnose(
-            self.mean_shape_.astype(np.float64),
-            self.basis_.astype(np.float64),
-            motion / self._frame_sizes[fitted, None, None],
-            np.asarray(self.alpha_, dtype=np.float64)[fitted],
-            self.noise_variance_ / self._unit**2,
-            self.reliability_,
-            self.camera_noise_ratio_,
-        )
-
     def __sklearn_tags__(self) -> Any:
         """Return the estimator's tags."""
         tags = super().__sklearn_tags__()
@@ -807,92 +411,57 @@ class AffineNRSfM(
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
-    def _count_components(
-        self, ready: Callable[[Table, int], ScaledTable], source: Table
-    ) -> int:
-        """Return the number of basis shapes that a table supports."""
-        if self.refinement != "joint":
+    def _fit(self, X: Any, y: Any) -> None:
+        """Check a table and its options, fit it, and set what was found."""
+        joint = self.refinement == "joint"
+        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
+        progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+        self._check_options(X)
+        X = np.asarray(X) if isinstance(X, np.memmap) and not self._in_blocks else X
+        source = self._opened(X, reset=True)
+        names = getattr(self, "feature_names_in_", None)
+        check_names(names, self.layout)
+        options = FitOptions(
+            self._strategy(),
+            self.isa is None,
+            self.block_recovery,
+            self.refinement,
+            self.camera,
+            self.independence,
+            self.loss,
+            self.layout,
+            self.scale_frames and self.camera != "orthographic",
+            self.max_iter,
+            self.tol,
+            names,
+        )
+        self._set(fit_table(source, self.n_components, options, progress), source)
+        progress.end()
+
+    @property
+    def _in_blocks(self) -> bool:
+        """Whether the fit reads a table block by block."""
+        return self.refinement == "joint" and self.loss == "linear"
+
+    def _check_options(self, X: Any) -> None:
+        """Refuse options that do not go together, or not with a table."""
+        joint = self.refinement == "joint"
+        if not joint and self.loss != "linear":
+            raise ValueError(
+                f"loss={self.loss!r} needs refinement='joint'; "
+                f"got refinement={self.refinement!r}"
+            )
+        if not joint and self.n_components == "auto":
             raise ValueError(
                 "n_components='auto' needs refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the fit will say the same
-            table = ready(source, 1)
-        most = largest_n_components(table.n_points)
-        most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
-        outliers, used = self._completed(table, most)
-        _, sample, factors = self._factors(table, used, most)
-        _, result = self._paper_result(factors, most, lambda stage: None)
-        found = count_components(
-            table.rows,
-            table.n_seen,
-            sample,
-            factors,
-            _stacked_shapes(result),
-            camera=self.camera,
-            outliers=outliers,
-            loss=self.loss,
-            max_iter=self.max_iter,
-            tol=JOINT_TOL if self.tol is None else self.tol,
-        )
-        if found == most:
-            warnings.warn(
-                f"all {most} basis shapes that were tried are relevant: the table may "
-                f"ask for more than n_components={most}",
-                stacklevel=4,
+        if not self._in_blocks and (is_on_dask(X) or isinstance(X, StoredTable)):
+            raise ValueError(
+                "tables that are not in memory need refinement='joint' and "
+                f"loss='linear'; got refinement={self.refinement!r} and "
+                f"loss={self.loss!r}"
             )
-        return found
-
-    def _completed(
-        self, table: ScaledTable, n_components: int
-    ) -> tuple[NDArray | None, FrameBlocks]:
-        """Return gross outliers, with a robust loss, and frames without gaps."""
-        outliers, used, complete = None, table.rows, table.complete
-        if self.loss != "linear":
-            outliers = gross_outliers(table.rows.whole().transpose(0, 2, 1))
-            used = table.rows.derive(rows_without, outliers)
-            complete = complete and not outliers.any()
-        if not complete:
-            used = complete_rows(used, table.n_points, n_components)
-        return outliers, used
-
-    def _factors(
-        self, table: ScaledTable, used: FrameBlocks, n_components: int
-    ) -> tuple[Triplets, Sample, Factorisation]:
-        """Return the singular triplets of a table, and the factors of a sample."""
-        shape = 2 * len(table.sizes), table.n_points
-        triplets = block_triplets(used, shape, 3 * n_components + 3)
-        if self.refinement == "joint":
-            sample = sample_frames(used, table.n_points, triplets.vectors[:3])
-        else:
-            sample = Sample(used.whole().reshape(shape), [])
-        factors = factorise(sample.W, n_components, table.precision, triplets)
-        return triplets, sample, factors
-
-    def _paper_result(
-        self,
-        factors: Factorisation,
-        n_components: int,
-        report: Callable[[str], None],
-    ) -> tuple[Any, PaperResult]:
-        """Return the fitted strategy and what the paper's pipeline finds with it."""
-        joint, isa = self.refinement == "joint", self._strategy()
-        with warnings.catch_warnings():
-            if joint and self.isa is None:
-                # It makes no difference to the joint refinement, which starts there.
-                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
-            result = run_paper_pipeline(
-                factors,
-                n_components,
-                isa,
-                block_recovery=self.block_recovery,
-                refinement="alternating" if joint else self.refinement,
-                max_iter=START_STEPS if joint else self.max_iter,
-                tol=START_TOL if joint else PAPER_TOL if self.tol is None else self.tol,
-                report=report,
-            )
-        return isa, result
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with what it leaves open filled in."""
@@ -917,210 +486,52 @@ class AffineNRSfM(
             isa.set_params(verbose=self.verbose)
         return isa
 
-    def _keep(
-        self,
-        table: ScaledTable,
-        W: NDArray,
-        factors: Factorisation,
-        result: PaperResult,
-    ) -> FrameFit:
-        """Set the shapes of the paper's pipeline and return the fit of the frames."""
-        dtype, sizes = table.dtype, table.sizes[:, None, None]
-        completed = W.reshape(len(sizes), 2, -1).transpose(0, 2, 1) * sizes
-        mean_shape, basis = result.mean_shape, result.basis
-        if self.camera != "affine":
-            mean_shape, basis = self._upgraded(table, factors, result)
-        paper = RigidFrames(mean_shape, basis, self.camera)
-        rigid = paper.fit(completed, table.sizes)
-        motion = rigid.motion / sizes
-        space = self._space(mean_shape, motion)
-        gauge = canonical_gauge(mean_shape, basis, motion, rigid.alpha, space)
-        self.mean_shape_ = gauge.mean_shape.astype(dtype)
-        self.basis_ = gauge.basis.astype(dtype)
-        covariance = reorder_blocks(result.mode_covariance, gauge.order)
-        self.mode_covariance_ = self._unit**2 * covariance
-        self._converged(result.converged, result.n_iter)
-        # The coefficients are those that transform gives, from the stored shapes.
-        self._frames = RigidFrames(self.mean_shape_, self.basis_, self.camera)
-        return self._model.decompose(table.source)
+    def _forget(self) -> None:
+        """Remove what an earlier fit has found."""
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
+        for name in ("_model", "_unit", "_frame_sizes", "_n_features_out"):
+            if hasattr(self, name):
+                delattr(self, name)
 
-    def _upgraded(
-        self, table: ScaledTable, factors: Factorisation, result: PaperResult
-    ) -> tuple[NDArray, NDArray]:
-        """Return the paper's shapes in the metric of the rigid cameras."""
-        scaled = self.camera == "weak_perspective"
-        _, shapes = rigid_start(factors, _stacked_shapes(result), scaled)
-        shapes = table.sizes[0] * shapes.transpose(0, 2, 1)
-        return shapes[0], shapes[1:]
+    def __sklearn_is_fitted__(self) -> bool:
+        """Return whether a fit has ended."""
+        return hasattr(self, "_model")
 
-    def _space(self, mean_shape: NDArray, motion: NDArray) -> NDArray:
-        """Return the affinity of space, or with calibrated cameras the rotation."""
-        if self.camera == "affine":
-            return canonical_space(mean_shape, motion)
-        unit = 1.0 if self.camera == "orthographic" else None
-        return euclidean_space(mean_shape, motion, unit)
-
-    def _refine_jointly(
-        self,
-        table: ScaledTable,
-        outliers: NDArray | None,
-        sample: Sample,
-        factors: Factorisation,
-        result: PaperResult,
-        spectrum: Spectrum,
-        progress: FitProgress,
-    ) -> FrameFit:
-        """Set the shapes of the joint refinement and return the fit of the frames."""
-        fitted = fit_jointly(
-            table.rows,
-            table.n_seen,
-            sample,
-            factors,
-            _stacked_shapes(result),
-            spectrum=spectrum,
-            camera=self.camera,
-            outliers=outliers,
-            loss=self.loss,
-            max_iter=self.max_iter,
-            tol=JOINT_TOL if self.tol is None else self.tol,
-            on_step=progress.step,
-        )
-        progress(JOINT_STAGE)
-        frames = PosteriorFrames(
-            fitted.shapes,
-            fitted.noise_variance,
-            spread_starts(fitted.alpha, N_STARTS),
-            self.loss,
-            FrameMap.identity(len(result.basis)),
-            self.camera,
-        )
-        posteriors = posterior_blocks(frames, fitted.frames, table.rows)
-        motion, alpha, covariance = posterior_moments(posteriors)
-        self.reliability_ = reliabilities(alpha, covariance)
-        gauge = independent_gauge(
-            fitted.shapes,
-            motion,
-            alpha,
-            self.independence,
-            self.camera,
-            float(table.sizes[0]) if self.camera == "orthographic" else None,
-        )
-        frames = frames._replace(gauge=gauge.frames)
-        self.mean_shape_ = gauge.mean_shape.astype(table.dtype)
-        self.basis_ = gauge.basis.astype(table.dtype)
-        self._frames = frames
-        self.noise_variance_ = self._unit**2 * fitted.noise_variance
-        self.camera_noise_ratio_ = fitted.camera_noise_ratio
-        self.objective_history_ = fitted.history
-        self.gradient_norm_ = fitted.gradient_norm
-        self._converged(fitted.converged, len(fitted.history) - 1)
-        shown = FrameFit.of_blocks(posteriors.map(frames.shown, table.sizes))
-        cameras = shown.motion / table.sizes[:, None, None]
-        covariance = mode_covariance(cameras, shown.alpha)
-        self.mode_covariance_ = self._unit**2 * covariance
-        return shown._replace(translation=shown.translation + table.translation)
-
-    @property
-    def _model(self) -> TableModel:
-        """The model of tables that was fitted."""
-        return TableModel(
-            self._frames,
-            self.mean_shape_,
-            self.basis_,
-            self.layout,
-            getattr(self, "feature_names_in_", None),
-            None if self._scales_frames else self._unit,
-        )
-
-    @property
-    def _scales_frames(self) -> bool:
-        """Whether each frame gets size one."""
-        return self.scale_frames and self.camera != "orthographic"
-
-    def _describe(self, table: ScaledTable, frames: FrameFit) -> None:
-        """Set what is said of the fit of all frames."""
-        sizes, dtype = table.sizes, table.dtype
-        cameras = frames.motion / sizes[:, None, None]
-        position = (frames.translation - table.translation) / sizes[:, None]
-        shapes = np.concatenate([self.mean_shape_[None], self.basis_])
-        self.inverse_snr_ = reprojection_error(
-            table.rows, shapes.transpose(0, 2, 1), cameras, position, frames.alpha
-        )
-        energy = image_energies(cameras, self.basis_, frames.alpha)
-        self.energy_share_ = energy / (energy.sum() or 1.0)
-        reference = reference_camera(cameras, sizes)
-        if self.camera != "affine":
-            row, scale = nearest_calibrated(reference[None])
-            reference = (scale[:, None, None] * row)[0]
-        self.reference_motion_ = reference.astype(dtype)
-        self.reference_translation_ = frames.translation.mean(axis=0).astype(dtype)
-
-    def _keep_frames(self, source: Table, table: ScaledTable, frames: FrameFit) -> None:
-        """Set what was found for each frame, in memory or in files, if it is wanted."""
-        kept = FrameFit(*map(table.of_all_rows, frames.astype(table.dtype)))
-        if isinstance(self.keep_frames, str | os.PathLike):
-            kept = kept.in_files(self.keep_frames)
+    def _set(self, fit: Fit, source: Table) -> None:
+        """Set all that a fit has found."""
+        found: dict[str, Any] = {
+            "mean_shape": fit.model.mean_shape,
+            "basis": fit.model.basis,
+            "isa": fit.isa,
+            "inverse_snr": fit.inverse_snr,
+            "rank_floor": fit.rank_floor,
+            "singular_values": fit.singular_values,
+            "mode_covariance": fit.mode_covariance,
+            "energy_share": fit.energy_share,
+            "n_iter": fit.n_iter,
+            "camera": fit.model.frames.camera,
+            "frames_scaled": fit.model.unit is None,
+            "reference_motion": fit.reference_motion,
+            "reference_translation": fit.reference_translation,
+        }
+        if fit.numbers is not None:
+            found |= fit.numbers._asdict()
         if self.keep_frames:
-            self._frame_sizes = table.of_all_rows(table.sizes)
+            kept = fit.frames
+            if isinstance(self.keep_frames, str | os.PathLike):
+                kept = kept.in_files(self.keep_frames)
             kept = FrameFit(*map(source.blocks.spread, kept))
-            self.motion_, self.translation_, self.alpha_, deviation = kept
+            found |= kept._asdict()
+            if fit.numbers is None:
+                del found["alpha_std"]
             if self.camera != "affine":
-                self.rotations_, self.scales_ = full_rotations(self.motion_)
-            if self.refinement == "joint":
-                self.alpha_std_ = deviation
-
-    def _need_frames(self, what: str) -> None:
-        """Refuse what depends on the frames of the fit where they were not kept."""
-        if not hasattr(self, "motion_"):
-            raise ValueError(
-                f"{what} needs the cameras and coefficients of the fitted table; fit "
-                f"with keep_frames=True, got keep_frames={self.keep_frames!r}"
-            )
-
-    def _converged(self, converged: bool, n_iter: int) -> None:
-        """Set the number of steps, and warn where they were too few."""
-        self.n_iter_ = n_iter
-        if not converged:
-            warnings.warn(
-                f"the refinement did not converge in max_iter={self.max_iter} steps; "
-                "increase max_iter or tol",
-                ConvergenceWarning,
-                stacklevel=5,
-            )
-
-    def _opened(self, X: Any, reset: bool = False) -> Table:
-        """Return a table, for the fit or for the fitted model, in blocks."""
-        if not reset:
-            check_is_fitted(self)
-        if is_stored(X) or is_on_dask(X):
-            validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
-            if is_on_dask(X):
-                return Table.on_dask(X)
-            return Table.stored(X, self.working_memory)
-        least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-        X = validate_data(self, X, reset=reset, **CHECKS, **least)
-        return Table.in_memory(X, self.n_jobs if reset else 1, whole=not reset)
-
-
-def _stacked_shapes(result: PaperResult) -> NDArray:
-    """Return mean shape and basis shapes (n_components + 1, 3, n_points)."""
-    shapes = np.concatenate([result.mean_shape[None], result.basis])
-    return shapes.transpose(0, 2, 1)
-
-
-def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
-    """Return a finite array of one of the allowed shapes, or say what came."""
-    array = check_array(
-        values,
-        dtype=[np.float64, np.float32],
-        input_name=name,
-        ensure_2d=False,
-        allow_nd=True,
-    )
-    if array.shape not in allowed:
-        expected = " or ".join(map(str, allowed))
-        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
-    return array
+                found["rotations"], found["scales"] = full_rotations(kept.motion)
+            self._frame_sizes = fit.frame_sizes
+        for name, value in found.items():
+            setattr(self, f"{name}_", value)
+        self._unit, self._n_features_out = fit.unit, len(fit.model.basis)
+        self._model = fit.model
 
 
 def check_class(estimator: object, where: str) -> None:

@@ -43,7 +43,7 @@ def _lines(model: Any) -> dict[str, str]:
         fitted = np.isfinite(model._frame_sizes)
         without = f", {(~fitted).sum()} rows without points" * (not fitted.all())
         lines["Frames"] = f"{fitted.sum()}{without}"
-    camera = model._frames.camera.replace("_", " ")
+    camera = model.camera_.replace("_", " ")
     ratio = getattr(model, "camera_noise_ratio_", None)
     meaning = "" if ratio is None else f"; {camera_meaning(ratio)}"
     lines["Cameras"] = f"{camera}{meaning}"
@@ -53,7 +53,7 @@ def _lines(model: Any) -> dict[str, str]:
         noise = math.sqrt(model.noise_variance_)
         lines["Noise"] = (
             f"{_percent(noise)} of a frame's size"
-            if model._scales_frames
+            if model.frames_scaled_
             else f"{noise:.3g} in the units of the table"
         )
     shares = [_percent(share) for share in model.energy_share_]

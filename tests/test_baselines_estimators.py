@@ -185,7 +185,7 @@ class TestFitted:
         assert rest < 0.02 * size
         error = inverse_snr(truth.data, model.reproject(truth.data))
         assert error < 2 * 0.01**2
-        motion, translation, alpha = model.decompose(truth.data)
+        motion, translation, alpha, _ = model.decompose(truth.data)
         assert_allclose(motion, model.motion_, atol=0.05)
         assert_allclose(translation, model.translation_)
         assert_array_equal(alpha, model.alpha_)

@@ -14,7 +14,7 @@ from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import callbacks as _callbacks
-from isa_nrsfm._estimator import JOINT_STAGE, STAGES
+from isa_nrsfm._fit import JOINT_STAGE, STAGES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 

@@ -339,10 +339,14 @@ def test_decompose_of_the_fitted_table_gives_the_attributes_to_the_bit(variant):
     model, table, _ = variant
     frames = model.decompose(table)
     assert isinstance(frames, Decomposition)
-    assert frames._fields == ("motion", "translation", "alpha")
+    assert frames._fields == ("motion", "translation", "alpha", "alpha_std")
     assert_array_equal(frames.motion, model.motion_)
     assert_array_equal(frames.translation, model.translation_)
     assert_array_equal(frames.alpha, model.alpha_)
+    if is_joint(model):
+        assert_array_equal(frames.alpha_std, model.alpha_std_)
+    else:
+        assert np.isnan(frames.alpha_std).all()
     assert_array_equal(model.transform(table), model.alpha_)
 
 
@@ -350,7 +354,7 @@ def test_decompose_of_the_fitted_table_gives_the_attributes_to_the_bit(variant):
 def test_methods_follow_the_formula(variant, which):
     model, table, new = variant
     table = table if which == "fitted" else new
-    motion, translation, alpha = model.decompose(table)
+    motion, translation, alpha, _ = model.decompose(table)
     assert_array_equal(model.transform(table), alpha)
 
     shapes = model.reconstruct(table)
@@ -386,7 +390,7 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
     if is_joint(model):
         pytest.skip("camera and coefficients are fitted together")
     table = table if which == "fitted" else new
-    motion, translation, alpha = model.decompose(table)
+    motion, translation, alpha, _ = model.decompose(table)
     tracks = tracks_of(table, model.layout)
     for i in range(0, len(table), 7):
         assert_allclose(translation[i], tracks[i].mean(axis=0), rtol=1e-12)
@@ -410,7 +414,7 @@ def test_cameras_of_the_joint_refinement_are_best_for_the_coefficients(variant, 
     if not is_joint(model) or model.loss != "linear" or model.camera != "affine":
         pytest.skip("cameras are not those of least squares, or points have weights")
     table = table if which == "fitted" else new
-    motion, translation, _ = model.decompose(table)
+    motion, translation, *_ = model.decompose(table)
     tracks, shapes = tracks_of(table, model.layout), model.reconstruct(table)
     for points, shape, M, t in zip(tracks, shapes, motion, translation, strict=True):
         design = np.column_stack([shape, np.ones(N_POINTS)])

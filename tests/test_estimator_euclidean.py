@@ -106,7 +106,7 @@ class TestContract:
         )
 
     def test_shapes_are_those_of_the_calibration(self, faces, model):
-        motion, translation, alpha = model.decompose(faces.data)
+        motion, translation, alpha, _ = model.decompose(faces.data)
         metric = deformation_metric(model.motion_, model.alpha_)
         frames = euclidean_frames(
             metric, motion, alpha, model.mean_shape_, model.basis_

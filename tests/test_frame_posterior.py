@@ -464,7 +464,7 @@ def fitted_shapes(tracks, n_components):
     model.fit(tracks.reshape(len(tracks), -1).astype(float))
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
-    frames = model._frames
+    frames = model._model.frames
     return centred / size, frames.shapes, frames.starts, frames.noise_variance
 
 

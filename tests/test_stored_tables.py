@@ -7,9 +7,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 import isa_nrsfm._paper.sample as sampling
 import isa_nrsfm._prepare.completion as completion
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._estimator import OF_FRAMES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
+
+# What is known of each frame.
+OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")

@@ -1,11 +1,11 @@
 """Metric upgrade: the affinity of space that makes affine cameras Euclidean ones."""
 
-import warnings
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
     SMALLEST_EIGENVALUE,
@@ -290,10 +290,9 @@ def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
 def warn_if_degenerate(condition_number: float) -> None:
     """Warn where the cameras hardly determine the metric."""
     if condition_number > LARGEST_CONDITION:
-        warnings.warn(
+        warn_caller(
             f"the cameras hardly determine the metric of space: its condition number "
             f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
             "may have wrong depth and angles. Take frames that are seen from more "
             "sides, or more frames, or affine shapes (camera=None)",
-            stacklevel=3,
         )

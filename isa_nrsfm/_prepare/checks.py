@@ -1,6 +1,5 @@
 """What a table has to be before it is factorised, and what is said if it is not."""
 
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple, Self
 
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bmat, csr_array
 from scipy.sparse.csgraph import connected_components
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.landmark_columns import names_layout
 from isa_nrsfm._tables.layout import (
     LAYOUTS,
@@ -46,16 +46,15 @@ class HalfPoints(NamedTuple):
         n_points = sum(part.n_points for part in parts)
         return cls(n_points, sum(part.n_rows for part in parts), first)
 
-    def warn(self, layout: Layout, names: NDArray | None, stacklevel: int) -> None:
+    def warn(self, layout: Layout, names: NDArray | None) -> None:
         """Warn if there are such points."""
         if self.first is None:
             return
         row, point = self.first
-        warnings.warn(
+        warn_caller(
             f"{self.n_points} point(s) in {self.n_rows} row(s) have only one of "
             "their two coordinates and count as missing; the first is "
             f"{_describe_point(point, layout, names)} in row {row}",
-            stacklevel=stacklevel + 1,
         )
 
 
@@ -162,7 +161,7 @@ def clean_tracks(
         If there are such points.
     """
     tracks, half = without_half_points(tracks)
-    half.warn(layout, names, stacklevel=4)
+    half.warn(layout, names)
     return tracks
 
 

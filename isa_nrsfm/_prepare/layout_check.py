@@ -1,10 +1,9 @@
 """The layout that a table has, by its numbers: told where it is not the one given."""
 
-import warnings
-
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.completion import rigid_noise
 from isa_nrsfm._tables.layout import (
     LAYOUTS,
@@ -35,9 +34,7 @@ def layout_sample(n_frames: int, n_columns: int) -> slice:
     return slice(None, None, max(-(-n_frames // enough), 1))
 
 
-def warn_if_other_layout(
-    X: NDArray, layout: Layout, scale_frames: bool, stacklevel: int = 4
-) -> None:
+def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None:
     """
     Warn where the columns in the other layout are nearer to a rigid object.
 
@@ -52,8 +49,6 @@ def warn_if_other_layout(
         What is said to be the order of its columns.
     scale_frames : bool
         Whether frames count alike.
-    stacklevel : int, default=4
-        Where the warning points to: four is the caller of a method that calls this.
 
     Warns
     -----
@@ -74,10 +69,9 @@ def warn_if_other_layout(
     sizes = np.where(sizes > 0, sizes, 1.0)
     given, swapped = (_rigid_residual(c, sizes) for c in centred)
     if given > ROUNDING and swapped < CLEARLY_BETTER * given:
-        warnings.warn(
+        warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
             f"what is not rigid has {swapped / given:.2g} times the energy",
-            stacklevel=stacklevel,
         )
 
 

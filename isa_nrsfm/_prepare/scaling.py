@@ -1,12 +1,12 @@
 """A table made ready for the fit: checked, each frame centred and of size one."""
 
-import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
     HalfPoints,
     PointReport,
@@ -137,7 +137,7 @@ def scaled_table(
     check_size(blocks.n_frames, n_points, n_components)
     found = list(blocks.map(partial(_examine, layout=layout)))
     frames, points, half = zip(*found, strict=True)
-    HalfPoints.merged(half, blocks.lengths).warn(layout, names, stacklevel=4)
+    HalfPoints.merged(half, blocks.lengths).warn(layout, names)
     report = FrameReport(*map(np.concatenate, zip(*frames, strict=True)))
     check_frames(report, n_points)
     shown = report.n_seen > 0
@@ -149,7 +149,7 @@ def scaled_table(
     check_places(report, n_points)
     n_frames = blocks.n_frames
     every = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
-    warn_if_other_layout(blocks.take(every), layout, scale_frames, stacklevel=5)
+    warn_if_other_layout(blocks.take(every), layout, scale_frames)
     size = np.sqrt(report.square / (2 * report.n_seen))
     if robust:
         robust_size = partial(_robust_sizes, layout=layout)
@@ -182,10 +182,9 @@ def _warn_of_empty(shown: NDArray) -> None:
     if not shown.any():
         raise ValueError(f"X shows no point: all of its {len(shown)} row(s) are NaN")
     empty = ~shown
-    warnings.warn(
+    warn_caller(
         f"{empty.sum()} of {len(empty)} row(s) show no point and are left out of the "
         f"fit, the first is row {empty.argmax()}",
-        stacklevel=5,
     )
 
 

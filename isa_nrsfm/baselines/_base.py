@@ -20,7 +20,6 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.parameters import fit_context
-from isa_nrsfm._estimator import Decomposition
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names, check_size
@@ -34,6 +33,7 @@ from isa_nrsfm._tables.layout import (
     tracks_to_table,
     weighting_sizes,
 )
+from isa_nrsfm._transformer import Decomposition
 from isa_nrsfm.baselines._orthographic_frames import OrthographicFrames
 from isa_nrsfm.baselines._shape_sequence import (
     ShapeSequence,
@@ -226,9 +226,9 @@ class ShapeSequenceNRSfM(
         Returns
         -------
         Decomposition
-            Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2) and
-            alpha (n_frames, n_components). For the fitted table the cameras are not
-            `motion_`, which belong to `shapes_`.
+            Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
+            alpha_std (n_frames, n_components), which is NaN. For the fitted table the
+            cameras are not `motion_`, which belong to `shapes_`.
         """
         check_is_fitted(self)
         return self._decompose(self._tracks(X, reset=False))
@@ -265,7 +265,7 @@ class ShapeSequenceNRSfM(
             Points of the model's shapes in their cameras, in the order of `layout`.
             `inverse_snr_` is not of these, but of `shapes_` in `motion_`.
         """
-        motion, translation, alpha = self.decompose(X)
+        motion, translation, alpha, _ = self.decompose(X)
         shapes = compose(self.mean_shape_, self.basis_, alpha)
         return tracks_to_table(project(shapes, motion, translation), self.layout)
 
@@ -309,7 +309,7 @@ class ShapeSequenceNRSfM(
         )
         cameras, alpha = frames.fit(centred / sizes[:, None, None])
         motion = (sizes / self._unit)[:, None, None] * cameras
-        found = (motion, translation, alpha)
+        found = (motion, translation, alpha, np.full_like(alpha, np.nan))
         return Decomposition(*(part.astype(tracks.dtype) for part in found))
 
 

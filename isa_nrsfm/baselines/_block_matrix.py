@@ -1,6 +1,5 @@
 """The block matrix method: shapes of least nuclear norm, then of low rank."""
 
-import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple
 
@@ -9,6 +8,7 @@ from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils._param_validation import Interval
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._pseudo_inverse import (
@@ -301,10 +301,9 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
             self.n_iter_ += found.n_iter
             converged &= found.converged
         if not converged:
-            warnings.warn(
+            warn_caller(
                 f"the shapes did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
-                stacklevel=4,
             )
         return ShapeSequence(cameras, truncate_rank(shapes, rank))

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm._tables.landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
@@ -165,10 +164,11 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
         refuse_overwriting(source, [output])
     X = _as_fitted(estimator, frames.points[frames.usable])
     n_frames, n_components = len(X), len(estimator.basis_)
-    fit = FrameFit.unknown(0, n_components)
+    none = np.empty((0, n_components))
+    fit = Decomposition(np.empty((0, 2, 3)), np.empty((0, 2)), none, none)
     quality = ["no frame was fitted"]
     if n_frames:
-        fit = _fitted_frames(estimator, X)
+        fit = estimator.decompose(X)
         quality = quality_lines(quality_report(estimator, X, fit))
     results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
@@ -312,11 +312,6 @@ def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
         return x_then_y.reshape(points.shape) if planar else points.to_numpy()
     in_order = points[[str(name).strip() for name in fitted]]
     return in_order.set_axis(list(fitted), axis=1)
-
-
-def _fitted_frames(estimator: AffineNRSfM, X: Any) -> FrameFit:
-    """Return cameras, coefficients and their standard deviations for a table."""
-    return estimator._model.decompose(estimator._opened(X))
 
 
 def _strategy(args: Namespace) -> Any:

@@ -1,12 +1,12 @@
 """Take the usable frames out of a table, and account for those left out."""
 
-import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._tables.landmark_columns import LandmarkColumns, landmark_sets
@@ -159,11 +159,10 @@ def _warn_of_zeros(tracks: NDArray[np.float64]) -> None:
     """Warn of points at the origin, which mark missing points in many tables."""
     at_origin = (tracks == 0).all(axis=2)
     if at_origin.any():
-        warnings.warn(
+        warn_caller(
             f"{np.count_nonzero(at_origin)} points in "
             f"{np.count_nonzero(at_origin.any(axis=1))} rows are at exactly (0, 0); if "
             "that marks missing points, use --zeros-missing",
-            stacklevel=2,
         )
 
 

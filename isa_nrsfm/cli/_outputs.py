@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, Decomposition
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.export import write_shapes, write_viewer
 from isa_nrsfm.export._shape_arrays import names_of_components
@@ -60,9 +60,8 @@ def prepare_folder(
     if not figures:
         stale = [name for name in FIGURES if (folder / name).exists()]
         if stale:
-            warnings.warn(
+            warn_caller(
                 f"{folder} has figures of an earlier run: {', '.join(stale)}",
-                stacklevel=2,
             )
     return files
 
@@ -91,10 +90,9 @@ def beside_other_columns(
             names[name] += "_"
     renamed = [f"{new} (not {name})" for name, new in names.items() if new != name]
     if renamed:
-        warnings.warn(
+        warn_caller(
             f"the table has columns named like results, which are called "
             f"{', '.join(renamed)}",
-            stacklevel=2,
         )
     row = pd.Series(results.index, index=results.index, name=names["row"])
     return pd.concat([row, other, results.rename(columns=names)], axis=1)
@@ -140,11 +138,11 @@ def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
             warnings.simplefilter("error", UserWarning)
             write_viewer(estimator, path, X=X)
     except (ValueError, UserWarning) as error:
-        warnings.warn(f"{path.name} has affine shapes: {error}", stacklevel=2)
+        warn_caller(f"{path.name} has affine shapes: {error}")
         write_viewer(estimator, path, X=X, camera=None)
 
 
-def alpha_table(fit: FrameFit, frames: Frames, *, std: bool) -> "pd.DataFrame":
+def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
     """Return the coefficients of all frames, empty for those that are not usable."""
     pd = import_optional("pandas", extra="io")
     names = component_names(fit.alpha.shape[1])
@@ -155,14 +153,14 @@ def alpha_table(fit: FrameFit, frames: Frames, *, std: bool) -> "pd.DataFrame":
     return alpha.reindex(frames.points.index)
 
 
-def fitted_frames(estimator: AffineNRSfM) -> FrameFit:
+def fitted_frames(estimator: AffineNRSfM) -> Decomposition:
     """Return cameras and coefficients of the table that a model was fitted to."""
     alpha = estimator.alpha_
     std = getattr(estimator, "alpha_std_", np.full_like(alpha, np.nan))
-    return FrameFit(estimator.motion_, estimator.translation_, alpha, std)
+    return Decomposition(estimator.motion_, estimator.translation_, alpha, std)
 
 
-def fitted_table(estimator: AffineNRSfM, fit: FrameFit) -> np.ndarray:
+def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
     """Return a table as the model has it."""
     return estimator.inverse_transform(fit.alpha, fit.motion, fit.translation)
 

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm import AffineNRSfM, Decomposition, __version__
 from isa_nrsfm._diagnostics import camera_meaning
-from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
 from isa_nrsfm.cli._parser import AUTO
@@ -59,7 +58,9 @@ def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
     }
 
 
-def quality_report(estimator: AffineNRSfM, X: Any, fit: FrameFit) -> dict[str, Any]:
+def quality_report(
+    estimator: AffineNRSfM, X: Any, fit: Decomposition
+) -> dict[str, Any]:
     """Describe how well a model explains a table."""
     off = fitted_table(estimator, fit) - np.asarray(X)
     return {
@@ -67,7 +68,7 @@ def quality_report(estimator: AffineNRSfM, X: Any, fit: FrameFit) -> dict[str, A
             X,
             fitted_table(estimator, fit),
             layout=estimator.layout,
-            scale_frames=estimator._scales_frames,
+            scale_frames=estimator.frames_scaled_,
         ),
         "held_out_error": -estimator.score(X),
         "rms_point_error": np.sqrt(2 * np.nanmean(off**2)),
@@ -97,7 +98,7 @@ def model_report(estimator: AffineNRSfM, X: Any, frames: Frames) -> dict[str, An
         "inverse_snr": estimator.inverse_snr_,
         "rank_floor": estimator.rank_floor_ if floor else None,
         "noise_variance": getattr(estimator, "noise_variance_", None),
-        "frames_scaled": estimator._scales_frames,
+        "frames_scaled": estimator.frames_scaled_,
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
         "camera_meaning": None if ratio is None else camera_meaning(ratio),

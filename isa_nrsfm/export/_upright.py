@@ -99,7 +99,7 @@ def upright_space(
     if camera not in ("weak_perspective", None):
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     model._need_frames("exporting shapes")
-    fitted, metric = model._frames.camera, None
+    fitted, metric = model.camera_, None
     told: str | None = camera if fitted == "affine" else fitted
     if fitted != "affine":
         transform = euclidean_axes(model)

@@ -127,7 +127,7 @@ def write_viewer(
     if X is None:
         motion, alpha = model.motion_[rows], model.alpha_[rows]
     elif len(rows):
-        motion, _, alpha = model.decompose(_safe_indexing(X, rows))
+        motion, _, alpha, _ = model.decompose(_safe_indexing(X, rows))
     else:
         motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
     motion, alpha = np.asarray(motion), np.asarray(alpha)

@@ -1,12 +1,12 @@
 """Read the csv and h5 files of DeepLabCut, which Lightning Pose writes, too."""
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
 from isa_nrsfm.io._landmarks import (
@@ -164,10 +164,9 @@ def _common_bodyparts(places: dict[str, dict[str, Any]]) -> list[str]:
     if len(places) > 1 and _UNIQUE in places:
         others = next(points for name, points in places.items() if name != _UNIQUE)
         if set(places[_UNIQUE]) != set(others):
-            warnings.warn(
+            warn_caller(
                 f"the points {', '.join(places[_UNIQUE])} belong to no animal "
                 f"(individual {_UNIQUE!r}) and are left out",
-                stacklevel=2,
             )
             del places[_UNIQUE]
     first, points = next(iter(places.items()))

@@ -1,6 +1,5 @@
 """FastISA with many starts: ISA1."""
 
-import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
@@ -12,6 +11,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import HasMethods, Interval
 from sklearn.utils.parallel import Parallel, delayed
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
@@ -194,11 +194,10 @@ class FastISA(BaseSubspaceAnalysis):
         )
         best = int(np.argmax(log_likelihoods))
         if not converged[best]:
-            warnings.warn(
+            warn_caller(
                 f"FastISA did not converge in max_iter={self.max_iter} steps: its "
                 "best start still moves; increase max_iter or tol",
                 ConvergenceWarning,
-                stacklevel=6,
             )
         self.log_likelihoods_ = log_likelihoods
         self.log_likelihood_ = float(log_likelihoods[best])

@@ -12,6 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.parameters import fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity
@@ -195,12 +196,11 @@ class PooledFastICA(BaseSubspaceAnalysis):
         if criterion is not None:
             W = _regroup(W, W @ whitening, in_order, criterion)
         if not converged:
-            warnings.warn(
+            warn_caller(
                 f"FastICA did not converge in max_iter={self.max_iter} steps in the "
                 "run that is kept: its sources may be ill determined; try "
                 "PooledFastICA with another fun or larger n_init or max_iter",
                 ConvergenceWarning,
-                stacklevel=6,
             )
         return W
 

@@ -1,0 +1,34 @@
+"""Warnings that point to the line of the user's program."""
+
+import contextlib
+import sys
+import warnings
+from pathlib import Path
+
+import joblib
+import sklearn
+
+# What stands between the user's line and ours: this package, and what calls it.
+INSIDE = (
+    str(Path(__file__).parents[1]),
+    str(Path(sklearn.__file__).parent),
+    str(Path(joblib.__file__).parent),
+    contextlib.__file__,
+)
+
+
+def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
+    """
+    Warn at the line that called this package, however deep the warning stands.
+
+    Parameters
+    ----------
+    message : str
+        What is said.
+    category : type, default=UserWarning
+        Kind of warning.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(INSIDE):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)

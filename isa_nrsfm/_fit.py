@@ -1,0 +1,515 @@
+"""The stages of a fit, in order: from a table to a fitted model.
+
+1. The table is checked, scaled and, where points are missing, completed.
+2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
+3. and 4. The paper's pipeline: independent subspaces, block structure, refinement.
+5. The joint refinement, where it is wanted.
+6. Gauge, and camera and coefficients of every frame.
+
+The first and the last stage see all frames. The others see those of the sample, but for
+the last steps of the joint refinement.
+"""
+
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.exceptions import ConvergenceWarning
+
+from isa_nrsfm._compat.callbacks import FitProgress
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._diagnostics import reliabilities
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.camera import reference_camera
+from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.posterior import spread_starts
+from isa_nrsfm._frames.projection import reprojection_error
+from isa_nrsfm._gauge.canonical import (
+    canonical_gauge,
+    canonical_space,
+    euclidean_space,
+    image_energies,
+    mode_covariance,
+    reorder_blocks,
+)
+from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
+from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
+from isa_nrsfm._joint.starts import rigid_start
+from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
+from isa_nrsfm._paper.sample import Sample, sample_frames
+from isa_nrsfm._paper.svd import Triplets, block_triplets
+from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
+from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.robust import gross_outliers
+from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.sources import Table
+
+# Tolerances where none is given: for each frame, of minus twice the log likelihood, and
+# for the paper's refinement, of the energy that it explains.
+JOINT_TOL, PAPER_TOL = 0.025, 1e-10
+# Steps and tolerance of the paper's refinement where the result is only a start.
+START_STEPS, START_TOL = 200, 1e-5
+# Basis shapes of which "auto" takes the relevant ones.
+MOST_COMPONENTS = 12
+# Coefficients of frames from which the fit of a frame starts besides zero.
+N_STARTS = 8
+# The joint refinement is a stage only where it is wanted.
+JOINT_STAGE = "joint refinement"
+STAGES = (
+    "table",
+    "factorisation",
+    "independent subspaces",
+    "block structure and refinement",
+    JOINT_STAGE,
+    "gauge and coefficients",
+)
+
+
+class FitOptions(NamedTuple):
+    """
+    How a table is fitted: parameters of `AffineNRSfM`, checked.
+
+    Attributes
+    ----------
+    isa : object
+        The unfitted strategy, with nothing left open.
+    default_isa : bool
+        Whether the strategy is not the user's.
+    block_recovery, refinement, camera, independence, loss, layout, max_iter, tol
+        As of `AffineNRSfM`.
+    scale_frames : bool
+        Whether each frame gets size one. Orthographic cameras never scale frames.
+    names : ndarray of shape (2 * n_points,) or None
+        Names of the columns.
+    """
+
+    isa: Any
+    default_isa: bool
+    block_recovery: str
+    refinement: str | None
+    camera: str
+    independence: str | None
+    loss: str
+    layout: Layout
+    scale_frames: bool
+    max_iter: int
+    tol: float | None
+    names: NDArray | None
+
+    @property
+    def joint(self) -> bool:
+        """Whether the refinement is the joint one."""
+        return self.refinement == "joint"
+
+    @property
+    def joint_tol(self) -> float:
+        """Tolerance of the joint refinement."""
+        return JOINT_TOL if self.tol is None else self.tol
+
+
+class JointNumbers(NamedTuple):
+    """What only the joint refinement tells; public attributes of the same names."""
+
+    noise_variance: float
+    camera_noise_ratio: float
+    reliability: NDArray
+    objective_history: NDArray
+    gradient_norm: float
+
+
+class Refined(NamedTuple):
+    """
+    The model and the frames, before they are described.
+
+    Attributes
+    ----------
+    model : TableModel
+        The fitted model, in the gauge.
+    frames : FrameFit
+        The fit of the frames of the table.
+    mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
+        As of `AffineNRSfM`.
+    n_iter : int
+        Steps of the refinement.
+    converged : bool
+        Whether they were enough.
+    numbers : JointNumbers or None
+        None for the paper's refinement.
+    """
+
+    model: TableModel
+    frames: FrameFit
+    mode_covariance: NDArray
+    n_iter: int
+    converged: bool
+    numbers: JointNumbers | None
+
+
+class Fit(NamedTuple):
+    """
+    Result of a fit.
+
+    Attributes
+    ----------
+    model : TableModel
+        The fitted model.
+    unit : float
+        The one size of all frames, 1 where each has its own.
+    frames : FrameFit
+        The fit of all rows of the table; NaN for rows that show nothing.
+    frame_sizes : ndarray of shape (n_rows,)
+        What the frames were divided by.
+    isa : object
+        The fitted strategy.
+    numbers : JointNumbers or None
+        What only the joint refinement tells.
+    inverse_snr, rank_floor, singular_values, mode_covariance, energy_share, n_iter
+        As of `AffineNRSfM`.
+    reference_motion, reference_translation : ndarray of shape (2, 3) and (2,)
+        As of `AffineNRSfM`.
+    """
+
+    model: TableModel
+    unit: float
+    frames: FrameFit
+    frame_sizes: NDArray
+    isa: Any
+    numbers: JointNumbers | None
+    inverse_snr: float
+    rank_floor: float
+    singular_values: NDArray
+    mode_covariance: NDArray
+    energy_share: NDArray
+    n_iter: int
+    reference_motion: NDArray
+    reference_translation: NDArray
+
+
+def fit_table(
+    source: Table, n_components: Any, options: FitOptions, progress: FitProgress
+) -> Fit:
+    """
+    Fit a table.
+
+    Parameters
+    ----------
+    source : Table
+        The table.
+    n_components : int or "auto"
+        K.
+    options : FitOptions
+        How.
+    progress : FitProgress
+        Is told of each stage that has ended, and of the steps of the joint refinement.
+
+    Returns
+    -------
+    Fit
+        The fitted model, and what is said of the fit.
+    """
+    if n_components == "auto":
+        n_components = _count_components(source, options)
+    # 1. Table
+    table = _scaled(source, n_components, options)
+    unit = 1.0 if options.scale_frames else float(table.sizes[0])
+    outliers, used = _completed(table, n_components, options.loss)
+    progress("table")
+    # 2. Factorisation
+    triplets, sample, factors = _factors(table, used, n_components, options.joint)
+    progress("factorisation")
+    # 3. and 4. The paper's pipeline
+    isa, paper = _paper_result(factors, n_components, options, progress)
+    # 5. Joint refinement
+    if options.joint:
+        spectrum = Spectrum.from_singular_values(
+            triplets.values,
+            triplets.rest_share,
+            n_components,
+            table.n_points,
+            table.n_seen,
+        )
+        refined = _refined_jointly(
+            table, outliers, sample, factors, paper, spectrum, options, unit, progress
+        )
+    else:
+        refined = _refined_by_paper(table, sample.W, factors, paper, options, unit)
+    if not refined.converged:
+        warn_caller(
+            f"the refinement did not converge in max_iter={options.max_iter} steps; "
+            "increase max_iter or tol",
+            ConvergenceWarning,
+        )
+    # 6. What is said of the frames
+    cameras = refined.frames.motion / table.sizes[:, None, None]
+    energy = image_energies(cameras, refined.model.basis, refined.frames.alpha)
+    frames = refined.frames.astype(table.dtype)
+    fit = Fit(
+        model=refined.model,
+        unit=unit,
+        frames=FrameFit(*map(table.of_all_rows, frames)),
+        frame_sizes=table.of_all_rows(table.sizes),
+        isa=isa,
+        numbers=refined.numbers,
+        inverse_snr=_inverse_snr(table, refined, cameras),
+        rank_floor=triplets.rest_share,
+        singular_values=unit * triplets.values,
+        mode_covariance=unit**2 * refined.mode_covariance,
+        energy_share=energy / (energy.sum() or 1.0),
+        n_iter=refined.n_iter,
+        reference_motion=_reference(cameras, table, options.camera),
+        reference_translation=refined.frames.translation.mean(axis=0).astype(
+            table.dtype
+        ),
+    )
+    progress("gauge and coefficients")
+    return fit
+
+
+def _count_components(source: Table, options: FitOptions) -> int:
+    """Return the number of basis shapes that a table supports."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the fit will say the same
+        table = _scaled(source, 1, options)
+    most = largest_n_components(table.n_points)
+    most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
+    outliers, used = _completed(table, most, options.loss)
+    _, sample, factors = _factors(table, used, most, joint=True)
+    _, paper = _paper_result(factors, most, options, lambda stage: None)
+    found = count_components(
+        table.rows,
+        table.n_seen,
+        sample,
+        factors,
+        _stacked_shapes(paper),
+        camera=options.camera,
+        outliers=outliers,
+        loss=options.loss,
+        max_iter=options.max_iter,
+        tol=options.joint_tol,
+    )
+    if found == most:
+        warn_caller(
+            f"all {most} basis shapes that were tried are relevant: the table may "
+            f"ask for more than n_components={most}"
+        )
+    return found
+
+
+def _scaled(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
+    """Return the table checked, centred and scaled."""
+    return scaled_table(
+        source,
+        n_components,
+        layout=options.layout,
+        names=options.names,
+        scale_frames=options.scale_frames,
+        robust=options.loss != "linear",
+    )
+
+
+def _completed(
+    table: ScaledTable, n_components: int, loss: str
+) -> tuple[NDArray | None, FrameBlocks]:
+    """Return gross outliers, with a robust loss, and frames without gaps."""
+    outliers, used, complete = None, table.rows, table.complete
+    if loss != "linear":
+        outliers = gross_outliers(table.rows.whole().transpose(0, 2, 1))
+        used = table.rows.derive(rows_without, outliers)
+        complete = complete and not outliers.any()
+    if not complete:
+        used = complete_rows(used, table.n_points, n_components)
+    return outliers, used
+
+
+def _factors(
+    table: ScaledTable, used: FrameBlocks, n_components: int, joint: bool
+) -> tuple[Triplets, Sample, Factorisation]:
+    """Return the singular triplets of a table, and the factors of a sample."""
+    shape = 2 * len(table.sizes), table.n_points
+    triplets = block_triplets(used, shape, 3 * n_components + 3)
+    if joint:
+        sample = sample_frames(used, table.n_points, triplets.vectors[:3])
+    else:
+        sample = Sample(used.whole().reshape(shape), [])
+    factors = factorise(sample.W, n_components, table.precision, triplets)
+    return triplets, sample, factors
+
+
+def _paper_result(
+    factors: Factorisation,
+    n_components: int,
+    options: FitOptions,
+    report: Callable[[str], None],
+) -> tuple[Any, PaperResult]:
+    """Return the fitted strategy and what the paper's pipeline finds with it."""
+    isa, joint = options.isa, options.joint
+    tol = PAPER_TOL if options.tol is None else options.tol
+    with warnings.catch_warnings():
+        if joint and options.default_isa:
+            # It makes no difference to the joint refinement, which starts there.
+            warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
+        result = run_paper_pipeline(
+            factors,
+            n_components,
+            isa,
+            block_recovery=options.block_recovery,
+            refinement="alternating" if joint else options.refinement,
+            max_iter=START_STEPS if joint else options.max_iter,
+            tol=START_TOL if joint else tol,
+            report=report,
+        )
+    return isa, result
+
+
+def _refined_by_paper(
+    table: ScaledTable,
+    W: NDArray,
+    factors: Factorisation,
+    paper: PaperResult,
+    options: FitOptions,
+    unit: float,
+) -> Refined:
+    """Return the shapes of the paper's pipeline, and frames with its model of them."""
+    dtype, sizes = table.dtype, table.sizes[:, None, None]
+    completed = W.reshape(len(sizes), 2, -1).transpose(0, 2, 1) * sizes
+    shapes = _stacked_shapes(paper)
+    if options.camera != "affine":
+        scaled = options.camera == "weak_perspective"
+        shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
+    mean_shape, basis = shapes[0].T, shapes[1:].transpose(0, 2, 1)
+    rigid = RigidFrames(mean_shape, basis, options.camera).fit(completed, table.sizes)
+    motion = rigid.motion / sizes
+    if options.camera == "affine":
+        space = canonical_space(mean_shape, motion)
+    else:
+        scale = 1.0 if options.camera == "orthographic" else None
+        space = euclidean_space(mean_shape, motion, scale)
+    gauge = canonical_gauge(mean_shape, basis, motion, rigid.alpha, space)
+    mean_shape, basis = gauge.mean_shape.astype(dtype), gauge.basis.astype(dtype)
+    model = _model(
+        RigidFrames(mean_shape, basis, options.camera), mean_shape, basis, options, unit
+    )
+    return Refined(
+        model,
+        # The coefficients are those that transform gives, from the stored shapes.
+        model.decompose(table.source),
+        reorder_blocks(paper.mode_covariance, gauge.order),
+        paper.n_iter,
+        paper.converged,
+        None,
+    )
+
+
+def _refined_jointly(
+    table: ScaledTable,
+    outliers: NDArray | None,
+    sample: Sample,
+    factors: Factorisation,
+    paper: PaperResult,
+    spectrum: Spectrum,
+    options: FitOptions,
+    unit: float,
+    progress: FitProgress,
+) -> Refined:
+    """Return the shapes of the joint refinement, and their fit of the frames."""
+    fitted = fit_jointly(
+        table.rows,
+        table.n_seen,
+        sample,
+        factors,
+        _stacked_shapes(paper),
+        spectrum=spectrum,
+        camera=options.camera,
+        outliers=outliers,
+        loss=options.loss,
+        max_iter=options.max_iter,
+        tol=options.joint_tol,
+        on_step=progress.step,
+    )
+    progress(JOINT_STAGE)
+    frames = PosteriorFrames(
+        fitted.shapes,
+        fitted.noise_variance,
+        spread_starts(fitted.alpha, N_STARTS),
+        options.loss,
+        FrameMap.identity(len(paper.basis)),
+        options.camera,
+    )
+    posteriors = posterior_blocks(frames, fitted.frames, table.rows)
+    motion, alpha, covariance = posterior_moments(posteriors)
+    gauge = independent_gauge(
+        fitted.shapes,
+        motion,
+        alpha,
+        options.independence,
+        options.camera,
+        float(table.sizes[0]) if options.camera == "orthographic" else None,
+    )
+    frames = frames._replace(gauge=gauge.frames)
+    shown = FrameFit.of_blocks(posteriors.map(frames.shown, table.sizes))
+    cameras = shown.motion / table.sizes[:, None, None]
+    return Refined(
+        _model(
+            frames,
+            gauge.mean_shape.astype(table.dtype),
+            gauge.basis.astype(table.dtype),
+            options,
+            unit,
+        ),
+        shown._replace(translation=shown.translation + table.translation),
+        mode_covariance(cameras, shown.alpha),
+        len(fitted.history) - 1,
+        fitted.converged,
+        JointNumbers(
+            unit**2 * fitted.noise_variance,
+            fitted.camera_noise_ratio,
+            reliabilities(alpha, covariance),
+            fitted.history,
+            fitted.gradient_norm,
+        ),
+    )
+
+
+def _model(
+    frames: RigidFrames | PosteriorFrames,
+    mean_shape: NDArray,
+    basis: NDArray,
+    options: FitOptions,
+    unit: float,
+) -> TableModel:
+    """Return the fitted model of tables."""
+    one_unit = None if options.scale_frames else unit
+    return TableModel(
+        frames, mean_shape, basis, options.layout, options.names, one_unit
+    )
+
+
+def _inverse_snr(table: ScaledTable, refined: Refined, cameras: NDArray) -> float:
+    """Return the inverse SNR of all frames."""
+    model, frames = refined.model, refined.frames
+    position = (frames.translation - table.translation) / table.sizes[:, None]
+    shapes = np.concatenate([model.mean_shape[None], model.basis]).transpose(0, 2, 1)
+    return reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
+
+
+def _reference(cameras: NDArray, table: ScaledTable, camera: str) -> NDArray:
+    """Return the camera (2, 3) that sees the mean shape as the frames do on average."""
+    reference = reference_camera(cameras, table.sizes)
+    if camera != "affine":
+        row, scale = nearest_calibrated(reference[None])
+        reference = (scale[:, None, None] * row)[0]
+    return reference.astype(table.dtype)
+
+
+def _stacked_shapes(paper: PaperResult) -> NDArray:
+    """Return mean shape and basis shapes (n_components + 1, 3, n_points)."""
+    shapes = np.concatenate([paper.mean_shape[None], paper.basis])
+    return shapes.transpose(0, 2, 1)

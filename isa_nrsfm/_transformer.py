@@ -1,0 +1,383 @@
+"""A fitted model as a transformer of tables: all methods but `fit`."""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import (
+    BaseEstimator,
+    ClassNamePrefixFeaturesOutMixin,
+    TransformerMixin,
+)
+from sklearn.utils import check_array
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from isa_nrsfm._diagnostics import Diagnostics, diagnose
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._metric_upgrade.deforming import deformation_metric
+from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
+from isa_nrsfm._tables.layout import tracks_to_table
+from isa_nrsfm._tables.sources import (
+    CHECKS,
+    Table,
+    column_sample,
+    is_on_dask,
+    is_stored,
+)
+
+
+class Decomposition(NamedTuple):
+    """
+    Camera and coefficients of each frame of a table.
+
+    Attributes
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    translation : ndarray of shape (n_frames, 2)
+        Images of the shapes' centroid.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients of the basis shapes.
+    alpha_std : ndarray of shape (n_frames, n_components)
+        Their standard deviations given the frame; NaN where the model of the frames
+        knows no noise, as that of the paper's refinement.
+    """
+
+    motion: NDArray
+    translation: NDArray
+    alpha: NDArray
+    alpha_std: NDArray
+
+
+class TableTransformer(
+    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
+):
+    """
+    The methods of `AffineNRSfM` that need a fit.
+
+    They need the attributes that `fit` sets, of which `_model` is the fitted model.
+    """
+
+    mean_shape_: NDArray
+    basis_: NDArray
+    alpha_: NDArray
+    motion_: NDArray
+    rotations_: NDArray
+    mode_covariance_: NDArray
+    reference_motion_: NDArray
+    reference_translation_: NDArray
+    noise_variance_: float
+    camera_noise_ratio_: float
+    reliability_: NDArray
+    refinement: str | None
+    keep_frames: Any
+    working_memory: float | None
+    n_jobs: int | None
+    camera_: str
+    _model: TableModel
+    _unit: float
+    _frame_sizes: NDArray
+
+    def transform(self, X: Any) -> NDArray:
+        """
+        Return the coefficients of the frames of a table.
+
+        Each frame is fitted by itself: its result does not depend on the others.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_components)
+            Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
+            too little is seen.
+        """
+        return self.decompose(X).alpha
+
+    def decompose(self, X: Any) -> Decomposition:
+        """
+        Return camera and coefficients of each frame of a table.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        Decomposition
+            Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
+            alpha_std (n_frames, n_components).
+        """
+        table = self._opened(X)
+        return Decomposition(*self._model.decompose(table))
+
+    def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
+        """
+        Return the 3D shape of each frame of a table.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        camera : {"orthographic", "weak_perspective"} or None, default=None
+            What is known of the cameras, for a model with affine ones. None returns the
+            affine shapes, in the space of `mean_shape_`: angles and proportions in
+            depth are not those of the object. Otherwise shapes are Euclidean, up to
+            rotation and mirror image, which are the same for all frames.
+            "weak_perspective" lets each camera have a scale of its own, so that the
+            sizes of the shapes mean nothing; "orthographic" has one scale for all, so
+            that shapes are in the units of the table.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_points, 3)
+            Shapes, without camera; NaN for rows of which too little is seen. Euclidean
+            ones are turned to be as near as possible to the mean shape.
+
+        Raises
+        ------
+        ValueError
+            If `camera` is something else, if the cameras of the fitted table see less
+            than three directions of space, or if the model has other calibrated cameras
+            than those that are asked for.
+
+        Warns
+        -----
+        UserWarning
+            If the cameras of the fitted table turn too little to tell its metric.
+
+        See Also
+        --------
+        isa_nrsfm.calibration.euclidean_frames : Rotations and scales, too.
+
+        Notes
+        -----
+        The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
+        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is. Models
+        that were fitted with calibrated cameras have Euclidean shapes as they are: no
+        shape is turned, and `scales_` and `rotations_` belong to them.
+        """
+        if camera is not None and camera not in CAMERA_MODELS:
+            raise ValueError(
+                f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
+            )
+        table = self._opened(X)
+        fitted, metric = self.camera_, None
+        if fitted != "affine" and camera not in (None, fitted):
+            raise ValueError(
+                f"the model was fitted with camera={fitted!r}, whose shapes are "
+                f"Euclidean as they are; got camera={camera!r}"
+            )
+        if camera is not None and fitted == "affine":
+            self._need_frames("reconstruct with a camera")
+            metric = deformation_metric(self.motion_, self.alpha_)
+        scaled = metric is not None and camera == "orthographic"
+        return self._model.reconstruct(table, metric, scaled)
+
+    def mirror(self) -> Self:
+        """
+        Turn the model into its mirror image in depth, which fits as well.
+
+        Neither affine nor calibrated cameras tell an object from its mirror image: the
+        fit takes the one of which the mean shape has a depth of positive third moment.
+        Where it is the wrong one, for instance a face whose nose points away, this
+        takes the other one. Coefficients, reprojection and score stay as they are.
+
+        Returns
+        -------
+        AffineNRSfM
+            The same estimator: the signs of z of its shapes and of the third column of
+            its cameras are changed, and rotations are ``D R D`` with ``D = diag(1, 1,
+            -1)``.
+
+        Examples
+        --------
+        >>> from isa_nrsfm import AffineNRSfM
+        >>> from isa_nrsfm.datasets import make_face_tracks
+        >>> faces = make_face_tracks(n_frames=100, random_state=0)
+        >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
+        >>> depth = model.mean_shape_[:, 2].copy()
+        >>> bool((model.mirror().mean_shape_[:, 2] == -depth).all())
+        True
+        """
+        check_is_fitted(self)
+        depth = np.array([1.0, 1.0, -1.0])
+        dtype = self.mean_shape_.dtype
+        for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
+            if hasattr(self, name):
+                setattr(self, name, getattr(self, name) * depth.astype(dtype))
+        if hasattr(self, "rotations_"):
+            turned = depth[:, None] * self.rotations_ * depth
+            self.rotations_ = turned.astype(dtype, copy=False)
+        signs = np.tile(depth, len(self.basis_))
+        self.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        self._model = self._model._replace(
+            frames=self._model.frames.mirrored(),
+            mean_shape=self.mean_shape_,
+            basis=self.basis_,
+        )
+        return self
+
+    def reproject(self, X: Any) -> NDArray:
+        """
+        Return a table as the model sees it, missing points filled in.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2 * n_points)
+            Points of the fitted shapes in the fitted cameras. NaN for rows of which too
+            little is seen.
+        """
+        table = self._opened(X)
+        return self._model.reproject(table)
+
+    def inverse_transform(
+        self, alpha: Any, motion: Any = None, translation: Any = None
+    ) -> NDArray:
+        """
+        Return the table of shapes with given coefficients.
+
+        Parameters
+        ----------
+        alpha : array-like of shape (n_frames, n_components)
+            Coefficients.
+        motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
+            Cameras; None is `reference_motion_`, the mean view of the fitted table.
+        translation : array-like of shape (n_frames, 2) or (2,), default=None
+            Positions; None is `reference_translation_`, the mean centroid of the
+            fitted table.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2 * n_points)
+            The table, in the order of `layout`.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not fit the model or each other.
+        """
+        check_is_fitted(self)
+        alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
+        if motion is None:
+            motion = self.reference_motion_
+        if translation is None:
+            translation = self.reference_translation_
+        n_frames, n_components = len(alpha), len(self.basis_)
+        alpha = checked("alpha", alpha, (n_frames, n_components))
+        motion = checked("motion", motion, (n_frames, 2, 3), (2, 3))
+        translation = checked("translation", translation, (n_frames, 2), (2,))
+        shapes = compose(self.mean_shape_, self.basis_, alpha)
+        return tracks_to_table(project(shapes, motion, translation), self._model.layout)
+
+    def score(self, X: Any, y: Any = None) -> float:
+        """
+        Return minus the inverse SNR of points held out of the fit of their frame.
+
+        The points are divided into five parts, always the same. Each is predicted from
+        the others, frame by frame. Unlike the reprojection of the points that are
+        fitted, this gets worse with too many basis shapes, and so it serves to choose
+        `n_components`.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        float
+            ``-sum ||m - mhat||^2 / sum ||m - centroid_i||^2`` over all points, frames
+            scaled as in the fit; larger is better. Points whose frame the others do not
+            determine are left out.
+        """
+        table = self._opened(X)
+        return -self._model.held_out_error(table)
+
+    def diagnostics(self) -> Diagnostics:
+        """
+        Tell how far the fitted table determines the answer.
+
+        Returns
+        -------
+        Diagnostics
+            Named tuple of camera_singular_values, deformation_amplitude, reliability,
+            effective_frames, weak_deviations, camera_noise_ratio and camera_meaning.
+
+        Raises
+        ------
+        ValueError
+            If the model was not refined jointly: the paper's pipeline knows no noise.
+
+        Warns
+        -----
+        UserWarning
+            If the table does not support so many basis shapes, or hardly determines
+            the part of them that cameras absorb.
+        """
+        check_is_fitted(self)
+        if not hasattr(self, "noise_variance_"):
+            raise ValueError(
+                "diagnostics needs a model with refinement='joint'; "
+                f"got refinement={self.refinement!r}"
+            )
+        self._need_frames("diagnostics")
+        fitted = np.isfinite(self._frame_sizes)
+        motion = np.asarray(self.motion_)[fitted]
+        return diagnose(
+            self.mean_shape_.astype(np.float64),
+            self.basis_.astype(np.float64),
+            motion / self._frame_sizes[fitted, None, None],
+            np.asarray(self.alpha_, dtype=np.float64)[fitted],
+            self.noise_variance_ / self._unit**2,
+            self.reliability_,
+            self.camera_noise_ratio_,
+        )
+
+    def _need_frames(self, what: str) -> None:
+        """Refuse what depends on the frames of the fit where they were not kept."""
+        if not hasattr(self, "motion_"):
+            raise ValueError(
+                f"{what} needs the cameras and coefficients of the fitted table; fit "
+                f"with keep_frames=True, got keep_frames={self.keep_frames!r}"
+            )
+
+    def _opened(self, X: Any, reset: bool = False) -> Table:
+        """Return a table, for the fit or for the fitted model, in blocks."""
+        if not reset:
+            check_is_fitted(self)
+        if is_stored(X) or is_on_dask(X):
+            validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
+            if is_on_dask(X):
+                return Table.on_dask(X)
+            return Table.stored(X, self.working_memory)
+        least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
+        X = validate_data(self, X, reset=reset, **CHECKS, **least)
+        return Table.in_memory(X, self.n_jobs if reset else 1, whole=not reset)
+
+
+def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
+    """Return a finite array of one of the allowed shapes, or say what came."""
+    array = check_array(
+        values,
+        dtype=[np.float64, np.float32],
+        input_name=name,
+        ensure_2d=False,
+        allow_nd=True,
+    )
+    if array.shape not in allowed:
+        expected = " or ".join(map(str, allowed))
+        raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
+    return array
