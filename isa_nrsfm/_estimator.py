@@ -792,7 +792,7 @@ class AffineNRSfM(
             np.asarray(self.alpha_, dtype=np.float64)[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
-            self.camera_noise_ratio_,
+            getattr(self, "camera_noise_ratio_", np.nan),
         )
 
     def __sklearn_tags__(self) -> Any:
