@@ -570,6 +570,18 @@ def test_a_parameter_that_is_no_more_is_told_where_it_counts(path):
     assert caught[0].filename == __file__
 
 
+def test_what_an_older_fit_did_not_measure_is_not_known(fitted):
+    contents = model_contents(fitted("default")[0])
+    contents["attributes"]["camera_noise_ratio_"] = None
+    loaded = model_from_contents(contents)
+    assert not hasattr(loaded, "camera_noise_ratio_")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        found = loaded.diagnostics()
+    assert np.isnan(found.camera_noise_ratio)
+    assert found.camera_meaning.startswith("not known")
+
+
 def test_attributes_that_older_files_never_had_are_refused(path):
     path.write_bytes(with_attributes(elasticity=1))
     with pytest.raises(ValueError, match=r"not known: \['elasticity'\]"):
