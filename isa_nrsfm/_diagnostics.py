@@ -53,7 +53,7 @@ class Diagnostics(NamedTuple):
         rotations only, so that these are upper bounds for them.
     camera_noise_ratio : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
-        with affine ones.
+        with affine ones; NaN for models that were saved before it was measured.
     camera_meaning : str
         What that ratio says of the cameras, in a sentence.
     """
@@ -149,13 +149,16 @@ def camera_meaning(ratio: float) -> str:
     Parameters
     ----------
     ratio : float
-        Noise variance with calibrated cameras, divided by that with affine ones.
+        Noise variance with calibrated cameras, divided by that with affine ones; NaN
+        where it was not measured.
 
     Returns
     -------
     str
         A sentence.
     """
+    if np.isnan(ratio):
+        return "not known: the model was saved before this was measured"
     if ratio < SAME_NOISE:
         what = "calibrated cameras explain the table as well as affine ones"
     elif ratio < OTHER_CAMERAS:

@@ -343,7 +343,7 @@ class TableTransformer(
             np.asarray(self.alpha_, dtype=np.float64)[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
-            self.camera_noise_ratio_,
+            getattr(self, "camera_noise_ratio_", np.nan),
         )
 
     def _need_frames(self, what: str) -> None:

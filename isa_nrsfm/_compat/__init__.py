@@ -1,1 +1,1 @@
-"""Optional dependencies, and private names of scikit-learn."""
+"""Optional dependencies, private names of scikit-learn, and files."""

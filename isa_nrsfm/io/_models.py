@@ -3,35 +3,32 @@
 import os
 from pathlib import Path
 
-from sklearn.utils.validation import check_is_fitted
-
-from isa_nrsfm._compat.callbacks import without_callbacks
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._estimator import AffineNRSfM
+from isa_nrsfm.io._model_contents import model_contents, model_from_contents
+from isa_nrsfm.io._old_models import contents_of_old, is_old_model
+from isa_nrsfm.io._skops_values import read_values
 
-#: The types beside those that skops trusts by itself that a model file may contain.
-TRUSTED_TYPES = (
-    "isa_nrsfm._estimator.AffineNRSfM",
-    "isa_nrsfm._frames.models.PosteriorFrames",
-    "isa_nrsfm._frames.models.RigidFrames",
-    "isa_nrsfm._frames.basis_change.FrameMap",
-    "isa_nrsfm.isa._density.SqrtDensity",
-    "isa_nrsfm.isa._fastisa.FastISA",
-    "isa_nrsfm.isa._pooled_fastica.PooledFastICA",
-)
+#: The types that a model file contains beside those that skops trusts by itself: none.
+#: Files that named types of this package are read as well, by their plain contents.
+TRUSTED_TYPES: tuple[str, ...] = ()
 
 
 def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     """
     Save a fitted model to a file that is safe to share.
 
-    The file is written by skops: it holds numbers, text and names of classes, but no
-    code, and so opening it runs nothing.
+    The file is written by skops. It holds a dict of numbers, texts and arrays under
+    public names, and no code, so that opening it runs nothing and later versions read
+    it. `load_model` is tried on it before it is put in place: the file is written as a
+    whole or not at all.
 
     Parameters
     ----------
     estimator : AffineNRSfM
-        A fitted estimator.
+        A fitted estimator. Arrays that are memory maps go into the file; callbacks
+        are left out.
     path : str or path-like
         The file to write, by custom with the suffix ``.skops``. An existing file is
         replaced.
@@ -39,8 +36,11 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     ValueError
-        If the estimator is no AffineNRSfM, is not fitted, or has parts of types other
-        than `TRUSTED_TYPES`, which `load_model` would refuse.
+        If the estimator is no AffineNRSfM, is not fitted, or has parts that
+        `load_model` would refuse: they are named. Strategies are `FastISA` and
+        `PooledFastICA`, not subclasses or others.
+    ImportError
+        If skops is not installed.
     OSError
         If the file cannot be written.
 
@@ -52,7 +52,8 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>>     >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
     >>> from isa_nrsfm.io import load_model, save_model
     >>> table = make_face_tracks(n_frames=50, random_state=0).data
     >>> model = AffineNRSfM(n_components=2, random_state=0).fit(table)
@@ -63,19 +64,21 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     True
     """
     skops_io = import_optional("skops.io", extra="share")
-    check_class(estimator, "estimator")
-    check_is_fitted(estimator)
-    contents = skops_io.dumps(without_callbacks(estimator))
-    _refuse_untrusted(skops_io.get_untrusted_types(data=contents), "the estimator")
-    Path(path).write_bytes(contents)
+    contents = skops_io.dumps(model_contents(estimator))
+    try:
+        model_from_contents(read_values(contents))
+    except ValueError as error:
+        raise ValueError(f"the estimator cannot be saved: {error}") from error
+    write_whole(path, contents)
 
 
 def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     """
     Load a model that `save_model` has saved.
 
-    Only objects of types that skops trusts and of `TRUSTED_TYPES` are created, so that
-    files of unknown origin do no harm.
+    Files of this and of all earlier versions of the package are read. Numbers, texts
+    and arrays are read and checked, and nothing else, so that files of unknown origin
+    do no harm.
 
     Parameters
     ----------
@@ -90,38 +93,32 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     Raises
     ------
     ValueError
-        If the file is no model file, is damaged, contains other types (they are named),
-        or something other than an AffineNRSfM.
+        If the file is no model file, is damaged, was written by a newer version, or has
+        entries that are missing, not known or of the wrong type or shape, or objects
+        that are not part of a model. What is wrong is named.
     OSError
         If the file cannot be opened.
+
+    Warns
+    -----
+    UserWarning
+        If the model was fitted with a parameter that there is no more, and that a new
+        fit would need for the same result.
 
     See Also
     --------
     save_model : Save a model.
     """
-    skops_io = import_optional("skops.io", extra="share")
-    contents = Path(path).read_bytes()
-    not_a_model = f"{os.fspath(path)} is not a model file written by save_model"
-    # What a foreign or damaged file makes of the reader is not documented by skops.
+    stored = Path(path).read_bytes()
     try:
-        untrusted = skops_io.get_untrusted_types(data=contents)
-    except Exception as error:
-        raise ValueError(not_a_model) from error
-    _refuse_untrusted(untrusted, os.fspath(path))
-    try:
-        model = skops_io.loads(contents, trusted=list(TRUSTED_TYPES))
-    except Exception as error:
-        raise ValueError(f"{not_a_model}, or it is damaged: {error}") from error
-    check_class(model, os.fspath(path))
-    check_is_fitted(model)
-    return model
-
-
-def _refuse_untrusted(types: list[str], where: str) -> None:
-    """Raise if there are types that are not trusted."""
-    untrusted = sorted(set(types) - set(TRUSTED_TYPES))
-    if untrusted:
+        values = read_values(stored)
+    except ValueError as error:
         raise ValueError(
-            f"{where} contains objects that are not part of a model: "
-            f"{', '.join(untrusted)}"
-        )
+            f"{os.fspath(path)} is not a model file written by save_model, or it is "
+            f"damaged: {error}"
+        ) from error
+    try:
+        contents = contents_of_old(values) if is_old_model(values) else values
+        return model_from_contents(contents)
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from error
