@@ -6,11 +6,15 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import importlib
+import sys
+from pathlib import Path
 from pkgutil import iter_modules
 
 from sphinx_gallery.sorting import ExplicitOrder
 
 import isa_nrsfm
+
+sys.path.insert(0, str(Path(__file__).parent))  # for _mathml
 
 project = "isa_nrsfm"
 author = "The isa_nrsfm developers"
@@ -18,6 +22,7 @@ copyright = author
 version = release = isa_nrsfm.__version__
 
 extensions = [
+    "_mathml",
     "myst_parser",
     "numpydoc",
     "sphinx.ext.autodoc",
@@ -49,6 +54,9 @@ autodoc_member_order = "bysource"
 
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath"]
+
+# Formulas need no network, either.
+html_math_renderer = "mathml"
 
 html_theme = "pydata_sphinx_theme"
 html_title = "isa_nrsfm"

@@ -1,0 +1,131 @@
+"""Units of the fitted attributes: a table times ten changes each by 1, 10 or 100."""
+
+import inspect
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "conventions.md"
+TIMES = 10.0
+# What the words of the page's table are worth for a table that is ten times as large.
+FACTORS = {"1": 1.0, "unit": TIMES, "unit^2": TIMES**2}
+# The settings that have a column of the page's table, in its order.
+COLUMNS = [
+    {"camera": "affine", "scale_frames": True},
+    {"camera": "affine", "scale_frames": False},
+    {"camera": "weak_perspective", "scale_frames": True},
+    {"camera": "weak_perspective", "scale_frames": False},
+    {"camera": "orthographic"},
+]
+OF_JOINT_FIT = {
+    "alpha_std_",
+    "noise_variance_",
+    "camera_noise_ratio_",
+    "reliability_",
+    "objective_history_",
+    "gradient_norm_",
+}
+# What is different with orthographic cameras where there is no joint refinement: it is
+# the covariance of what multiplies white signals, not shapes in the units of the table.
+OF_WHITE_SIGNALS = {"mode_covariance_": "unit^2"}
+NO_NUMBERS = {"isa_", "feature_names_in_"}
+
+
+def units():
+    """Return the rows of the page's table: a word for each column, by attribute."""
+    section = PAGE.read_text(encoding="utf-8").partition("## Units of the attributes")
+    rows = {}
+    for line in section[2].partition("\n## ")[0].splitlines():
+        if line.startswith("| `"):
+            names, *words = [cell.strip() for cell in line.split("|")[1:-1]]
+            rows |= dict.fromkeys(re.findall(r"`(\w+_)`", names), words)
+    return rows
+
+
+def table(camera):
+    """Return a table that such cameras see, away from the origin."""
+    scene = make_nonrigid_tracks(
+        60,
+        30,
+        2,
+        noise=0.01,
+        camera="orthographic" if camera == "orthographic" else "weak_perspective",
+        random_state=0,
+    )
+    return scene.data + 5.0
+
+
+def fitted(settings, times):
+    """Return the estimator that is fitted to a table in other units."""
+    model = AffineNRSfM(2, random_state=0, **settings)
+    return model.fit(times * table(settings["camera"]))
+
+
+def assert_times(got, expected, factor, name):
+    """Check that all numbers are so many times the expected ones."""
+    expected = factor * np.asarray(expected)
+    size = np.abs(expected).max()
+    assert size > 0, name
+    assert_allclose(got, expected, rtol=0, atol=1e-8 * size, err_msg=name)
+
+
+def documented():
+    """Return the attributes that the docstring of the estimator lists."""
+    doc = inspect.getdoc(AffineNRSfM).partition("\nAttributes\n")[2]
+    return set(re.findall(r"^(\w+_) : ", doc.partition("\nSee Also\n")[0], re.M))
+
+
+def test_the_page_has_all_attributes():
+    assert set(units()) == documented() - NO_NUMBERS
+    assert all(len(words) == len(COLUMNS) for words in units().values())
+
+
+# The paper's pipeline says so of tables with as few points as this one.
+@pytest.mark.filterwarnings("ignore:FastICA did not converge")
+@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@pytest.mark.parametrize("column", range(len(COLUMNS)))
+def test_attributes_have_the_units_of_the_page(column, refinement):
+    settings = COLUMNS[column] | {"refinement": refinement}
+    one, ten = fitted(settings, 1.0), fitted(settings, TIMES)
+    for name, words in units().items():
+        word = words[column]
+        if refinement != "joint" and name in OF_JOINT_FIT:
+            word = ""
+        if refinement != "joint" and settings["camera"] == "orthographic":
+            word = OF_WHITE_SIGNALS.get(name, word)
+        if not word:
+            assert not hasattr(one, name)
+            continue
+        assert_times(getattr(ten, name), getattr(one, name), FACTORS[word], name)
+
+
+@pytest.mark.parametrize("column", range(len(COLUMNS)))
+def test_methods_have_the_units_of_the_attributes(column):
+    settings = COLUMNS[column]
+    X = table(settings["camera"])[:20]
+    one, ten = fitted(settings, 1.0), fitted(settings, TIMES)
+    factors = {name: FACTORS[words[column] or "1"] for name, words in units().items()}
+    shapes = one.reconstruct(X)
+    assert_times(ten.reconstruct(TIMES * X), shapes, factors["mean_shape_"], "shapes")
+    again = ten.decompose(TIMES * X)._asdict()
+    for name, value in one.decompose(X)._asdict().items():
+        assert_times(again[name], value, factors[f"{name}_"], name)
+    assert_times(ten.score(TIMES * X), one.score(X), 1.0, "score")
+    assert_times(ten.reproject(TIMES * X), one.reproject(X), TIMES, "images")
+
+
+def test_orthographic_cameras_do_not_scale_frames():
+    # So that one column of the page is enough.
+    models = [
+        fitted({"camera": "orthographic", "scale_frames": scaled}, 1.0)
+        for scaled in (True, False)
+    ]
+    for name in units():
+        values = [getattr(model, name) for model in models]
+        np.testing.assert_array_equal(*values, err_msg=name)
