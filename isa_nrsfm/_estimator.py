@@ -10,10 +10,9 @@ from sklearn.base import (
     clone,
 )
 from sklearn.utils import check_random_state, estimator_html_repr
-from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
-from isa_nrsfm._compat.parameters import fit_context
+from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
 from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, fit_table
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (

@@ -365,7 +365,7 @@ class TableTransformer(
             return Table.stored(X, self.working_memory)
         least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
         X = validate_data(self, X, reset=reset, **CHECKS, **least)
-        return Table.in_memory(X, self.n_jobs if reset else 1, whole=not reset)
+        return Table.in_memory(X, self.n_jobs)
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

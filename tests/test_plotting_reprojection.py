@@ -1,10 +1,9 @@
-from copy import deepcopy
-
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
@@ -65,7 +64,7 @@ def test_artists_are_the_numbers(faces, estimator):
 
 def test_planar_tables_show_the_same(faces, estimator):
     planar = faces.tracks.transpose(0, 2, 1).reshape(60, -1)
-    other = deepcopy(estimator).set_params(layout="planar")
+    other = clone(estimator).set_params(layout="planar").fit(planar)
     one = ReprojectionDisplay.from_estimator(estimator, faces.data, random_state=0)
     two = ReprojectionDisplay.from_estimator(other, planar, random_state=0)
     assert_array_equal(one.observed, two.observed)

@@ -34,7 +34,7 @@ OF_JOINT_FIT = {
 # What is different with orthographic cameras where there is no joint refinement: it is
 # the covariance of what multiplies white signals, not shapes in the units of the table.
 OF_WHITE_SIGNALS = {"mode_covariance_": "unit^2"}
-NO_NUMBERS = {"isa_", "feature_names_in_"}
+NO_NUMBERS = {"isa_", "feature_names_in_", "camera_", "frames_scaled_"}
 
 
 def units():

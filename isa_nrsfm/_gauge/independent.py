@@ -84,6 +84,7 @@ def independent_gauge(
     white = shapes[1:].transpose(0, 2, 1) @ space.T
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
+    mixing: NDArray
     if independence == "shapes":
         mixing = shared_mixing(white)
     elif independence == "coefficients":

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils.parallel import _threadpool_controller_decorator
 
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.many_points import (
@@ -166,7 +166,7 @@ class JointFit(NamedTuple):
 
 
 # The products are of small blocks: more threads would wait for each other.
-@_threadpool_controller_decorator(limits=1, user_api="blas")
+@one_blas_thread
 def fit_jointly(
     rows: FrameBlocks,
     n_seen: NDArray,
@@ -258,7 +258,7 @@ def fit_jointly(
     )
 
 
-@_threadpool_controller_decorator(limits=1, user_api="blas")
+@one_blas_thread
 def count_components(
     rows: FrameBlocks,
     n_seen: NDArray,

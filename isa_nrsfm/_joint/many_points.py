@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._joint.quasi_newton import JointResult, JointState, regular
+from isa_nrsfm._joint.quasi_newton import JointResult, regular
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._tables.blocks import FrameBlocks
 
@@ -44,7 +44,7 @@ def in_all_points(
     result: JointResult,
     problem: JointProblem,
     rows: FrameBlocks,
-    refined: Callable[[JointProblem, JointState], JointResult],
+    refined: Callable[..., JointResult],
 ) -> tuple[JointResult, JointProblem]:
     """
     Return the refinement in all points of one along some directions.
@@ -86,8 +86,12 @@ def in_all_points(
         frames = JointFrames.along(rows, directions[size > FLAT * size[0]])
         problem = problem.of(frames)
         shapes = frames.coordinates(after.reshape(before.shape))
-        further = refined(problem, state._replace(shapes=shapes))
-        history = np.concatenate([result.history, further.history])
+        n_left = problem.steps.max_iter - (len(result.history) - 1)
+        if not n_left:
+            break
+        further = refined(problem, state._replace(shapes=shapes), max_iter=n_left)
+        # It goes on where the refinement along fewer directions has ended.
+        history = np.concatenate([result.history, further.history[1:]])
         result = further._replace(history=history)
     return result, problem
 

@@ -45,12 +45,9 @@ class Table(NamedTuple):
     dtype: Any
 
     @classmethod
-    def in_memory(
-        cls, X: NDArray, n_jobs: int | None = 1, whole: bool = False
-    ) -> "Table":
-        """Return an array, as one block or as many that threads may work on."""
+    def in_memory(cls, X: NDArray, n_jobs: int | None = 1) -> "Table":
+        """Return an array, in blocks that threads may work on."""
         length = min(max(BLOCK_NUMBERS // max(X.shape[1], 1), 1), BLOCK_FRAMES)
-        length = max(len(X), 1) if whole else length
         blocks = MemoryBlocks.of(X, length, effective_n_jobs(n_jobs))
         return cls(blocks, X.shape[1], X.dtype)
 

@@ -16,10 +16,9 @@ from sklearn.base import (
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
 )
-from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.parameters import fit_context
+from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names, check_size

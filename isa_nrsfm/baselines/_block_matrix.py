@@ -6,9 +6,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils._param_validation import Interval
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._pseudo_inverse import (

@@ -11,8 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval
 
+from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 from sklearn.utils import Bunch, check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 
-from isa_nrsfm._compat.parameters import checked_parameters
+from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
 from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm.datasets._scene import (
     CAMERAS,

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import _safe_indexing
-from sklearn.utils._missing import is_pandas_na
-from sklearn.utils.validation import _num_samples
 
+from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm.export._drawing import Links, choose_links, edges_of
 from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
 from isa_nrsfm.export._upright import (
@@ -121,13 +119,13 @@ def write_viewer(
     _check_n_frames(n_frames)
     space = upright_space(model, camera, origin, mirrored)
     components = names_of_components(names, len(model.basis_))
-    n_rows = len(model.alpha_) if X is None else _num_samples(X)
+    n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
     rows = _evenly_spread(n_rows, n_frames)
     if X is None:
         motion, alpha = model.motion_[rows], model.alpha_[rows]
     elif len(rows):
-        motion, _, alpha, _ = model.decompose(_safe_indexing(X, rows))
+        motion, _, alpha, _ = model.decompose(taken_rows(X, rows))
     else:
         motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
     motion, alpha = np.asarray(motion), np.asarray(alpha)

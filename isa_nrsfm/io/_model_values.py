@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from isa_nrsfm._compat.scikit_learn import check_parameters
 from isa_nrsfm.io._skops_values import NUMPY_TYPES, PLAIN_TYPES
 from isa_nrsfm.io._value_checks import (
     check_array,
@@ -179,8 +180,7 @@ def with_parameters(create: Callable[..., Any], parts: dict[str, Any]) -> Any:
             for key, value in parameters.items()
         }
     )
-    if hasattr(estimator, "_parameter_constraints"):
-        estimator._validate_params()
+    check_parameters(estimator)
     output = check_choice(parts["set_output"], f"set_output of {name}", OUTPUTS)
     if output is not None:
         estimator.set_output(transform=output)

@@ -11,9 +11,9 @@ from sklearn.base import (
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
 )
-from sklearn.utils._param_validation import Interval
-from sklearn.utils.parallel import _threadpool_controller_decorator
 from sklearn.utils.validation import check_is_fitted, validate_data
+
+from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
 
 # Signals whose smallest variance is below this share of the largest are dependent.
 DEPENDENT = 1e-14
@@ -42,7 +42,7 @@ class BaseSubspaceAnalysis(
     subspace_size: int
 
     # Threads cost more than they give on matrices of this size.
-    @_threadpool_controller_decorator(limits=1, user_api="blas")
+    @one_blas_thread
     def _fit(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(

@@ -8,11 +8,10 @@ from joblib import effective_n_jobs
 from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import HasMethods, Interval
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.parameters import fit_context
+from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
 from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.parameters import fit_context
+from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity
 from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
-from sklearn.utils.parallel import _threadpool_controller_decorator
 
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
@@ -53,7 +53,7 @@ LEAST_GAIN, ROUNDING = 1e-3, 1e-13
 
 
 # Threads cost more than they give on matrices of this size.
-@_threadpool_controller_decorator(limits=1, user_api="blas")
+@one_blas_thread
 def shared_mixing(
     signals: NDArray, *, n_starts: int = 8, random_state: int = 0
 ) -> NDArray[np.float64]:

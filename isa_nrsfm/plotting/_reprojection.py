@@ -6,10 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import _safe_indexing, check_random_state
+from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
@@ -234,7 +235,7 @@ class ReprojectionDisplay:
         """
         check_is_fitted(estimator, "mean_shape_")
         rows = choose_frames(len(X), n_frames, frames, random_state)
-        table = _safe_indexing(X, rows)
+        table = taken_rows(X, rows)
         view = view_of(estimator)
         mean_shape = estimator.mean_shape_ @ view.T
         layout = estimator.layout

@@ -1,0 +1,161 @@
+"""All private names of scikit-learn that are used, each with a public fallback.
+
+The checks of parameters are those of scikit-learn's own estimators, so that messages
+are alike. Where a version does not have them any more, the plain ones take over.
+"""
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+from isa_nrsfm._compat.plain_checks import check_values
+
+try:
+    from sklearn.base import _fit_context
+    from sklearn.utils._param_validation import (
+        HasMethods,
+        Interval,
+        StrOptions,
+        validate_params,
+    )
+except ImportError:
+    from isa_nrsfm._compat.plain_checks import (
+        HasMethods,
+        Interval,
+        StrOptions,
+        validate_params,
+    )
+    from isa_nrsfm._compat.plain_checks import fit_context as _fit_context
+
+try:
+    from sklearn.utils._missing import is_pandas_na
+except ImportError:
+
+    def is_pandas_na(x: Any) -> bool:
+        """Return whether a value is pandas' mark of a missing one."""
+        return type(x).__name__ == "NAType"
+
+
+try:
+    from sklearn.utils import _safe_indexing as taken_rows
+    from sklearn.utils.validation import _num_samples as number_of_rows
+except ImportError:
+
+    def taken_rows(X: Any, indices: Any) -> Any:
+        """Return rows of an array or a dataframe."""
+        return X.iloc[indices] if hasattr(X, "iloc") else X[indices]
+
+    def number_of_rows(x: Any) -> int:
+        """Return the number of rows of an array or a dataframe."""
+        return len(x)
+
+
+__all__ = [
+    "HasMethods",
+    "Interval",
+    "StrOptions",
+    "check_parameters",
+    "checked_parameters",
+    "fit_context",
+    "is_pandas_na",
+    "number_of_rows",
+    "one_blas_thread",
+    "taken_rows",
+]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def fit_context(*, nested: bool) -> Callable[[Function], Function]:
+    """
+    Return the decorator of methods `fit`, which checks the estimator's parameters.
+
+    Parameters
+    ----------
+    nested : bool
+        Whether estimators that are fitted inside check theirs, too.
+
+    Returns
+    -------
+    callable
+        The decorator.
+    """
+    decorate: Callable[[Function], Function] = _fit_context(
+        prefer_skip_nested_validation=not nested
+    )
+    return decorate
+
+
+def checked_parameters(
+    constraints: dict[str, list[Any]],
+) -> Callable[[Function], Function]:
+    """
+    Return a decorator of functions that checks their parameters.
+
+    Parameters
+    ----------
+    constraints : dict
+        For each parameter what it may be, as in scikit-learn's estimators.
+
+    Returns
+    -------
+    callable
+        The decorator.
+    """
+    decorate: Callable[[Function], Function] = validate_params(
+        constraints, prefer_skip_nested_validation=True
+    )
+    return decorate
+
+
+def check_parameters(estimator: Any) -> None:
+    """
+    Check the parameters of an estimator.
+
+    Parameters
+    ----------
+    estimator : estimator
+        The estimator. One without constraints is not checked.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not what it may be.
+    """
+    if hasattr(estimator, "_validate_params"):
+        estimator._validate_params()
+    elif hasattr(estimator, "_parameter_constraints"):
+        name = type(estimator).__name__
+        constraints = estimator._parameter_constraints
+        check_values(constraints, estimator.get_params(deep=False), name)
+
+
+@cache
+def _thread_pools() -> ThreadpoolController:
+    """Return the libraries with threads; to look for them takes a while."""
+    return ThreadpoolController()
+
+
+def one_blas_thread(function: Function) -> Function:
+    """
+    Return a function that runs with one thread of the linear algebra.
+
+    Parameters
+    ----------
+    function : callable
+        A function whose matrices are so small that threads would wait for each other.
+
+    Returns
+    -------
+    callable
+        The same function otherwise.
+    """
+
+    @wraps(function)
+    def limited(*args: Any, **kwargs: Any) -> Any:
+        with _thread_pools().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited  # type: ignore[return-value]
