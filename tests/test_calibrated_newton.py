@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
@@ -130,7 +131,7 @@ def assert_calibrated(motion, camera):
 class TestMinimum:
     @BOTH
     @GAPS
-    @pytest.mark.parametrize("depth", [1.0, 0.1])
+    @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
     def test_is_no_higher_than_from_many_other_starts(self, camera, gaps, depth):
         scene = random_scene(camera, noise=0.1, n_frames=3, depth=depth)
         scene = scene.hidden() if gaps else scene
@@ -206,8 +207,8 @@ class TestMinimum:
                 assert_allclose(got[i], expected[i], rtol=1e-7, atol=1e-9)
 
     @BOTH
-    @pytest.mark.parametrize("depth", [0.1, 0.03, 0.01, 0.0])
-    @pytest.mark.parametrize("deviation", [0.005, 0.02])
+    @pytest.mark.parametrize("depth", slow_after(2, [0.1, 0.0, 0.03, 0.01]))
+    @pytest.mark.parametrize("deviation", slow_after(1, [0.02, 0.005]))
     def test_of_thin_objects_is_no_higher_than_from_the_truth(
         self, camera, depth, deviation
     ):

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from layers import slow_after
 from sklearn.model_selection import cross_val_score
 
 from isa_nrsfm import AffineNRSfM, __version__
@@ -180,7 +181,7 @@ def test_defaults_are_those_of_the_estimator(run, table, tmp_path):
     assert model.get_params() == AffineNRSfM(random_state=0).get_params()
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))
 def test_calibrated_cameras(run, tmp_path, camera):
     faces = make_face_tracks(
         80, n_components=2, camera=camera, noise=0.01, random_state=0

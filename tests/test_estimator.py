@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
@@ -122,9 +123,7 @@ def model():
         {"layout": "planar"},
         {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
         {"loss": "huber"},
-        {"loss": "cauchy", "independence": None},
         {"camera": "weak_perspective"},
-        {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
         {"camera": "orthographic"},
         {"camera": "weak_perspective", "refinement": None},
         {"n_components": 1},
@@ -135,6 +134,11 @@ def model():
         {"refinement": None, "layout": "planar", "scale_frames": False},
         {"refinement": None, "block_recovery": "irls"},
         {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
+        pytest.param({"loss": "cauchy", "independence": None}, marks=pytest.mark.slow),
+        pytest.param(
+            {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=str,
 )
@@ -1210,7 +1214,7 @@ def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
         model.reconstruct(truth.data, camera=other)
 
 
-@pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
+@pytest.mark.parametrize("camera", slow_after(1, [*CALIBRATED, "affine"]))
 def test_the_number_of_components_is_found(camera):
     truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)
     model = AffineNRSfM("auto", camera=camera, random_state=0).fit(truth.data)

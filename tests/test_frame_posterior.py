@@ -493,6 +493,7 @@ class TestStarts:
         assert (zero.objective > 1.1 * least).any()
         assert np.mean(fits.objective <= 1.001 * least) >= 0.995
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("gaps", [0.0, 0.4])
     def test_faces_do_not(self, load_data, monkeypatch, gaps):
         tracks = load_data("faces_wild_68_combined")["W2d"][::8]

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
@@ -359,7 +360,7 @@ class TestEstimator:
         error = affine_shape_error(faces.shapes, model.reconstruct(faces.data))
         assert error < 1e-9
 
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     @pytest.mark.parametrize("missing", [0.0, 0.15])
     def test_exact_tables_with_and_without_gaps(self, seed, missing):
         truth = make_nonrigid_tracks(

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import measurements, rotate_frames
@@ -194,6 +195,7 @@ class TestFit:
 EACH = pytest.mark.parametrize("camera", CAMERAS)
 CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 GAPS = pytest.mark.parametrize("gaps", [False, True])
+GAPS_ARE_SLOW = pytest.mark.parametrize("gaps", slow_after(1, [False, True]))
 
 
 def table_of(camera, seed=0, gaps=False, **options):
@@ -238,7 +240,7 @@ class TestCameras:
 
     @EACH
     @GAPS
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     def test_without_noise_shapes_are_exact(self, camera, gaps, seed):
         tracks, truth, result = fit_of(camera, None, seed, gaps, 0.0)
         assert result.converged
@@ -290,7 +292,7 @@ class TestCameras:
 
     @EACH
     @GAPS
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     def test_noise_is_the_true_one_within_the_error_of_sampling(
         self, camera, gaps, seed
     ):
@@ -317,7 +319,7 @@ class TestCameras:
 class TestCameraNoiseRatio:
     @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
     @pytest.mark.parametrize("kind", ["weak_perspective", "orthographic"])
-    @pytest.mark.parametrize("deviation", [0.01, DEVIATION])
+    @pytest.mark.parametrize("deviation", slow_after(1, [0.01, DEVIATION]))
     def test_is_one_for_calibrated_cameras(self, camera, kind, deviation):
         result = fit_of(camera, kind, 0, False, deviation).result
         assert 1.0 <= result.camera_noise_ratio < 1.1
@@ -356,6 +358,7 @@ class TestEquivariance:
     def fit(self, tracks, camera):
         return fitted(tracks, tol=1e-4, camera=camera)
 
+    @pytest.mark.slow
     @EACH
     @GAPS
     def test_order_of_frames_and_points(self, gaps, camera):
@@ -374,7 +377,7 @@ class TestEquivariance:
         )
 
     @EACH
-    @GAPS
+    @GAPS_ARE_SLOW
     def test_rotation_of_single_frames(self, gaps, camera):
         kind = "weak_perspective" if camera == "affine" else camera
         tracks, _ = table_of(kind, gaps=gaps, n_frames=40, n_points=30)
@@ -391,7 +394,7 @@ class TestEquivariance:
 
 
 class TestNoiseVariance:
-    @pytest.mark.parametrize("seed", range(2))
+    @pytest.mark.parametrize("seed", slow_after(1, range(2)))
     @pytest.mark.parametrize("gaps", [False, True])
     @pytest.mark.parametrize("n_frames", [30, 100])
     def test_is_the_true_one_within_the_error_of_sampling(self, seed, gaps, n_frames):
@@ -426,7 +429,7 @@ class TestNoiseVariance:
 
 class TestLargeTables:
     @EACH
-    @GAPS
+    @GAPS_ARE_SLOW
     def test_end_where_small_ones_do(self, gaps, camera):
         kind = "orthographic" if camera == "orthographic" else "weak_perspective"
         tracks, truth = random_table(
