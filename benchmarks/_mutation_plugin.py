@@ -1,4 +1,4 @@
-"""A plugin of pytest: CPU seconds of each test, and the tests that were chosen.
+"""A plugin of pytest: CPU seconds of tests that pass, and tests that were chosen.
 
 Files are named by environment variables, as workers of pytest-xdist have them, too.
 """
@@ -15,10 +15,10 @@ CHOSEN = "MUTATION_CHOSEN"  # a file with a list of tests
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item, nextitem):
-    """Add a line with the seconds of a test to the file of this process."""
-    before = os.times()
+    """Add a line with the seconds of a test that passes to the file of this process."""
+    before, failed = os.times(), item.session.testsfailed
     result = yield
-    if SECONDS in os.environ:
+    if SECONDS in os.environ and item.session.testsfailed == failed:
         after = os.times()
         seconds = sum(after[:4]) - sum(before[:4])
         path = Path(os.environ[SECONDS], f"{os.getpid()}.jsonl")

@@ -45,16 +45,16 @@ NOT_COPIED = (".git", ".hypothesis", "__pycache__", ".*_cache", "docs")
 
 class Coverage(NamedTuple):
     """
-    What tests of a layer cover.
+    What the tests of a layer that pass cover.
 
     Attributes
     ----------
     lines : dict
-        By module and line, as ``"module:line"``, the tests that run it.
+        By module and line, as ``"module:line"``, the places of the tests that run it.
     modules : dict
-        By module the tests that run any function of it: for lines that run at import.
+        By module those that run any function of it: for lines that run at import.
     seconds : dict
-        By test, its CPU seconds, in the order in which they ran.
+        By test, its CPU seconds, in the order in which they ran: their places.
     """
 
     lines: dict
@@ -64,16 +64,16 @@ class Coverage(NamedTuple):
     def tests_of(self, mutant: Mutant):
         """Return the tests that cover a line, the cheapest files first."""
         first, last = mutant.lines
-        tests = {
-            test
+        covering = {
+            place
             for line in range(first, last + 1)
-            for test in self.lines.get(f"{mutant.file}:{line}", ())
+            for place in self.lines.get(f"{mutant.file}:{line}", ())
         }
         if not mutant.in_function:
-            tests |= set(self.modules.get(mutant.file, ()))
+            covering |= set(self.modules.get(mutant.file, ()))
         files = defaultdict(list)
-        for test in self.seconds:  # in their order: fixtures of files are kept
-            if test in tests:
+        for place, test in enumerate(self.seconds):  # in order: fixtures are kept
+            if place in covering:
                 files[test.partition("::")[0]].append(test)
         return [
             test
@@ -147,7 +147,7 @@ def record(layer: str, jobs: int) -> Coverage:
         if done.returncode > 1:
             raise SystemExit("the tests of the layer did not run")
         if done.returncode:
-            print("some tests fail without any change; they kill every mutant")
+            print("some tests fail without any change: they are left out")
         took = [
             json.loads(line)
             for file in sorted(seconds.iterdir())
@@ -161,13 +161,15 @@ def record(layer: str, jobs: int) -> Coverage:
 def coverage_of(data, root: Path, seconds: dict) -> Coverage:
     """Return the tests by line of the measured files below a folder."""
     lines, modules = {}, defaultdict(set)
+    places = {test: place for place, test in enumerate(seconds)}
     for path in data.measured_files():
         name = Path(path).relative_to(root).as_posix()
         for line, contexts in data.contexts_by_lineno(path).items():
-            tests = {each.rpartition("|")[0] for each in contexts} & seconds.keys()
-            if tests:
-                lines[f"{name}:{line}"] = sorted(tests)
-                modules[name] |= tests
+            # A context is a test and its phase.
+            tests = {each.rpartition("|")[0] for each in contexts}
+            if found := [places[test] for test in tests if test in places]:
+                lines[f"{name}:{line}"] = sorted(found)
+                modules[name].update(found)
     return Coverage(lines, {n: sorted(t) for n, t in modules.items()}, seconds)
 
 

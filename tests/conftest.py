@@ -21,7 +21,7 @@ matplotlib.use("Agg")
 # The same examples each time; HYPOTHESIS_PROFILE=ci tries many more.
 SAME = settings(deadline=None, derandomize=True, database=None)
 settings.register_profile("quick", SAME, max_examples=5)
-settings.register_profile("ci", SAME, max_examples=50)
+settings.register_profile("ci", SAME, max_examples=100)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 NO_DATA = "tables that are no part of this project (docs/benchmarks/README.md, Sets)"
