@@ -38,6 +38,7 @@ CORE = ("isa_nrsfm/_*/**/*.py", "isa_nrsfm/_*.py", "isa_nrsfm/isa/*.py")
 LAYERS = {"quick": [], "full": ["-m", "not (lint or browser or cluster)"]}
 PYTEST = [sys.executable, "-m", "pytest", "-p", "benchmarks._mutation_plugin", "-q"]
 UNTIL_ONE_FAILS = ["-x", "--tb=no", "-p", "no:cacheprovider"]
+WRONG_USAGE, NO_TESTS = 4, 5  # exit codes: the map is not of these tests
 STARTUP = 60.0  # CPU seconds for imports and the collection of tests
 SLOWER = 5.0  # how much longer than at first tests may take, whatever else runs
 NOT_COPIED = (".git", ".hypothesis", "__pycache__", ".*_cache", "docs")
@@ -271,8 +272,10 @@ def run(tests: list[str], copy: Path, layer: str, limit: float):
     _, status, usage = ended
     process.returncode = os.waitstatus_to_exitcode(status)
     seconds = usage.ru_utime + usage.ru_stime
-    if process.returncode == 0:
+    if process.returncode in (0, NO_TESTS):
         return "", seconds
+    if process.returncode == WRONG_USAGE:
+        raise RuntimeError(output.read_text())
     if process.returncode < 0:
         return f"signal {-process.returncode}, after {seconds:.0f} s", seconds
     failed = [
