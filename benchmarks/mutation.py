@@ -4,8 +4,8 @@
 
 Each place is a sign, a comparison, a bound, an index, a factor, a term, ... of one
 line (`_mutants`). The broken module is written into a copy of the checkout, where the
-tests run that cover the line: file by file, the cheapest first, until one fails or
-their CPU seconds are spent. Which tests cover a line, and how long they take, is
+tests run that cover the line, as many of the fastest as CPU seconds allow: file by
+file, the cheapest first, until one fails. Which tests cover a line, and how long they take, is
 recorded first (pytest-cov), once for each state of the package and its tests.
 
 A change that survives is not one that the tests must notice: it may change nothing, or
@@ -204,11 +204,12 @@ def places(n_places: int, seed: int) -> list[Mutant]:
 def judge(mutant: Mutant, copy: Path, coverage: Coverage, layer, most, number: int):
     """Return the verdict of the tests on a mutant."""
     covering = coverage.tests_of(mutant)
-    chosen, cost = [], 0.0
-    for test in covering:
-        if not chosen or cost + coverage.seconds[test] <= most:
-            chosen.append(test)
-            cost += coverage.seconds[test]
+    cheapest, cost = set(), 0.0
+    for test in sorted(covering, key=coverage.seconds.get):
+        cost += coverage.seconds[test]
+        if not cheapest or cost <= most:
+            cheapest.add(test)
+    chosen = [test for test in covering if test in cheapest]
     if not chosen:
         return Verdict("not covered", "", 0, 0, 0.0)
     path, seconds = copy / mutant.file, 0.0

@@ -133,6 +133,9 @@ def assert_models_agree(model, expected):
     assert_allclose(model.alpha_, expected.alpha_, atol=ALPHA_TOLERANCE, rtol=0)
     assert_shapes_agree(all_shapes(model), all_shapes(expected))
     assert_allclose(model.inverse_snr_, expected.inverse_snr_, rtol=1e-6)
+    if model.refinement == "joint":
+        found, wanted = (m.diagnostics().weak_deviations for m in (model, expected))
+        assert_allclose(found, wanted, rtol=1e-4)
 
 
 # --- invariances --------------------------------------------------------------------

@@ -192,6 +192,30 @@ class TestFit:
             assert affine_shape_error(truth, frames_of(result, tracks)[1]) < 0.02
 
 
+class TestSpectrum:
+    @pytest.mark.parametrize("n_components", [1, 2])
+    def test_of_complete_frames(self, n_components):
+        # Rows of 20 points that are centred: 19 singular values.
+        squares = np.sort(np.random.default_rng(0).exponential(size=19))[::-1]
+        rank = 3 * n_components + 3
+        found = Spectrum.from_singular_values(
+            np.sqrt(squares[:rank]),
+            squares[rank:].sum() / squares.sum(),
+            n_components,
+            20,
+            np.full(30, 20),
+        )
+        others = squares[rank:].mean() / squares.mean()
+        assert found.noise == pytest.approx(others)
+        missing = squares[n_components + 3 :].sum() / squares.sum()
+        assert found.missing == pytest.approx(missing)
+
+    def test_without_other_singular_values(self):
+        found = Spectrum.from_singular_values(np.ones(6), 0.0, 1, 7, np.full(9, 7))
+        assert found.noise == 0.0
+        assert found.missing == pytest.approx(2 / 6)
+
+
 EACH = pytest.mark.parametrize("camera", CAMERAS)
 CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 GAPS = pytest.mark.parametrize("gaps", [False, True])
