@@ -5,8 +5,8 @@
 Each place is a sign, a comparison, a bound, an index, a factor, a term, ... of one
 line (`_mutants`). The broken module is written into a copy of the checkout, where the
 tests run that cover the line, as many of the fastest as CPU seconds allow: file by
-file, the cheapest first, until one fails. Which tests cover a line, and how long they take, is
-recorded first (pytest-cov), once for each state of the package and its tests.
+file, the cheapest first, until one fails. Which tests cover a line, and how long they
+take, is recorded first (pytest-cov), once for each state of the package and its tests.
 
 A change that survives is not one that the tests must notice: it may change nothing, or
 only the number of steps.
