@@ -6,19 +6,41 @@ os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before scipy is imported
 # Before numpy is imported: the tables of the tests are too small for more threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from collections import Counter
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
+from estimator_contract import widen
+from hypothesis import settings
+from sklearn.utils import estimator_checks
 
 matplotlib.use("Agg")
+
+# The same examples each time; HYPOTHESIS_PROFILE=ci tries many more.
+SAME = settings(deadline=None, derandomize=True, database=None)
+settings.register_profile("quick", SAME, max_examples=5)
+settings.register_profile("ci", SAME, max_examples=100)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+
+NO_DATA = "tables that are no part of this project (docs/benchmarks/README.md, Sets)"
 
 
 def _data_folder():
     named = os.environ.get("ISA_NRSFM_DATA")
     checkout = Path(__file__).resolve().parents[1]
     return Path(named) if named else checkout.parent / "shared" / "data"
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say once for each reason how many tests it skipped."""
+    reasons = Counter(
+        report.longrepr[2].removeprefix("Skipped: ")
+        for report in terminalreporter.stats.get("skipped", ())
+    )
+    for reason, number in reasons.items():
+        terminalreporter.write_line(f"{number} skipped: {reason}")
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +50,7 @@ def data_path():
     def path(name):
         file = _data_folder() / name
         if not file.is_file():
-            pytest.skip(f"{name} not found: set ISA_NRSFM_DATA to the folder with it")
+            pytest.skip(f"{NO_DATA}: set ISA_NRSFM_DATA to the folder that has them")
         return file
 
     return path
@@ -52,3 +74,10 @@ def run(capsys):
         return code, captured.out, captured.err
 
     return run_command
+
+
+@pytest.fixture
+def landmark_tables(monkeypatch):
+    """Widen the tables of scikit-learn's checks to tables of landmarks."""
+    # They hand their tables to no function of ours on the way.
+    monkeypatch.setattr(estimator_checks, "_enforce_estimator_tags_X", widen)

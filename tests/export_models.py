@@ -8,6 +8,8 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
 
 N_FRAMES, N_COMPONENTS = 150, 3
+HOSTILE = "</script><script>document.title = 'taken'</script><b>&amp;'\"\u2028"
+LABELS = [["neutral", HOSTILE, "smile"][i % 3] for i in range(N_FRAMES)]
 
 
 @cache

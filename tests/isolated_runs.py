@@ -9,16 +9,28 @@ MEGABYTE = 1_000_000
 
 
 def use_memory(measured, n_before, n_inside):
-    """Use megabytes before and inside of what is measured, and give them back."""
+    """Use megabytes before and inside of what is measured, and give them back.
+
+    Return the seconds of what is measured, by clocks just inside and just outside.
+    """
     before = np.ones(n_before * MEGABYTE // 8)
     del before
+    clock = time.perf_counter
+    seconds = {"inside": 0.0, "outside": 0.0}
+    outside = clock()
     with measured():
-        inside = np.ones(n_inside * MEGABYTE // 8)
-        total = inside.sum()
-        time.sleep(0.2)
+        inside = clock()
+        array = np.ones(n_inside * MEGABYTE // 8)
+        total = array.sum()
+        seconds["inside"] += clock() - inside
+    seconds["outside"] += clock() - outside
+    outside = clock()
     with measured():
+        inside = clock()
         time.sleep(0.1)
-    return {"total": total}
+        seconds["inside"] += clock() - inside
+    seconds["outside"] += clock() - outside
+    return {"total": total, **seconds}
 
 
 def misbehave(measured, how):
@@ -32,8 +44,11 @@ def misbehave(measured, how):
             time.sleep(60)
 
 
-def sleep(measured, seconds):
-    """Take some seconds."""
-    with measured():
-        time.sleep(seconds)
-    return {"seconds": seconds}, {"array": np.arange(3)}
+def count_run(measured, path, ends):
+    """Add a line to a file; then return at once, or not for a minute."""
+    with path.open("a") as file:
+        file.write("run\n")
+    if not ends:
+        with measured():
+            time.sleep(60)
+    return {"ends": ends}, {"array": np.arange(3)}

@@ -11,7 +11,10 @@ import pytest
 from benchmarks import _cost
 from benchmarks.asv_suite import _measured, fits, stages
 
-pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),
+]
 
 PREFIXES = ("time_", "peakmem_", "track_")
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from baseline_scenes import camera_frame, exact_table, mocap_shapes, rotations
+from layers import slow_after
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from sklearn.exceptions import ConvergenceWarning
@@ -179,9 +180,15 @@ def test_shark(load_data):
 @pytest.mark.parametrize(
     ("name", "n_components", "inverse_snr", "error"),
     [
-        ("akhter_drink", 11, 0.00132, 0.0227),
-        ("akhter_pickup", 11, 0.00409, 0.0485),
         ("akhter_yoga", 9, 0.00532, 0.0342),
+        *slow_after(
+            0,
+            [
+                ("akhter_drink", 11, 0.00132, 0.0227),
+                ("akhter_pickup", 11, 0.00409, 0.0485),
+            ],
+            together=True,
+        ),
     ],
 )
 def test_motion_capture(load_data, name, n_components, inverse_snr, error):

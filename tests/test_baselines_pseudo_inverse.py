@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from baseline_scenes import camera_frame, exact_table, mocap_shapes
+from layers import slow_after
 from numpy.testing import assert_allclose
 from scenes import measurements
 from scipy.spatial.transform import Rotation
@@ -110,9 +111,15 @@ def test_shark(load_data):
 @pytest.mark.parametrize(
     ("name", "n_components", "inverse_snr", "error"),
     [
-        ("akhter_drink", 11, 0.00690, 0.446),
-        ("akhter_pickup", 11, 0.0267, 0.547),
         ("akhter_yoga", 9, 0.0504, 0.611),
+        *slow_after(
+            0,
+            [
+                ("akhter_drink", 11, 0.00690, 0.446),
+                ("akhter_pickup", 11, 0.0267, 0.547),
+            ],
+            together=True,
+        ),
     ],
 )
 def test_motion_capture(load_data, name, n_components, inverse_snr, error):

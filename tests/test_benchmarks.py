@@ -1,10 +1,9 @@
 import json
-import time
 from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from isolated_runs import MEGABYTE, misbehave, sleep, use_memory
+from isolated_runs import MEGABYTE, count_run, misbehave, use_memory
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
@@ -57,16 +56,18 @@ def record(**changes):
 # Processes
 
 
+@pytest.mark.subprocess
 def test_seconds_and_memory_are_those_of_what_is_measured():
     outcome = run_isolated(
-        use_memory, {"n_before": 400, "n_inside": 150}, time_limit=30
+        use_memory, {"n_before": 400, "n_inside": 150}, time_limit=600
     )
     assert outcome.status == "ok"
-    assert outcome.values == {"total": 150 * MEGABYTE / 8}
-    assert 0.3 <= outcome.seconds < 3.0
+    assert outcome.values["total"] == 150 * MEGABYTE / 8
+    assert outcome.values["inside"] <= outcome.seconds <= outcome.values["outside"]
     assert 145 < outcome.memory < 250
 
 
+@pytest.mark.subprocess
 @pytest.mark.parametrize(
     ("how", "status", "message"),
     [
@@ -76,32 +77,36 @@ def test_seconds_and_memory_are_those_of_what_is_measured():
     ],
 )
 def test_what_a_method_does_wrong_is_reported(how, status, message):
-    since = time.perf_counter()
     outcome = run_isolated(misbehave, {"how": how}, time_limit=0.5)
     assert (outcome.status, outcome.message) == (status, message)
     assert outcome.values is None
     assert outcome.seconds is None
-    assert time.perf_counter() - since < 30
 
 
+@pytest.mark.subprocess
 def test_memory_is_limited():
     outcome = run_isolated(
-        use_memory, {"n_before": 0, "n_inside": 8000}, time_limit=30, memory_limit=4
+        use_memory, {"n_before": 0, "n_inside": 8000}, time_limit=600, memory_limit=4
     )
     assert outcome.status == "error"
     assert "MemoryError" in outcome.message
 
 
-def test_what_was_too_slow_is_not_run_again():
+@pytest.mark.subprocess
+def test_what_was_too_slow_is_not_run_again(tmp_path):
+    # What is measured of the slow method does not end, of the fast one nothing is.
     jobs = [
-        Job("truth", "drink", method, seed, sleep, {"seconds": seconds}, {})
+        Job("truth", "drink", method, seed, count_run, arguments, {})
         for seed in (0, 1)
-        for method, seconds in (("slow", 60), ("fast", 0.1))
+        for method, arguments in (
+            ("slow", {"path": tmp_path / "slow", "ends": False}),
+            ("fast", {"path": tmp_path / "fast", "ends": True}),
+        )
     ]
     limits = Limits(time=0.5, memory=None, threads=1)
-    since = time.perf_counter()
     done = list(run_jobs(jobs, limits, 1, "now"))
-    assert time.perf_counter() - since < 40
+    assert (tmp_path / "slow").read_text() == "run\n"
+    assert (tmp_path / "fast").read_text() == "run\nrun\n"
     assert {(r.method, r.seed, r.status) for r, _ in done} == {
         ("slow", 0, "over time"),
         ("slow", 1, "over time"),
@@ -110,7 +115,7 @@ def test_what_was_too_slow_is_not_run_again():
     }
     for kept, arrays in done:
         if kept.status == "ok":
-            assert kept.values == {"seconds": 0.1}
+            assert kept.values == {"ends": True}
             np.testing.assert_array_equal(arrays["array"], [0, 1, 2])
         else:
             assert kept.message == "over 0.5 s"
@@ -562,6 +567,7 @@ def test_bars_are_drawn_for_what_there_is(tmp_path):
 # The command
 
 
+@pytest.mark.subprocess
 def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     chosen = ["truth", "--sets", "synthetic", "--methods", "rigid", "floor"]
     output = ["--output", str(tmp_path)]

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from frame_parts import camera_and_alpha, numbers_of
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
@@ -130,7 +132,7 @@ def assert_calibrated(motion, camera):
 class TestMinimum:
     @BOTH
     @GAPS
-    @pytest.mark.parametrize("depth", [1.0, 0.1])
+    @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
     def test_is_no_higher_than_from_many_other_starts(self, camera, gaps, depth):
         scene = random_scene(camera, noise=0.1, n_frames=3, depth=depth)
         scene = scene.hidden() if gaps else scene
@@ -192,7 +194,7 @@ class TestMinimum:
         scene = random_scene(camera)
         scene = scene.hidden() if gaps else scene
         fits = fitted(scene, camera)
-        rest = scene.tracks - images(scene.shapes, *fits[:3])
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
         assert_allclose(np.nanmean(rest, axis=1), 0.0, atol=1e-12)
 
     @BOTH
@@ -202,12 +204,14 @@ class TestMinimum:
         together = fitted(scene, camera, noises)
         for i, noise in enumerate(noises):
             alone = fitted(scene, camera, noise)
-            for got, expected in zip(together[:6], alone[:6], strict=True):
+            for got, expected in zip(
+                numbers_of(together), numbers_of(alone), strict=True
+            ):
                 assert_allclose(got[i], expected[i], rtol=1e-7, atol=1e-9)
 
     @BOTH
-    @pytest.mark.parametrize("depth", [0.1, 0.03, 0.01, 0.0])
-    @pytest.mark.parametrize("deviation", [0.005, 0.02])
+    @pytest.mark.parametrize("depth", slow_after(2, [0.1, 0.0, 0.03, 0.01]))
+    @pytest.mark.parametrize("deviation", slow_after(1, [0.02, 0.005]))
     def test_of_thin_objects_is_no_higher_than_from_the_truth(
         self, camera, depth, deviation
     ):
@@ -409,7 +413,9 @@ class TestExact:
         scene = random_scene(camera, noise=0.0)
         given = scene.hidden() if gaps else scene
         fits = fitted(given, camera, 0.0)
-        for got, true in zip(fits[:3], scene[2:], strict=True):
+        for got, true in zip(
+            camera_and_alpha(fits), camera_and_alpha(scene), strict=True
+        ):
             assert_allclose(got, true, atol=1e-8)
         assert fits.converged.all()
         assert_allclose(fits.residual, 0.0, atol=1e-9)
@@ -661,7 +667,7 @@ class TestDegenerate:
         scene = scene._replace(shapes=self.shapes_of(kind, scene.shapes))
         for given in (scene, scene.hidden()):
             fits = fitted(given, camera, variance, starts=np.ones((2, 3)))
-            for each in fits[:6]:
+            for each in numbers_of(fits):
                 assert np.isfinite(each).all()
             variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
             assert (variances >= 0).all()
@@ -694,7 +700,7 @@ class TestDegenerate:
         scene.tracks[3, 4:] = np.nan
         fits = fitted(scene, camera, starts=np.ones((1, 3)))
         expected = np.arange(6) >= 3
-        for each in fits[:6]:
+        for each in numbers_of(fits):
             finite = np.isfinite(each.reshape(6, -1))
             assert_array_equal(finite.all(axis=1), expected)
             assert_array_equal(finite.any(axis=1), expected)
@@ -705,10 +711,10 @@ class TestDegenerate:
         scene = random_scene(camera, n_frames=3)
         scene.tracks[1] = scene.tracks[1, 0]
         fits = fitted(scene, camera, variance)
-        for each in fits[:6]:
+        for each in numbers_of(fits):
             assert np.isfinite(each).all()
         # The centroids are what it shows.
-        rest = scene.tracks - images(scene.shapes, *fits[:3])
+        rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
         assert_allclose(rest.mean(axis=1), 0.0, atol=1e-12)
 
     @BOTH

@@ -219,6 +219,15 @@ class TestInverseCurvature:
             assert least >= -1e-6 * np.abs(found).max()
 
     @CALIBRATED
+    @pytest.mark.parametrize("unit", [1e-12, 1e12])
+    def test_unit_of_the_curvature(self, name, unit):
+        motion, (_, packed) = random_cameras(name=name), random_curvatures()
+        cameras = CAMERAS[name]
+        expected = cameras.inverse_curvature(motion, packed) / unit
+        found = cameras.inverse_curvature(motion, unit * packed)
+        assert_allclose(found, expected, rtol=1e-9)
+
+    @CALIBRATED
     def test_cameras_of_zero(self, name):
         motion, cameras = np.zeros((2, 3, N)), CAMERAS[name]
         inverse = cameras.inverse_curvature(motion, random_curvatures()[1])

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from layers import slow_after
 from sklearn.model_selection import cross_val_score
 
 from isa_nrsfm import AffineNRSfM, __version__
@@ -180,7 +181,7 @@ def test_defaults_are_those_of_the_estimator(run, table, tmp_path):
     assert model.get_params() == AffineNRSfM(random_state=0).get_params()
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))
 def test_calibrated_cameras(run, tmp_path, camera):
     faces = make_face_tracks(
         80, n_components=2, camera=camera, noise=0.01, random_state=0
@@ -379,6 +380,7 @@ def test_standard_deviations_are_written_where_they_are_known(
     assert "was fitted with refinement=None" in message
 
 
+@pytest.mark.slow
 def test_number_of_basis_shapes_is_chosen_by_held_out_points(
     run, fails, table, fitted, faces, tmp_path
 ):
@@ -740,6 +742,7 @@ def test_warnings_are_shown_once_and_in_one_line(run, table, tmp_path, monkeypat
     assert (code, err) == (0, "isa-nrsfm: warning: a long warning\n")
 
 
+@pytest.mark.slow
 def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # All numbers that the demo tries would take long.
@@ -765,6 +768,7 @@ def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
     assert (folder / "alpha.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_table_as_it_is_distributed(run, data_path, tmp_path):
     table = data_path("raw/muct76-opencv.csv")
     code, out, err = run(
@@ -791,6 +795,7 @@ def test_program_reports_on_standard_output_only(table, tmp_path, capfd):
     assert out.startswith("2 basis shapes fitted to")
 
 
+@pytest.mark.subprocess
 def test_progress_is_shown_on_a_terminal(table, tmp_path):
     reading, writing = pty.openpty()
     done = subprocess.run(
@@ -827,6 +832,7 @@ def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch,
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.subprocess
 def test_signal_of_the_keyboard_stops_the_program(table, tmp_path):
     folder = tmp_path / "results"
     started = subprocess.Popen(

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
@@ -184,7 +185,7 @@ def test_the_residual_of_a_step_is_that_of_least_squares_with_a_ridge(small):
 # --- exact tables -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 @pytest.mark.parametrize(
     ("n_frames", "n_points", "n_components", "missing"),
     [(60, 30, 2, 0.2), (60, 30, 3, 0.3), (300, 68, 5, 0.3), (300, 68, 9, 0.2)],

@@ -90,17 +90,20 @@ def run(*command):
     return done.returncode, done.stdout + done.stderr
 
 
+@pytest.mark.lint
 @pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=" ".join)
 def test_ruff_has_no_complaints(command):
     status, output = run("-m", "ruff", *command, *FOLDERS)
     assert status == 0, output
 
 
+@pytest.mark.lint
 def test_mypy_has_no_complaints():
     status, output = run("-m", "mypy")
     assert status == 0, output
 
 
+@pytest.mark.lint
 @pytest.mark.parametrize("name", documented_names())
 def test_docstrings_are_complete(name):
     errors = [e for e in validate(name)["errors"] if e[0] not in NOT_NEEDED]
@@ -196,6 +199,7 @@ def test_modules_keep_no_state(file):
                     assert is_dunder or name.id.strip("_")[0].isupper(), name.id
 
 
+@pytest.mark.subprocess
 def test_every_module_can_be_imported_without_optional_libraries():
     modules = [
         name
@@ -224,11 +228,13 @@ def linted_imports(folder):
     return done.returncode, done.stdout
 
 
+@pytest.mark.lint
 def test_imports_go_down():
     status, output = linted_imports(ROOT)
     assert status == 0, output
 
 
+@pytest.mark.lint
 @pytest.mark.parametrize(
     ("file", "line"),
     [

@@ -107,11 +107,11 @@ class TestThreads:
             AffineNRSfM(K).fit(chunked(X))
 
 
+@pytest.mark.cluster
 class TestCluster:
     @pytest.fixture(autouse=True)
     def sampled(self, monkeypatch):
         """Take the first steps on few frames, as of large tables."""
-        monkeypatch.setattr("isa_nrsfm._paper.sample.SMALL_TABLE", 1000)
         monkeypatch.setattr("isa_nrsfm._paper.sample.SMALL_TABLE", 1000)
         monkeypatch.setattr("isa_nrsfm._paper.sample.SAMPLE_FRAMES", 40)
 
@@ -161,6 +161,7 @@ def size_of(found):
     return np.size(found)
 
 
+@pytest.mark.cluster
 class TestJoblib:
     def test_grid_search_and_restarts(self, cluster):
         X = table()

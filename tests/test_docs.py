@@ -13,6 +13,8 @@ import isa_nrsfm
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.lint
+
 PAGES = ["README.md", "docs/getting_started.md", "docs/migration.md"]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 

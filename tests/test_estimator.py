@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator, clone
 from sklearn.decomposition import FastICA
@@ -114,39 +115,66 @@ def model():
     return estimator().fit(TABLE)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        {},
-        {"scale_frames": False},
-        {"layout": "planar"},
-        {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
-        {"loss": "huber"},
-        {"loss": "cauchy", "independence": None},
-        {"camera": "weak_perspective"},
-        {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
-        {"camera": "orthographic"},
-        {"camera": "weak_perspective", "refinement": None},
-        {"n_components": 1},
-        {"n_components": 6},
-        {"refinement": "alternating"},
-        {"refinement": "alternating", "scale_frames": False},
-        {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
-        {"refinement": None, "layout": "planar", "scale_frames": False},
-        {"refinement": None, "block_recovery": "irls"},
-        {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
-    ],
-    ids=str,
-)
-def variant(request):
+VARIANTS = [
+    {},
+    {"scale_frames": False},
+    {"layout": "planar"},
+    {"isa": PooledFastICA(n_init=3), "independence": "coefficients"},
+    {"loss": "huber"},
+    {"camera": "weak_perspective"},
+    {"camera": "orthographic"},
+    {"camera": "weak_perspective", "refinement": None},
+    {"n_components": 1},
+    {"n_components": 6},
+    {"refinement": "alternating"},
+    {"refinement": "alternating", "scale_frames": False},
+    {"refinement": "alternating", "block_recovery": "eigen", "n_components": 6},
+    {"refinement": None, "layout": "planar", "scale_frames": False},
+    {"refinement": None, "block_recovery": "irls"},
+    {"refinement": None, "isa": PooledFastICA(n_init=3), "n_components": 1},
+]
+SLOW_VARIANTS = [
+    {"loss": "cauchy", "independence": None},
+    {"camera": "weak_perspective", "loss": "cauchy", "layout": "planar"},
+]
+
+
+def variants(**required):
+    """Return the variants that have some values of parameters, for a test."""
+    return [
+        pytest.param(i, id=str(params), marks=[pytest.mark.slow] * (i >= len(VARIANTS)))
+        for i, params in enumerate(VARIANTS + SLOW_VARIANTS)
+        if all(
+            getattr(estimator(**params), name) in values
+            for name, values in required.items()
+        )
+    ]
+
+
+def only(**required):
+    """Return a decorator for tests of the variants with some values of parameters."""
+    return pytest.mark.parametrize("variant", variants(**required), indirect=True)
+
+
+only_joint = only(refinement=["joint"])
+
+
+@cache
+def fitted_variant(number):
     """Return a fitted model, its training table and another table."""
-    fitted = estimator(**request.param)
+    fitted = estimator(**(VARIANTS + SLOW_VARIANTS)[number])
     table, new = TABLE, make_face_tracks(30, n_components=5, random_state=1).data
     if fitted.layout == "planar":
         table, new = planar(table), planar(new)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return fitted.fit(table), table, new
+
+
+@pytest.fixture(params=variants())
+def variant(request):
+    """Return a fitted model, its training table and another table."""
+    return fitted_variant(request.param)
 
 
 # --- attributes ---------------------------------------------------------------------
@@ -234,10 +262,9 @@ def is_joint(model):
     return model.refinement == "joint"
 
 
+@only(loss=["linear"])  # of others outliers have been filled in
 def test_singular_values_and_rank_floor_are_those_of_the_measurement_matrix(variant):
     model, table, _ = variant
-    if model.loss != "linear":
-        pytest.skip("outliers have been filled in")
     S = np.linalg.svd(scaled_matrix(model, table), compute_uv=False)
     rank = 3 * model.n_components + 3
     assert_allclose(model.rank_floor_, np.sum(S[rank:] ** 2) / np.sum(S**2), rtol=1e-9)
@@ -313,20 +340,18 @@ def test_coefficients_have_unit_variance_and_energy_decreases(variant):
     assert_allclose(model.energy_share_, energy / energy.sum(), rtol=1e-9)
 
 
+@only_joint
 def test_objective_never_rises(variant):
     model, *_ = variant
-    if not is_joint(model):
-        pytest.skip("only the joint refinement has one")
     history = model.objective_history_
     assert np.all(np.diff(history) <= 1e-9 * np.abs(history).max())
     assert 0 <= model.gradient_norm_ < 0.1
     assert model.camera_noise_ratio_ >= 1
 
 
+@only_joint
 def test_deviations_are_positive_and_below_the_prior(variant):
     model, *_ = variant
-    if not is_joint(model):
-        pytest.skip("only the joint refinement knows them")
     assert np.all(model.alpha_std_ > 0)
     # On average nothing is known less well than its spread over the frames, which is 1.
     assert np.all(np.mean(model.alpha_std_**2, axis=0) < 1)
@@ -383,12 +408,11 @@ def test_methods_follow_the_formula(variant, which):
         assert noise / signal < 0.01
 
 
+@only(refinement=["alternating", None])
 @pytest.mark.parametrize("which", ["fitted", "new"])
 def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
     # Camera: the rigid fit to the mean shape. Coefficients: the fit that follows.
     model, table, new = variant
-    if is_joint(model):
-        pytest.skip("camera and coefficients are fitted together")
     table = table if which == "fitted" else new
     motion, translation, alpha, _ = model.decompose(table)
     tracks = tracks_of(table, model.layout)
@@ -407,12 +431,12 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
         assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
 
 
+# Of others cameras are not those of least squares, or points have weights.
+@only(refinement=["joint"], loss=["linear"], camera=["affine"])
 @pytest.mark.parametrize("which", ["fitted", "new"])
 def test_cameras_of_the_joint_refinement_are_best_for_the_coefficients(variant, which):
     # They are the least squares fit to the shape of the frame, position included.
     model, table, new = variant
-    if not is_joint(model) or model.loss != "linear" or model.camera != "affine":
-        pytest.skip("cameras are not those of least squares, or points have weights")
     table = table if which == "fitted" else new
     motion, translation, *_ = model.decompose(table)
     tracks, shapes = tracks_of(table, model.layout), model.reconstruct(table)
@@ -1214,7 +1238,7 @@ def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
         model.reconstruct(truth.data, camera=other)
 
 
-@pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
+@pytest.mark.parametrize("camera", slow_after(1, [*CALIBRATED, "affine"]))
 def test_the_number_of_components_is_found(camera):
     truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)
     model = AffineNRSfM("auto", camera=camera, random_state=0).fit(truth.data)

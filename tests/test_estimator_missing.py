@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
@@ -218,7 +219,7 @@ def test_points_with_one_coordinate_count_as_missing_and_warn(complete_model, me
 # --- methods ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale_frames", [True, False])
+@pytest.mark.parametrize("scale_frames", slow_after(1, [True, False]))
 def test_the_fitted_table_has_its_coefficients_to_the_bit(variant, scale_frames):
     if scale_frames:
         fitted = variant
@@ -296,7 +297,7 @@ def test_reproject_fills_in_what_is_missing(model):
 # --- accuracy -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_shapes_of_tables_with_missing_points(seed):
     # Without 0.3 of the points the noise alone makes them worse by 1 / sqrt(0.7), 1.2
     # times; frames with few points lose more, each has a camera to pay for. Of these
@@ -308,6 +309,7 @@ def test_shapes_of_tables_with_missing_points(seed):
     assert holed < 1.4 * complete
 
 
+@pytest.mark.slow
 def test_shapes_of_real_faces_with_missing_points(load_data):
     data = load_data("ict_bu3dfe_like_68")
     tracks, truth = data["W2d"][::5].astype(float), data["S3d"][::5]
@@ -331,7 +333,10 @@ def with_outliers(made, seed, share=0.05, size=1.0):
     return tracks.reshape(len(tracks), -1)
 
 
-@pytest.mark.parametrize(("seed", "size"), [(0, 1.0), (1, 1.0), (2, 1.0), (0, 5.0)])
+@pytest.mark.parametrize(
+    ("seed", "size"),
+    slow_after(1, [(0, 5.0), (0, 1.0), (1, 1.0), (2, 1.0)], together=True),
+)
 @pytest.mark.parametrize("loss", LOSSES[1:])
 def test_robust_losses_withstand_outliers(loss, seed, size):
     # The influence of outliers is bounded by "huber", but not small.
@@ -393,6 +398,7 @@ def aligned(true, found, deviation):
     return one @ solution[n:].reshape(n, n + 1).T / scale[:, None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", [0.0, 0.3])
 @pytest.mark.parametrize("independence", ["shapes", "coefficients"])
 def test_deviations_of_the_coefficients_cover_the_truth(independence, missing):

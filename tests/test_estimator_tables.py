@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import ConvergenceWarning
 
@@ -297,11 +298,11 @@ def test_two_places_only():
 # --- degenerate tables, joint refinement ---------------------------------------------
 
 
-def jointly(tracks, n_components, repeat=True, **params):
-    """Return the default model of tracks; it is finite, and the same when repeated.
+def jointly(tracks, n_components, repeat=False, **params):
+    """Return the default model of tracks; it is finite, and the same if repeated.
 
     The table may determine little, then the refinement may not converge and say so;
-    other warnings are errors. Fits that take long are not repeated.
+    other warnings are errors.
     """
     params = {"refinement": "joint", "isa": None} | params
     model = fitted(tracks, n_components, **params)
@@ -314,18 +315,20 @@ def jointly(tracks, n_components, repeat=True, **params):
     return model
 
 
-@pytest.mark.parametrize("n_components", [1, 2, 3, 6])
+@pytest.mark.parametrize("n_components", slow_after(1, [1, 2, 3, 6]))
 def test_joint_refinement_of_the_shark(load_data, n_components):
     # The refinement has hardly an end where the table determines so little.
     tracks = real_tracks(load_data, "shark_torresani")[::8]
-    model = jointly(tracks, n_components, repeat=n_components == 2, max_iter=100)
+    model = jointly(tracks, n_components, repeat=n_components == 1, max_iter=100)
     paper = fitted(tracks, n_components)
     assert model.inverse_snr_ < paper.inverse_snr_
 
 
 @pytest.mark.parametrize("n_components", [1, 2])
 @pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
-@pytest.mark.parametrize("independence", ["shapes", "coefficients", None])
+@pytest.mark.parametrize(
+    "independence", slow_after(1, ["shapes", "coefficients", None])
+)
 def test_joint_refinement_of_rigid_objects(flat, n_components, independence):
     rng = np.random.default_rng(0)
     shape = rng.normal(size=(20, 3)) * flat
@@ -353,33 +356,41 @@ def test_robust_fit_of_a_rigid_object(loss):
     assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])
 def test_robust_fit_of_the_shark(load_data, loss):
     # Most of its points hardly move: those that do are no outliers.
     tracks = real_tracks(load_data, "shark_torresani")[::8]
-    model = jointly(tracks, 2, repeat=False, loss=loss, max_iter=50)
+    model = jointly(tracks, 2, loss=loss, max_iter=50)
     assert model.inverse_snr_ < fitted(tracks, 2).inverse_snr_
 
 
-@pytest.mark.parametrize(("n_components", "noise"), [(3, 0.0), (1, 0.01), (3, 0.01)])
+@pytest.mark.parametrize(
+    ("n_components", "noise"),
+    slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)], together=True),
+)
 def test_joint_refinement_of_flat_objects(n_components, noise):
     rng = np.random.default_rng(0)
     shape, basis = rng.normal(size=(2, 20, 3)) * [1, 1, 0]
     alpha = rng.normal(size=(40, 1, 1))
     tracks = seen(shape + 0.2 * alpha * basis, cameras(rng, 40), rng)
     tracks += noise * rng.normal(size=tracks.shape)
-    model = jointly(tracks, n_components, repeat=noise > 0)
+    model = jointly(tracks, n_components)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
 
 @pytest.mark.parametrize(
     ("n_different", "n_components", "seed"),
-    [(1, 1, 0), (1, 5, 0), (2, 1, 0), (2, 2, 0), (3, 1, 0), (3, 5, 4)],
+    slow_after(
+        3,
+        [(1, 1, 0), (1, 5, 0), (3, 1, 0), (2, 1, 0), (2, 2, 0), (3, 5, 4)],
+        together=True,
+    ),
 )
 def test_joint_refinement_of_repeated_frames(n_different, n_components, seed):
     rng = np.random.default_rng(seed)
     tracks = rng.normal(size=(n_different, 20, 2))
-    model = jointly(np.repeat(tracks, 12, axis=0), n_components, n_different == 1)
+    model = jointly(np.repeat(tracks, 12, axis=0), n_components)
     assert model.inverse_snr_ < 1e-9
     assert ((model.reliability_ >= 0) & (model.reliability_ < 1 + 1e-12)).all()
     for i in range(n_different):
@@ -391,23 +402,34 @@ def test_joint_refinement_of_duplicated_points_and_frames():
     tracks = make_face_tracks(60, n_components=3, random_state=0).tracks
     once = jointly(tracks, 3)
     # A point that is seen twice tells a little more of the noise, a frame counts twice.
-    points = jointly(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 3, repeat=False)
+    points = jointly(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 3)
     assert_allclose(points.inverse_snr_, once.inverse_snr_, rtol=1e-2)
     assert_allclose(points.basis_[:, 68:], points.basis_[:, 67::-1], atol=1e-6)
-    frames = jointly(np.tile(tracks, (2, 1, 1)), 3, repeat=False)
+    frames = jointly(np.tile(tracks, (2, 1, 1)), 3)
     assert_allclose(frames.alpha_[60:], frames.alpha_[:60], atol=1e-9)
     assert_allclose(frames.inverse_snr_, once.inverse_snr_, rtol=1e-2)
 
 
 def test_joint_refinement_of_few_points_seen_many_times():
     tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    model = jointly(np.tile(tracks[:, ::10], (1, 5, 1)), 4, repeat=False)
+    model = jointly(np.tile(tracks[:, ::10], (1, 5, 1)), 4)
     assert model.inverse_snr_ < 1e-4
 
 
 @pytest.mark.parametrize(
     ("n_components", "n_cameras", "noise"),
-    [(1, 1, 0.0), (2, 1, 0.0), (2, 2, 0.0), (1, 2, 0.02), (2, 1, 0.02), (2, 2, 0.02)],
+    slow_after(
+        3,
+        [
+            (1, 1, 0.0),
+            (2, 1, 0.0),
+            (1, 2, 0.02),
+            (2, 2, 0.0),
+            (2, 1, 0.02),
+            (2, 2, 0.02),
+        ],
+        together=True,
+    ),
 )
 def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, noise):
     # All frames from one place, or from two: depth is seen in part or not at all.
@@ -417,7 +439,7 @@ def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, n
     motion = np.repeat(cameras(rng, n_cameras), 40 // n_cameras, axis=0)
     tracks = seen(shape + 0.2 * alpha * basis, motion, rng)
     tracks += noise * rng.normal(size=tracks.shape)
-    model = jointly(tracks, n_components, repeat=noise > 0)
+    model = jointly(tracks, n_components)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
 
@@ -435,7 +457,10 @@ def test_joint_refinement_of_smallest_tables(n_components, dtype):
         assert_allclose(deviation[model.basis_.any(axis=(1, 2))], 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("n_frames", "n_components"), [(60, 7), (200, 4), (400, 4)])
+@pytest.mark.parametrize(
+    ("n_frames", "n_components"),
+    slow_after(1, [(200, 4), (60, 7), (400, 4)], together=True),
+)
 def test_joint_refinement_of_real_tables(load_data, n_frames, n_components):
     tracks = real_tracks(load_data, "muct_68")
     model = jointly(tracks[:: len(tracks) // n_frames], n_components)
@@ -450,7 +475,9 @@ def joint_faces():
 
 @pytest.mark.parametrize(
     ("loss", "scale_frames"),
-    [("linear", False), ("huber", True), ("cauchy", False)],
+    slow_after(
+        1, [("linear", False), ("huber", True), ("cauchy", False)], together=True
+    ),
 )
 def test_joint_refinement_of_frames_that_are_lines_or_tiny(
     joint_faces, loss, scale_frames
@@ -460,8 +487,7 @@ def test_joint_refinement_of_frames_that_are_lines_or_tiny(
     tracks[5] = tracks[5].mean(axis=0) + 1e-7 * tracks[5]
     tracks[7] = tracks[7, :1]
     tracks[7, 0] += 1.0
-    repeat = loss == "cauchy"
-    model = jointly(tracks, 2, repeat, loss=loss, scale_frames=scale_frames)
+    model = jointly(tracks, 2, loss=loss, scale_frames=scale_frames)
     others = np.setdiff1d(np.arange(60), [3, 5, 7])
     errors = [
         each.reproject(table_of(tracks))[others] - table_of(tracks)[others]
@@ -470,10 +496,10 @@ def test_joint_refinement_of_frames_that_are_lines_or_tiny(
     assert np.median(np.abs(errors[0])) < 2 * np.median(np.abs(errors[1]))
 
 
-@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
+@pytest.mark.parametrize("scale", slow_after(2, [1e-150, 1e150, 1e-30, 1e30]))
 def test_joint_refinement_of_any_unit(joint_faces, scale):
     tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    model = jointly(tracks * scale, 2, repeat=False)
+    model = jointly(tracks * scale, 2)
     assert_allclose(model.alpha_, joint_faces.alpha_, atol=1e-6)
     assert_allclose(model.inverse_snr_, joint_faces.inverse_snr_, rtol=1e-6)
 
@@ -488,7 +514,7 @@ def test_joint_refinement_of_points_in_two_places():
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", slow_after(1, [0, 1]))
 @pytest.mark.parametrize(
     ("name", "n_components", "params", "percent"),
     [

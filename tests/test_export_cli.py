@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 from export_models import face_model, faces
+from exported_files import Read, content_of
 from numpy.testing import assert_array_equal
 from scipy.io import loadmat
-from test_export_gltf import Read
-from test_export_viewer import content_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main

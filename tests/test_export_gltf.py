@@ -1,62 +1,23 @@
 import json
 import os
 import shutil
-import struct
 import subprocess
 
 import numpy as np
 import pytest
 from export_models import N_COMPONENTS, blob_model, calibrated_model, face_model
+from exported_files import TYPES, Read
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import _gltf, write_glb
 from isa_nrsfm.export._drawing import edges_of, frontal_triangles, vertex_normals
 from isa_nrsfm.export._upright import upright_basis, upright_space
 
-TYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
 VALIDATE = """
 const validator = require("gltf-validator");
 const content = new Uint8Array(require("fs").readFileSync(process.argv[1]));
 validator.validateBytes(content).then((r) => console.log(JSON.stringify(r.issues)));
 """
-
-
-class Read:
-    """A .glb file, read as the specification has it."""
-
-    def __init__(self, path):
-        content = path.read_bytes()
-        magic, version, size = struct.unpack("<4sII", content[:12])
-        assert (magic, version, size) == (b"glTF", 2, len(content))
-        chunks, place = [], 12
-        while place < size:
-            length, kind = struct.unpack("<I4s", content[place : place + 8])
-            assert length % 4 == 0
-            chunks.append((kind, content[place + 8 : place + 8 + length]))
-            place += 8 + length
-        (json_kind, text), (binary_kind, self.binary) = chunks
-        assert (json_kind, binary_kind) == (b"JSON", b"BIN\0")
-        self.document = json.loads(text)
-        assert self.document["buffers"] == [{"byteLength": len(self.binary)}]
-
-    def array(self, number):
-        accessor = self.document["accessors"][number]
-        view = self.document["bufferViews"][accessor["bufferView"]]
-        assert view["byteOffset"] % 4 == 0
-        start, end = view["byteOffset"], view["byteOffset"] + view["byteLength"]
-        array = np.frombuffer(self.binary[start:end], TYPES[accessor["componentType"]])
-        if accessor["type"] == "VEC3":
-            array = array.reshape(-1, 3)
-        assert len(array) == accessor["count"]
-        return array
-
-    @property
-    def mesh(self):
-        return self.document["meshes"][0]
-
-    def primitive(self, mode):
-        (found,) = (p for p in self.mesh["primitives"] if p["mode"] == mode)
-        return found
 
 
 @pytest.fixture
@@ -92,6 +53,7 @@ def validate():
     return issues
 
 
+@pytest.mark.subprocess
 @pytest.mark.parametrize(
     ("make", "options"),
     [
@@ -111,6 +73,7 @@ def test_the_validator_of_khronos_finds_nothing(validate, tmp_path, make, option
     assert issues["numErrors"] == issues["numWarnings"] == 0
 
 
+@pytest.mark.subprocess
 def test_the_validator_would_find_something(validate, tmp_path, monkeypatch):
     monkeypatch.setattr(_gltf, "vertex_normals", lambda mean, links: 2 * mean)
     path = tmp_path / "model.glb"

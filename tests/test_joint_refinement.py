@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
@@ -180,7 +181,7 @@ class TestOptimum:
         assert result.gradient_norm == pytest.approx(expected, rel=1e-6)
 
     @KINDS
-    @pytest.mark.parametrize("size", [0.0, 0.2])
+    @pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
         self.check(

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -13,33 +14,6 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
-
-
-def rotations(rng, n_frames, spread=0.6):
-    return Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3))).as_matrix()
-
-
-def affinity(rng):
-    """A stretch between 1/2 and 2 with any axes and handedness."""
-    left, right = (np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in "ab")
-    return left @ np.diag([0.5, 1.0, 2.0]) @ right
-
-
-def weak_perspective(rng, n_frames=30, scales=None):
-    scales = rng.uniform(1, 5, n_frames) if scales is None else scales
-    return np.asarray(scales)[:, None, None] * rotations(rng, n_frames)[:, :2]
-
-
-def lorentz_cameras(rng, n_frames=30):
-    """Rows that are orthonormal in the metric diag(1, 1, -1), which is indefinite."""
-    angle = rng.uniform(0, 2 * np.pi, n_frames)
-    boost = 0.5 * rng.standard_normal(n_frames)
-    turn = Rotation.from_euler("z", angle[:, None]).as_matrix()
-    squeeze = np.zeros((n_frames, 3, 3))
-    squeeze[:, 0, 0] = squeeze[:, 2, 2] = np.cosh(boost)
-    squeeze[:, 0, 2] = squeeze[:, 2, 0] = np.sinh(boost)
-    squeeze[:, 1, 1] = 1
-    return (squeeze @ turn)[:, :2]
 
 
 def rolled_and_scaled(rng, motion, scales=None):

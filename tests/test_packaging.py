@@ -4,6 +4,8 @@ import subprocess
 import sys
 from importlib import resources
 
+import pytest
+
 FOUND_AT_IMPORT = """
 import sys, sklearn.decomposition
 before = set(sys.modules)
@@ -13,6 +15,7 @@ print(*(set(sys.modules) - before))
 OWN_PARTS = ("baselines", "calibration", "cli", "datasets", "io", "metrics", "plotting")
 
 
+@pytest.mark.subprocess
 def test_import_brings_only_what_every_fit_needs():
     command = [sys.executable, "-W", "error", "-c", FOUND_AT_IMPORT]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -7,6 +7,7 @@ import pytest
 from isa_nrsfm import plotting
 
 
+@pytest.mark.subprocess
 def test_matplotlib_is_imported_only_to_draw():
     code = (
         "import sys, isa_nrsfm.plotting; "

@@ -1,6 +1,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from layers import slow_after
 from matplotlib.colors import to_rgba
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import NotFittedError
@@ -343,10 +344,16 @@ def test_arguments_are_keywords():
 @pytest.mark.parametrize(
     ("name", "n_components", "order", "origin"),
     [
-        ("ict_bu3dfe_like_68", 3, IBUG, "lower"),
-        ("muct_68", 3, XM2VTS, "upper"),
         ("shark_torresani", 1, None, "upper"),
-        ("shark_torresani", 2, None, "upper"),
+        *slow_after(
+            0,
+            [
+                ("ict_bu3dfe_like_68", 3, IBUG, "lower"),
+                ("muct_68", 3, XM2VTS, "upper"),
+                ("shark_torresani", 2, None, "upper"),
+            ],
+            together=True,
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

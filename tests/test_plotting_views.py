@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
+from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
-from test_metric import affinity, lorentz_cameras, rotations, weak_perspective
 
 from isa_nrsfm.plotting._views import viewing_transform
 

@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
+from groupings import GROUPINGS, energy_inside
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, random_rotation, spherical_sources
 from sklearn.exceptions import ConvergenceWarning
-from test_grouping import GROUPINGS, energy_inside
 
 from isa_nrsfm import PooledFastICA
 from isa_nrsfm._paper.factors import factorise

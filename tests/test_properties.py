@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator
@@ -12,7 +12,6 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA
 
-few_examples = settings(max_examples=25, deadline=None, derandomize=True, database=None)
 seeds = st.integers(0, 2**32 - 1)
 scaled = st.booleans()
 
@@ -79,7 +78,6 @@ def assert_same(model, expected, frames=slice(None), points=slice(None)):
 # --- invariances --------------------------------------------------------------------
 
 
-@few_examples
 @given(tables(), seeds, scaled, st.floats(-9, 9), st.booleans())
 def test_similarities_of_the_image(table, seed, scale_frames, exponent, mirrored):
     tracks, n_components = table
@@ -93,7 +91,6 @@ def test_similarities_of_the_image(table, seed, scale_frames, exponent, mirrored
     assert_allclose(second.inverse_snr_, first.inverse_snr_, rtol=1e-6)
 
 
-@few_examples
 @given(tables(), seeds)
 def test_similarities_of_single_frames(table, seed):
     tracks, n_components = table
@@ -107,7 +104,6 @@ def test_similarities_of_single_frames(table, seed):
     assert_allclose(alpha, first.alpha_, atol=1e-8 * np.abs(alpha).max())
 
 
-@few_examples
 @given(tables(), seeds, st.integers(0, 11), scaled)
 def test_rotation_of_one_frame(table, seed, frame, scale_frames):
     tracks, n_components = table
@@ -119,7 +115,6 @@ def test_rotation_of_one_frame(table, seed, frame, scale_frames):
     assert_same(second, first)
 
 
-@few_examples
 @given(tables(), seeds, scaled)
 def test_order_of_frames_and_points(table, seed, scale_frames):
     tracks, n_components = table
@@ -130,7 +125,6 @@ def test_order_of_frames_and_points(table, seed, scale_frames):
     assert_same(changed, first, frames, points)
 
 
-@few_examples
 @given(tables(), scaled)
 def test_layouts_are_two_ways_to_write_the_same(table, scale_frames):
     tracks, n_components = table
@@ -149,7 +143,6 @@ def test_layouts_are_two_ways_to_write_the_same(table, scale_frames):
 # --- formula ------------------------------------------------------------------------
 
 
-@few_examples
 @given(tables(), seeds, scaled)
 def test_tables_that_the_model_makes_are_taken_apart_again(table, seed, scale_frames):
     tracks, n_components = table
@@ -169,7 +162,6 @@ def test_tables_that_the_model_makes_are_taken_apart_again(table, seed, scale_fr
     assert_allclose(model.reproject(made), made, atol=1e-7 * np.abs(made).max())
 
 
-@few_examples
 @given(tables(), scaled)
 def test_fitted_table(table, scale_frames):
     tracks, n_components = table
@@ -193,7 +185,6 @@ def test_fitted_table(table, scale_frames):
 # --- degenerate tables --------------------------------------------------------------
 
 
-@few_examples
 @given(seeds, st.integers(1, 3), st.integers(1, 2), scaled)
 def test_tables_of_small_integers_give_finite_numbers(
     seed, largest, n_components, scale_frames
@@ -211,7 +202,6 @@ def test_tables_of_small_integers_give_finite_numbers(
         assert np.isfinite(model.reproject(tracks.reshape(len(tracks), -1))).all()
 
 
-@few_examples
 @given(seeds, st.integers(0, 4), st.integers(1, 3))
 def test_tables_of_low_rank_give_finite_numbers(seed, rank, n_components):
     rng = np.random.default_rng(seed)
@@ -229,7 +219,6 @@ def test_tables_of_low_rank_give_finite_numbers(seed, rank, n_components):
 # --- errors -------------------------------------------------------------------------
 
 
-@few_examples
 @given(st.integers(5, 12), st.integers(0, 20), seeds)
 def test_odd_numbers_of_columns_are_refused(n_frames, half, seed):
     X = np.random.default_rng(seed).normal(size=(n_frames, 2 * half + 3))
@@ -237,7 +226,6 @@ def test_odd_numbers_of_columns_are_refused(n_frames, half, seed):
         AffineNRSfM(1).fit(X)
 
 
-@few_examples
 @given(st.integers(2, 30), st.integers(1, 20), st.integers(1, 6), seeds)
 def test_tables_are_refused_if_and_only_if_they_are_too_small(
     n_frames, n_points, n_components, seed
@@ -260,7 +248,6 @@ def test_tables_are_refused_if_and_only_if_they_are_too_small(
         assert fit(tracks, n_components).basis_.shape == (n_components, n_points, 3)
 
 
-@few_examples
 @given(
     tables(),
     st.sampled_from([np.inf, -np.inf]),
@@ -279,7 +266,6 @@ def test_infinite_values_are_refused(table, value, frame, point, axis):
         model.transform(broken.reshape(len(broken), -1))
 
 
-@few_examples
 @given(
     tables(),
     st.sets(st.integers(0, 15), min_size=1),

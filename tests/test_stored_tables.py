@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 
 import isa_nrsfm._paper.sample as sampling
@@ -96,7 +97,7 @@ class TestFit:
             assert np.isnan(found[empty]).all()
             assert_array_equal(found[~empty], getattr(expected, name))
 
-    @pytest.mark.parametrize("missing", [0.0, 0.1])
+    @pytest.mark.parametrize("missing", slow_after(1, [0.1, 0.0]))
     def test_block_size_makes_no_difference(self, sampled, tmp_path, missing):
         X = table(missing)
         expected = estimator().fit(X)
@@ -107,7 +108,7 @@ class TestFit:
                 expected.score(X), rel=1e-8
             )
 
-    @pytest.mark.parametrize("n_points", [100, 400])
+    @pytest.mark.parametrize("n_points", slow_after(1, [100, 400]))
     def test_of_many_points(self, monkeypatch, tmp_path, n_points):
         # Shapes along directions, and with the more points a Krylov method, too.
         monkeypatch.setattr("isa_nrsfm._paper.svd.DENSE", 300)
@@ -116,7 +117,7 @@ class TestFit:
         got = estimator(working_memory=1).fit(memmap(X, tmp_path))
         assert_same_model(got, expected)
 
-    @pytest.mark.parametrize("kind", ["npy", "parquet"])
+    @pytest.mark.parametrize("kind", slow_after(1, ["npy", "parquet"]))
     def test_of_folders(self, tmp_path, kind):
         X = table(0.1)
         stored = folder(X, tmp_path, kind)
@@ -133,8 +134,19 @@ class TestFit:
         for name in OF_SHAPES + OF_FRAMES:
             assert_array_equal(getattr(one, name), getattr(two, name))
 
-    @pytest.mark.parametrize("scale_frames", [True, False])
-    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    @pytest.mark.parametrize(
+        ("layout", "scale_frames"),
+        slow_after(
+            1,
+            [
+                ("planar", False),
+                ("planar", True),
+                ("interleaved", False),
+                ("interleaved", True),
+            ],
+            together=True,
+        ),
+    )
     def test_of_other_layouts_and_weights(self, tmp_path, layout, scale_frames):
         X = table()
         if layout == "planar":

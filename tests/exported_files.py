@@ -1,0 +1,54 @@
+"""Readers of exported files: what is in them, by their specifications."""
+
+import json
+import re
+import struct
+
+import numpy as np
+
+TYPES = {5126: "<f4", 5123: "<u2", 5125: "<u4"}
+
+
+class Read:
+    """A .glb file, read as the specification has it."""
+
+    def __init__(self, path):
+        content = path.read_bytes()
+        magic, version, size = struct.unpack("<4sII", content[:12])
+        assert (magic, version, size) == (b"glTF", 2, len(content))
+        chunks, place = [], 12
+        while place < size:
+            length, kind = struct.unpack("<I4s", content[place : place + 8])
+            assert length % 4 == 0
+            chunks.append((kind, content[place + 8 : place + 8 + length]))
+            place += 8 + length
+        (json_kind, text), (binary_kind, self.binary) = chunks
+        assert (json_kind, binary_kind) == (b"JSON", b"BIN\0")
+        self.document = json.loads(text)
+        assert self.document["buffers"] == [{"byteLength": len(self.binary)}]
+
+    def array(self, number):
+        accessor = self.document["accessors"][number]
+        view = self.document["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        start, end = view["byteOffset"], view["byteOffset"] + view["byteLength"]
+        array = np.frombuffer(self.binary[start:end], TYPES[accessor["componentType"]])
+        if accessor["type"] == "VEC3":
+            array = array.reshape(-1, 3)
+        assert len(array) == accessor["count"]
+        return array
+
+    @property
+    def mesh(self):
+        return self.document["meshes"][0]
+
+    def primitive(self, mode):
+        (found,) = (p for p in self.mesh["primitives"] if p["mode"] == mode)
+        return found
+
+
+def content_of(path):
+    """Return the data on a page."""
+    text = path.read_text(encoding="utf-8")
+    pattern = r'<script type="application/json" id="model">(.*?)</script>'
+    return json.loads(re.search(pattern, text, re.DOTALL)[1])

@@ -1,0 +1,89 @@
+"""What a fit says of itself: reliabilities and information, by their definitions."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import eigvals
+
+from isa_nrsfm._diagnostics import reliabilities, weak_information
+
+
+def random_coefficients(seed, n_frames=50, n_components=3):
+    """Return coefficients and the mean of their covariances."""
+    rng = np.random.default_rng(seed)
+    alpha = rng.normal(size=(n_frames, n_components)) * [2.0, 1.0, 0.3]
+    factor = rng.normal(size=(n_components, n_components))
+    return alpha, 0.2 * factor @ factor.T
+
+
+class TestReliabilities:
+    @pytest.mark.parametrize("seed", range(3))
+    def test_are_shares_of_the_variance(self, seed):
+        alpha, covariance = random_coefficients(seed)
+        moment = sum(np.outer(a, a) for a in alpha) / len(alpha)
+        expected = np.sort(eigvals(moment, moment + covariance).real)[::-1]
+        assert_allclose(reliabilities(alpha, covariance), expected, rtol=1e-9)
+
+    def test_more_frames_alike_change_nothing(self):
+        alpha, covariance = random_coefficients(0)
+        expected = reliabilities(alpha, covariance)
+        found = reliabilities(np.tile(alpha, (7, 1)), covariance)
+        assert_allclose(found, expected, rtol=1e-9)
+
+    def test_known_coefficients_are_reliable(self):
+        alpha, _ = random_coefficients(0)
+        assert_allclose(reliabilities(alpha, np.zeros((3, 3))), 1.0, rtol=1e-9)
+
+    def test_directions_without_variance_have_none(self):
+        alpha, covariance = random_coefficients(0)
+        alpha[:, 1] = 0.0
+        covariance[1] = covariance[:, 1] = 0.0
+        found = reliabilities(alpha, covariance)
+        assert found[-1] == 0
+        kept = [0, 2]
+        expected = reliabilities(alpha[:, kept], covariance[np.ix_(kept, kept)])
+        assert_allclose(found[:2], expected, rtol=1e-9)
+
+
+class TestWeakInformation:
+    def test_is_what_cameras_and_coefficients_do_not_explain(self):
+        # By differences: images are linear in each of the unknowns.
+        rng = np.random.default_rng(0)
+        n_frames, n_points, n_components = 5, 9, 2
+        shapes = rng.normal(size=(n_components + 1, n_points, 3))
+        shapes -= shapes.mean(axis=1, keepdims=True)
+        motion = rng.normal(size=(n_frames, 2, 3))
+        alpha = rng.normal(size=(n_frames, n_components))
+
+        def images(M, t, a, V):
+            basis = shapes[1:] + np.stack([shapes[0] @ each.T for each in V])
+            return ((shapes[0] + np.tensordot(a, basis, 1)) @ M.T + t).ravel()
+
+        def changes(f, size):
+            return np.stack([f(e) - f(np.zeros(size)) for e in np.eye(size)], axis=1)
+
+        still = np.zeros((n_components, 3, 3))
+        expected = np.zeros((9 * n_components, 9 * n_components))
+        for M, a in zip(motion, alpha, strict=True):
+            free = np.hstack(
+                [
+                    changes(
+                        lambda x, M=M, a=a: images(
+                            M + x[:6].reshape(2, 3), x[6:8], a, still
+                        ),
+                        8,
+                    ),
+                    changes(
+                        lambda x, M=M, a=a: images(M, 0.0, a + x, still),
+                        n_components,
+                    ),
+                ]
+            )
+            strain = changes(
+                lambda x, M=M, a=a: images(M, 0.0, a, x.reshape(-1, 3, 3)),
+                9 * n_components,
+            )
+            rest = strain - free @ np.linalg.lstsq(free, strain)[0]
+            expected += rest.T @ rest
+        found = weak_information(shapes[0], shapes[1:], motion, alpha)
+        assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
