@@ -454,7 +454,7 @@ def _refined_jointly(
         float(table.sizes[0]) if options.camera == "orthographic" else None,
     )
     frames = frames._replace(gauge=gauge.frames)
-    shown = FrameFit.of_blocks(posteriors.map(frames.shown, table.sizes))
+    shown = FrameFit.from_blocks(posteriors.map(frames.shown, table.sizes))
     cameras = shown.motion / table.sizes[:, None, None]
     return Refined(
         _model(

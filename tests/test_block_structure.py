@@ -14,10 +14,10 @@ from scenes import (
 from isa_nrsfm._paper.block_structure import (
     BLOCK_RECOVERIES,
     LIFT_RIDGE,
-    frame_products,
     leading_blocks,
     lifted_blocks,
     lifted_moments,
+    motion_products,
     pack,
     packed_inner,
     recover_blocks,
@@ -82,7 +82,7 @@ def published_irls(scene, k, n_frames, n_iter=50):
 class TestProducts:
     def test_definitions(self):
         scene = structured_motion(0, noise=0.3)
-        products = frame_products(scene.rigid, scene.motion)
+        products = motion_products(scene.rigid, scene.motion)
         M_0 = scene.rigid.reshape(-1, 2, 3)
         for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
             assert_allclose(products.cross[i], M_0[i].T @ M_i, atol=1e-13)
@@ -92,14 +92,14 @@ class TestProducts:
     def test_rotated_products_are_those_of_the_rotated_motion(self):
         scene = structured_motion(0, noise=0.3)
         A = random_rotation(1, 9)
-        rotated = frame_products(scene.rigid, scene.motion).rotated(A.T)
-        expected = frame_products(scene.rigid, scene.motion @ A)
+        rotated = motion_products(scene.rigid, scene.motion).rotated(A.T)
+        expected = motion_products(scene.rigid, scene.motion @ A)
         for got, wanted in zip(rotated, expected, strict=True):
             assert_allclose(got, wanted, atol=1e-12)
 
     def test_blocks(self):
         scene = structured_motion(0, noise=0.3)
-        blocks = frame_products(scene.rigid, scene.motion).blocks()
+        blocks = motion_products(scene.rigid, scene.motion).blocks()
         assert blocks.shape == (3, 25, 9)
         for k in range(3):
             M_0, M = block(scene, k)
@@ -108,10 +108,10 @@ class TestProducts:
 
     def test_rotation_of_single_frames_changes_nothing(self):
         scene = structured_motion(0, noise=0.3)
-        rotated = frame_products(
+        rotated = motion_products(
             rotate_frames(scene.rigid, 1), rotate_frames(scene.motion, 1)
         )
-        expected = frame_products(scene.rigid, scene.motion)
+        expected = motion_products(scene.rigid, scene.motion)
         for got, wanted in zip(rotated, expected, strict=True):
             assert_allclose(got, wanted, atol=1e-12)
 
@@ -128,14 +128,14 @@ class TestAllMethods:
     @pytest.mark.parametrize("seed", range(5))
     def test_exact_data(self, method, seed):
         scene = structured_motion(seed)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
         assert D.shape == (3, 3, 3)
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(np.linalg.inv(scene.E)), atol=1e-8)
 
     def test_exact_data_say_the_coefficients(self, method):
         scene = structured_motion(0)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
         for k in range(3):
             M_0, M = block(scene, k)
             scale = np.sum((M @ D[k]) * M_0, axis=(1, 2)) / np.sum(M_0**2, axis=(1, 2))
@@ -146,9 +146,9 @@ class TestAllMethods:
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units(self, method, unit):
         scene = structured_motion(0, noise=0.3)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
         for factors in ((unit, unit), (1.0, unit), (unit, 1.0)):
-            products = frame_products(
+            products = motion_products(
                 factors[0] * scene.rigid, factors[1] * scene.motion
             )
             other = recover_blocks(products, method)
@@ -156,24 +156,24 @@ class TestAllMethods:
 
     def test_subspaces_are_separate(self, method):
         scene = structured_motion(0, noise=0.3)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
         for k in range(3):
             part = scene.motion[:, 3 * k : 3 * k + 3]
-            alone = recover_blocks(frame_products(scene.rigid, part), method)
+            alone = recover_blocks(motion_products(scene.rigid, part), method)
             assert_allclose(direction(alone)[0], direction(D)[k], atol=1e-10)
 
     def test_rotation_inside_a_subspace_turns_the_solution(self, method):
         scene = structured_motion(0, n_blocks=1, noise=0.3)
         R = random_rotation(1)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
-        turned = recover_blocks(frame_products(scene.rigid, scene.motion @ R), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
+        turned = recover_blocks(motion_products(scene.rigid, scene.motion @ R), method)
         assert_allclose(direction(R @ turned), direction(D), atol=1e-9)
 
     def test_subspace_without_motion(self, method):
         scene = structured_motion(0, noise=0.3)
         motion = scene.motion.copy()
         motion[:, 3:6] = 0
-        D = recover_blocks(frame_products(scene.rigid, motion), method)
+        D = recover_blocks(motion_products(scene.rigid, motion), method)
         assert_array_equal(D[1], 0)
         assert_allclose(np.linalg.norm(D[[0, 2]], axis=(1, 2)), 1)
 
@@ -182,7 +182,7 @@ class TestAllMethods:
         scene = structured_motion(0, noise=0.3)
         motion = scene.motion.copy()
         motion[:, n_moving:3] = 0
-        D = recover_blocks(frame_products(scene.rigid, motion), method)
+        D = recover_blocks(motion_products(scene.rigid, motion), method)
         assert np.isfinite(D).all()
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
 
@@ -191,7 +191,7 @@ class TestAllMethods:
         scene = structured_motion(0, noise=0.3)
         rigid = scene.rigid.copy()
         rigid[:, 3 - n_flat :] = 0
-        D = recover_blocks(frame_products(rigid, scene.motion), method)
+        D = recover_blocks(motion_products(rigid, scene.motion), method)
         assert np.isfinite(D).all()
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
 
@@ -199,17 +199,17 @@ class TestAllMethods:
         scene = structured_motion(0, noise=0.3)
         rigid = scene.rigid.copy()
         rigid[:6] = 0  # the first frame is one of them
-        D = recover_blocks(frame_products(rigid, scene.motion), method)
+        D = recover_blocks(motion_products(rigid, scene.motion), method)
         assert np.isfinite(D).all()
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
 
     def test_repeated_frames(self, method):
         scene = structured_motion(0, n_frames=12, noise=0.3)
         rigid, motion = np.tile(scene.rigid, (3, 1)), np.tile(scene.motion, (3, 1))
-        D = recover_blocks(frame_products(rigid, motion), method)
+        D = recover_blocks(motion_products(rigid, motion), method)
         assert np.isfinite(D).all()
         if method != "irls":  # which holds one of the three equal frames only
-            once = recover_blocks(frame_products(scene.rigid, scene.motion), method)
+            once = recover_blocks(motion_products(scene.rigid, scene.motion), method)
             assert_allclose(direction(D), direction(once), atol=1e-10)
 
 
@@ -217,7 +217,7 @@ class TestSingleMethods:
     @pytest.mark.parametrize("seed", range(3))
     def test_eigen_has_the_least_constrained_cost(self, seed):
         scene = structured_motion(seed, noise=0.5)
-        products = frame_products(scene.rigid, scene.motion)
+        products = motion_products(scene.rigid, scene.motion)
         solutions = {m: recover_blocks(products, m) for m in BLOCK_RECOVERIES}
         random = np.random.default_rng(seed).normal(size=(50, 3, 3))
         for k in range(3):
@@ -229,7 +229,7 @@ class TestSingleMethods:
     @pytest.mark.parametrize("seed", range(3))
     def test_generalized_eigen_explains_the_largest_share(self, seed):
         scene = structured_motion(seed, noise=0.5)
-        products = frame_products(scene.rigid, scene.motion)
+        products = motion_products(scene.rigid, scene.motion)
         solutions = {m: recover_blocks(products, m) for m in BLOCK_RECOVERIES}
         random = np.random.default_rng(seed).normal(size=(50, 3, 3))
         for k in range(3):
@@ -244,7 +244,7 @@ class TestSingleMethods:
     )
     def test_gradient_vanishes(self, method, objective):
         scene = structured_motion(0, noise=0.5)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)[1]
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)[1]
         value = objective(scene, 1, D)
         for step in 1e-5 * np.eye(9).reshape(9, 3, 3):
             slope = objective(scene, 1, D + step) - objective(scene, 1, D - step)
@@ -255,14 +255,14 @@ class TestSingleMethods:
         scene = structured_motion(0, noise=0.5)
         rigid, _ = permute_frames(scene.rigid, 1)
         motion, _ = permute_frames(scene.motion, 1)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), method)
-        permuted = recover_blocks(frame_products(rigid, motion), method)
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
+        permuted = recover_blocks(motion_products(rigid, motion), method)
         assert_allclose(direction(permuted), direction(D), atol=1e-10)
 
     @pytest.mark.parametrize("seed", range(3))
     def test_irls_is_the_fixed_point_of_the_published_iteration(self, seed):
         scene = structured_motion(seed, noise=0.5)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), "irls")
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), "irls")
         published = np.array([published_irls(scene, k, 25) for k in range(3)])
         assert_allclose(np.linalg.norm(published, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(published), atol=1e-9)
@@ -270,15 +270,15 @@ class TestSingleMethods:
     def test_irls_depends_on_the_first_frame(self):
         scene = structured_motion(0, noise=0.5)
         rigid, motion = np.roll(scene.rigid, 2, axis=0), np.roll(scene.motion, 2, 0)
-        D = recover_blocks(frame_products(scene.rigid, scene.motion), "irls")
-        rolled = recover_blocks(frame_products(rigid, motion), "irls")
+        D = recover_blocks(motion_products(scene.rigid, scene.motion), "irls")
+        rolled = recover_blocks(motion_products(rigid, motion), "irls")
         assert np.abs(direction(rolled) - direction(D)).max() > 1e-3
 
     def test_irls_where_the_first_frame_says_nothing(self):
         scene = structured_motion(0, noise=0.5)
         motion = scene.motion.copy()
         motion[:2] = 0
-        products = frame_products(scene.rigid, motion)
+        products = motion_products(scene.rigid, motion)
         expected = recover_blocks(products, "generalized_eigen")
         assert_allclose(recover_blocks(products, "irls"), expected)
 
@@ -286,7 +286,7 @@ class TestSingleMethods:
         scene = structured_motion(0, n_blocks=1, noise=0.5)
         R = random_rotation(3)
         motion = (scene.motion * [1.0, 0.5, 0.0]) @ R
-        D = recover_blocks(frame_products(scene.rigid, motion), "generalized_eigen")[0]
+        D = recover_blocks(motion_products(scene.rigid, motion), "generalized_eigen")[0]
         assert_allclose(R[2] @ D, 0, atol=1e-12)
 
     @pytest.mark.parametrize("scale_frames", [True, False])
@@ -296,7 +296,7 @@ class TestSingleMethods:
         W = measurements(load_data("shark_torresani")["W2d"], scale_frames)
         f = factorise(W, 1)
         scene = structured_motion(0)._replace(rigid=f.rigid_motion, motion=f.motion)
-        products = frame_products(f.rigid_motion, f.motion)
+        products = motion_products(f.rigid_motion, f.motion)
         D = {m: recover_blocks(products, m)[0] for m in BLOCK_RECOVERIES}
         energy = np.sum(f.motion**2)
         assert constrained_cost(scene, 0, D["eigen"]) < 1e-20 * energy
@@ -325,13 +325,13 @@ class TestLiftedMotion:
 
     def test_moments_by_plain_loops(self):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         L = self.lifted(scene.rigid, scene.motion)
         assert_allclose(moments, np.einsum("iam,ibn->abmn", L, L), atol=1e-12)
 
     def test_blocks_are_moments_of_the_turned_lifted_motion(self):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         subspaces = random_rotation(1, 9).reshape(3, 3, 9)
         L = self.lifted(scene.rigid, scene.motion)
         got = lifted_blocks(moments, subspaces)
@@ -341,7 +341,7 @@ class TestLiftedMotion:
 
     def test_leading_blocks_are_eigenvectors_by_decreasing_eigenvalue(self):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         subspaces = random_rotation(1, 9).reshape(3, 3, 9)
         E = leading_blocks(moments, subspaces, 3)
         assert E.shape == (3, 3, 3, 3)
@@ -353,7 +353,7 @@ class TestLiftedMotion:
 
     def test_energies_are_the_largest_eigenvalues(self):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         subspaces = random_rotation(1, 9).reshape(3, 3, 9)
         E = leading_blocks(moments, subspaces, 1).reshape(3, 9)
         blocks = lifted_blocks(moments, subspaces)
@@ -364,7 +364,7 @@ class TestLiftedMotion:
 
     def test_energies_do_not_depend_on_the_basis_of_a_subspace(self):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         subspaces = random_rotation(1, 9).reshape(3, 3, 9)
         turned = random_rotation(2) @ subspaces
         assert_allclose(
@@ -373,7 +373,7 @@ class TestLiftedMotion:
 
     def test_true_subspaces_have_more_structure_than_random_ones(self):
         scene = structured_motion(0, n_frames=100)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         true = structure_energies(moments, np.eye(9).reshape(3, 3, 9)).sum()
         for seed in range(30):
             random = random_rotation(seed, 9).reshape(3, 3, 9)
@@ -381,7 +381,7 @@ class TestLiftedMotion:
 
     def test_leading_block_is_nearly_the_true_one(self):
         scene = structured_motion(0, n_frames=200)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
         E = leading_blocks(moments, np.eye(9).reshape(3, 3, 9), 1)[:, 0]
         cosine = np.sum(E * scene.E, axis=(1, 2)) / np.linalg.norm(scene.E, axis=(1, 2))
         assert np.abs(cosine).min() > 0.95
@@ -389,15 +389,15 @@ class TestLiftedMotion:
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units(self, unit):
         scene = structured_motion(0, noise=0.3)
-        moments = lifted_moments(frame_products(scene.rigid, scene.motion))
-        other = lifted_moments(frame_products(unit * scene.rigid, unit * scene.motion))
+        moments = lifted_moments(motion_products(scene.rigid, scene.motion))
+        other = lifted_moments(motion_products(unit * scene.rigid, unit * scene.motion))
         assert_allclose(other, moments, atol=1e-12)
 
     def test_flat_rigid_object_and_frames_that_do_not_see_it(self):
         scene = structured_motion(0, noise=0.3)
         rigid = scene.rigid * [1.0, 1.0, 0.0]
         rigid[:4] = 0
-        moments = lifted_moments(frame_products(rigid, scene.motion))
+        moments = lifted_moments(motion_products(rigid, scene.motion))
         assert np.isfinite(moments).all()
         E = leading_blocks(moments, np.eye(9).reshape(3, 3, 9), 2)
         assert_allclose(np.linalg.norm(E, axis=(2, 3)), 1)

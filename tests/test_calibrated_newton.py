@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames import calibrated_newton as module
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.point_sums import frame_products, frame_tracks
+from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
 from isa_nrsfm._linalg.packed_symmetric import unpacked
 
@@ -113,7 +113,7 @@ def problem_of(scene, camera, noise):
     search = CalibratedSearch(scene.shapes, cameras.scaled)
     seen = np.isfinite(scene.tracks[..., 0])
     weights = None if seen.all() else 1.0 * seen
-    products = frame_products(frame_tracks(scene.tracks, weights), search.shapes)
+    products = frame_sums(frame_tracks(scene.tracks, weights), search.shapes)
     problem = module._problem(products, np.full(len(scene.tracks), noise), cameras)
     axes = search.cameras(np.eye(3)[None])[0].T
     motion = np.ascontiguousarray((scene.motion @ axes).transpose(1, 2, 0))
@@ -565,7 +565,7 @@ class TestReversal:
 
     def search(self, scene, camera, noise, motion):
         search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
-        products = frame_products(frame_tracks(scene.tracks), search.shapes)
+        products = frame_sums(frame_tracks(scene.tracks), search.shapes)
         return search.reversed_cameras(products, noise, motion)
 
     @BOTH

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scenes import random_rotation
 
 from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
-from isa_nrsfm._frames.point_sums import frame_products, frame_tracks
+from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
 
 NOISE = 0.05
@@ -22,7 +22,7 @@ class Scene(NamedTuple):
     weights: NDArray | None
 
     def posterior(self, noise=NOISE, **options):
-        products = frame_products(frame_tracks(self.tracks, self.weights), self.shapes)
+        products = frame_sums(frame_tracks(self.tracks, self.weights), self.shapes)
         return coefficient_posterior(products, self.motion, noise, **options)
 
 

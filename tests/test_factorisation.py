@@ -242,7 +242,9 @@ class TestLargeBothWays:
         W = low_rank(0, 8, *size) + 1e-2 * centred_matrix(1, *size)
         frames = W.reshape(len(W) // 2, 2, -1)
         expected = leading_triplets(W, 5)
-        found = block_triplets(MemoryBlocks.of(frames, block_frames), W.shape, 5)
+        found = block_triplets(
+            MemoryBlocks.from_array(frames, block_frames), W.shape, 5
+        )
         assert_allclose(found.values, expected.values, rtol=1e-7)
         assert_allclose(found.rest, expected.rest, rtol=1e-6)
         signs = np.sign(np.vecdot(found.vectors, expected.vectors))

@@ -11,8 +11,10 @@ N_FRAMES = 23
 
 def blocks_of(kind, array, length):
     if kind == "stored":
-        return StoredBlocks.of(array, length)
-    return MemoryBlocks.of(array, length, n_threads=3 if kind == "threads" else 1)
+        return StoredBlocks.from_table(array, length)
+    return MemoryBlocks.from_array(
+        array, length, n_threads=3 if kind == "threads" else 1
+    )
 
 
 @pytest.fixture(params=["memory", "threads", "stored"])
@@ -77,13 +79,13 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
         calls.append(len(block))
         return block
 
-    stored = StoredBlocks.of(array, 10).derive(recorded)
+    stored = StoredBlocks.from_table(array, 10).derive(recorded)
     assert calls == []
     list(stored.map(len))
     stored.whole()
     assert calls == [10, 10, 3] * 2
     calls.clear()
-    kept = MemoryBlocks.of(array, 10).derive(recorded)
+    kept = MemoryBlocks.from_array(array, 10).derive(recorded)
     kept.whole()
     assert calls == [10, 10, 3]
 
@@ -95,7 +97,7 @@ def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
         calls.append(len(block))
         return block
 
-    stored = StoredBlocks.of(array, 4).derive(recorded)
+    stored = StoredBlocks.from_table(array, 4).derive(recorded)
     frames = np.isin(np.arange(N_FRAMES), [0, 22])
     assert_array_equal(stored.kept(frames).whole(), array[frames])
     assert max(calls) == 4
@@ -103,7 +105,7 @@ def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
 def test_small_blocks_are_regrouped(array, n_frames, lengths):
-    blocks = MemoryBlocks.of(array, 3)
+    blocks = MemoryBlocks.from_array(array, 3)
     larger = blocks.regrouped(np.concatenate, n_frames)
     assert larger.lengths == lengths
     assert_array_equal(larger.whole(), array)
@@ -114,11 +116,11 @@ def test_an_error_in_a_thread_is_raised(array):
         raise ValueError("no good")
 
     with pytest.raises(ValueError, match="no good"):
-        list(MemoryBlocks.of(array, 2, n_threads=2).map(fail))
+        list(MemoryBlocks.from_array(array, 2, n_threads=2).map(fail))
 
 
 def test_no_frames():
-    blocks = MemoryBlocks.of(np.empty((0, 4)), 5)
+    blocks = MemoryBlocks.from_array(np.empty((0, 4)), 5)
     (got,) = blocks.gather(lambda b: (b,), ((4,),), np.float32)
     assert got.shape == (0, 4)
     assert got.dtype == np.float32

@@ -8,7 +8,7 @@ from scenes import random_rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames import affine_newton, posterior
-from isa_nrsfm._frames.point_sums import frame_products, frame_tracks, whitened
+from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks, whitened
 from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._linalg.packed_symmetric import unpacked
 
@@ -64,7 +64,7 @@ def assert_same_fits(got, expected, atol=1e-9):
 def problem_of(tracks, shapes, variance, weights=None):
     """Return the module's inner problem, in the coordinates of white shapes."""
     white, _ = whitened(shapes)
-    products = frame_products(frame_tracks(tracks, weights), white)
+    products = frame_sums(frame_tracks(tracks, weights), white)
     variance = np.full(len(tracks), variance)
     return affine_newton._problem(products, variance, shapes.shape[2])
 

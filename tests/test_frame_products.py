@@ -8,7 +8,7 @@ from isa_nrsfm._frames.point_sums import (
     FrameGram,
     SharedGram,
     determines_camera,
-    frame_products,
+    frame_sums,
     frame_tracks,
     whitened,
 )
@@ -42,7 +42,7 @@ def plain_gram(shapes, weights):
 class TestProducts:
     def test_by_definition(self):
         tracks, shapes, weights = random_problem(0)
-        products = frame_products(frame_tracks(tracks, weights), shapes)
+        products = frame_sums(frame_tracks(tracks, weights), shapes)
         first, second = pair_indices(3)
         for i, w in enumerate(weights):
             mean = w @ tracks[i] / w.sum()
@@ -59,8 +59,8 @@ class TestProducts:
 
     def test_complete_frames_share_a_gram_matrix(self):
         tracks, shapes, weights = random_problem(0)
-        shared = frame_products(frame_tracks(tracks), shapes)
-        own = frame_products(frame_tracks(tracks, np.ones_like(weights)), shapes)
+        shared = frame_sums(frame_tracks(tracks), shapes)
+        own = frame_sums(frame_tracks(tracks, np.ones_like(weights)), shapes)
         assert isinstance(shared.gram, SharedGram)
         assert isinstance(own.gram, FrameGram)
         pairs = np.broadcast_to(shared.gram.pairs[..., None], own.gram.pairs.shape)
@@ -72,16 +72,16 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         hidden = np.where(weights[..., None] == 0, np.nan, tracks)
         hidden[0, 0, 0], weights[0, 0] = np.inf, 0.0
-        got = frame_products(frame_tracks(hidden, weights), shapes)
+        got = frame_sums(frame_tracks(hidden, weights), shapes)
         tracks[0, 0] = 5.0
-        expected = frame_products(frame_tracks(tracks, weights), shapes)
+        expected = frame_sums(frame_tracks(tracks, weights), shapes)
         assert_array_equal(got.cross, expected.cross)
         assert_array_equal(got.energy, expected.energy)
 
     def test_frame_without_points(self):
         tracks, shapes, weights = random_problem(0)
         tracks[1], weights[1] = np.nan, 0.0
-        products = frame_products(frame_tracks(tracks, weights), shapes)
+        products = frame_sums(frame_tracks(tracks, weights), shapes)
         for each in (products.cross, products.centroid, products.gram.pairs):
             assert_array_equal(each[..., 1], 0)
             assert np.isfinite(each).all()
@@ -89,9 +89,9 @@ class TestProducts:
     def test_position_of_the_tracks(self):
         tracks, shapes, weights = random_problem(0)
         for w in (None, weights):
-            here = frame_products(frame_tracks(tracks, w), shapes)
+            here = frame_sums(frame_tracks(tracks, w), shapes)
             moved = tracks + np.array([1e3, -1e4])
-            there = frame_products(frame_tracks(moved, w), shapes)
+            there = frame_sums(frame_tracks(moved, w), shapes)
             assert_allclose(there.cross, here.cross, atol=1e-10)
             assert_allclose(there.energy, here.energy, rtol=1e-10)
 
@@ -99,11 +99,11 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         for w in (None, weights):
             columns = None if w is None else np.asfortranarray(w)
-            got = frame_products(
+            got = frame_sums(
                 frame_tracks(np.asfortranarray(tracks), columns),
                 np.asfortranarray(shapes),
             )
-            expected = frame_products(frame_tracks(tracks, w), shapes)
+            expected = frame_sums(frame_tracks(tracks, w), shapes)
             assert_array_equal(got.cross, expected.cross)
             assert_array_equal(got.gram.pairs, expected.gram.pairs)
 
@@ -112,9 +112,9 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         some = np.array([4, 1, 1])
         w = weights if weighted else None
-        taken = frame_products(frame_tracks(tracks, w), shapes).take(some)
+        taken = frame_sums(frame_tracks(tracks, w), shapes).take(some)
         w = weights[some] if weighted else None
-        expected = frame_products(frame_tracks(tracks[some], w), shapes)
+        expected = frame_sums(frame_tracks(tracks[some], w), shapes)
         for got, want in zip(taken, expected, strict=True):
             if isinstance(got, np.ndarray):
                 assert_allclose(got, want, rtol=1e-13, atol=1e-14)
@@ -129,7 +129,7 @@ class TestGram:
             weights = np.ones_like(weights)
         given = frame_tracks(tracks, weights if weighted else None)
         plain = np.stack([plain_gram(shapes, w) for w in weights], axis=-1)
-        return frame_products(given, shapes).gram, plain
+        return frame_sums(given, shapes).gram, plain
 
     def test_products(self, weighted):
         gram, G = self.gram(weighted)
@@ -195,7 +195,7 @@ class TestDeterminesCamera:
     def answer(self, shapes, weights):
         white, _ = whitened(shapes)
         tracks = np.zeros((*weights.shape, 2))
-        products = frame_products(frame_tracks(tracks, weights), white)
+        products = frame_sums(frame_tracks(tracks, weights), white)
         return determines_camera(products, white[0])
 
     def test_number_of_points(self):

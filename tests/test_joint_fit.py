@@ -60,7 +60,7 @@ def with_gaps(tracks, share=0.1):
 def rows_of(tracks):
     """Return tracks in blocks, as the table's stage does."""
     rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
-    return MemoryBlocks.of(rows, 64)
+    return MemoryBlocks.from_array(rows, 64)
 
 
 def fitted(

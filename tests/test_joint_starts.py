@@ -246,8 +246,8 @@ class TestLiftedShapes:
 
 
 def problem_of(scene, to_the_end=True):
-    rows = MemoryBlocks.of(scene.rows, 64)
-    frames = JointFrames.of_points(rows, True)
+    rows = MemoryBlocks.from_array(scene.rows, 64)
+    frames = JointFrames.from_points(rows, True)
     return JointProblem(frames, Steps(1000, 0.01, to_the_end=to_the_end), 0.0)
 
 

@@ -13,9 +13,9 @@ from scenes import (
 
 from isa_nrsfm._paper.alternating import _state, _steps, refine_alternating
 from isa_nrsfm._paper.block_structure import (
-    frame_products,
     leading_blocks,
     lifted_moments,
+    motion_products,
     recover_blocks,
 )
 from isa_nrsfm._paper.factors import factorise
@@ -67,7 +67,7 @@ def random_starts(seed, n_blocks, n_starts=1):
 
 
 def refine(rigid, motion, starts, max_iter=500, tol=1e-14):
-    products = frame_products(rigid, motion)
+    products = motion_products(rigid, motion)
     return refine_alternating(products, starts, max_iter=max_iter, tol=tol)
 
 
@@ -179,7 +179,7 @@ class TestDerivatives:
     def setup_method(self):
         scene = structured_motion(1, n_frames=40, n_blocks=1, noise=0.3)
         self.M_0, self.M = frames(scene.rigid, scene.motion)
-        products = frame_products(scene.rigid, scene.motion)
+        products = motion_products(scene.rigid, scene.motion)
         self.P, self.rigid = products.blocks()[0], products.rigid
         self.optimum = refine(scene.rigid, scene.motion, random_starts(0, 1, 4)).E[0]
         self.near = self.optimum + 0.05 * random_starts(1, 1)[0, 0]
@@ -352,7 +352,7 @@ class TestDegenerate:
 
     def test_shark_reaches_the_best_of_random_starts(self, load_data):
         f = factorise(measurements(load_data("shark_torresani")["W2d"], False), 1)
-        products = frame_products(f.rigid_motion, f.motion)
+        products = motion_products(f.rigid_motion, f.motion)
         D = recover_blocks(products, "generalized_eigen")
         start = np.linalg.pinv(D, rcond=1e-9)[:, None]
         result = refine_alternating(products, start, max_iter=200, tol=1e-10)
@@ -380,7 +380,7 @@ def test_starts_of_the_pipeline_against_random_ones(
     # The energy has mild local maxima: the few starts may miss one per cent of it.
     W = measurements(load_data(name)["W2d"][::step])
     f = factorise(W, K)
-    products = frame_products(f.rigid_motion, f.motion)
+    products = motion_products(f.rigid_motion, f.motion)
     isa = PooledFastICA(n_init=2, random_state=0)
     components = isa.fit(f.signals.T, covariance=products.gram).components_
     U, _, Vt = np.linalg.svd(components)

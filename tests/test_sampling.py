@@ -25,7 +25,7 @@ def matrix(n_frames, n_points=20):
 
 
 def sample(W, block_frames=64):
-    rows = MemoryBlocks.of(W.reshape(len(W) // 2, 2, -1), block_frames)
+    rows = MemoryBlocks.from_array(W.reshape(len(W) // 2, 2, -1), block_frames)
     return sample_frames(rows, W.shape[1], factorise(W, 2).rigid_shape)
 
 

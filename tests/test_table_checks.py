@@ -75,7 +75,7 @@ def checked(tracks, *options):
     seen = ~np.isnan(tracks).any(axis=2)
     for length in (len(seen), 7):
         blocks = [seen[start : start + length] for start in range(0, len(seen), length)]
-        report = PointReport.merged([PointReport.of(block) for block in blocks])
+        report = PointReport.merged([PointReport.from_seen(block) for block in blocks])
         check_points(report, seen.sum(axis=1), *options)
 
 

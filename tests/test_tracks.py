@@ -258,7 +258,7 @@ class TestFrames:
         assert usable_frames(tracks).all()
         check_frames(report_frames(tracks), tracks.shape[1])
         seen = ~np.isnan(tracks).any(axis=2)
-        check_points(PointReport.of(seen), seen.sum(axis=1), 9)
+        check_points(PointReport.from_seen(seen), seen.sum(axis=1), 9)
 
 
 class TestMeasurementMatrix:

@@ -13,8 +13,8 @@ from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, fit_jointly
 from isa_nrsfm._paper.alternating import refine_alternating
 from isa_nrsfm._paper.block_structure import (
-    frame_products,
     lifted_moments,
+    motion_products,
     recover_blocks,
     structure_energies,
 )
@@ -181,7 +181,7 @@ class SubspacesFastISA(Stage):
 class SubspacesPooled(Stage):
     def prepare(self):
         factors = self.factors
-        products = frame_products(factors.rigid_motion, factors.motion)
+        products = motion_products(factors.rigid_motion, factors.motion)
         n_rows, n_points = self.W.shape
         self.covariance = products.gram * n_points / n_rows
         self.criterion = partial(structure_energies, lifted_moments(products))
@@ -204,7 +204,7 @@ class Blocks(Stage):
 
     def prepare(self):
         factors = self.factors
-        products = frame_products(factors.rigid_motion, factors.motion)
+        products = motion_products(factors.rigid_motion, factors.motion)
         self.products = products.rotated(self.isa.components_)
 
     def run(self):

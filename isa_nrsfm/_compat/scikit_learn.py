@@ -124,9 +124,11 @@ def check_parameters(estimator: Any) -> None:
     ValueError
         If a parameter is not what it may be.
     """
+    if not hasattr(estimator, "_parameter_constraints"):
+        return
     if hasattr(estimator, "_validate_params"):
         estimator._validate_params()
-    elif hasattr(estimator, "_parameter_constraints"):
+    else:
         name = type(estimator).__name__
         constraints = estimator._parameter_constraints
         check_values(constraints, estimator.get_params(deep=False), name)

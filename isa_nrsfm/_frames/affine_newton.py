@@ -26,7 +26,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameGram, FrameProducts, SharedGram, whitened
+from isa_nrsfm._frames.point_sums import FrameGram, FrameSums, SharedGram, whitened
 from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
@@ -80,7 +80,7 @@ class AffineSearch:
 
     def fit(
         self,
-        products: FrameProducts,
+        products: FrameSums,
         variance: NDArray,
         n_points: float,
         initial: NDArray,
@@ -91,7 +91,7 @@ class AffineSearch:
 
         Parameters
         ----------
-        products : FrameProducts
+        products : FrameSums
             Sums of the frames for `shapes`.
         variance : ndarray of shape (n_frames,)
             Noise variances.
@@ -122,7 +122,7 @@ class AffineSearch:
         )
 
     def rough_cameras(
-        self, products: FrameProducts, variance: NDArray, n_points: float
+        self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (2, 3, n_frames) by two steps from coefficients of zero."""
         problem = _problem(products, variance, n_points)
@@ -153,7 +153,7 @@ class _Problem(NamedTuple):
         )
 
 
-def _problem(products: FrameProducts, variance: NDArray, n_points: float) -> _Problem:
+def _problem(products: FrameSums, variance: NDArray, n_points: float) -> _Problem:
     """Return the problem with its ridges, each relative to the frame."""
     energy, weight = products.energy, products.weight
     ridge = np.maximum(variance, RIDGE * energy)

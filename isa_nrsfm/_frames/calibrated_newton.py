@@ -33,7 +33,7 @@ from isa_nrsfm._frames.coefficients import (
     CoefficientPosterior,
     coefficient_posterior,
 )
-from isa_nrsfm._frames.point_sums import FLAT, FrameProducts
+from isa_nrsfm._frames.point_sums import FLAT, FrameSums
 from isa_nrsfm._frames.search import MAX_STEPS, FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
@@ -98,7 +98,7 @@ class CalibratedSearch:
 
     def fit(
         self,
-        products: FrameProducts,
+        products: FrameSums,
         variance: NDArray,
         n_points: float,
         initial: NDArray,
@@ -109,7 +109,7 @@ class CalibratedSearch:
 
         Parameters
         ----------
-        products : FrameProducts
+        products : FrameSums
             Sums of the frames for `shapes`.
         variance : ndarray of shape (n_frames,)
             Noise variances.
@@ -134,14 +134,14 @@ class CalibratedSearch:
         return _found(problem, motion, converged)
 
     def reversed_cameras(
-        self, products: FrameProducts, noise: float, motion: NDArray
+        self, products: FrameSums, noise: float, motion: NDArray
     ) -> tuple[NDArray, NDArray]:
         """
         Return the cameras that frames reach from reversed ones, where they are better.
 
         Parameters
         ----------
-        products : FrameProducts
+        products : FrameSums
             Sums of the frames for `shapes`.
         noise : float
             Noise variance.
@@ -165,7 +165,7 @@ class CalibratedSearch:
         return motion, better
 
     def rough_cameras(
-        self, products: FrameProducts, variance: NDArray, n_points: float
+        self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (2, 3, n_frames) by a few steps from coefficients of zero."""
         problem = _problem(products, variance, self._models)
@@ -177,7 +177,7 @@ class CalibratedSearch:
 class _Problem(NamedTuple):
     """What the search for n frames needs."""
 
-    products: FrameProducts
+    products: FrameSums
     noise: NDArray  # s2, not zero (n,)
     cameras: CalibratedCameras
 
@@ -188,7 +188,7 @@ class _Problem(NamedTuple):
 
 
 def _problem(
-    products: FrameProducts, variance: NDArray, cameras: CalibratedCameras
+    products: FrameSums, variance: NDArray, cameras: CalibratedCameras
 ) -> _Problem:
     """Return the problem, with a noise that is not zero."""
     noise = np.maximum(variance, RIDGE * products.energy)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameProducts
+from isa_nrsfm._frames.point_sums import FrameSums
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
     ROWS,
@@ -80,7 +80,7 @@ def camera_gram(motion: NDArray) -> NDArray:
 
 
 def coefficient_posterior(
-    products: FrameProducts,
+    products: FrameSums,
     motion: NDArray,
     noise: NDArray | float,
     *,
@@ -91,7 +91,7 @@ def coefficient_posterior(
 
     Parameters
     ----------
-    products : FrameProducts
+    products : FrameSums
         Sums of the frames for the shapes.
     motion : ndarray of shape (2, 3, n_frames)
         Cameras.

@@ -62,7 +62,7 @@ class FrameFit(NamedTuple):
         return type(self)(*(part.astype(dtype, copy=False) for part in self))
 
     @classmethod
-    def of_blocks(cls, parts: "Iterable[FrameFit]") -> "FrameFit":
+    def from_blocks(cls, parts: "Iterable[FrameFit]") -> "FrameFit":
         """Return the fits of consecutive blocks of frames as one."""
         parts = list(parts)
         if len(parts) == 1:
@@ -147,10 +147,10 @@ class RigidFrames(NamedTuple):
         """Return the fit of complete frames."""
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
-        motion, alpha = self.of_rows(W)
+        motion, alpha = self.fit_rows(W)
         return motion, translation, alpha
 
-    def of_rows(self, W: NDArray) -> tuple[NDArray, NDArray]:
+    def fit_rows(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """
         Return cameras and coefficients of complete frames.
 

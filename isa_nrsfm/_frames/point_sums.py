@@ -180,7 +180,7 @@ class FrameTracks(NamedTuple):
         )
 
 
-class FrameProducts(NamedTuple):
+class FrameSums(NamedTuple):
     """
     Sums over the points of frames, with weights w_ij.
 
@@ -278,9 +278,9 @@ def shared_gram(shapes: NDArray) -> SharedGram:
     return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
 
 
-def frame_products(
+def frame_sums(
     tracks: FrameTracks, shapes: NDArray, gram: SharedGram | None = None
-) -> FrameProducts:
+) -> FrameSums:
     """
     Return the sums over the points of frames.
 
@@ -295,7 +295,7 @@ def frame_products(
 
     Returns
     -------
-    FrameProducts
+    FrameSums
         With a `SharedGram` where all weights are 1, a `FrameGram` otherwise.
     """
     weighted, W, centroid, weight, energy = tracks
@@ -305,13 +305,13 @@ def frame_products(
     if W is None:
         means = np.zeros((n_shapes, 3, len(weight)))
         shared = shared_gram(shapes) if gram is None else gram
-        return FrameProducts(cross, shared, means, centroid, weight, energy)
+        return FrameSums(cross, shared, means, centroid, weight, energy)
     means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
     products = _pair_products(rows.reshape(shapes.shape))
     pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
     # The rows are centred over all points, so that little is subtracted.
     pairs -= _pair_products(means * np.sqrt(weight))
-    return FrameProducts(cross, FrameGram(pairs), means, centroid, weight, energy)
+    return FrameSums(cross, FrameGram(pairs), means, centroid, weight, energy)
 
 
 def _pair_products(rows: NDArray) -> NDArray:
@@ -353,13 +353,13 @@ def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
     return white, space
 
 
-def determines_camera(products: FrameProducts, mean_shape: NDArray) -> NDArray:
+def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     """
     Return for each frame whether the points that it sees determine a camera.
 
     Parameters
     ----------
-    products : FrameProducts
+    products : FrameSums
         Sums of the frames for `whitened` shapes, with a `FrameGram`.
     mean_shape : ndarray of shape (3, n_points)
         B_0 of these shapes.

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import (
-    FrameProducts,
+    FrameSums,
     FrameTracks,
     determines_camera,
-    frame_products,
+    frame_sums,
     frame_tracks,
 )
 from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch
@@ -218,19 +218,19 @@ class _Tracks(NamedTuple):
         """Return some of the frames."""
         return type(self)(self.tracks[frames], self.weights[frames])
 
-    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
         """Yield blocks of the frames that determine a camera, and their products."""
         tracks, weights = self
         complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
         for first in range(0, len(frames), COMPLETE_BLOCK):
             block = frames[first : first + COMPLETE_BLOCK]
-            yield block, frame_products(frame_tracks(tracks[block]), shapes)
+            yield block, frame_sums(frame_tracks(tracks[block]), shapes)
         frames = np.flatnonzero(~complete)
         for first in range(0, len(frames), WEIGHTED_BLOCK):
             block = frames[first : first + WEIGHTED_BLOCK]
             part = frame_tracks(tracks[block], weights[block])
-            yield _determined(block, frame_products(part, shapes), shapes)
+            yield _determined(block, frame_sums(part, shapes), shapes)
 
 
 class _Prepared(NamedTuple):
@@ -254,22 +254,22 @@ class _Prepared(NamedTuple):
         """Return some of the frames."""
         return type(self)(self.frames.take(frames))
 
-    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameProducts]]:
+    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
         """Yield blocks of the frames that determine a camera, and their products."""
         complete = self.frames.weights is None
         length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
         for first in range(0, len(self.weight), length):
             block = np.arange(first, min(first + length, len(self.weight)))
             part = self.frames.take(slice(first, first + length))
-            products = frame_products(part, shapes)
+            products = frame_sums(part, shapes)
             yield (
                 (block, products) if complete else _determined(block, products, shapes)
             )
 
 
 def _determined(
-    frames: NDArray, products: FrameProducts, shapes: NDArray
-) -> tuple[NDArray, FrameProducts]:
+    frames: NDArray, products: FrameSums, shapes: NDArray
+) -> tuple[NDArray, FrameSums]:
     """Return those of some frames that determine a camera, and their products."""
     usable = np.flatnonzero(determines_camera(products, shapes[0]))
     return frames[usable], products.take(usable)

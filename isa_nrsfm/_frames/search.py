@@ -4,7 +4,7 @@ from typing import NamedTuple, Protocol
 
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameProducts
+from isa_nrsfm._frames.point_sums import FrameSums
 
 # The most steps of a search.
 MAX_STEPS = 60
@@ -59,7 +59,7 @@ class FrameSearch(Protocol):
 
     def fit(
         self,
-        products: FrameProducts,
+        products: FrameSums,
         variance: NDArray,
         n_points: float,
         initial: NDArray,
@@ -68,6 +68,6 @@ class FrameSearch(Protocol):
         """Return the minima that frames reach from given coefficients."""
 
     def rough_cameras(
-        self, products: FrameProducts, variance: NDArray, n_points: float
+        self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (2, 3, n_frames) that are close to those of a fit."""

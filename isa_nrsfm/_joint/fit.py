@@ -320,15 +320,15 @@ def _ready(
     wide = complete and loss == "linear" and has_many_points(n_points, n_shapes)
     used = None
     if wide:
-        frames = JointFrames.along(rows, leading_directions(factors))
+        frames = JointFrames.from_directions(rows, leading_directions(factors))
     elif loss == "linear":
-        frames = JointFrames.of_points(rows, complete)
+        frames = JointFrames.from_points(rows, complete)
     else:
         used = seen_points(rows.whole().transpose(0, 2, 1))
         if outliers is not None:
             used &= ~outliers
         weights = None if used.all() else used * 1.0
-        frames = JointFrames.of_points(rows, complete, weights)
+        frames = JointFrames.from_points(rows, complete, weights)
     steps = steps._replace(to_the_end=n_frames <= FEW_FRAMES)
     problem = JointProblem(frames, steps, 0.0)
     n_numbers, energy = problem.totals

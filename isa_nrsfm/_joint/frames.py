@@ -41,7 +41,7 @@ class JointFrames(NamedTuple):
         return self.blocks.n_frames
 
     @classmethod
-    def of_points(
+    def from_points(
         cls, rows: FrameBlocks, complete: bool, weights: NDArray | None = None
     ) -> Self:
         """
@@ -66,7 +66,7 @@ class JointFrames(NamedTuple):
         return cls(rows.derive(partial(_plain_frames, complete=complete)), None)
 
     @classmethod
-    def along(cls, rows: FrameBlocks, directions: NDArray) -> Self:
+    def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
         """
         Return complete frames given by their products with some directions.
 

@@ -30,7 +30,7 @@ from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     SharedGram,
-    frame_products,
+    frame_sums,
     frame_tracks,
     shared_gram,
 )
@@ -44,7 +44,7 @@ BLOCK_FRAMES = 2048
 TINY_NOISE = 1e-7
 
 
-class Passed(NamedTuple):
+class LikelihoodTerms(NamedTuple):
     """
     What a pass over frames gives.
 
@@ -169,7 +169,9 @@ class MarginalLikelihood:
         self.penalty = penalty
         self.n_seen, self.square = totals(frames) if known is None else known
 
-    def __call__(self, shapes: NDArray, motion: NDArray, noise: float) -> Passed:
+    def __call__(
+        self, shapes: NDArray, motion: NDArray, noise: float
+    ) -> LikelihoodTerms:
         """
         Return the objective, its gradient and an approximate curvature.
 
@@ -184,7 +186,7 @@ class MarginalLikelihood:
 
         Returns
         -------
-        Passed
+        LikelihoodTerms
             The sums over the frames.
         """
         n_shapes = len(shapes)
@@ -204,7 +206,7 @@ class MarginalLikelihood:
         curvature = kronecker_matrices(packed, n_shapes)
         rows = shapes.reshape(3 * n_shapes, -1).T[:, :, None]
         pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
-        return Passed(
+        return LikelihoodTerms(
             float(value + self.n_seen * np.log(noise)),
             shape_gradient + (2 / noise) * pulled,
             motion_gradient,
@@ -237,10 +239,12 @@ class MarginalLikelihood:
             alpha[frames] = part.alpha.T
         return alpha
 
-    def _over_block(self, shapes: NDArray, noise: float) -> Callable[..., Passed]:
+    def _over_block(
+        self, shapes: NDArray, noise: float
+    ) -> Callable[..., LikelihoodTerms]:
         """Return what goes over a block, given the cameras of its frames."""
         return partial(
-            _pass_over_block,
+            _block_terms,
             shapes=shapes,
             gram=shared_gram(shapes),
             noise=noise,
@@ -281,7 +285,7 @@ def _totals(block: list[FrameTracks]) -> tuple[float, float]:
     return 2.0 * n_seen, square
 
 
-def _sums(part: Passed) -> tuple[float, NDArray, float, NDArray, float]:
+def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]:
     """Return what is a sum over the frames."""
     return (
         part.value,
@@ -292,7 +296,7 @@ def _sums(part: Passed) -> tuple[float, NDArray, float, NDArray, float]:
     )
 
 
-def _pass_over_block(
+def _block_terms(
     block: list[FrameTracks],
     motion: NDArray,
     shapes: NDArray,
@@ -300,19 +304,21 @@ def _pass_over_block(
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
-) -> Passed:
-    """Return the parts of `Passed` for a block, as `_pass_over` does for a part."""
+) -> LikelihoodTerms:
+    """Return the terms of a block, the sums and arrays of those of its parts."""
     motion, start, parts = motion.transpose(1, 2, 0), 0, []
     for frames in block:
         end = start + len(frames.weight)
         part = motion[:, :, start:end]
-        parts.append(_pass_over(frames, shapes, gram, part, noise, penalty, tiny_noise))
+        parts.append(
+            _frame_terms(frames, shapes, gram, part, noise, penalty, tiny_noise)
+        )
         start = end
     if len(parts) == 1:
         return parts[0]
     sums: Any = (sum(part) for part in zip(*map(_sums, parts), strict=True))
     value, shape_gradient, noise_gradient, shape_curvature, residual = sums
-    return Passed(
+    return LikelihoodTerms(
         value,
         shape_gradient,
         np.concatenate([part.motion_gradient for part in parts], axis=-1),
@@ -324,7 +330,7 @@ def _pass_over_block(
     )
 
 
-def _pass_over(
+def _frame_terms(
     block: FrameTracks,
     shapes: NDArray,
     gram: SharedGram,
@@ -332,15 +338,15 @@ def _pass_over(
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
-) -> Passed:
+) -> LikelihoodTerms:
     """
-    Return the parts of `Passed` for one block, but for what is common to all.
+    Return the parts of `LikelihoodTerms` for one block, but for what is common to all.
 
     Left out are ``N log s2`` and what the curvature adds to the gradient by the shapes;
     the curvature is packed: (n_pairs, 6, n_points or 1).
     """
     n_shapes, _, n_points = shapes.shape
-    products = frame_products(block, shapes, gram)
+    products = frame_sums(block, shapes, gram)
     posterior = coefficient_posterior(products, motion, noise, refined=tiny_noise)
     c, alpha = posterior.c, posterior.alpha
     value = np.sum(posterior.objective / noise + posterior.log_determinant)
@@ -367,7 +373,7 @@ def _pass_over(
         mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
-    return Passed(
+    return LikelihoodTerms(
         float(value),
         (-2 / noise) * shape_gradient.reshape(shapes.shape),
         (2 / noise) * motion_gradient,

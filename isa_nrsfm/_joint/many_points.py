@@ -83,8 +83,8 @@ def in_all_points(
             break
         both = np.concatenate([after, before.reshape(after.shape)])
         _, size, directions = np.linalg.svd(both, full_matrices=False)
-        frames = JointFrames.along(rows, directions[size > FLAT * size[0]])
-        problem = problem.of(frames)
+        frames = JointFrames.from_directions(rows, directions[size > FLAT * size[0]])
+        problem = problem.with_frames(frames)
         shapes = frames.coordinates(after.reshape(before.shape))
         n_left = problem.steps.max_iter - (len(result.history) - 1)
         if not n_left:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.point_sums import FrameTracks, frame_products
+from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
@@ -74,7 +74,7 @@ class JointProblem:
         steps = self.steps._replace(**changed)
         return type(self)(self.frames.take(chosen), steps, self.penalty)
 
-    def of(self, frames: JointFrames) -> Self:
+    def with_frames(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
         return type(self)(frames, self.steps, self.penalty)
 
@@ -194,7 +194,7 @@ def _reversed_back(
     """Return cameras (n_frames, 2, 3) of a block, and which of them are new."""
     search, parts, first = CalibratedSearch(shapes, scaled), [], 0
     for part in block:
-        products = frame_products(part, search.shapes)
+        products = frame_sums(part, search.shapes)
         some = motion[first : first + len(part.weight)]
         parts.append(search.reversed_cameras(products, noise, some))
         first += len(part.weight)

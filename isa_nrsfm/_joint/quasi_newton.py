@@ -127,7 +127,7 @@ def refine_joint(
     """
     floor = least_noise * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
-    point = _Point(likelihood, cameras, start, floor)
+    point = _Iterate(likelihood, cameras, start, floor)
     remembered = min(MEMORY_NUMBERS // (2 * point.gradient.size), MEMORY)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(
         maxlen=max(remembered, LEAST_MEMORY)
@@ -187,8 +187,8 @@ def _remember(
 
 
 def _without_noise(
-    likelihood: MarginalLikelihood, point: "_Point", floor: float
-) -> "_Point | None":
+    likelihood: MarginalLikelihood, point: "_Iterate", floor: float
+) -> "_Iterate | None":
     """Return where Gauss-Newton steps lead to, None if it is no better."""
     shapes, motion, _ = point.state
     if not np.isfinite(point.value):
@@ -203,11 +203,11 @@ def _without_noise(
     if left > point.left:
         return None
     state = JointState(*found, max(left, floor))
-    reached = _Point(likelihood, point.cameras, state, floor)
+    reached = _Iterate(likelihood, point.cameras, state, floor)
     return reached if reached.value < point.value else None
 
 
-class _Point:
+class _Iterate:
     """A state with the objective, its gradient and its curvature there."""
 
     def __init__(
@@ -288,7 +288,7 @@ def _stacked(shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
 
 
 def _inverse_hessian_product(
-    point: _Point, memory: deque[tuple[NDArray, NDArray, float]]
+    point: _Iterate, memory: deque[tuple[NDArray, NDArray, float]]
 ) -> NDArray:
     """Return the gradient times the inverse Hessian of the remembered steps."""
     vector = point.gradient.copy()
@@ -306,8 +306,8 @@ def _inverse_hessian_product(
 
 
 def _line_search(
-    likelihood: MarginalLikelihood, point: _Point, step: NDArray, floor: float
-) -> tuple[_Point | None, NDArray]:
+    likelihood: MarginalLikelihood, point: _Iterate, step: NDArray, floor: float
+) -> tuple[_Iterate | None, NDArray]:
     """Return the first point along a step that is low enough, and the way to it."""
     slope = point.gradient @ step
     length = min(
@@ -318,7 +318,7 @@ def _line_search(
     while length > SHORTEST_STEP:
         moved = length * step
         state = point.moved(moved, floor)
-        reached = _Point(likelihood, point.cameras, state, floor)
+        reached = _Iterate(likelihood, point.cameras, state, floor)
         if reached.value <= point.value + SUFFICIENT_DECREASE * length * slope:
             moved[-1] = np.log(reached.state.noise / point.state.noise)
             return reached, moved

@@ -72,7 +72,7 @@ def reweighted(
         weights[seen] = robust_weights(loss, distance[seen] / deviation)
         if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
             break
-        problem = problem.of(JointFrames.of_points(rows, False, weights))
+        problem = problem.with_frames(JointFrames.from_points(rows, False, weights))
         counted = weights
         result = refined(problem, result.state)
     return result, deviation**2

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._paper.block_structure import FrameProducts, packed_inner, unpack
+from isa_nrsfm._paper.block_structure import MotionProducts, packed_inner, unpack
 
 # Alternations from every start before the best one is taken on.
 N_TRIAL_STEPS = 6
@@ -60,14 +60,14 @@ class _State(NamedTuple):
 
 
 def refine_alternating(
-    products: FrameProducts, starts: NDArray, *, max_iter: int, tol: float
+    products: MotionProducts, starts: NDArray, *, max_iter: int, tol: float
 ) -> Refinement:
     """
     Return the blocks that explain most of the motion, each from several starts.
 
     Parameters
     ----------
-    products : FrameProducts
+    products : MotionProducts
         Products of the frames after ISA; consecutive signals form a subspace.
     starts : ndarray of shape (n_blocks, n_starts, 3, 3)
         Where to start each block; the best after a few alternations is taken on.

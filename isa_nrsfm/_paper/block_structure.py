@@ -21,7 +21,7 @@ _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 _UNPACKED = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
-class FrameProducts(NamedTuple):
+class MotionProducts(NamedTuple):
     """
     Products of the rigid motion M_0^i and the motion M^i of n_signals signals.
 
@@ -39,10 +39,10 @@ class FrameProducts(NamedTuple):
     rigid: NDArray
     gram: NDArray
 
-    def rotated(self, components: NDArray) -> "FrameProducts":
+    def rotated(self, components: NDArray) -> "MotionProducts":
         """Return the products for the motion ``M A`` with ``A^T = components``."""
         cross = self.cross @ components.T
-        return FrameProducts(cross, self.rigid, components @ self.gram @ components.T)
+        return MotionProducts(cross, self.rigid, components @ self.gram @ components.T)
 
     def blocks(self) -> NDArray:
         """Return ``M_0^iT M_ik``, shape (n_blocks, n_frames, 9), by rows."""
@@ -53,7 +53,7 @@ class FrameProducts(NamedTuple):
         )
 
 
-def frame_products(rigid_motion: NDArray, motion: NDArray) -> FrameProducts:
+def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
     """
     Return the products that block structure and refinement need of the frames.
 
@@ -66,13 +66,13 @@ def frame_products(rigid_motion: NDArray, motion: NDArray) -> FrameProducts:
 
     Returns
     -------
-    FrameProducts
+    MotionProducts
         The products.
     """
     M_0 = rigid_motion.reshape(-1, 2, 3)
     transposed = M_0.transpose(0, 2, 1)
     cross = transposed @ motion.reshape(len(M_0), 2, -1)
-    return FrameProducts(cross, pack(transposed @ M_0), motion.T @ motion)
+    return MotionProducts(cross, pack(transposed @ M_0), motion.T @ motion)
 
 
 def pack(symmetric: NDArray) -> NDArray:
@@ -91,7 +91,7 @@ def packed_inner(packed: NDArray, symmetric: NDArray) -> NDArray:
     return packed @ weights.T
 
 
-def recover_blocks(products: FrameProducts, method: str) -> NDArray:
+def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     """
     Return for each subspace the matrix that brings its motion to the rigid motion.
 
@@ -100,7 +100,7 @@ def recover_blocks(products: FrameProducts, method: str) -> NDArray:
 
     Parameters
     ----------
-    products : FrameProducts
+    products : MotionProducts
         Products of the frames after ISA; consecutive signals form a subspace.
     method : {"generalized_eigen", "eigen", "irls"}
         See `AffineNRSfM`.
@@ -190,7 +190,7 @@ _METHODS: dict[str, Callable[[NDArray, NDArray, NDArray], NDArray]] = {
 BLOCK_RECOVERIES = tuple(_METHODS)
 
 
-def lifted_moments(products: FrameProducts) -> NDArray:
+def lifted_moments(products: MotionProducts) -> NDArray:
     """
     Return the second moments of the motions lifted through their rigid cameras.
 
@@ -200,7 +200,7 @@ def lifted_moments(products: FrameProducts) -> NDArray:
 
     Parameters
     ----------
-    products : FrameProducts
+    products : MotionProducts
         Products of the frames.
 
     Returns

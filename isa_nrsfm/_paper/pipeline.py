@@ -15,10 +15,10 @@ from sklearn.utils.validation import has_fit_parameter
 
 from isa_nrsfm._paper.alternating import refine_alternating
 from isa_nrsfm._paper.block_structure import (
-    FrameProducts,
-    frame_products,
+    MotionProducts,
     leading_blocks,
     lifted_moments,
+    motion_products,
     recover_blocks,
     structure_energies,
 )
@@ -97,7 +97,7 @@ def run_paper_pipeline(
         Shapes before a gauge is chosen.
     """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
-    products = frame_products(factors.rigid_motion, factors.motion)
+    products = motion_products(factors.rigid_motion, factors.motion)
     moments = lifted_moments(products)
     components = _independent_subspaces(
         isa, factors.signals, products, moments, n_points / n_rows
@@ -134,7 +134,7 @@ def run_paper_pipeline(
 def _independent_subspaces(
     isa: Any,
     signals: NDArray,
-    products: FrameProducts,
+    products: MotionProducts,
     moments: NDArray,
     scale: float,
 ) -> NDArray:

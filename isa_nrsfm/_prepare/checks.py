@@ -75,7 +75,7 @@ class PointReport(NamedTuple):
     group: NDArray
 
     @classmethod
-    def of(cls, seen: NDArray) -> Self:
+    def from_seen(cls, seen: NDArray) -> Self:
         """Return the report of some frames (n_frames, n_points)."""
         n_frames = seen.sum(axis=0)
         if seen.all(axis=1).any():

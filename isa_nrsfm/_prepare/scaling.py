@@ -193,7 +193,7 @@ def _examine(
 ) -> tuple[FrameReport, PointReport, HalfPoints]:
     """Return what is to be known of all rows of a table before any is scaled."""
     tracks, half = without_half_points(table_to_tracks(rows, layout))
-    return report_frames(tracks), PointReport.of(seen_points(tracks)), half
+    return report_frames(tracks), PointReport.from_seen(seen_points(tracks)), half
 
 
 def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArray:

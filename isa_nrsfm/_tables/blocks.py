@@ -212,7 +212,7 @@ class MemoryBlocks(FrameBlocks):
         self.n_threads = n_threads
 
     @classmethod
-    def of(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
+    def from_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
         """Return an array (n_frames, ...) in blocks of so many frames."""
         starts = range(0, len(array), block_frames)
         blocks = [array[start : start + block_frames] for start in starts]
@@ -239,7 +239,7 @@ class MemoryBlocks(FrameBlocks):
     def kept(self, frames: NDArray) -> Self:
         """Return only some of the frames, of blocks that are arrays."""
         array = self.joined(kept_rows, frames)
-        return self.of(array, max(self.lengths), self.n_threads)
+        return self.from_array(array, max(self.lengths), self.n_threads)
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
         """Return blocks of at most so many frames, made of as many as can be."""
@@ -273,7 +273,7 @@ class StoredBlocks(FrameBlocks):
         self.read = read
 
     @classmethod
-    def of(cls, table: Any, block_frames: int) -> Self:
+    def from_table(cls, table: Any, block_frames: int) -> Self:
         """Return what can be sliced along its frames in blocks of so many."""
         read = partial(read_rows, table)
         return cls(read, _block_lengths(table.shape[0], block_frames))

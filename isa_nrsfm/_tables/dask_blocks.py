@@ -32,7 +32,7 @@ class DaskBlocks(FrameBlocks):
         self.blocks = blocks
 
     @classmethod
-    def of(cls, table: Any) -> Self:
+    def from_table(cls, table: Any) -> Self:
         """Return the chunks of a dask array (n_frames, 2 * n_points)."""
         if np.isnan(table.shape[0]):
             table = table.compute_chunk_sizes()

@@ -48,7 +48,7 @@ class Table(NamedTuple):
     def in_memory(cls, X: NDArray, n_jobs: int | None = 1) -> "Table":
         """Return an array, in blocks that threads may work on."""
         length = min(max(BLOCK_NUMBERS // max(X.shape[1], 1), 1), BLOCK_FRAMES)
-        blocks = MemoryBlocks.of(X, length, effective_n_jobs(n_jobs))
+        blocks = MemoryBlocks.from_array(X, length, effective_n_jobs(n_jobs))
         return cls(blocks, X.shape[1], X.dtype)
 
     @classmethod
@@ -59,14 +59,14 @@ class Table(NamedTuple):
             working_memory = get_config()["working_memory"]
         numbers = MEGABYTE * working_memory / (np.dtype(float).itemsize * COPIES)
         length = max(int(numbers // max(X.shape[1], 1)), 1)
-        blocks = StoredBlocks.of(X, length).derive(checked_rows)
+        blocks = StoredBlocks.from_table(X, length).derive(checked_rows)
         return cls(blocks, X.shape[1], _floating(X.dtype))
 
     @classmethod
     def on_dask(cls, X: Any) -> "Table":
         """Return a dask array, computed where dask does it."""
         _check_dimensions(X)
-        blocks = DaskBlocks.of(X).derive(checked_rows)
+        blocks = DaskBlocks.from_table(X).derive(checked_rows)
         return cls(blocks, X.shape[1], _floating(X.dtype))
 
 
