@@ -12,7 +12,7 @@ from sklearn.base import clone
 from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM, _block_dictionary, _compressible
 from isa_nrsfm.baselines._block_dictionary import (
@@ -46,7 +46,7 @@ class SparseScene(NamedTuple):
 
 def random_cameras(rng, n_frames):
     """Return cameras with orthonormal rows."""
-    return nearest_orthonormal(rng.normal(size=(n_frames, 2, 3)))
+    return polar(rng.normal(size=(n_frames, 2, 3))).rows
 
 
 def sparse_scene(seed, n_frames=200, n_points=40, n_atoms=4, sparsity=2):
@@ -498,7 +498,7 @@ class TestAlignBlocks:
             assert agreement(-random_rotation(other)) < best
         for size in (1e-3, 1e-2):
             for change in size * rng.normal(size=(20, 3, 3)):
-                assert agreement(nearest_orthonormal(found + change)) < best
+                assert agreement(polar(found + change).rows) < best
 
 
 class TestChainAtoms:
@@ -748,7 +748,7 @@ def depth_error(model, truth):
     third = np.cross(cameras[:, 0], cameras[:, 1])[:, None]
     space = np.concatenate([cameras, third], axis=1)
     shapes = model.shapes_ @ space.swapaxes(1, 2)
-    A = nearest_orthonormal(np.einsum("ija,ijb->ab", truth, shapes))
+    A = polar(np.einsum("ija,ijb->ab", truth, shapes)).rows
     distance = np.linalg.norm(truth - shapes @ A.T, axis=2).mean()
     return distance / truth.std(axis=1).mean()
 

@@ -7,11 +7,11 @@ from scenes import permute_frames, random_rotation, rotate_frames
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
+from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     NOISE_PRICE,
     _derivatives,
     _residuals,
-    nearest_orthonormal,
     orthonormal_cameras,
     orthonormal_mixture,
     orthonormality_residuals,
@@ -250,18 +250,18 @@ def test_residuals_of_orthonormal_rows_are_zero():
     assert_allclose(orthonormality_residuals(cameras), np.zeros((3, 5)), atol=1e-14)
 
 
-def test_nearest_orthonormal():
+def test_polar_factors():
     rng = np.random.default_rng(0)
     cameras = rng.normal(size=(6, 2, 3))
-    nearest = nearest_orthonormal(cameras)
+    nearest = polar(cameras).rows
     assert_allclose(orthonormality_residuals(nearest), np.zeros((3, 6)), atol=1e-14)
     # What is left is a symmetric positive semidefinite matrix times the result.
     rest = cameras @ nearest.transpose(0, 2, 1)
     assert_allclose(rest, rest.transpose(0, 2, 1), atol=1e-14)
     assert (np.linalg.eigvalsh(rest) > 0).all()
-    assert_allclose(nearest_orthonormal(nearest), nearest, atol=1e-14)
+    assert_allclose(polar(nearest).rows, nearest, atol=1e-14)
     turn = random_rotation(0)
-    assert_allclose(nearest_orthonormal(cameras @ turn), nearest @ turn, atol=1e-13)
+    assert_allclose(polar(cameras @ turn).rows, nearest @ turn, atol=1e-13)
 
 
 class TestColumns:

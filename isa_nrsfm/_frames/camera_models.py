@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, inverse3, unpack3
+from isa_nrsfm._linalg.polar import polar
 
 # Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
 RIDGE = 1e-9
@@ -306,8 +307,8 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
     scales : ndarray of shape (n_frames,)
         Means of their singular values.
     """
-    U, values, Vt = np.linalg.svd(motion, full_matrices=False)
-    return U @ Vt, values.mean(axis=1)
+    rows, values, _ = polar(motion)
+    return rows, values.mean(axis=1)
 
 
 def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:

@@ -185,24 +185,6 @@ def orthonormal_mixture(
     return found[0], float(cost[0])
 
 
-def nearest_orthonormal(cameras: NDArray) -> NDArray:
-    """
-    Return the cameras with orthonormal rows that are nearest to given ones.
-
-    Parameters
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2, 3)
-        Their polar factors.
-    """
-    U, _, Vt = np.linalg.svd(cameras, full_matrices=False)
-    return U @ Vt
-
-
 def orthonormality_residuals(cameras: NDArray) -> NDArray:
     """
     Return how far the rows of cameras are from orthonormal ones.

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
     SMALLEST_EIGENVALUE,
@@ -280,11 +281,10 @@ def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
 
 def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
     """Return rotations (I, 3, 3) and stretches P (I, 2, 2): cameras are ``P R[:2]``."""
-    left, values, right = np.linalg.svd(cameras, full_matrices=False)
-    across = left @ right
-    depth = np.cross(across[:, 0], across[:, 1])
-    stretches = (left * values[:, None]) @ left.transpose(0, 2, 1)
-    return np.concatenate([across, depth[:, None]], axis=1), stretches
+    rows, values, axes = polar(cameras)
+    depth = np.cross(rows[:, 0], rows[:, 1])
+    stretches = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
+    return np.concatenate([rows, depth[:, None]], axis=1), stretches
 
 
 def warn_if_degenerate(condition_number: float) -> None:

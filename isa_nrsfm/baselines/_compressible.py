@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
     conformal_equations,
@@ -109,11 +109,11 @@ def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
     """
     products = np.einsum("irc,ird->icd", blocks, cameras).reshape(-1, 9)
     start = np.linalg.eigh(products.T @ products)[1][:, -1]
-    O = nearest_orthonormal(start.reshape(3, 3))  # noqa: E741
+    O = polar(start.reshape(3, 3)).rows  # noqa: E741
     for _ in range(MAX_ROUNDS):
         coefficients = products @ O.ravel()
         before = O
-        O = nearest_orthonormal((coefficients @ products).reshape(3, 3))  # noqa: E741
+        O = polar((coefficients @ products).reshape(3, 3)).rows  # noqa: E741
         if np.abs(O - before).max() < ALIGNED:
             break
     return O
@@ -158,9 +158,9 @@ def chain_atoms(atoms: NDArray, code: BlockCode) -> ChainedAtoms:
             G = G @ align_blocks(motion, cameras[users[shared]])
         elif atom != first:
             shape = np.linalg.pinv(G) @ atoms[atom]
-            G = G @ nearest_orthonormal(shape @ shapes[first].T)
+            G = G @ polar(shape @ shapes[first].T).rows
         motion = blocks[users, atom] @ G
-        cameras[users[~shared]] = nearest_orthonormal(motion[~shared])
+        cameras[users[~shared]] = polar(motion[~shared]).rows
         seen[users] = True
         coefficients[users, atom] = np.einsum("irc,irc->i", motion, cameras[users]) / 2
         shapes[atom] = np.linalg.pinv(G) @ atoms[atom]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.projection import compose
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import nearest_orthonormal
+from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._tables.layout import measurement_matrix
 
 # Frames that are fitted at a time: their equations need little memory.
@@ -151,7 +151,7 @@ def _fit(
         active = active[~done & (damping[active] < LARGEST_DAMPING)]
         if not len(active):
             break
-    return nearest_orthonormal(cameras), alpha, cost
+    return polar(cameras).rows, alpha, cost
 
 
 def _cost(
