@@ -89,7 +89,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         shapes leaves as likely: "shapes" makes these independent of each other over the
         points, as the paper assumes, "coefficients" makes their coefficients
         independent over the frames, and None takes the principal axes of the
-        deformation. Shapes of frames, reprojection and score do not depend on it.
+        deformation. Shapes of frames, reprojection and score do not depend on it. Only
+        for the joint refinement.
     loss : {"linear", "huber", "cauchy"}, default="linear"
         How points count that are far from the model: with "huber" from 1.5 and with
         "cauchy" from 2.5 standard deviations of the noise, which is estimated from the
@@ -121,8 +122,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         `working_memory`. The result does not depend on it. A few numbers for each frame
         are in memory besides, about 1 kB.
     n_jobs : int or None, default=None
-        Number of threads that work on the frames, and of joblib workers for strategies
-        that use them. The result does not depend on it.
+        Number of threads that work on the frames, in `fit` and in the methods for
+        tables, and of joblib workers for strategies that use them. The result does not
+        depend on it.
     verbose : int, default=0
         Above zero, print a line for each stage. With scikit-learn 1.9 and later the fit
         tells its callbacks of stages and steps, too: ``set_callbacks(ProgressBar())``.
@@ -444,17 +446,17 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
 
     def _check_options(self, X: Any) -> None:
         """Refuse options that do not go together, or not with a table."""
-        joint = self.refinement == "joint"
-        if not joint and self.loss != "linear":
-            raise ValueError(
-                f"loss={self.loss!r} needs refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
-        if not joint and self.n_components == "auto":
-            raise ValueError(
-                "n_components='auto' needs refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
+        only_joint = {
+            "n_components": self.n_components == "auto",
+            "loss": self.loss != "linear",
+            "independence": self.independence != "shapes",
+        }
+        for name, asked_for in only_joint.items():
+            if asked_for and self.refinement != "joint":
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} needs refinement='joint'; "
+                    f"got refinement={self.refinement!r}"
+                )
         if not self._in_blocks and (is_on_dask(X) or isinstance(X, StoredTable)):
             raise ValueError(
                 "tables that are not in memory need refinement='joint' and "

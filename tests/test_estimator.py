@@ -871,13 +871,58 @@ def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
         assert model.inverse_snr_ < 1.2 * JOINT_INVERSE_SNR
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize(
+    "option",
+    [
+        {"loss": "huber"},
+        {"loss": "cauchy"},
+        {"independence": "coefficients"},
+        {"independence": None},
+        {"n_components": "auto"},
+    ],
+)
 @pytest.mark.parametrize("refinement", ["alternating", None])
-def test_robust_losses_need_the_joint_refinement(refinement, loss):
-    with pytest.raises(
-        ValueError, match=f"loss='{loss}' needs refinement='joint'; got"
-    ):
-        estimator(refinement=refinement, loss=loss).fit(TABLE)
+def test_options_that_need_the_joint_refinement(refinement, option):
+    ((name, value),) = option.items()
+    message = rf"{name}={value!r} needs refinement='joint'; got refinement="
+    model = AffineNRSfM(refinement=refinement, **option)
+    with pytest.raises(ValueError, match=message):
+        model.fit(TABLE)
+    with pytest.raises(NotFittedError):
+        model.transform(TABLE)
+
+
+def test_a_fit_that_fails_leaves_nothing_of_the_one_before():
+    model = estimator().fit(TABLE)
+    with pytest.raises(ValueError, match="infinity"):
+        model.fit(np.full_like(TABLE, np.inf))
+    assert not [name for name in vars(model) if name.endswith("_")]
+    with pytest.raises(NotFittedError):
+        model.transform(TABLE)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"layout": "planar"}, {"scale_frames": False}, {"camera": "orthographic"}],
+)
+def test_parameters_set_after_the_fit_change_nothing(changed):
+    model = estimator().fit(TABLE)
+    expected = model.transform(TABLE), model.reproject(TABLE), model.score(TABLE)
+    model.set_params(**changed)
+    found = model.transform(TABLE), model.reproject(TABLE), model.score(TABLE)
+    for before, after in zip(expected, found, strict=True):
+        assert_array_equal(after, before)
+
+
+def test_threads_work_on_new_frames_to_the_bit():
+    many = make_nonrigid_tracks(5000, 14, 2, noise=0.02, random_state=0).data
+    model = AffineNRSfM(2, random_state=0).fit(many[:300])
+    alone = model.decompose(many), model.score(many)
+    model.set_params(n_jobs=2)
+    together = model.decompose(many), model.score(many)
+    for one, two in zip(alone[0], together[0], strict=True):
+        assert_array_equal(one, two)
+    assert alone[1] == together[1]
 
 
 def test_shapes_of_frames_do_not_depend_on_the_independence(model):

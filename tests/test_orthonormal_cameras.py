@@ -262,6 +262,9 @@ def test_polar_factors():
     assert_allclose(polar(nearest).rows, nearest, atol=1e-14)
     turn = random_rotation(0)
     assert_allclose(polar(cameras @ turn).rows, nearest @ turn, atol=1e-13)
+    rows, values, axes = polar(cameras)
+    stretches = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
+    assert_allclose(stretches @ rows, cameras, atol=1e-13)
 
 
 class TestColumns:
