@@ -432,16 +432,16 @@ def noise(options):
 
 def noise_ratio(X, camera, n_components):
     """Return the noise without floor and prior, divided by that of the spectrum."""
-    ratios, original = [], joint_fit._judged
+    ratios, original = [], joint_fit.judged
 
     def recorded(problem, result, start, cameras, spectrum):
         n_seen, energy = problem.totals
-        free = joint_fit._unregularised(problem, result.state, cameras)
+        free = joint_fit.unregularised(problem, result.state, cameras)
         known = max(spectrum.noise, joint_fit.EXACT)
         ratios.append(free.state.noise * n_seen / energy / known)
         return original(problem, result, start, cameras, spectrum)
 
-    with mock.patch.object(joint_fit, "_judged", recorded):
+    with mock.patch.object(joint_fit, "judged", recorded):
         fit_set(X, camera, n_components)
     return ratios[0]
 

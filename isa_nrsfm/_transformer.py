@@ -174,7 +174,7 @@ class TableTransformer(
                 f"Euclidean as they are; got camera={camera!r}"
             )
         if camera is not None and fitted == "affine":
-            self._need_frames("reconstruct with a camera")
+            check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled = metric is not None and camera == "orthographic"
         return self._model.reconstruct(table, metric, scaled)
@@ -333,7 +333,7 @@ class TableTransformer(
                 "diagnostics needs a model with refinement='joint'; "
                 f"got refinement={self.refinement!r}"
             )
-        self._need_frames("diagnostics")
+        check_frames_kept(self, "diagnostics")
         fitted = np.isfinite(self._frame_sizes)
         motion = np.asarray(self.motion_)[fitted]
         return diagnose(
@@ -345,14 +345,6 @@ class TableTransformer(
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
         )
-
-    def _need_frames(self, what: str) -> None:
-        """Refuse what depends on the frames of the fit where they were not kept."""
-        if not hasattr(self, "motion_"):
-            raise ValueError(
-                f"{what} needs the cameras and coefficients of the fitted table; fit "
-                f"with keep_frames=True, got keep_frames={self.keep_frames!r}"
-            )
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
         """Return a table, for the fit or for the fitted model, in blocks."""
@@ -381,3 +373,12 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
+
+
+def check_frames_kept(estimator: Any, what: str) -> None:
+    """Refuse what depends on the frames of the fit where they were not kept."""
+    if not hasattr(estimator, "motion_"):
+        raise ValueError(
+            f"{what} needs the cameras and coefficients of the fitted table; fit with "
+            f"keep_frames=True, got keep_frames={estimator.keep_frames!r}"
+        )

@@ -256,6 +256,32 @@ def test_an_import_that_goes_up_is_found(tmp_path, file, line):
     assert "BROKEN" in output
 
 
+# Methods of named tuples have such names, and a benchmark looks into a stage.
+NAMED_TUPLES = {"_asdict", "_replace", "_fields", "_make"}
+LOOKED_INTO = {"argparse._ActionsContainer", "model._model"}
+
+
+@pytest.mark.parametrize(
+    "folder",
+    [
+        "isa_nrsfm/cli",
+        "isa_nrsfm/export",
+        "isa_nrsfm/plotting",
+        "benchmarks",
+        "docs/examples",
+    ],
+)
+def test_what_stands_on_top_uses_public_attributes(folder):
+    for file in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Attribute) or node.attr[:1] != "_":
+                continue
+            own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            known = node.attr in NAMED_TUPLES or node.attr.startswith("__")
+            name = ast.unparse(node)
+            assert own or known or name in LOOKED_INTO, f"{file}: {name}"
+
+
 def test_the_top_of_the_package_is_short():
     assert len([path for path in PACKAGE.iterdir() if path.is_file()]) <= 10
 

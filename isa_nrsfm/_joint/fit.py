@@ -222,7 +222,7 @@ def fit_jointly(
     ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
     result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
-    result, least_noise, right = _judged(first, result, start, cameras, spectrum)
+    result, least_noise, right = judged(first, result, start, cameras, spectrum)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
     problems = ready.problems
     if right:
@@ -408,7 +408,7 @@ def _refined(
     return problem.refined(state, cameras, least_noise, **steps)
 
 
-def _judged(
+def judged(
     problem: JointProblem,
     result: JointResult,
     start: JointState,
@@ -433,7 +433,7 @@ def _judged(
     at_floor = result.state.noise < (1 + SLACK) * LEAST_NOISE * mean_square
     if at_floor or result.state.noise < right:
         for state in (result.state, start):
-            free = _unregularised(problem, state, cameras)
+            free = unregularised(problem, state, cameras)
             if free.state.noise < right:
                 return free, NOISE_FLOOR, True
     least_noise = LEAST_NOISE
@@ -443,7 +443,7 @@ def _judged(
     return result, least_noise, False
 
 
-def _unregularised(
+def unregularised(
     problem: JointProblem, state: JointState, cameras: CameraModel
 ) -> JointResult:
     """Return the fit without prior and floor, as long as the noise falls."""

@@ -24,6 +24,7 @@ from isa_nrsfm._metric_upgrade.deforming import (
 )
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
+from isa_nrsfm._transformer import check_frames_kept
 from isa_nrsfm.calibration._canonical_pose import canonical_pose
 from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
 from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform
@@ -98,7 +99,7 @@ def upright_space(
     check_is_fitted(model)
     if camera not in ("weak_perspective", None):
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
-    model._need_frames("exporting shapes")
+    check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
     told: str | None = camera if fitted == "affine" else fitted
     if fitted != "affine":
