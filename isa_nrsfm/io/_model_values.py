@@ -242,6 +242,8 @@ def _checked_fit(fitted: dict[str, Any], where: str) -> dict[str, Any]:
             "log_likelihoods_": lambda a, w: check_array(a, w, (None,)),
             "n_iters_": lambda a, w: check_array(a, w, (None,), kind="whole"),
         }
+    if unchecked := sorted(fitted.keys() - checks.keys()):
+        raise ValueError(f"{where} has {', '.join(unchecked)}, which nothing checks")
     return {
         name: checks[name](value, f"{where}.{name}")
         for name, value in fitted.items()
