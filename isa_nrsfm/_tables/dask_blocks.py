@@ -80,7 +80,7 @@ class DaskBlocks(FrameBlocks):
         )
 
     def spread(self, values: NDArray) -> Any:
-        """Return an array (n_frames, ...) as a dask array with chunks as these blocks."""
+        """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
         array = import_optional("dask.array", extra="dask")
         chunks = (tuple(self.lengths), *values.shape[1:])
         return array.from_array(values, chunks=chunks)
