@@ -7,19 +7,21 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 
-# Frames of which the information on the weak directions is computed.
+# The information matrix of the weak directions is computed from this many frames.
 INFORMATIVE_FRAMES = 400
-# A direction of the coefficients of which less than this is signal is not supported.
+# Directions of the coefficients with a lower reliability are not supported by the
+# table.
 LEAST_RELIABILITY = 0.8
-# Variance of a direction relative to the largest that is rounding errors.
+# Variances of directions below this share of the largest are rounding errors.
 NO_VARIANCE = 1e-14
-# Standard deviation of a number of V_k, from which on it counts as not determined.
+# Entries of V_k with a larger standard deviation count as not determined.
 LARGEST_DEVIATION = 0.1
-# Ratios of noise variances, calibrated to affine, up to which cameras are calibrated
-# ones as far as the table tells, and from which on they hardly are. Artificial tables:
-# weak-perspective cameras have 1.02, perspective ones at 8 to 2.5 radii up to 1.2,
-# cameras that stretch the image 22 to 48; motion capture with too few basis shapes 1.1
-# to 4 (``python -m benchmarks.accuracy cameras``).
+# Bounds on the noise variance with calibrated cameras over that with affine ones. Below
+# the first, cameras are calibrated as far as the table tells. Above the second they
+# hardly are. Measured on artificial tables: 1.02 for weak-perspective cameras, up to
+# 1.2 for perspective ones at 8 to 2.5 radii, 22 to 48 for cameras that stretch the
+# image. Motion capture with too few basis shapes has 1.1 to 4
+# (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
 
 
@@ -30,12 +32,12 @@ class Diagnostics(NamedTuple):
     Attributes
     ----------
     camera_singular_values : ndarray of shape (3,)
-        Singular values of the stacked cameras, of frames of size one, in the space in
-        which the mean shape is white, divided by the root of the number of their rows:
-        how much the images show of each direction of space.
+        How much the images show of each direction of space: singular values of the
+        stacked cameras, divided by the root of the number of rows. Frames have size
+        one, and the mean shape is white.
     deformation_amplitude : float
-        Root mean square of the deformation relative to that of the mean shape, in that
-        space.
+        Root mean square of the deformation over that of the mean shape, in the space in
+        which the mean shape is white.
     reliability : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are not uncertainty, along
         uncorrelated directions, decreasing. Directions near zero are noise: the table
@@ -45,12 +47,13 @@ class Diagnostics(NamedTuple):
         alpha_ik^2)^2 / sum_i alpha_ik^4``.
     weak_deviations : ndarray of shape (8 * n_components,)
         Standard deviations of the weakly determined parts of the basis shapes,
-        increasing. Shapes ``B_k + V_k B_0`` can be told from B_k by terms of second
-        order in the deformation alone; of each V_k (3x3) all but the trace can be
-        known, and these are the deviations of their principal directions, from the
-        noise and with everything else known: an entry of 0.1 adds a tenth of the mean
-        shape, per standard deviation of a coefficient. Calibrated cameras absorb
-        rotations only, so that these are upper bounds for them.
+        increasing. Shapes ``B_k + V_k B_0`` differ from B_k in the images only by terms
+        of second order in the deformation. Of each V_k (3x3) all but the trace can be
+        determined. These are the standard deviations along the principal directions of
+        all V_k, as far as they come from the noise, given the rest of the shapes. A
+        value of 0.1 adds a tenth of the mean shape, per standard deviation of a
+        coefficient. Calibrated cameras absorb rotations only: for them these are upper
+        bounds.
     camera_noise_ratio : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
         with affine ones; NaN for models that were saved before it was measured.
@@ -112,6 +115,7 @@ def diagnose(
     ) / len(alpha)
     fourth = np.sum(alpha**4, axis=0)
     square = np.sum(alpha**2, axis=0) ** 2
+    # The traces of the V_k, one direction each, are not determined: left out.
     information = weak_information(mean_shape, basis, motion, alpha)
     known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
     floats = np.finfo(float)
@@ -184,20 +188,21 @@ def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
     covariance : ndarray of shape (n_components, n_components)
-        Mean of their covariances.
+        Mean over the frames of their posterior covariances.
 
     Returns
     -------
     ndarray of shape (n_components,)
-        Eigenvalues of the second moment of the coefficients relative to the whole
-        variance, that and the mean covariance, decreasing. Zero for directions in
-        which there is no variance at all.
+        Eigenvalues of ``(S + C)^-1 S``, decreasing, with S the second moment of the
+        coefficients and C the mean covariance: ``S + C`` is the whole variance. Zero
+        for directions in which there is no variance at all.
     """
-    known = alpha / np.sqrt(len(alpha))
+    known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
     variance, axes = np.linalg.eigh(known.T @ known + covariance)
     kept = variance > NO_VARIANCE * variance[-1]
     white = axes[:, kept] / np.sqrt(variance[kept])
     shares = np.zeros(len(kept))
+    # Squared singular values are the eigenvalues, with less rounding error.
     deviations = np.linalg.svd(known @ white, compute_uv=False)
     shares[: len(deviations)] = deviations**2
     return shares
@@ -207,7 +212,7 @@ def weak_information(
     mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
 ) -> NDArray:
     """
-    Return what the images tell of V_k in the basis shapes ``B_k + V_k B_0``.
+    Return the information matrix of V_k in the basis shapes ``B_k + V_k B_0``.
 
     Parameters
     ----------
@@ -223,8 +228,8 @@ def weak_information(
     Returns
     -------
     ndarray of shape (9 * n_components, 9 * n_components)
-        Information matrix of V_1, ..., V_K for unit noise, cameras and coefficients of
-        the frames being unknown and the rest of the shapes known.
+        Information matrix of V_1, ..., V_K for noise of variance one. Cameras and
+        coefficients of the frames are unknown, the rest of the shapes is known.
     """
     n_frames, n_components = alpha.shape
     chosen = np.unique(np.linspace(0, n_frames - 1, INFORMATIVE_FRAMES).astype(int))
@@ -232,11 +237,12 @@ def weak_information(
     for i in chosen:
         shape = mean_shape + np.tensordot(alpha[i], basis, 1)
         shape = shape - shape.mean(axis=0)
-        # Images (2 J) of changes of the camera and of the coefficients.
+        # Derivatives of the image (2J) in camera and coefficients span `tangent`.
         cameras = np.kron(np.eye(2), shape)
         moved = (basis @ motion[i].T).transpose(2, 1, 0).reshape(-1, n_components)
         tangent, _ = np.linalg.qr(np.hstack([cameras, moved]))
-        # Images of alpha_k V_k B_0, for the nine entries of V.
+        # Derivatives in the nine entries of V, before the factor alpha_k. What camera
+        # and coefficients can imitate is projected out.
         strain = np.einsum("ra,jb->rjab", motion[i], mean_shape).reshape(-1, 9)
         strain = strain - tangent @ (tangent.T @ strain)
         total += np.kron(np.outer(alpha[i], alpha[i]), strain.T @ strain)

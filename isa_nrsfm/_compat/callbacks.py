@@ -1,7 +1,7 @@
-"""How a fit tells of its progress: lines on the terminal, scikit-learn's callbacks.
+"""Progress of a fit: lines on the terminal, and scikit-learn's callbacks.
 
-Callbacks are new in scikit-learn 1.9, and experimental there. All that is known of them
-is in this module; with older versions nobody is told but the terminal.
+Callbacks are new in scikit-learn 1.9, and experimental there. No other module uses
+their interface. With older versions there are only the lines on the terminal.
 """
 
 import copy
@@ -22,7 +22,7 @@ except ImportError:
 
 
 class _NoContext:
-    """A task of which nobody is told."""
+    """Stands in for scikit-learn's callback context where there are no callbacks."""
 
     def subcontext(self, **_: Any) -> Self:
         """Return the context of a part of the task."""
@@ -38,7 +38,7 @@ class _NoContext:
 
 
 def without_callbacks(estimator: Any) -> Any:
-    """Return a copy of an estimator that nobody is told of."""
+    """Return a shallow copy of an estimator, without its callbacks."""
     copied = copy.copy(estimator)
     vars(copied).pop("_skl_callbacks", None)
     return copied
@@ -46,10 +46,10 @@ def without_callbacks(estimator: Any) -> Any:
 
 class FitProgress:
     """
-    Tells of the stages of a fit, and of the steps of one of them.
+    Reports the stages of a fit, and the steps of one of them.
 
-    The fit is a task whose subtasks are the stages; the steps of a stage are subtasks
-    of that. A line is printed for each stage that has ended, where it is wanted.
+    For callbacks the fit is a task, its stages are subtasks, and the steps of a stage
+    are subtasks of that. With `verbose`, a line is printed at the end of each stage.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from pathlib import Path
 import joblib
 import sklearn
 
-# What stands between the user's line and ours: this package, and what calls it.
+# Files whose frames are skipped on the way from the warning up to the user's line.
 INSIDE = (
     str(Path(__file__).parents[1]),
     str(Path(sklearn.__file__).parent),

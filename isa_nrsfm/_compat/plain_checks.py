@@ -1,7 +1,7 @@
-"""Checks of parameters for versions of scikit-learn that lack those used otherwise.
+"""Fallbacks for scikit-learn's private checks of parameters.
 
 Constraints are written as in scikit-learn's estimators. Only the kinds that this
-package uses are known.
+package uses are implemented.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -15,7 +15,7 @@ from sklearn.utils import check_random_state
 
 
 class Interval:
-    """Numbers of a type between two bounds, of which None is no bound."""
+    """Numbers of a type between two bounds. A bound of None is infinite."""
 
     def __init__(self, type: type, left: Any, right: Any, *, closed: str):
         self.type, self.left, self.right, self.closed = type, left, right, closed
@@ -42,28 +42,28 @@ class Interval:
 
 
 class StrOptions:
-    """Some texts."""
+    """A string that is one of the given options."""
 
     def __init__(self, options: Iterable[str]):
         self.options = set(options)
 
     def is_satisfied_by(self, value: Any) -> bool:
-        """Return whether a value is one of them."""
+        """Return whether a value is one of the options."""
         return isinstance(value, str) and value in self.options
 
     def __str__(self) -> str:
-        """Return the texts."""
+        """Return the options in words."""
         return f"a str among {sorted(self.options)}"
 
 
 class HasMethods:
-    """Objects with some methods."""
+    """An object with the given methods."""
 
     def __init__(self, methods: str | Sequence[str]):
         self.methods = [methods] if isinstance(methods, str) else list(methods)
 
     def is_satisfied_by(self, value: Any) -> bool:
-        """Return whether a value has them."""
+        """Return whether a value has all of the methods."""
         return all(callable(getattr(value, name, None)) for name in self.methods)
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
 """All private names of scikit-learn that are used, each with a public fallback.
 
-The checks of parameters are those of scikit-learn's own estimators, so that messages
-are alike. Where a version does not have them any more, the plain ones take over.
+Parameters are checked by scikit-learn's own code, so that messages are the same as its
+own. A version that lacks this code gets the fallbacks of `plain_checks`.
 """
 
 from collections.abc import Callable
@@ -70,12 +70,12 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
     """
-    Return the decorator of methods `fit`, which checks the estimator's parameters.
+    Return the decorator of `fit` methods that checks the estimator's parameters.
 
     Parameters
     ----------
     nested : bool
-        Whether estimators that are fitted inside check theirs, too.
+        Whether estimators that this one fits check their parameters, too.
 
     Returns
     -------
@@ -136,13 +136,13 @@ def check_parameters(estimator: Any) -> None:
 
 @cache
 def _thread_pools() -> ThreadpoolController:
-    """Return the libraries with threads; to look for them takes a while."""
+    """Return the loaded libraries with threads. The search is slow, so it is cached."""
     return ThreadpoolController()
 
 
 def one_blas_thread(function: Function) -> Function:
     """
-    Return a function that runs with one thread of the linear algebra.
+    Decorate a function to run with one BLAS thread.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def one_blas_thread(function: Function) -> Function:
     Returns
     -------
     callable
-        The same function otherwise.
+        The function, with BLAS limited to one thread while it runs.
     """
 
     @wraps(function)

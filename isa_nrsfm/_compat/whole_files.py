@@ -1,4 +1,4 @@
-"""Files that are written all or nothing."""
+"""Atomic writes of files."""
 
 import os
 import uuid
@@ -7,10 +7,11 @@ from pathlib import Path
 
 def write_whole(path: str | os.PathLike[str], contents: bytes) -> None:
     """
-    Write a file such that it has all of its new contents or stays as it was.
+    Write a file atomically: it has all of its new contents, or stays as it was.
 
-    The contents go to a new file in the same folder, which then takes the place of the
-    old one and has its permissions. What is no file, such as a pipe, is written to.
+    The contents go to a new file in the same folder. That file gets the permissions of
+    the old one and replaces it. A path that is no regular file, such as a pipe, is
+    written to directly.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """The canonical choice among shapes and cameras that fit a table equally well.
 
-An affinity of space (with calibrated cameras a rotation), the order, scale and sign of
-the basis shapes are free: here they are fixed. What stays free is the mirror image in
-depth: the tables do not tell it.
+An affinity of space (with calibrated cameras a rotation) and the order, scale and sign
+of the basis shapes are free. Here they are fixed. The sign of depth is fixed by a
+convention only: a table does not tell an object from its mirror image.
 """
 
 from typing import NamedTuple
@@ -32,9 +32,9 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
     -------
     ndarray of shape (3, 3)
         Orthogonal matrix A such that shapes ``S A^T`` and cameras ``M A^T`` are
-        canonical: the x and y axes are as near to the rows of the mean camera as can
-        be. Where the cameras have no common view x, y and z are the principal axes of
-        ``sum_i M_i^T M_i``. The third moment of depth is not negative.
+        canonical. The x and y axes are the orthonormal pair nearest to the rows of the
+        mean camera. Where the cameras have no common view, x, y and z are the principal
+        axes of ``sum_i M_i^T M_i``. The third moment of depth is not negative.
     """
     view = mean_view(cameras)
     if view is None:
@@ -62,12 +62,10 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (3, 3)
-        A such that shapes ``B A^T`` and cameras ``M A^-1`` are canonical: the mean of
+        A such that shapes ``B A^T`` and cameras ``M A^-1`` are canonical. The mean of
         ``b b^T`` over the points of the mean shape is the identity (with zeros along
-        directions in which it is flat), and the rows of the mean camera span the x
-        and y axes and are as near to them as can be. Where the cameras have no common
-        view x, y and z are the principal axes of ``sum_i M_i^T M_i`` instead. The
-        third moment of depth is not negative.
+        directions in which it is flat). In that white space A is the rotation or
+        reflection of `canonical_rotation`.
     """
     variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
     inside = variance > 1e-18 * variance[-1]
@@ -82,7 +80,7 @@ def euclidean_space(
     mean_shape: NDArray, motion: NDArray, size: float | None
 ) -> NDArray:
     """
-    Return the rotation and the unit of space that show the mean shape from front.
+    Return the scaled rotation of space that shows the mean shape from front.
 
     Parameters
     ----------
@@ -91,7 +89,7 @@ def euclidean_space(
     motion : ndarray of shape (n_frames, 2, 3)
         Calibrated cameras, each divided by the size of its frame.
     size : float or None
-        What a unit of the shapes becomes; None to make the mean square of the
+        Factor by which shapes are multiplied. None makes the mean square of the
         coordinates of the mean shape one.
 
     Returns
@@ -104,8 +102,8 @@ def euclidean_space(
     return size * canonical_rotation(mean_shape, motion)
 
 
-# A basis shape with less than this share of the rigid motion's energy in the images
-# holds rounding errors only.
+# A basis shape holds only rounding errors if its energy in the images is below this
+# share of that of the mean shape.
 NO_MOTION = 1e-20
 
 
@@ -120,9 +118,9 @@ class Gauge(NamedTuple):
     basis : ndarray of shape (n_components, n_points, 3)
         Basis shapes in the canonical space, order and scale.
     order : ndarray of int, shape (n_components,)
-        Where each basis shape was before.
+        Index of each basis shape in the given basis.
     factors : ndarray of shape (n_components,)
-        What it has been multiplied by, zero for those without motion.
+        Factor by which each was multiplied, zero for those without motion.
     """
 
     mean_shape: NDArray
@@ -157,9 +155,9 @@ def canonical_gauge(
     Returns
     -------
     Gauge
-        The shapes in that space, the basis by decreasing energy
-        in the images, ``sum_i ||alpha_ik M_i B_k||_F^2``, and such that the
-        coefficients have unit variance over the frames (unit mean square where they
+        The shapes in that space. The basis is sorted by decreasing energy in the
+        images, ``sum_i ||alpha_ik M_i B_k||_F^2``. Its scales and signs are such that
+        the coefficients have unit variance over the frames (unit mean square where they
         do not vary) and a third moment that is not negative. A basis shape without
         motion becomes zero.
     """
@@ -212,8 +210,8 @@ def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (3 * n_components, 3 * n_components)
-        ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``, what the covariance over
-        the images of Brandt et al. (2018), section 3.3, is for motion that has block
+        ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``. This is the covariance
+        over the images of Brandt et al. (2018), section 3.3, if the motion has block
         structure.
     """
     total = np.zeros((3 * alpha.shape[1],) * 2)
@@ -234,7 +232,7 @@ def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:
     matrix : ndarray of shape (3 * n_blocks, 3 * n_blocks)
         The matrix.
     order : ndarray of int, shape (n_blocks,)
-        Where each block was before.
+        Index of each block in the given matrix.
 
     Returns
     -------

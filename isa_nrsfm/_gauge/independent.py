@@ -1,11 +1,14 @@
 """The independent basis among all bases that fit a table equally well.
 
 A fit determines the shapes of the frames, up to one affinity of space and one scale a
-frame, but not their basis: ``B_0 + sum_k u_k B_k``, ``B_k + v_k B_0`` (absorbed by the
-scales of the cameras) and any invertible mixing of the basis shapes fit equally well.
-Here u, v and the mixing are fixed: by coefficients with mean zero, basis shapes
-without a part along the mean shape, and independence (Brandt, Ackermann, Grasshof
-2018, whose assumption this is, but with one mixing for all three coordinates).
+frame. It does not determine their basis. Three changes fit equally well:
+
+- ``B_0 + sum_k u_k B_k`` for B_0, fixed by coefficients with mean zero;
+- ``B_k + v_k B_0`` for B_k, which the scales of the cameras absorb, fixed by basis
+  shapes without a part along the mean shape;
+- any invertible mixing of the basis shapes, fixed by independence. This is the
+  assumption of Brandt, Ackermann, Grasshof (2018), but with one mixing for all three
+  coordinates.
 """
 
 from typing import NamedTuple
@@ -18,10 +21,10 @@ from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclide
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 INDEPENDENCE = ("shapes", "coefficients")
-# The alternation of the two shifts ends when they are below this, or after so many.
+# Alternation of the shifts u and v: its convergence tolerance, and the most rounds.
 SHIFTED = 1e-12
 MAX_SHIFTS = 200
-# The scale of a frame does not get below this share of the mean.
+# If the scale of a frame gets below this share of the mean, v stays zero.
 SMALLEST_SCALE = 0.1
 
 
@@ -36,7 +39,7 @@ class IndependentGauge(NamedTuple):
     basis : ndarray of shape (n_components, n_points, 3)
         Basis shapes, ordered, scaled and signed as by `canonical_gauge`.
     frames : FrameMap
-        What happens to cameras and coefficients.
+        Map of cameras and coefficients of frames to these shapes.
     """
 
     mean_shape: NDArray
@@ -78,12 +81,14 @@ def independent_gauge(
     IndependentGauge
         The basis, and the map of the frames to it.
     """
+    # The shifts u and v, then the affinity of space.
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
     white = shapes[1:].transpose(0, 2, 1) @ space.T
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
+    # The mixing of the basis shapes, then their order, scale and signs.
     mixing: NDArray
     if independence == "shapes":
         mixing = shared_mixing(white)
@@ -94,6 +99,7 @@ def independent_gauge(
     basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
     unmixing = np.linalg.inv(mixing).T
     gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
+    # Coefficients (1, alpha_i) change by the inverse transpose of what shapes do.
     factors = gauge.factors
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
     coefficients = np.linalg.inv(shift).T
@@ -107,19 +113,25 @@ def _centred(
     shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return the mixing of B_0, ..., B_K to centred coefficients and pure basis shapes.
+    Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
 
-    The coefficients get mean zero by ``B_0 + sum_k u_k B_k``, and the basis shapes
-    ``tr(B_k B_0^+) = 0`` by ``B_k + v_k B_0``, which is ``<T B_k, T B_0> = 0`` where T
-    whitens B_0; with weak-perspective cameras ``<B_k, B_0> = 0``. The one undoes the
-    other a little: they alternate. Where that would turn a frame inside out, or has no
-    end, or where cameras have no scales that absorb it, the basis shapes stay as they
-    are. Cameras and coefficients for the new shapes are returned, too.
+    ``B_0 + sum_k u_k B_k`` gives the coefficients mean zero. ``B_k + v_k B_0`` makes
+    the basis shapes orthogonal to the mean shape: ``<T B_k, T B_0> = 0`` where T
+    whitens B_0, that is ``tr(B_k B_0^+) = 0``. With weak-perspective cameras it is
+    ``<B_k, B_0> = 0``. Each shift slightly undoes the other, so they alternate until
+    both vanish.
+
+    Then ``1 - sum_k v_k alpha_ik`` is the factor of the scale of frame i. Only u is
+    used, with v = 0, where such a factor is not positive or too small, where the
+    alternation does not converge, and for orthographic cameras, whose scale is fixed.
+
+    Shapes are (n, 3, n_points), cameras (n_frames, 2, 3), alpha (n_frames, n - 1).
     """
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=1e-9), 1)
     first = total = _mean_shift(alpha)
     moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
     for _ in range(0 if camera == "orthographic" else MAX_SHIFTS):
+        # v, from the current shapes: <B_k, dual> is the part of B_k along B_0.
         current = np.tensordot(total, shapes, 1)
         if camera == "affine":
             dual = np.linalg.pinv(current[0], rcond=1e-9).T / rank
@@ -127,11 +139,13 @@ def _centred(
             dual = current[0] / (np.vdot(current[0], current[0]) or 1.0)
         along = np.eye(len(shapes))
         along[1:, 0] = -np.einsum("kcj,cj->k", current[1:], dual)
+        # Scales of the frames absorb it, and coefficients follow.
         factor = 1 - moved @ along[1:, 0]
         if not (factor > 0).all():
             break
         scale = scale * factor
         moved = moved / factor[:, None]
+        # u, from the new coefficients.
         mean = _mean_shift(moved)
         moved = moved - mean[0, 1:]
         total = mean @ along @ total
@@ -144,14 +158,17 @@ def _centred(
 
 
 def _mean_shift(alpha: NDArray) -> NDArray:
-    """Return the mixing that takes the mean of the coefficients into B_0."""
+    """Return the mixing (n, n) that adds the mean of alpha (n_frames, n - 1) to B_0."""
     mixing = np.eye(alpha.shape[1] + 1)
     mixing[0, 1:] = alpha.mean(axis=0)
     return mixing
 
 
 def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
-    """Return the mixing to uncorrelated coefficients and orthogonal basis shapes."""
+    """Return the mixing (K, K) to uncorrelated coefficients, orthogonal basis shapes.
+
+    The basis is (K, n_points, 3) in the white space, alpha is (n_frames, K).
+    """
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
     variance = np.where(variance > 1e-20 * max(variance[-1], 1e-300), variance, 1.0)
     root = (axes * np.sqrt(variance)) @ axes.T

@@ -1,10 +1,14 @@
 """Algebra of many small symmetric matrices, the index of the matrix last.
 
-With the index last each operation is one pass over long rows of numbers, which for
-matrices of one to fifteen rows is faster than a call of LAPACK for each. Symmetric
-matrices are packed: of each row the part from the diagonal on, one row after the other.
-None of the functions divides by zero: a pivot that is not positive is left out, as said
-at each.
+With the index last each operation is one pass over long rows of numbers. For matrices
+of one to fifteen rows that is faster than a call of LAPACK for each.
+
+There are two packings. k x k matrices are packed by rows, each row from the diagonal
+on. 3x3 matrices of space, in the functions whose names end in 3, have the diagonal
+first: xx, yy, zz, xy, xz, yz.
+
+No function divides by zero. A pivot that is not positive is left out; each docstring
+says what that means for the result.
 """
 
 import math
@@ -12,11 +16,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-# Symmetric 3x3 matrices, of space, are packed as xx, yy, zz, xy, xz, yz.
+# Row and column of the packed entries of a 3x3 matrix, and the way back.
 ROWS = (0, 1, 2, 0, 0, 1)
 COLUMNS = (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
-# What elimination leaves of a diagonal entry is rounding errors below this share.
+# A pivot below this share of its diagonal entry before elimination is rounding error.
 SMALLEST_PIVOT = 1e-13
 # For up to so many matrices LAPACK is faster than elimination by passes.
 FEW = 48
@@ -58,7 +62,10 @@ def inverse_factor3(packed: NDArray) -> NDArray:
 
 
 def _inverse_root(pivot: NDArray, diagonal: NDArray) -> NDArray:
-    """Return ``pivot^(-1/2)``, and zero where the pivot is rounding errors."""
+    """Return ``pivot^(-1/2)`` (n,), zero where the pivot is rounding error.
+
+    The diagonal (n,) has the entries before elimination.
+    """
     kept = pivot > SMALLEST_PIVOT * diagonal
     return kept / np.sqrt(np.where(kept, pivot, 1.0))
 
@@ -93,18 +100,20 @@ def eigh3(packed: NDArray) -> tuple[NDArray, NDArray]:
     Returns
     -------
     values : ndarray of shape (3, n)
-        Eigenvalues. The first one is that which is farthest from the other two.
+        Eigenvalues, not sorted. The first is the one farthest from the other two.
     axes : ndarray of shape (3, 3, n)
         ``A = axes diag(values) axes^T``, axes orthogonal up to rounding, also where
         eigenvalues are equal.
 
     Notes
     -----
-    The first eigenvalue is the root of the cubic equation farthest from the others, by
-    a cosine (Smith, "Eigenvalues of a symmetric 3x3 matrix", Communications of the ACM
-    4, 1961), and so well apart that its eigenvector is safe. One rotation in the plane
-    across it gives the others.
+    The first eigenvalue is the root of the characteristic polynomial that is farthest
+    from the other two, by the trigonometric formula (Smith, "Eigenvalues of a symmetric
+    3x3 matrix", Communications of the ACM 4, 1961). Being well separated, it has a well
+    determined eigenvector. One Jacobi rotation in the plane orthogonal to it gives the
+    other two.
     """
+    # The first eigenvalue, of the matrix without trace and of norm one.
     mean = packed[:3].mean(axis=0)
     rest = packed.copy()
     rest[:3] -= mean
@@ -115,15 +124,16 @@ def eigh3(packed: NDArray) -> tuple[NDArray, NDArray]:
     angle = np.arccos(np.minimum(np.abs(determinant) / 2, 1.0)) / 3
     first = np.copysign(2 * np.cos(angle), determinant)
 
-    # The adjugate of the shifted matrix is a positive multiple of v v^T.
+    # Its eigenvector v: the adjugate of the shifted matrix is a positive multiple of
+    # v v^T, of which the column with the largest diagonal entry is taken.
     a, b, c = rest[:3] - first
     x, y, z = b * c - f * f, a * c - e * e, a * b - d * d
     xy, xz, yz = e * f - c * d, d * f - b * e, d * e - a * f
     from_x, from_y = (x >= y) & (x >= z), y >= z
     v = np.where(from_x, (x, xy, xz), np.where(from_y, (xy, y, yz), (xz, yz, z)))
     v /= np.sqrt(_dot(v, v))
-    # Two axes across v (Duff et al., "Building an orthonormal basis, revisited",
-    # Journal of Computer Graphics Techniques 6, 2017).
+    # Two axes u and w orthogonal to v (Duff et al., "Building an orthonormal basis,
+    # revisited", Journal of Computer Graphics Techniques 6, 2017).
     sign = np.copysign(1.0, v[2])
     share = -1 / (sign + v[2])
     product = v[0] * v[1] * share
@@ -153,7 +163,7 @@ def pair_indices(k: int) -> tuple[NDArray, NDArray]:
     """Return row and column of the entries of packed symmetric k x k matrices."""
     rows = np.arange(k)
     first = np.repeat(rows, k - rows)
-    # Row i begins where i rows, the j-th of them j short of k, have ended.
+    # Row j has k - j entries, so row i starts at i k - (0 + 1 + ... + (i - 1)).
     starts = rows * k - rows * (rows - 1) // 2
     return first, np.arange(len(first)) - starts[first] + first
 
@@ -177,13 +187,13 @@ def unpacked(packed: NDArray) -> NDArray:
 
 
 def diagonal_of(packed: NDArray) -> NDArray:
-    """Return where packed matrices have their diagonals."""
+    """Return the indices (k,) of the diagonal in packed matrices (n_pairs, ...)."""
     k = _size(packed)
     return np.cumsum([0, *range(k, 1, -1)])[:k]
 
 
 def packed_gram(rows: NDArray) -> NDArray:
-    """Return the packed products ``A A^T`` of matrices (k, m, n)."""
+    """Return the products ``A A^T`` of n matrices (k, m, n), packed: (n_pairs, n)."""
     k, _, n = rows.shape
     if n <= FEW:
         return np.einsum("kmn,lmn->kln", rows, rows)[pair_indices(k)]
@@ -223,7 +233,7 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         if _cholesky(matrices) is not None:
             x = np.linalg.solve(matrices, b.T[..., None])
             return np.ascontiguousarray(x[..., 0].T), np.ones(n, dtype=bool)
-    # The right side is the last entry of each row.
+    # Gaussian elimination, with the right side as the last entry of each row.
     rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
     diagonal = [row[0].copy() for row in rows]
     positive = np.ones(n, dtype=bool)
@@ -234,6 +244,7 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
             part = np.multiply(scaled[j - i - 1 :], row[j - i], out=room[: k + 1 - j])
             rows[j] -= part
         row[1:] = scaled
+    # Back substitution.
     x = np.empty((k, n))
     for i in range(k - 1, -1, -1):
         x[i] = rows[i][-1] - np.einsum("jn,jn->n", rows[i][1:-1], x[i + 1 :])
@@ -241,7 +252,7 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _cholesky(matrices: NDArray) -> NDArray | None:
-    """Return the factors of matrices (n, k, k) if all are positive definite."""
+    """Return Cholesky factors of matrices (n, k, k), None if one is not definite."""
     try:
         factors = np.linalg.cholesky(matrices)
     except np.linalg.LinAlgError:
@@ -335,7 +346,10 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
 
 
 def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
-    """Return the inverse pivots, zero for those left out, and mark these."""
+    """Return the inverse pivots (n,), zero for those left out.
+
+    Matrices with a pivot left out become False in `positive` (n,), in place.
+    """
     kept = pivot > SMALLEST_PIVOT * diagonal
     if kept.all():
         return 1.0 / pivot

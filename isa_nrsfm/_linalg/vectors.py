@@ -1,4 +1,4 @@
-"""Rows of numbers: their energies, and signs that they are given."""
+"""Energies of rows of numbers, and a convention for their signs."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -21,18 +21,19 @@ from isa_nrsfm._metric_upgrade.rigid import (
     warn_if_degenerate,
 )
 
-# The largest, and first, standard deviation of an entry of E_k. Affine cameras
-# that bend space more than that with the deformation are not believed.
+# Prior standard deviation of an entry of E_k: its first value, and its upper bound.
+# Larger strains are taken for errors of the affine cameras.
 STRAIN_DEVIATION = 0.3
-# The logarithm of the metric of a frame is no larger, so that unusual coefficients do
-# not stretch any direction by more than exp(1 / 2).
+# Bound on the eigenvalues of the strain of a frame. Unusual coefficients then stretch
+# no direction by more than exp(1 / 2).
 LARGEST_STRAIN = 1.0
-# Rounds of estimating the deviation, and the change of its logarithm that ends them.
+# Rounds of estimating the two variances, and their convergence tolerance: the largest
+# change of a logarithm.
 MAX_ROUNDS = 15
 SETTLED = 0.05
-# Until then metrics are as good as that.
+# Convergence tolerance of the metric in these rounds, as `shortest_step`.
 ROUGH_STEP = 1e-4
-# Rounding errors of the residuals.
+# Least standard deviation of the residuals: rounding errors.
 ROUNDING = 1e-12
 
 
@@ -43,10 +44,11 @@ class DeformationMetric(NamedTuple):
     Attributes
     ----------
     Q : ndarray of shape (3, 3)
-        Symmetric and positive definite, as in `MetricUpgrade`; of the mean shape.
+        The upgrade of the mean shape: symmetric and positive definite, as in
+        `MetricUpgrade`.
     strain : ndarray of shape (n_components, 3, 3)
-        E_k, symmetric and without trace, for one unit of coefficient k: cameras of a
-        frame become those of a scaled rotation by ``Q exp(sum_k alpha_ik E_k / 2)``.
+        E_k, symmetric and without trace, for one unit of coefficient k: ``M_i Q
+        exp(sum_k alpha_ik E_k / 2)`` is nearly two rows of a scaled rotation.
     residual : float
         As in `MetricUpgrade`, with the strain.
     condition_number : float
@@ -84,11 +86,11 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     r"""
     Find the coordinates of space in which cameras of a deforming shape are Euclidean.
 
-    Affine cameras hide part of the deformation: that of a basis shape :math:`B_k + V
-    B_0` is absorbed by cameras :math:`M_i (I - \alpha_{ik} V)`, to first order. They
-    are not orthogonal any more then, which tells V, but for rotations and scales. So
-    ``Q exp(sum_k alpha_ik E_k / 2)`` takes the place of the one Q of `metric_upgrade`,
-    with symmetric strains E_k without trace.
+    Affine cameras can absorb part of the deformation. To first order, the basis shape
+    :math:`B_k + V B_0` gives the same images as :math:`B_k`, with cameras :math:`M_i (I
+    - \alpha_{ik} V)`. The rows of such cameras are not orthogonal, which determines V
+    up to rotations and scales. So the one Q of `metric_upgrade` becomes ``Q exp(sum_k
+    alpha_ik E_k / 2)`` for frame i, with symmetric strains E_k without trace.
 
     Parameters
     ----------
@@ -121,12 +123,12 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
 
     Notes
     -----
-    The sum of squares of the weak-perspective residuals plus a price of the squared
-    norm of the strains is minimised. The price is that of maximal evidence (MacKay,
-    "Bayesian interpolation", Neural Computation 4, 1992): residuals and entries of the
-    strains are taken for normally distributed, with variances that are estimated with
-    them, that of the strains being at most :math:`0.3^2`. Few frames, or cameras that
-    are not weak-perspective ones, then lead to small strains.
+    The sum of the squared weak-perspective residuals plus a ridge times the squared
+    norm of the strains is minimised. The ridge is the ratio of two variances, of
+    residuals and of entries of the strains, which are taken as normally distributed.
+    Both are estimated by maximising the evidence (MacKay, "Bayesian interpolation",
+    Neural Computation 4, 1992), the second being at most :math:`0.3^2`. Few frames, or
+    cameras that are not weak-perspective ones, lead to small strains.
     """
     cameras, usable = usable_cameras(motion)
     weights = np.asarray(alpha, dtype=np.float64)
@@ -138,7 +140,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
     fit = _fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
-    # E_k in the axes of the symmetric Q.
+    # The symmetric Q is fit.Q times a rotation, which turns the strains, too.
     Q = symmetric_power(fit.Q @ fit.Q.T, 0.5)
     turn = np.linalg.solve(Q, fit.Q)
     strain = turn @ fit.strain @ turn.T
@@ -187,12 +189,15 @@ def euclidean_frames(
 
     Notes
     -----
-    Three steps lead from an affine shape to a Euclidean one: the metric of the frame
-    (eigenvalues of its strain are limited to one, which only unusual coefficients or
-    fits that have failed exceed); the least stretching in the plane of the image that
-    makes the camera, nearly a scaled rotation by now, exactly one; and the rotation
-    that brings the shape nearest to the mean shape. Whether the object turned or the
-    camera, and how much of a rotation is deformation, no image tells.
+    Three steps lead from an affine shape to a Euclidean one.
+
+    1. The metric of the frame is applied. Eigenvalues of its strain are limited to one;
+       only unusual coefficients, or a failed fit, exceed that.
+    2. The camera is now nearly a scaled rotation. The smallest stretch in the image
+       plane that makes it exactly one is moved to the shape.
+    3. The shape is rotated to be as near as possible to the mean shape. Images do not
+       tell whether the object or the camera turned, nor how much of a rotation is
+       deformation.
 
     Examples
     --------
@@ -229,6 +234,7 @@ def euclidean_frames(
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
 
+    # The metric of each frame.
     stretch, axes = np.linalg.eigh(np.tensordot(weights, metric.strain, 1))
     stretch = np.clip(stretch, -LARGEST_STRAIN, LARGEST_STRAIN)
     strain = (axes * stretch[:, None]) @ axes.transpose(0, 2, 1)
@@ -237,11 +243,13 @@ def euclidean_frames(
     shapes = shapes @ np.linalg.inv(Q).transpose(0, 2, 1)
     rotations, stretches = nearest_rotations(cameras @ Q)
     scales = np.trace(stretches, axis1=1, axis2=2) / 2
-    # In the axes of the image the camera is the stretch, which moves to the shape.
+    # Cameras are stretches times rotations. Seen in the axes of the image, the shape
+    # takes over the stretch, and the scaled rotation is left.
     seen = shapes @ rotations.transpose(0, 2, 1)
     seen[:, :, :2] = seen[:, :, :2] @ (stretches / scales[:, None, None])
     shapes = seen @ rotations
-    turns = _turns_to(shapes, mean @ np.linalg.inv(metric.Q).T)
+    # The rotation nearest to the mean shape.
+    turns = _rotations_to_mean(shapes, mean @ np.linalg.inv(metric.Q).T)
 
     frames = EuclideanFrames(
         np.full((len(usable), *mean.shape), np.nan),
@@ -255,7 +263,12 @@ def euclidean_frames(
 
 
 def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
-    """Return the metric with strains, their price being that of maximal evidence."""
+    """
+    Return the metric with strains, with the ridge of maximal evidence.
+
+    Cameras are (n_frames, 2, 3), alpha is (n_frames, n_components), `rigid` is the fit
+    without strains.
+    """
     size = len(strain_basis("weak_perspective"))
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, ROUNDING**2)
@@ -266,24 +279,30 @@ def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit
     for _ in range(MAX_ROUNDS):
         ridge = noise / variance
         fit = refine_fit(blocks, fit, "weak_perspective", ridge, ROUGH_STEP)
-        across = fit.curvature[:size, size:]
-        inside = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
-        own = fit.curvature[size:, size:] - across.T @ inside @ across
-        known = np.linalg.eigvalsh(own)
-        known = np.maximum(known, 0.0)
-        n_known = float(np.sum(known / (known + ridge)))
-        freedom = max(n_equations - size - n_known, 0.1 * n_equations)
+        # Curvature in the strains, with the common metric eliminated (a Schur
+        # complement), and the effective number of strain parameters from it.
+        mixed = fit.curvature[:size, size:]
+        inverse = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
+        own = fit.curvature[size:, size:] - mixed.T @ inverse @ mixed
+        values = np.linalg.eigvalsh(own)
+        values = np.maximum(values, 0.0)
+        n_effective = float(np.sum(values / (values + ridge)))
+        # The two variances: sums of squares over effective numbers (MacKay).
+        freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
         noise = max(fit.cost / freedom, ROUNDING**2)
-        variance = np.sum(fit.strain**2) / max(n_known, 1e-3)
+        variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
         variance = np.clip(variance, ROUNDING, STRAIN_DEVIATION**2)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < SETTLED:
             break
     return refine_fit(blocks, fit, "weak_perspective", ridge)
 
 
-def _turns_to(shapes: NDArray, mean_shape: NDArray) -> NDArray:
-    """Return the rotations O that bring ``shape @ O`` nearest to the mean shape."""
+def _rotations_to_mean(shapes: NDArray, mean_shape: NDArray) -> NDArray:
+    """Return rotations O (I, 3, 3) that take ``shape @ O`` nearest to the mean shape.
+
+    Shapes are (I, n_points, 3), the mean shape is (n_points, 3).
+    """
     centred = mean_shape - mean_shape.mean(axis=0)
     left, _, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ centred)
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]

@@ -1,10 +1,12 @@
 """The metric of space in which cameras are most nearly scaled rotations.
 
-What is left of orthonormality (`orthonormality`) is minimised by damped Gauss-Newton
-steps along geodesics, ``Q <- Q exp(E_0 / 2)``. Any step leads to a metric, so that a
-minimum is found also where the linear equations for the entries of G (`metric_quadric`)
-have an indefinite solution. Where the residuals are large Gauss-Newton steps approach
-it slowly: what they miss of the curvature is learnt from how the gradient changes.
+The sum of squares of the residuals of `orthonormality` is minimised by damped
+Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``. After any step ``Q Q^T`` is
+positive definite. So a minimum is found even where the linear equations for the entries
+of G (`metric_quadric`) have an indefinite solution. Where the residuals are large,
+Gauss-Newton steps converge slowly: ``J^T J`` lacks the second-order part of the
+Hessian. That part is estimated from changes of the gradient, as in quasi-Newton
+methods.
 """
 
 import numpy as np
@@ -20,21 +22,23 @@ from isa_nrsfm._metric_upgrade.residuals import (
     strain_basis,
 )
 
-# Metrics that are nearly singular are saddle points. A start is one that stretches no
-# direction, relative to another one that the cameras see as well, by more than this.
+# Bound on the ratio of stretches of a metric to start from, in the space in which the
+# cameras see all directions alike. Nearly singular metrics are near saddle points.
 STRETCH_OF_START = 3.0
 MAX_STEPS = 200
-# It has converged when no entry of a step, a change of a logarithm, is larger.
+# Convergence tolerance: the largest entry of a step.
 SHORTEST_STEP = 1e-9
-# Damping relative to the diagonal: the first, how it falls and rises, and the largest.
+# Damping relative to the diagonal of the curvature: the first value, the factors after
+# a step that succeeds and one that fails, and the largest value.
 FIRST_DAMPING = 1e-3
 EASED, STIFFENED = 0.2, 5.0
 LARGEST_DAMPING = 1e10
-# A step changes the logarithm of the metric of a frame by no more than about this.
+# A step changes the logarithm of the metric of any frame by at most about this.
 LONGEST_STEP = 2.0
-# An update of the curvature whose cosine with the step is smaller is not safe.
+# The rank-one update is skipped if its direction has a smaller cosine with the step:
+# its denominator is then too near to zero.
 LEAST_ALONG = 1e-8
-# A share of the cost that is rounding errors.
+# Rounding errors of the cost, relative to it.
 ROUNDING = 1e-14
 
 
@@ -49,19 +53,20 @@ def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
     Q : ndarray of shape (3, 3)
         A symmetric matrix, positive definite or not: the linear solution for G.
     camera : {"orthographic", "weak_perspective"}
-        Orthographic cameras say how large G is.
+        Only orthographic cameras determine the scale of G.
 
     Returns
     -------
     ndarray of shape (3, 3)
-        Of a metric that has the same axes, in the space in which the cameras see all
-        directions alike, but is stretched by at most `STRETCH_OF_START` there.
+        Q of a positive definite metric. In the space in which the mean of ``M_i^T M_i``
+        is the identity, it has the axes of the given one, and its stretches differ by
+        at most the factor `STRETCH_OF_START`.
     """
     counted = motion if camera == "orthographic" else unit_cameras(motion)
     root = symmetric_power(mean_gram(counted), 0.5)
     values, axes = np.linalg.eigh(root @ Q @ root)
     values = np.maximum(values, values[-1] / STRETCH_OF_START**2)
-    # The mean of tr(M_i G M_i^T) is that of two rows of unit length.
+    # Scale: the mean of tr(M_i G M_i^T) is 2, that of two rows of unit length.
     values *= 2 / values.sum()
     return np.linalg.solve(root, axes * np.sqrt(values))
 
@@ -74,7 +79,7 @@ def refine_metric(
     ridge: float = 0.0,
 ) -> MetricFit:
     """
-    Minimise what is left of orthonormality from a start without strains.
+    Minimise the squared residuals of `orthonormality`, from a start without strains.
 
     Parameters
     ----------
@@ -87,7 +92,7 @@ def refine_metric(
     alpha : ndarray of shape (n_frames, n_components), optional
         Coefficients of the strains; by default there are none.
     ridge : float, default=0.0
-        Price of the squared norm of the strains.
+        Ridge: the regularisation weight of the squared norm of the strains.
 
     Returns
     -------
@@ -109,7 +114,7 @@ def refine_fit(
     shortest_step: float = SHORTEST_STEP,
 ) -> MetricFit:
     """
-    Minimise what is left of orthonormality from any fit.
+    Minimise the squared residuals of `orthonormality`, from any fit.
 
     Parameters
     ----------
@@ -120,7 +125,7 @@ def refine_fit(
     camera, ridge
         As of `refine_metric`.
     shortest_step : float
-        The search ends with a step of which no entry is larger.
+        Convergence tolerance: the largest entry of a step.
 
     Returns
     -------
@@ -129,29 +134,36 @@ def refine_fit(
     """
     basis = strain_basis(camera)
     size = len(basis)
+    # The unknowns of a step are coordinates in this basis: those of E_0, which is zero
+    # at each iterate, and those of the strains E_k, in `numbers`. `ridges` is the
+    # diagonal of the ridge. `second_order` estimates what J^T J lacks of the Hessian.
+    # `reach` bounds the change of the metric of a frame by one entry of a step.
     numbers = np.einsum("kab,nab->kn", fit.strain, basis)
-    prices = np.repeat([0.0, ridge], [size, numbers.size])
+    ridges = np.repeat([0.0, ridge], [size, numbers.size])
     reach = 1.0 + max(np.abs(alpha).sum(axis=0).max(initial=0) for _, alpha in blocks)
     value = fit.cost + ridge * float(np.sum(numbers**2))
     damping = FIRST_DAMPING
-    missing = np.zeros_like(fit.curvature)
+    second_order = np.zeros_like(fit.curvature)
     for _ in range(MAX_STEPS):
-        curvature = fit.curvature + missing + np.diag(prices)
-        gradient = fit.gradient + prices * np.append(np.zeros(size), numbers)
+        # Damped step, shortened to LONGEST_STEP.
+        curvature = fit.curvature + second_order + np.diag(ridges)
+        gradient = fit.gradient + ridges * np.append(np.zeros(size), numbers)
         scale = np.maximum(curvature.diagonal(), 1e-12 * curvature.diagonal().max())
         step = -np.linalg.lstsq(curvature + np.diag(damping * scale), gradient)[0]
         step *= min(1.0, LONGEST_STEP / max(reach * np.abs(step).max(), 1e-300))
+        # The cost there.
         change = np.tensordot(step[:size], basis, 1)
         changed = numbers + step[size:].reshape(numbers.shape)
         new_Q = fit.Q @ exponential(change / 2)
         new = fit_at(blocks, new_Q, np.tensordot(changed, basis, 1), camera)
         new_value = new.cost + ridge * float(np.sum(changed**2))
+        # Accept the step, or drop the estimated part of the Hessian, or damp more.
         if new_value <= value * (1 + ROUNDING):
-            missing = _missing_curvature(missing, step, fit, new, prices)
+            second_order = _updated_second_order(second_order, step, fit, new, ridges)
             value, numbers, fit = new_value, changed, new
             damping *= EASED
-        elif missing.any():
-            missing = np.zeros_like(missing)
+        elif second_order.any():
+            second_order = np.zeros_like(second_order)
         else:
             damping *= STIFFENED
         if np.abs(step).max() < shortest_step or damping > LARGEST_DAMPING:
@@ -159,24 +171,35 @@ def refine_fit(
     return fit
 
 
-def _missing_curvature(
-    missing: NDArray, step: NDArray, old: MetricFit, new: MetricFit, prices: NDArray
+def _updated_second_order(
+    second_order: NDArray,
+    step: NDArray,
+    old: MetricFit,
+    new: MetricFit,
+    ridges: NDArray,
 ) -> NDArray:
     """
-    Return what ``J^T J`` lacks of the curvature after a step.
+    Return the estimate of what ``J^T J`` lacks of the Hessian, updated after a step.
 
-    The update of rank one by which the curvature explains the change of the gradient
-    (Nocedal, Wright, "Numerical optimization", 2006, chapter 6.2; only of the part that
-    is missing: Dennis, Gay, Welsch, "An adaptive nonlinear least-squares algorithm",
-    ACM Transactions on Mathematical Software 7, 1981). Zeros are returned where the
-    curvature would not be positive.
+    This is the symmetric rank-one update (SR1; Nocedal, Wright, "Numerical
+    optimization", 2006, chapter 6.2), after which the Hessian explains the change of
+    the gradient. As in Dennis, Gay, Welsch ("An adaptive nonlinear least-squares
+    algorithm", ACM Transactions on Mathematical Software 7, 1981), only the part beyond
+    ``J^T J`` is updated. Zeros are returned where the Hessian would not be positive
+    definite.
+
+    Matrices are (n_unknowns, n_unknowns), the step and ridges are (n_unknowns,).
     """
-    rest = new.gradient - old.gradient - (new.curvature + missing) @ step
+    rest = new.gradient - old.gradient - (new.curvature + second_order) @ step
     along = rest @ step
     if abs(along) > LEAST_ALONG * np.linalg.norm(rest) * np.linalg.norm(step):
-        missing = missing + np.outer(rest, rest) / along
-    whole = new.curvature + missing + np.diag(prices)
-    return missing if np.linalg.eigvalsh(whole)[0] > 0 else np.zeros_like(missing)
+        second_order = second_order + np.outer(rest, rest) / along
+    whole = new.curvature + second_order + np.diag(ridges)
+    return (
+        second_order
+        if np.linalg.eigvalsh(whole)[0] > 0
+        else np.zeros_like(second_order)
+    )
 
 
 def exponential(matrices: NDArray) -> NDArray:

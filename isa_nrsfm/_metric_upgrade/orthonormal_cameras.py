@@ -8,26 +8,27 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
-# Columns that are added at a time: as many as a basis shape has.
+# Number of columns that are added at a time: a basis shape has three.
 STEP = 3
-# A column that the ones before it determine up to this share of it is left out.
+# A column is linearly dependent on those before it if less than this share of its norm
+# is orthogonal to them.
 DEPENDENT = 1e-10
-# Share of the largest squared singular value that is rounding errors.
+# Squared singular values below this share of the largest are rounding errors.
 NO_ENERGY = 1e-13
-# Steps after which starts can be compared: the best of the twenty then leads to the
-# least cost, or close to it.
+# Steps from each start before the starts are compared. The best of the about twenty
+# starts then leads to the least cost, or close to it.
 ROUGH_STEPS = 8
-# Damping of the steps, relative to the mean curvature: the first, how a good and a
-# failing step change it, and its bounds.
+# Levenberg-Marquardt damping, relative to the mean curvature: the first value, the
+# factors after a step that succeeds and one that fails, and the bounds.
 FIRST_DAMPING = 1e-3
 EASED, RAISED = 0.1, 4.0
 SMALLEST_DAMPING, LARGEST_DAMPING = 1e-10, 1e8
-# A cost below this, or a step that gains less than this share of it, is the end.
+# Convergence tolerances: the cost itself, and the gain of a step relative to the cost.
 ROUNDING = 1e-26
 LEAST_GAIN = 1e-9
 # Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
-# by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2): by 4 tr C, on average over all
-# cameras. C is the noise variance times Q^T Q.
+# by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2). On average over all cameras that is
+# 4 tr C. C is the noise variance times Q^T Q.
 NOISE_PRICE = 4.0
 
 
@@ -88,11 +89,12 @@ def orthonormal_cameras(
     Notes
     -----
     The cost is minimised for mixtures of the first three columns, then of the first
-    six, nine and so on, each time from the last mixture, while it falls. There are
-    local minima: where columns are added for the first time, each three of the columns
-    make a start, too. With noise the expected cost is minimised: to first order errors
-    of P add ``4 noise_variance ||Q||_F^2`` to it, for cameras that see all directions
-    alike. The result does not change when frames are turned in their image planes.
+    six, nine and so on, as long as it falls. Each minimisation starts from the last
+    mixture. Because of local minima the first one with more than three columns also
+    starts from each triple of its columns. With noise the expected cost is minimised:
+    to first order errors of P add ``4 noise_variance ||Q||_F^2`` to it, for cameras
+    that see all directions alike. The result does not change when frames are turned in
+    their image planes.
 
     Cameras of an object that deforms a lot are hard to tell from those of one that
     turns and deforms otherwise: a low cost does not mean that they are right.
@@ -158,10 +160,10 @@ def orthonormal_mixture(
     basis : ndarray of shape (2 * n_frames, n_columns)
         Columns of a motion factor, about as long as columns of cameras.
     mixing : ndarray of shape (n_before, 3)
-        The best mixture of the first columns, to start from. Where there were three of
-        them, each three of the columns make a start, too.
+        The best mixture of the first columns, to start from. If these are three, each
+        triple of the columns is a start, too.
     penalty : ndarray of shape (n_columns, n_columns), optional
-        L, for a price of ``||L Q||^2``.
+        L, for a penalty of ``||L Q||_F^2``.
     max_iter : int, default=200
         The most Levenberg-Marquardt steps.
 
@@ -170,8 +172,8 @@ def orthonormal_mixture(
     mixing : ndarray of shape (n_columns, 3)
         Q.
     cost : float
-        Mean over the frames of the squares of `orthonormality_residuals`, plus the
-        price.
+        Mean over the frames of the squared norm of `orthonormality_residuals`, plus the
+        penalty.
     """
     n = basis.shape[1]
     L = np.zeros((0, n)) if penalty is None else penalty
@@ -209,24 +211,27 @@ def _minimised(
     Q: NDArray, basis: NDArray, L: NDArray, max_iter: int
 ) -> tuple[NDArray, NDArray]:
     """
-    Return the least costs next to mixtures, by Levenberg-Marquardt steps.
+    Return mixtures at local minima of the cost, and their costs.
 
-    Mixtures are (n_starts, n_columns, 3), costs (n_starts,).
+    Levenberg-Marquardt steps are made from all starts at once. Mixtures Q are
+    (n_starts, n_columns, 3), costs (n_starts,), L is (n_rows, n_columns).
     """
     n = Q[0].size
     residuals, J = _residuals(Q, basis, L), _derivatives(Q, basis, L)
     cost = np.vecdot(residuals, residuals)
     damping, running = np.full(len(Q), FIRST_DAMPING), np.ones(len(Q), dtype=bool)
     for _ in range(max_iter):
+        # Damped step.
         curvature = J.swapaxes(1, 2) @ J
         scale = damping * np.trace(curvature, axis1=1, axis2=2) / n
         slope = J.swapaxes(1, 2) @ residuals[..., None]
-        # The curvature is zero where no direction changes the cost.
+        # Where the curvature is zero, any damping makes the matrix invertible.
         scale = np.where(scale > 0, scale, 1.0)
         step = np.linalg.solve(curvature + scale[:, None, None] * np.eye(n), slope)
         moved = Q - step.reshape(Q.shape)
         rest = _residuals(moved, basis, L)
         reached = np.vecdot(rest, rest)
+        # Accept it where the cost falls.
         better = running & (reached < cost)
         gain = np.where(better, cost - reached, np.inf)
         ended = better & ((reached < ROUNDING) | (gain <= LEAST_GAIN * cost))
@@ -254,7 +259,7 @@ def _residuals(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
 
 
 def _derivatives(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
-    """Return the derivatives of the residuals by the entries of mixtures."""
+    """Return the derivatives (n_starts, n, 3 n_columns) of `_residuals` in Q."""
     n_frames = len(basis) // 2
     P = basis.reshape(n_frames, 2, -1, 1)
     R = (basis @ Q).reshape(len(Q), n_frames, 2, 1, 3)
@@ -268,11 +273,11 @@ def _derivatives(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
 
 def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return which columns are independent, and a basis of what the first n of them span.
+    Return indices of independent columns, an orthogonal basis of them, and its mixing.
 
-    Columns of the basis are triangular mixtures of the columns that are kept, the third
-    result. They are orthogonal and as long as columns of cameras are on average, so
-    that the cost is well scaled.
+    ``basis = motion[:, kept] @ inverse`` with a triangular `inverse`. So the first n
+    columns of the basis span the first n columns that are kept. Columns of the basis
+    have the mean length of columns of cameras, so that the cost is well scaled.
     """
     lengths = np.linalg.norm(motion, axis=0)
     kept = np.flatnonzero(lengths > 0)

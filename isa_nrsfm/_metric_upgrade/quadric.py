@@ -10,18 +10,18 @@ recovery", 1997).
 import numpy as np
 from numpy.typing import NDArray
 
-# The smallest eigenvalue, relative to the largest, down to which a symmetric matrix is
-# taken for positive definite.
+# A symmetric matrix counts as positive definite if its smallest eigenvalue is above
+# this share of the largest.
 SMALLEST_EIGENVALUE = 1e-10
-# Five unknowns are determined while the smallest singular value of their equations is
-# above this share of the largest one.
+# Linear equations determine their unknowns if the smallest singular value is above this
+# share of the largest.
 SMALLEST_SINGULAR_VALUE = 1e-6
-# The upgrade is trusted while no axis of space is stretched, relative to another one,
-# by more than this: a depth that cameras hardly show is stretched without limit.
+# Bound on the ratio of stretches of space by Q. It is exceeded where the cameras hardly
+# show the depth, which noise then stretches without limit.
 LARGEST_STRETCH = 20.0
 
-# Unknowns of a symmetric 3x3 matrix: its diagonal, and sqrt(2) times the entries above
-# it, so that the norm of the six is the Frobenius norm of the matrix.
+# The six unknowns of a symmetric 3x3 matrix are its diagonal, and sqrt(2) times the
+# entries above it. Their norm is the Frobenius norm of the matrix.
 _ROWS, _COLUMNS = [0, 0, 1], [1, 2, 2]
 
 
@@ -51,7 +51,7 @@ def symmetric_power(matrix: NDArray, power: float) -> NDArray:
 
 def conformal_equations(cameras: NDArray) -> NDArray:
     """
-    Return what weak-perspective cameras ask of the metric of space.
+    Return the linear equations of weak-perspective cameras for the metric of space.
 
     Parameters
     ----------
@@ -93,10 +93,10 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
 
     The rows m1 and m2 of each camera, divided by its norm, should satisfy
     ``m1 Q m1^T = m2 Q m2^T`` and ``m1 Q m2^T = 0``: homogeneous linear equations in
-    six unknowns, solved by least squares. They are weighted such that turning a frame
-    in its image plane changes nothing. What is kept constant, to exclude Q = 0, is the
-    mean of ``m1 Q m1^T + m2 Q m2^T``, so that a depth which the cameras show little of
-    does not pass for a solution.
+    six unknowns, solved by least squares. Their weights are such that turning a frame
+    in its image plane changes nothing. To exclude Q = 0 the mean of ``m1 Q m1^T + m2 Q
+    m2^T`` is fixed. With a fixed norm of Q instead, a Q along a direction that the
+    cameras hardly see would nearly solve the equations.
 
     Parameters
     ----------
@@ -106,27 +106,29 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     Returns
     -------
     ndarray of shape (3, 3) or None
-        Q, positive definite, the mean of ``m1 Q m1^T + m2 Q m2^T`` being one. None
-        where the equations do not determine it, and where it is not safely positive
-        definite.
+        Q, positive definite, the mean of ``m1 Q m1^T + m2 Q m2^T`` being one. None if
+        the equations do not determine it, or if it is not safely positive definite.
     """
-    Q = _most_metric(motion)
+    Q = _least_squares_quadric(motion)
     if Q is None:
         return None
     eigenvalues = np.linalg.eigvalsh(Q)
-    # Q is stretched as the square of space.
+    # Eigenvalues of Q are squares of the stretches of space.
     return Q if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
 
 
-def _most_metric(motion: NDArray) -> NDArray | None:
-    """Return Q of `metric_quadric`, positive definite or not, if it is determined."""
+def _least_squares_quadric(motion: NDArray) -> NDArray | None:
+    """Return Q (3, 3) of `metric_quadric`, positive definite or not.
+
+    Cameras are (n_frames, 2, 3). None if the equations do not determine Q.
+    """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)
     eigenvalues = np.linalg.eigvalsh(gram)
     if eigenvalues[0] <= SMALLEST_EIGENVALUE * eigenvalues[-1]:
         return None
-    # In coordinates in which the mean of M_i^T M_i is the identity the mean to be kept
-    # is the trace of Q: the identity over three plus five unknowns without trace.
+    # In coordinates where the mean of M_i^T M_i is the identity, the mean that is fixed
+    # is the trace of Q. So Q is I / 3 plus a matrix without trace, of five unknowns.
     whitening = symmetric_power(gram, -0.5)
     equations = conformal_equations(cameras @ whitening)
     trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
@@ -156,15 +158,15 @@ def anisotropy(motion: NDArray) -> float:
     float
         Root mean square over the cameras of ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and
         s2 the singular values of the camera in the metric of `metric_quadric`, from 0
-        for scaled orthographic cameras to 1. Axes that are stretched too much there are
-        shortened to what is allowed. Zero where the metric is not determined.
+        for scaled orthographic cameras to 1. Stretches of that metric are limited to
+        `LARGEST_STRETCH`. Zero where the metric is not determined.
     """
     motion = motion[np.isfinite(motion).all(axis=(1, 2)) & motion.any(axis=(1, 2))]
     if not len(motion):
         return 0.0
-    # In the space in which all directions are seen alike.
+    # In the space in which the cameras see all directions alike.
     motion = motion @ np.linalg.pinv(symmetric_power(mean_gram(motion), 0.5))
-    Q = _most_metric(motion)
+    Q = _least_squares_quadric(motion)
     if Q is None:
         return 0.0
     stretch, axes = np.linalg.eigh(Q)

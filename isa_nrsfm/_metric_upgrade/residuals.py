@@ -5,11 +5,14 @@ camera M_i are orthogonal and of equal length in it where ``M_i Q = s_i R_i``, t
 two rows of a scaled rotation. It may change with the deformation of the object, as
 ``G_i = Q exp(sum_k alpha_ik E_k) Q^T`` with symmetric strains E_k.
 
-What is left of orthonormality is linearised along geodesics, ``Q <- Q exp(E_0 / 2)``,
-and in the strains. The derivative of the exponential is that of Daleckii and Krein
-(Higham, "Functions of matrices", 2008, theorem 3.11). A frame has few numbers of its
-own, and its derivatives by E_k are those by its strain times alpha_ik: the derivatives
-by all unknowns are never made, only the sums over frames of their products.
+The residuals (`orthonormality`) are linearised along geodesics, ``Q <- Q exp(E_0 /
+2)``, and in the strains. The derivative of the exponential is that of Daleckii and
+Krein (Higham, "Functions of matrices", 2008, theorem 3.11).
+
+The strain of a frame, ``sum_k alpha_ik E_k``, has five or six unknowns, its coordinates
+in `strain_basis`. Derivatives in those of E_k are alpha_ik times the derivatives in
+these. So the Jacobian in all unknowns is never formed, only sums of products over the
+frames: ``J^T J`` and ``J^T r``.
 """
 
 from typing import Literal, NamedTuple
@@ -23,7 +26,7 @@ CameraModel = Literal["orthographic", "weak_perspective"]
 CAMERA_MODELS = ("orthographic", "weak_perspective")
 Block = tuple[NDArray, NDArray]
 
-# A share of the largest curvature that is rounding errors.
+# Eigenvalues of the curvature below this share of the largest are rounding errors.
 ROUNDING = 1e-14
 # Frames taken at a time, for which all that a step needs stays in the cache.
 BLOCK_FRAMES = 2048
@@ -31,12 +34,12 @@ BLOCK_FRAMES = 2048
 
 class MetricFit(NamedTuple):
     """
-    A metric of least squares.
+    A metric, with its cost and derivatives.
 
     Attributes
     ----------
     Q : ndarray of shape (3, 3)
-        Of the metric of frames without deformation.
+        ``G = Q Q^T`` is the metric of frames without deformation.
     strain : ndarray of shape (n_components, 3, 3)
         E_k, symmetric and without trace.
     n_frames : int
@@ -44,8 +47,9 @@ class MetricFit(NamedTuple):
     cost : float
         Sum of the squared residuals, those of `orthonormality`.
     curvature : ndarray of shape (n_unknowns, n_unknowns)
-        ``J^T J`` with J the derivatives of the residuals by the numbers of E_0, E_1,
-        ..., the coefficients of `strain_basis`, in this order.
+        ``J^T J``, the Gauss-Newton approximation of half the Hessian. J are the
+        derivatives of the residuals in the unknowns: the coordinates of E_0, E_1, ...
+        in `strain_basis`, in this order.
     gradient : ndarray of shape (n_unknowns,)
         ``J^T r`` with r the residuals.
     """
@@ -74,12 +78,13 @@ class MetricFit(NamedTuple):
 
 def strain_basis(camera: CameraModel) -> NDArray:
     """
-    Return an orthonormal basis of the strains that cameras tell from none.
+    Return an orthonormal basis of the strains that change the residuals.
 
     Parameters
     ----------
     camera : {"orthographic", "weak_perspective"}
-        With a scale of its own for each frame no strain has a trace.
+        With weak-perspective cameras each frame has a scale of its own. A strain with a
+        trace only changes these scales.
 
     Returns
     -------
@@ -108,10 +113,10 @@ def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
     Returns
     -------
     ndarray of shape (3, n_frames) or (2, n_frames)
-        ``(xx - 1, sqrt(2) xy, yy - 1)``, of the norm ``||M_i G M_i^T - I||_F``, for
-        orthographic cameras, and ``(xx - yy, 2 xy) / (xx + yy)``, of the norm ``(s1^2 -
-        s2^2) / (s1^2 + s2^2)`` with s1, s2 the singular values of ``M_i Q``, for
-        weak-perspective ones: neither roll nor scale of a frame changes that.
+        For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i
+        G M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``,
+        with the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular
+        values of ``M_i Q``. Roll and scale of a frame do not change that norm.
     """
     entries = np.tensordot(_patterns(camera), gram, 2)
     if camera == "orthographic":
@@ -120,7 +125,11 @@ def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
 
 
 def _patterns(camera: CameraModel) -> NDArray:
-    """Return the symmetric matrices whose products with a Gram matrix count."""
+    """Return symmetric matrices F_c (n, 2, 2) with the entries of residuals.
+
+    Residual c is ``<F_c, M_i G M_i^T>``, before it is shifted (orthographic) or divided
+    by the trace (weak-perspective).
+    """
     if camera == "orthographic":
         across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
         return np.stack([np.diag([1.0, 0.0]), across, np.diag([0.0, 1.0])])
@@ -167,7 +176,7 @@ def fit_at(
     blocks : list of tuple of ndarray
         Of `frame_blocks`.
     Q : ndarray of shape (3, 3)
-        Of the metric of frames without deformation.
+        ``G = Q Q^T`` is the metric of frames without deformation.
     strain : ndarray of shape (n_components, 3, 3)
         E_k.
     camera : {"orthographic", "weak_perspective"}
@@ -176,7 +185,7 @@ def fit_at(
     Returns
     -------
     MetricFit
-        Cost, curvature and gradient there.
+        The metric, with its cost, curvature and gradient.
     """
     parts = [
         _normal_equations(alpha, *_linearised(Q.T @ cameras, strain, alpha, camera))
@@ -215,12 +224,14 @@ def _linearised(
     residuals : ndarray of shape (n, n_frames)
         As of `orthonormality`.
     slopes : ndarray of shape (n_numbers, n, n_frames)
-        Derivatives by the numbers of E_0.
+        Derivatives in the coordinates of E_0 in `strain_basis`.
     own_slopes : ndarray of shape (n_numbers, n, n_frames)
-        Derivatives by the numbers of the strain ``sum_k alpha_ik E_k`` of the frame:
-        those by the numbers of E_k are alpha_ik times as large.
+        Derivatives in the coordinates of ``E = sum_k alpha_ik E_k``, the strain of the
+        frame. Those in the coordinates of E_k are alpha_ik times as large.
     """
     numbers = strain_basis(camera)
+    # M_i Q exp(E) is `grown`, and M_i G_i M_i^T the product of that with M_i Q. The
+    # eigenvectors of E are `axes`, and `seen` is M_i Q in these axes.
     grown = cameras
     if len(strain):
         stretch, axes = eigh3(strain[:, ROWS, COLUMNS].T @ alpha)
@@ -228,7 +239,8 @@ def _linearised(
         grown = np.einsum("abn,pbn->pan", axes, np.exp(stretch) * seen)
     gram = np.einsum("pan,qan->pqn", grown, cameras)
     residuals = orthonormality(gram, camera)
-    # Residual c changes by tr(F_c d(M_i G_i M_i^T)).
+    # Residual c changes by tr(F_c d(M_i G_i M_i^T)). The weak-perspective residual is a
+    # quotient: F_c is (pattern - residual * I) / (xx + yy).
     F = np.broadcast_to(
         _patterns(camera)[..., None], (len(residuals), 2, 2, cameras.shape[-1])
     )
@@ -236,13 +248,16 @@ def _linearised(
         F = F - residuals[:, None, None] * np.eye(2)[:, :, None]
         F /= gram[0, 0] + gram[1, 1]
 
-    # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes by the mean of E_0 exp(E), exp(E) E_0.
+    # Derivatives in E_0: exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by
+    # (E_0 exp(E) + exp(E) E_0) / 2.
     turned = np.einsum("cpqn,qan->cpan", F, cameras)
     by_common = np.einsum("cpan,pbn->abcn", turned, grown)
     slopes = np.tensordot(numbers, by_common, 2)
     if not len(strain):
         return residuals, slopes, slopes
-    # In the axes of the strain exp(E) changes by divided differences of exp times dE.
+    # Derivatives in E: in its axes, exp(E) changes by dE times, entry by entry, the
+    # divided differences of exp at two eigenvalues, which are
+    # exp((a + b) / 2) sinh((a - b) / 2) / ((a - b) / 2).
     half_gap = (stretch[:, None] - stretch) / 2
     equal = half_gap == 0
     divided = np.where(equal, 1.0, np.sinh(half_gap) / np.where(equal, 1.0, half_gap))
@@ -250,6 +265,7 @@ def _linearised(
     divided *= root[:, None] * root
     turned = np.einsum("cpqn,qan->cpan", F, seen)
     by_own = np.einsum("cpan,pbn->abcn", turned, seen) * divided[:, :, None]
+    # Back to the axes of space.
     by_own = np.einsum("xan,abcn->xbcn", axes, by_own)
     by_own = np.einsum("ybn,xbcn->xycn", axes, by_own)
     return residuals, slopes, np.tensordot(numbers, by_own, 2)
@@ -258,7 +274,12 @@ def _linearised(
 def _normal_equations(
     alpha: NDArray, residuals: NDArray, slopes: NDArray, own_slopes: NDArray
 ) -> tuple[float, NDArray, NDArray]:
-    """Return cost, curvature and gradient, as in `MetricFit`, of `_linearised`."""
+    """
+    Return cost, curvature and gradient, as in `MetricFit`, from `_linearised`.
+
+    The shapes are those given there. `curvature` has the axes (k, a, m, b): coordinate
+    a of E_k and coordinate b of E_m.
+    """
     n_components, size = len(alpha), len(slopes)
     rows = slopes.reshape(size, -1)
     curvature = np.empty((1 + n_components, size, 1 + n_components, size))
@@ -270,7 +291,8 @@ def _normal_equations(
         mixed = np.einsum("acn,bcn->abn", slopes, own_slopes) @ alpha.T
         curvature[0, :, 1:] = mixed.transpose(0, 2, 1)
         curvature[1:, :, 0] = mixed.transpose(2, 1, 0)
-        # Sums over the frames of products of two numbers and of two coefficients.
+        # Both factors are symmetric: each pair of coordinates, and each pair of
+        # coefficients, is multiplied once.
         (a, b), numbers = _pairs(size)
         (k, m), components = _pairs(n_components)
         products = np.einsum("pcn,pcn->pn", own_slopes[a], own_slopes[b])
@@ -281,7 +303,7 @@ def _normal_equations(
 
 
 def _pairs(n: int) -> tuple[tuple[NDArray, NDArray], NDArray]:
-    """Return the pairs (a, b) with a <= b < n, and a table of where each of them is."""
+    """Return the pairs (a, b) with a <= b < n, and the index (n, n) of each pair."""
     a, b = np.triu_indices(n)
     where = np.empty((n, n), dtype=int)
     where[a, b] = where[b, a] = np.arange(len(a))

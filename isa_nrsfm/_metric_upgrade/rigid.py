@@ -17,7 +17,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
 )
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS, CameraModel, MetricFit
 
-# A condition number from which on the cameras hardly show the metric: rotations by
+# Above this condition number the cameras hardly determine the metric. Rotations by
 # about five degrees have it.
 LARGEST_CONDITION = 50.0
 
@@ -124,11 +124,11 @@ def metric_upgrade(
     Notes
     -----
     ``G = Q Q^T`` solves ``M_i G M_i^T = s_i^2 I``, equations that are linear in G
-    (Tomasi, Kanade 1992; Poelman, Kanade 1997). Their solution minimises the wrong
-    thing where there is no exact one and may not be positive definite. It is where the
-    sum of squares of `residual` is minimised from, over positive definite matrices
-    only; another start is the metric in which the cameras see all directions alike, and
-    the better result is taken.
+    (Tomasi, Kanade 1992; Poelman, Kanade 1997). If there is no exact solution, that of
+    least squares minimises an algebraic error, and may not be positive definite. It is
+    only a start for the minimisation of the sum of squares of `residual` over positive
+    definite matrices. A second start is the metric in which the cameras see all
+    directions alike. The better of the two results is taken.
 
     References
     ----------
@@ -213,7 +213,10 @@ def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
 
 
 def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
-    """Return cameras as an array, and which of them are neither NaN nor zero."""
+    """Return cameras (n_frames, 2, 3), and which of them are neither NaN nor zero.
+
+    `least` is the least number of cameras that is accepted.
+    """
     cameras = np.asarray(motion, dtype=np.float64)
     if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
         raise ValueError(
@@ -228,7 +231,7 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
 
 
 def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
-    """Return the best metric of usable cameras, from two starts."""
+    """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
     eigenvalues = np.zeros(3)
     if len(cameras):
         gram = mean_gram(unit_cameras(cameras))
@@ -272,8 +275,12 @@ def best_metric(motion: NDArray) -> NDArray:
 
 
 def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
-    """Return Q with a scale such that that of the cameras has mean square one."""
-    # A scale is the mean of the two singular values, the product of which is the area.
+    """Return Q (3, 3), scaled so that the scales of the cameras have mean square one.
+
+    Cameras are (n_frames, 2, 3).
+    """
+    # A scale is s = (s1 + s2) / 2 with the singular values of a camera. Then
+    # s^2 = (s1^2 + s2^2) / 4 + s1 s2 / 2, and s1 s2 is the area that the rows span.
     rows = cameras @ Q
     area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
     return Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))

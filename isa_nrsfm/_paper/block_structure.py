@@ -1,8 +1,8 @@
-"""Block structure of the motion: which 3x3 matrix makes a subspace a camera.
+"""Block structure of the motion: 3x3 matrices that take subspaces to the rigid motion.
 
-After the right 3x3 transformation D_k the motion of subspace k is the rigid motion
-times a coefficient, ``M_ik D_k ~ alpha_ik M_0^i`` (Brandt et al. 2018, appendix A).
-Everything here needs the frames only through a few products per frame.
+The motion of subspace k is known up to a 3x3 matrix. With the right D_k it is the rigid
+motion times a coefficient, ``M_ik D_k ~ alpha_ik M_0^i`` (Brandt et al. 2018, appendix
+A). All functions here need of each frame only the products in `MotionProducts`.
 """
 
 from collections.abc import Callable
@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-# Directions of a subspace with less than this share of its largest variance count
-# as empty: the block is degenerate.
+# Directions of a subspace with less than this share of its largest variance are left
+# out. The subspace does not move along them.
 EMPTY_DIRECTION = 1e-9
-# Share of a camera's energy that regularises its inverse in `lifted_moments`.
+# Ridge in `lifted_moments`, relative to the energy of the camera.
 LIFT_RIDGE = 0.1
 _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 _UNPACKED = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
@@ -45,7 +45,7 @@ class MotionProducts(NamedTuple):
         return MotionProducts(cross, self.rigid, components @ self.gram @ components.T)
 
     def blocks(self) -> NDArray:
-        """Return ``M_0^iT M_ik``, shape (n_blocks, n_frames, 9), by rows."""
+        """Return ``M_0^iT M_ik`` as (n_blocks, n_frames, 9), each matrix row by row."""
         n_frames, _, n_signals = self.cross.shape
         split = self.cross.reshape(n_frames, 3, n_signals // 3, 3)
         return np.ascontiguousarray(split.transpose(2, 0, 1, 3)).reshape(
@@ -86,17 +86,17 @@ def unpack(packed: NDArray) -> NDArray:
 
 
 def packed_inner(packed: NDArray, symmetric: NDArray) -> NDArray:
-    """Return ``<Q, S>`` of each packed Q (n, 6) and each symmetric S (..., 3, 3)."""
+    """Return ``<Q, S>`` (n, ...) of packed Q (n, 6) and symmetric S (..., 3, 3)."""
     weights = pack(symmetric) * np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
     return packed @ weights.T
 
 
 def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     """
-    Return for each subspace the matrix that brings its motion to the rigid motion.
+    Return for each subspace the matrix D_k that takes its motion to the rigid motion.
 
-    It minimises ``sum_i ||M_ik D_k - alpha_ik M_0^i||_F^2`` over D_k and alpha_k in
-    the sense of the method.
+    D_k and alpha_k make ``sum_i ||M_ik D_k - alpha_ik M_0^i||_F^2`` small. The methods
+    differ in how they exclude ``D_k = 0``.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     Returns
     -------
     ndarray of shape (n_blocks, 3, 3)
-        D_k with ``||D_k||_F = 1``, of any sign; the zero matrix for a subspace
+        D_k with ``||D_k||_F = 1``, of arbitrary sign. The zero matrix for a subspace
         without motion.
     """
     solve = _METHODS[method]
@@ -119,7 +119,7 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
         block = slice(3 * k, 3 * k + 3)
         gram = products.gram[block, block]
         if np.trace(gram) > 0:
-            # M_ik^T M_0^i by rows, so that <M_ik D, M_0^i> = m_i . vec(D).
+            # m_i is M_ik^T M_0^i, row by row: <M_ik D, M_0^i> = m_i . vec(D).
             m = P.reshape(-1, 3, 3).transpose(0, 2, 1).reshape(-1, 9)
             d = solve(m, energy, gram)
             D[k] = (d / np.linalg.norm(d)).reshape(3, 3)
@@ -128,11 +128,14 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
 
 def _eigen(m: NDArray, energy: NDArray, gram: NDArray) -> NDArray:
     """
-    Return the exact minimiser under the norm constraint.
+    Return vec(D) (9,) of norm one that minimises the cost.
 
-    With alpha_i = <M_ik D, M_0^i> / ||M_0^i||^2 eliminated the cost is a quadratic
-    form in vec(D): its smallest eigenvector. It may collapse onto a direction in
-    which the subspace hardly moves.
+    With ``alpha_i = <M_ik D, M_0^i> / ||M_0^i||^2`` put in, the cost is a quadratic
+    form in vec(D). Its minimiser is the eigenvector of the smallest eigenvalue. That
+    may be a direction in which the subspace hardly moves.
+
+    Here and in the other methods m is (n_frames, 9) as in `recover_blocks`, `energy`
+    (n_frames,) is ``||M_0^i||^2`` and `gram` (3, 3) is ``sum_i M_ik^T M_ik``.
     """
     cost = np.kron(gram, np.eye(3)) - _explained(m, energy)
     return eigh(cost, subset_by_index=(0, 0))[1][:, 0]
@@ -140,10 +143,10 @@ def _eigen(m: NDArray, energy: NDArray, gram: NDArray) -> NDArray:
 
 def _generalized_eigen(m: NDArray, energy: NDArray, gram: NDArray) -> NDArray:
     """
-    Return the D that explains the largest share of the energy of M_k D.
+    Return vec(D) (9,) for which the rigid motion explains the largest share of M_k D.
 
-    It maximises ``sum_i <M_ik D, M_0^i>^2 / ||M_0^i||^2`` relative to
-    ``sum_i ||M_ik D||^2``, over the directions in which the subspace moves.
+    The share is the ratio of ``sum_i <M_ik D, M_0^i>^2 / ||M_0^i||^2`` to ``sum_i
+    ||M_ik D||^2``. Directions in which the subspace does not move are left out.
     """
     variance, axes = eigh(gram)
     moving = variance > EMPTY_DIRECTION * variance[-1]
@@ -156,19 +159,19 @@ def _irls(
     m: NDArray, energy: NDArray, gram: NDArray, max_iter: int = 100, tol: float = 1e-12
 ) -> NDArray:
     """
-    Return the result of iteratively reweighted least squares, as published.
+    Return vec(D) (9,) by iteratively reweighted least squares, as published.
 
-    alpha of the first frame is held, the linear least squares for D and the other
-    alphas is solved, the held alpha is divided by the norm of D (Brandt et al. 2018,
-    appendix A). The solution is proportional to the held alpha, so that the
-    iteration ends after one rescaling.
+    A step holds alpha of the first frame, solves the linear least squares for D and the
+    other alphas, and divides the held alpha by the norm of D (Brandt et al. 2018,
+    appendix A). The solution is proportional to the held alpha. So the iteration ends
+    after one rescaling.
     """
     cost = np.kron(gram, np.eye(3)) - _explained(m[1:], energy[1:])
     held = 1.0
     for _ in range(max_iter):
         d = np.linalg.lstsq(cost, held * m[0])[0]
         norm = float(np.linalg.norm(d))
-        if norm == 0.0:  # the first frame says nothing
+        if norm == 0.0:  # m[0] is zero: the first frame says nothing
             return _generalized_eigen(m, energy, gram)
         held /= norm
         if abs(norm - 1.0) < tol:
@@ -177,7 +180,7 @@ def _irls(
 
 
 def _explained(m: NDArray, energy: NDArray) -> NDArray:
-    """Return the quadratic form ``sum_i <M_ik D, M_0^i>^2 / ||M_0^i||^2``."""
+    """Return (9, 9): ``sum_i <M_ik D, M_0^i>^2 / ||M_0^i||^2`` as a form in vec(D)."""
     weighted = np.divide(m, energy[:, None], where=energy[:, None] > 0, out=0.0 * m)
     return m.T @ weighted
 
@@ -192,11 +195,13 @@ BLOCK_RECOVERIES = tuple(_METHODS)
 
 def lifted_moments(products: MotionProducts) -> NDArray:
     """
-    Return the second moments of the motions lifted through their rigid cameras.
+    Return the second moments of the lifted motions.
 
-    ``L_i = (M_0^iT M_0^i + ridge)^-1 M_0^iT M^i`` is 3 x n_signals; where the motion
-    of subspace k is ``alpha_ik M_0^i E_k`` its columns are nearly ``alpha_ik E_k``,
-    and the leading eigenvector of the moments of that block is nearly E_k.
+    The motion of a frame is lifted from the image to space by a regularised inverse of
+    its rigid camera, ``L_i = (M_0^iT M_0^i + ridge I)^-1 M_0^iT M^i``, a 3 x n_signals
+    matrix. If the motion of subspace k is ``alpha_ik M_0^i E_k``, the columns of L_i
+    that belong to it are nearly ``alpha_ik E_k``, and the leading eigenvector of their
+    second moments is nearly E_k.
 
     Parameters
     ----------
@@ -230,7 +235,8 @@ def lifted_blocks(moments: NDArray, subspaces: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_subspaces, 9, 9)
-        Moments of the 3x3 matrices ``L_i A_k``, by rows.
+        Second moments of the 3x3 matrices ``L_i A_k``, row by row, where the columns
+        of A_k are the rows of subspace k.
     """
     rows = subspaces[:, None, None]
     blocks = rows @ moments @ rows.swapaxes(-1, -2)  # (k, a, b, m, n)
@@ -251,7 +257,8 @@ def structure_energies(moments: NDArray, subspaces: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_subspaces,)
-        Largest eigenvalue of the lifted moments: the energy along one matrix E_k.
+        Largest eigenvalue of the moments of `lifted_blocks`: the energy that is a
+        coefficient times one matrix E_k.
     """
     return np.linalg.eigvalsh(lifted_blocks(moments, subspaces))[:, -1]
 

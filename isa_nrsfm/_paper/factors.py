@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._paper.svd import Triplets, _complete, leading_triplets
 
-# A direction whose singular value is below this share of the first is null, whatever
-# the precision of the table: it has less than 1e-20 of the energy.
+# Singular values below this share of the first count as zero, however precise the table
+# is. They have less than 1e-20 of the energy.
 NULL_DIRECTION = 1e-10
 
 
@@ -28,18 +28,18 @@ class Factorisation(NamedTuple):
     rigid_motion : ndarray of shape (2 * n_frames, 3)
         M_0, two rows a frame; its columns are orthogonal.
     rigid_shape : ndarray of shape (3, n_points)
-        B_0, centred and white: ``B_0 B_0^T = n_points I``, but for rows of zeros
-        where W has a rank below 3.
+        B_0, centred and white: ``B_0 B_0^T = n_points I``. Rows are zero where W has a
+        rank below 3.
     motion : ndarray of shape (2 * n_frames, n_signals)
         M', by decreasing column norm.
     signals : ndarray of shape (n_signals, n_points)
-        B', centred and white, orthogonal to B_0. `n_signals` is 3K, or the least
-        multiple of three that holds every direction with a singular value above
-        rounding errors.
+        B', centred and white, orthogonal to B_0. `n_signals` is 3K, or less where W has
+        a lower rank: the least multiple of three with room for all singular values
+        above rounding errors.
     singular_values : ndarray of shape (3K + 3,)
         Largest singular values of W, decreasing; fewer if W does not have as many.
     rest : float
-        Energy of W outside these, the sum of the squares of the others.
+        Energy of W that is left: the sum of the squares of its other singular values.
     """
 
     rigid_motion: NDArray
@@ -68,24 +68,26 @@ def factorise(
     precision : float, default=0.0
         Rounding error of the entries of W, relative to their root mean square.
     triplets : Triplets, optional
-        The 3K + 3 leading triplets of a matrix of which W holds some of the frames, by
-        default of W.
+        The 3K + 3 leading triplets of a larger matrix, of which W has some of the
+        frames. By default those of W are computed.
 
     Returns
     -------
     Factorisation
-        The factors; of the larger matrix those that belong to these frames.
+        The factors. With triplets of a larger matrix, its factors for these frames.
     """
     n_points = W.shape[1]
     root = np.sqrt(n_points)
     if triplets is None:
         triplets = leading_triplets(W, 3 * n_components + 3)
     S, Vt, rest = triplets
+    # Rows of Vt above rounding errors, centred, their signs fixed.
     null = max(NULL_DIRECTION, precision) * S[0]
     rank = int(np.sum(S > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
 
+    # The first three are the rigid shape, the next ones the signals.
     B_0 = np.zeros((3, n_points))
     B_0[: min(rank, 3)] = root * Vt[:3]
     B = _complete(Vt, 3 * max(1, -(-(rank - 3) // 3))) * root

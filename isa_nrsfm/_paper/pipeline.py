@@ -24,12 +24,12 @@ from isa_nrsfm._paper.block_structure import (
 )
 from isa_nrsfm._paper.factors import Factorisation
 
-# Fixed-point iterations from random starts are chaotic at first: rounding errors, such
-# as other orders of summation make, could lead them elsewhere. The signals, of unit
-# variance, are rounded by far more than those and far less than they are known, and the
-# samples are sorted, so that the order of frames and points makes no difference.
+# The signals are rounded to this many decimals, and their samples sorted, before the
+# analysis. Fixed-point iterations from random starts magnify rounding errors, so that
+# another order of frames or points could lead to another optimum. Signals have unit
+# variance: this is far coarser than rounding errors, and far finer than their errors.
 SIGNAL_DECIMALS = 5
-# Eigenvectors of the lifted motion that the refinement starts from.
+# Number of eigenvectors of `leading_blocks` that the refinement starts from.
 N_LIFTED_STARTS = 2
 
 
@@ -46,7 +46,7 @@ class PaperResult(NamedTuple):
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
         ``(J / 2I) M_ISA^T M_ISA``, in the order of the basis.
     n_iter : int
-        Steps of the refinement, 1 without one.
+        Steps of the refinement, 1 without a refinement.
     converged : bool
         Whether it has converged.
     """
@@ -89,7 +89,7 @@ def run_paper_pipeline(
     tol : float
         Tolerance of the refinement.
     report : callable
-        Is told what has been done.
+        Called with the name of each stage that has ended.
 
     Returns
     -------
@@ -104,6 +104,7 @@ def run_paper_pipeline(
     )
     report("independent subspaces")
 
+    # Block structure. E_k is the inverse of D_k.
     products = products.rotated(components)
     E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=1e-9)
     n_iter, converged = 1, True
@@ -117,6 +118,7 @@ def run_paper_pipeline(
         )
     report("block structure and refinement")
 
+    # Shapes. Subspaces that W has no rank for stay zero.
     basis = np.zeros((n_components, 3, n_points))
     basis[: len(E)] = E @ (components @ factors.signals).reshape(-1, 3, n_points)
     used = 3 * len(E)
@@ -141,10 +143,14 @@ def _independent_subspaces(
     """
     Fit a strategy to the signals and return its orthogonal unmixing matrix.
 
-    A strategy that pools takes the covariance over the images, ``C = (J / 2I) M'^T
-    M'`` (Brandt et al. 2018, section 3.3, without the mean term, which would depend
-    on the rotation of single images); one that chooses between candidates is told
-    how much block structure they have.
+    If `fit` of the strategy has a parameter `covariance`, it gets the covariance over
+    the images, ``C = (J / 2I) M'^T M'`` (Brandt et al. 2018, section 3.3). Their mean
+    term is left out: it would depend on the rotation of single images. If it has a
+    parameter `criterion`, it gets the function `structure_energies`, which values
+    candidates for subspaces by their block structure.
+
+    Signals are (n_signals, n_points), moments as of `lifted_moments`, `scale` is J /
+    2I.
     """
     fit_params: dict[str, Any] = {}
     if has_fit_parameter(isa, "covariance"):
@@ -159,5 +165,6 @@ def _independent_subspaces(
             f"isa must give components_ of shape {(n_signals, n_signals)}; "
             f"got {isa.components_.shape}"
         )
-    U, _, Vt = np.linalg.svd(isa.components_)  # the signals are white
+    # The nearest orthogonal matrix: the signals are white, up to rounding.
+    U, _, Vt = np.linalg.svd(isa.components_)
     return U @ Vt

@@ -1,8 +1,8 @@
 """Which frames of a large table the first stages work on.
 
-The stages of the paper and the first steps of the joint refinement lead to a start for
-the next ones, which a part of the frames gives as well. It holds frames from the most
-to the least rigid one, the same in whatever order they come.
+The stages of the paper and the first steps of the joint refinement only make a start
+for the steps that follow. A sample of the frames makes one as good. It is spread evenly
+from the most to the least rigid frame, so that the order of the frames does not matter.
 """
 
 from functools import partial
@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import spread
 
-# With more frames than that the first steps are made on so many of them, the next ones
-# on so many times more, up to about so many, and the last ones on all.
+# Frames of the first sample. Each further sample is GROWTH times larger, up to about
+# MOST_SAMPLED frames. The last steps take all frames.
 SAMPLE_FRAMES = 600
 GROWTH = 4
 MOST_SAMPLED = 40_000
 # Tables with fewer coordinates than this are taken whole.
 SMALL_TABLE = 150_000
-# Directions in which a shape is thinner than this share of its width are flat.
+# A direction whose singular value is below this share of the largest counts as flat.
 FLAT = 1e-10
 
 
@@ -34,8 +34,9 @@ class Sample(NamedTuple):
     W : ndarray of shape (2 * n_chosen, n_points)
         Their measurement matrix, completed where points are missing.
     parts : list of ndarray of int
-        The frames of W, increasing, and larger and larger sets of them for the stages
-        that follow; empty where W has all frames.
+        Indices of frames, increasing. The first array has the frames of W, the others
+        the larger and larger samples of the steps that follow. Empty where W has all
+        frames.
     """
 
     W: NDArray
@@ -76,7 +77,7 @@ def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sam
 
 def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
     """
-    Return for each frame the energy that a rigid shape leaves of it.
+    Return for each frame the energy of its residual after the fit of a rigid shape.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_frames,)
-        ``min_M ||W_i - M shape||_F^2``, to rounding errors of ``||W_i||_F^2``.
+        ``min_M ||W_i - M shape||_F^2``, with the rounding errors of ``||W_i||_F^2``.
     """
     axes, size, _ = np.linalg.svd(shape.T, full_matrices=False)
     axes = axes[:, size > FLAT * size[0]]

@@ -11,16 +11,18 @@ from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
 
-# Where both sides of W are longer than this only the leading triplets are computed.
+# A matrix with more rows and more columns than this is not factorised as a whole. Its
+# leading subspace is found by a block Krylov method.
 DENSE = 1500
-# Directions beyond those that are wanted that the search for them follows, the most
-# passes over the matrix, and the gain of one, relative to what is left, that ends it.
+# Block Krylov method: columns of a block beyond the k that are wanted, the most passes
+# over the matrix, and the convergence tolerance. It ends when the next pass would raise
+# the energy found by less than this share of the energy that is left.
 OVERSAMPLING = 10
 MOST_PASSES = 12
 CONVERGED = 1e-6
-# What is left counts as at least this share of the energy: rounding errors.
+# Least energy that is left, relative to that of the matrix: below are rounding errors.
 ROUNDING = 1e-14
-# So many times its width is stacked before a triangular factor is made of it.
+# Triangular factors are stacked up to this many times their width, then factorised.
 STACKED = 6
 
 
@@ -35,7 +37,7 @@ class Triplets(NamedTuple):
     vectors : ndarray of shape (k, n_columns)
         Their right singular vectors as rows. The left ones are ``W V / S``.
     rest : float
-        Energy of the matrix outside these.
+        Energy of the matrix that is left, the sum of its other squared singular values.
     """
 
     values: NDArray
@@ -91,10 +93,10 @@ def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Tripl
     which is put together from those of the blocks (Demmel, Grigori, Hoemmen, Langou,
     "Communication-optimal parallel and sequential QR and LU factorizations", 2012).
 
-    A matrix that is large both ways is not factorised as a whole: the subspace of its
-    leading right vectors comes from a block Krylov method (Golub, Van Loan, "Matrix
-    computations", 2013, section 10.3.6), the triplets from the matrix projected to it,
-    so that small singular values are as precise as the others.
+    Of a matrix with many rows and many columns, the subspace of the leading right
+    vectors comes from a block Krylov method (Golub, Van Loan, "Matrix computations",
+    2013, section 10.3.6). The triplets are those of the matrix projected to it. They
+    do not come from ``W^T W``, so small singular values keep their precision.
     """
     n_rows, n_columns = shape
     if min(shape) > max(DENSE, 4 * k):
@@ -112,7 +114,7 @@ def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Tripl
 
 
 def _matrix(block: NDArray) -> NDArray:
-    """Return the rows of a block."""
+    """Return the rows (n_rows, n_columns) of a block (n_frames, ..., n_columns)."""
     return block.reshape(-1, block.shape[-1])
 
 
@@ -122,7 +124,10 @@ def _energy(block: NDArray) -> float:
 
 
 def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:
-    """Return the triangular factor of a tall matrix, or of its product with V."""
+    """Return the triangular factor of a tall matrix W, or of W V with V given.
+
+    `width` is the number of columns of W or W V, and V is (n_columns, width).
+    """
     pending: list[NDArray] = []
     for part in blocks.map(partial(_block_triangle, V=V)):
         pending.append(part)
@@ -149,10 +154,14 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     """
     Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
 
-    It starts from those of some of the rows, and ends when another pass over the matrix
-    would add less than 1e-6 of what is left to the energy that is found: what it adds
-    shrinks from pass to pass, faster and faster.
+    A block Krylov method: each pass adds the block ``W^T W V`` to the basis, V being
+    the last block. The first block is the leading subspace of some of the rows.
+
+    The energy in the subspace grows with each pass, and the gains shrink by larger and
+    larger factors. So the last two gains predict the next one, from above. The method
+    ends when the predicted gain is below 1e-6 of the energy that is left.
     """
+    # First block: the leading subspace of a sample of frames.
     width = k + OVERSAMPLING
     n_frames = blocks.n_frames
     some = spread(order_by_halves(blocks), min(n_frames, 4 * width))
@@ -162,32 +171,39 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     energy = sum(blocks.map(_energy))
     found, gains = 0.0, []
     for _ in range(MOST_PASSES):
+        # One pass over the matrix. Ritz values and vectors of W^T W in the basis.
         products = np.hstack([products, sum(blocks.map(partial(_squared, V=last)))])
         gram = basis.T @ products
         values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
+        # Predict the gain of the next pass.
         before, found = found, float(values[-k:].sum())
-        little = CONVERGED * max(energy - found, ROUNDING * energy)
-        gains.append(max(found - before, little))
-        following = gains[-1]
-        if len(gains) > 2:  # the first gain is from nothing
-            following *= min(gains[-1] / gains[-2], 1.0)
-        if following <= little or basis.shape[1] + width > n_columns:
+        least_gain = CONVERGED * max(energy - found, ROUNDING * energy)
+        gains.append(max(found - before, least_gain))
+        next_gain = gains[-1]
+        if len(gains) > 2:  # the first gain is the whole energy found
+            next_gain *= min(gains[-1] / gains[-2], 1.0)
+        if next_gain <= least_gain or basis.shape[1] + width > n_columns:
             break
+        # The next block, orthogonalised against the basis. Rounding asks for two
+        # rounds.
         last = products[:, -width:]
-        for _ in range(2):  # twice is enough
+        for _ in range(2):
             last = np.linalg.qr(last - basis @ (basis.T @ last))[0]
         basis = np.hstack([basis, last])
     return basis[:, : len(axes)] @ axes[:, -k:]
 
 
 def _squared(block: NDArray, V: NDArray) -> NDArray:
-    """Return the product of a block's transpose, the block and V."""
+    """Return ``W^T W V`` (n_columns, width) for a block W of the matrix."""
     matrix = _matrix(block)
     return (matrix.T @ (matrix @ V.astype(matrix.dtype))).astype(np.float64)
 
 
 def _complete(Vt: NDArray, n_signals: int) -> NDArray:
-    """Return the non-rigid rows of Vt, completed by centred orthonormal rows."""
+    """Return rows 3 onwards of Vt (rank, n_points), completed to n_signals rows.
+
+    The rows that are added are centred, orthonormal, and orthogonal to Vt.
+    """
     rows = Vt[3:]
     n_missing = n_signals - len(rows)
     if n_missing:

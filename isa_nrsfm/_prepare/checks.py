@@ -37,7 +37,7 @@ class HalfPoints(NamedTuple):
 
     @classmethod
     def merged(cls, parts: "Sequence[HalfPoints]", lengths: list[int]) -> Self:
-        """Return those of consecutive blocks of rows."""
+        """Return the half points of a table from those of its consecutive blocks."""
         start, first = 0, None
         for part, length in zip(parts, lengths, strict=True):
             if first is None and part.first is not None:
@@ -67,8 +67,7 @@ class PointReport(NamedTuple):
     n_frames : ndarray of int, shape (n_points,)
         Number of frames that show each point.
     group : ndarray of int, shape (n_points,)
-        The same number for points that frames connect, by showing both of them or
-        points connected to them.
+        Connected component of each point. Two points are linked if a frame shows both.
     """
 
     n_frames: NDArray
@@ -76,11 +75,12 @@ class PointReport(NamedTuple):
 
     @classmethod
     def from_seen(cls, seen: NDArray) -> Self:
-        """Return the report of some frames (n_frames, n_points)."""
+        """Return the report from the mask of seen points (n_frames, n_points)."""
         n_frames = seen.sum(axis=0)
         if seen.all(axis=1).any():
             return cls(n_frames, np.zeros(len(n_frames), dtype=np.intp))
         shown = csr_array(seen)
+        # Nodes are the points, then the frames. A frame is linked to what it shows.
         graph = bmat([[None, shown.T], [shown, None]])
         return cls(
             n_frames, connected_components(graph, directed=False)[1][: len(n_frames)]
@@ -88,7 +88,7 @@ class PointReport(NamedTuple):
 
     @classmethod
     def merged(cls, reports: "Sequence[PointReport]") -> Self:
-        """Return the report of all frames of some."""
+        """Return the report of a table from those of its blocks."""
         n_points = len(reports[0].group)
         points = np.arange(n_points)
         firsts = []
@@ -119,9 +119,9 @@ def without_half_points(tracks: NDArray) -> tuple[NDArray, HalfPoints]:
         The tracks themselves, or a copy where points of which one coordinate is
         missing have lost the other, too.
     half : HalfPoints
-        What these are.
+        How many such points there are, and where the first one is.
     """
-    if not np.isnan(tracks.sum()):  # faster than to look at each
+    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
         return tracks, HalfPoints(0, 0, None)
     missing = np.isnan(tracks)
     half = missing[..., 0] != missing[..., 1]
@@ -184,14 +184,15 @@ def largest_n_components(n_points: int) -> int:
 
 def smallest_n_frames(n_components: int) -> int:
     """Return the least number of frames that determines the affine factorisation."""
-    # Each frame has 2J numbers and K + 8 unknowns; the shapes 3J (K + 1); the gauge
-    # has (K + 1)^2 + 8. More points stop helping: 2I >= 3K + 3 and the cameras
-    # overdetermine the 3x3 blocks only from here on.
+    # However many the points, W = M B leaves an invertible matrix between its factors:
+    # 9 (K + 1)^2 unknowns, less the (K + 1)^2 + 8 of the gauge. A frame has 6 (K + 1)
+    # entries of M, but 6 numbers of its camera and K coefficients: 5K equations. So
+    # 5K I >= 8 (K + 1)^2 - 8 = 8K (K + 2), rounded up.
     return -(-8 * (n_components + 2) // 5)
 
 
 def most_for_frames(n_frames: int) -> int:
-    """Return the largest K that so many frames determine, at least 1."""
+    """Return the largest K that n_frames frames determine, at least 1."""
     return max(5 * n_frames // 8 - 2, 1)
 
 
@@ -226,10 +227,10 @@ def check_points(
     """
     Refuse tables whose seen points do not determine the shapes.
 
-    A point has 3 (K + 1) unknowns and two equations in each frame that shows it. A
-    frame that shows n points has 2 n equations, of which 8 + K go into its camera and
-    its coefficients. These are counts: that they suffice does not mean that the shapes
-    are well determined.
+    Equations and unknowns are counted. A point has 3 (K + 1) unknowns, and two
+    equations in each frame that shows it. A frame that shows n points has 2 n
+    equations, and 8 + K unknowns of its own: camera, translation and coefficients. The
+    counts are necessary conditions. The shapes may still be poorly determined.
 
     Parameters
     ----------

@@ -1,13 +1,15 @@
 """Completion of tracks with missing points by a low-rank model of the table.
 
 Each row of the measurement matrix is modelled as ``w = B^T z + t 1 + noise`` over its
-seen points, with coefficients z ~ N(0, I), any translation t, and noise of one variance
-everywhere: probabilistic principal components (Tipping and Bishop 1999) with missing
-values (Ilin and Raiko 2010). B has the rank of the factorisation, 3K + 3.
+seen points. The coefficients have the prior z ~ N(0, I), the translation t has none,
+and the noise has one variance everywhere. This is probabilistic principal component
+analysis (Tipping and Bishop 1999) with missing values (Ilin and Raiko 2010). B has the
+rank of the factorisation, 3K + 3.
 
-EM finds B, the rank growing from that of a rigid object. A frame sees its
-points in both of its rows, so everything quadratic is computed once for every
-distinct set of seen points.
+EM finds B. The rank is raised step by step from 3, that of a rigid object. The
+posterior covariance of z depends on a row only through its *pattern*, the set of its
+seen points. It is computed once for each distinct pattern; the two rows of a frame
+share one.
 """
 
 from collections.abc import Iterator
@@ -23,27 +25,29 @@ from isa_nrsfm._tables.ordering import order_by_halves, spread
 from isa_nrsfm._tables.visibility import seen_points
 
 RIGID_RANK = 3
-# A step that lowers the noise variance by less than this share is the last one. Further
-# steps fit the noise more than they improve the missing points.
+# Convergence tolerance: EM ends when a step lowers the noise variance by less than this
+# share. Further steps fit the noise more than they improve the missing points.
 TOL = 0.05
-# Steps at each rank below the last one. They only have to lead to its start.
+# EM steps at each rank below the final one. They only make a start for the next rank.
 STEPS_WHILE_GROWING = 10
-# Share of its weight below which a direction of the start is lifted, so that it can
-# grow: EM leaves a direction without weight where it is.
+# Least variance along a new direction of B, relative to the largest. EM cannot move a
+# direction of zero variance.
 LEAST_WEIGHT = 1e-3
-# The noise variance counts as at least this much of a frame's mean square coordinate
-# where a matrix is inverted: frames with fewer points than unknowns have singular ones.
+# Least noise variance where a matrix is inverted, relative to the mean square
+# coordinate of a frame. Frames with fewer points than coefficients have singular
+# matrices.
 LEAST_NOISE = 1e-13
-# Added to the mean square coefficient, which is 1, where a point's row is solved for.
+# Ridge of the least squares for the B of one point, relative to the mean square
+# coefficient, which is 1.
 LEAST_RIDGE = 1e-12
-# A mean square residual of this size is that of a table without noise, fitted exactly.
+# Below this mean square residual the table has no noise: the fit is exact.
 EXACT = 1e-20
 # Least number of degrees of freedom left to the noise, relative to the numbers seen.
 LEAST_FREEDOM = 0.02
 # Numbers in the largest array of a block of frames.
 BLOCK_NUMBERS = 2**20
-# With more frames the model is found from so many of them, and from as many that show
-# each point, if there are.
+# With more frames than MODEL_FRAMES the model is found from that many of them. Frames
+# are added for each point that fewer than FEWEST_SHOWN of these show.
 MODEL_FRAMES = 10_000
 FEWEST_SHOWN = 200
 
@@ -55,8 +59,8 @@ class Completion(NamedTuple):
     Attributes
     ----------
     centred : ndarray of shape (n_frames, n_points, 2)
-        Tracks without missing points, each frame centred over all of them. Seen
-        points are those that came, moved by minus the shift.
+        Tracks without missing points, each frame centred over all of its points. Seen
+        points are the given ones minus the shift.
     shift : ndarray of shape (n_frames, 2)
         Centroid of all points of a frame relative to that of its seen points.
     """
@@ -66,11 +70,11 @@ class Completion(NamedTuple):
 
 
 class _Frames(NamedTuple):
-    """Frames in the order of their patterns, the distinct sets of seen points.
+    """Frames sorted by their patterns, the distinct sets of seen points.
 
-    ``rows`` (n_frames, 2, n_points) are zero where not seen and centred over the seen
-    points, ``pattern`` (n_frames,) is the number of each frame's pattern, and
-    ``patterns`` (n_patterns, n_points) are 1.0 where seen.
+    ``rows`` (n_frames, 2, n_points) are centred over the seen points, and zero where
+    not seen. ``pattern`` (n_frames,) is the index of each frame's pattern, increasing.
+    ``patterns`` (n_patterns, n_points) are 1.0 where seen and 0.0 elsewhere.
     """
 
     rows: NDArray
@@ -79,11 +83,11 @@ class _Frames(NamedTuple):
 
 
 class _Posterior(NamedTuple):
-    """Coefficients of a block of frames given the model.
+    """Posterior of the coefficients and translations of a block of frames.
 
-    ``z`` (n_frames, 2, rank) and ``t`` (n_frames, 2, 1) are the expected coefficients
-    and translations. For each pattern of the block, ``covariance`` (n_patterns, rank,
-    rank) is that of z and ``cross`` (n_patterns, rank) that of z with minus t, both
+    ``z`` (n_frames, 2, rank) and ``t`` (n_frames, 2, 1) are the posterior means. For
+    each pattern of the block, ``covariance`` (n_patterns, rank, rank) is the posterior
+    covariance of z, and ``cross`` (n_patterns, rank) that of z with -t. Both are
     divided by the noise variance.
     """
 
@@ -110,7 +114,7 @@ class CompletionModel(NamedTuple):
 
     @property
     def ridge(self) -> float:
-        """The noise variance that matrices are inverted with."""
+        """The noise variance, bounded below so that matrices can be inverted."""
         return max(self.noise, LEAST_NOISE)
 
 
@@ -125,10 +129,10 @@ def complete_tracks(
     """
     Return tracks with their missing points filled in, as a start for the factorisation.
 
-    Missing points are the expectation of a model of rank 3K + 3 given the seen points
-    of their frame. It is exact where the table has that rank and no noise and each
-    frame sees at least 3K + 4 points. In other frames what the seen points do not
-    determine is most probable rather than true, and nothing fails.
+    Missing points get their posterior means, given the seen points of their frame, in a
+    model of rank 3K + 3. They are exact where the table has that rank and no noise, and
+    each frame sees at least 3K + 4 points. With fewer points the prior of the model
+    fills what they leave open.
 
     Parameters
     ----------
@@ -140,8 +144,8 @@ def complete_tracks(
     n_components : int
         K, the number of basis shapes.
     tol : float, default=0.05
-        A step that lowers the noise variance by less than this share is the last one
-        at its rank.
+        Convergence tolerance: EM at one rank ends when a step lowers the noise variance
+        by less than this share.
     max_iter : int, default=200
         The most steps at the final rank.
 
@@ -180,18 +184,19 @@ def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameB
     n_frames = rows.n_frames
     frames = np.arange(n_frames)
     if n_frames > MODEL_FRAMES:
-        frames = _telling_frames(rows, n_points)
+        frames = _model_frames(rows, n_points)
     tracks = rows.take(frames).transpose(0, 2, 1)
     model = completion_model(tracks, np.ones(len(tracks)), n_components)
     return rows.derive(partial(_filled_rows, model=model))
 
 
-def _telling_frames(rows: FrameBlocks, n_points: int) -> NDArray:
+def _model_frames(rows: FrameBlocks, n_points: int) -> NDArray:
     """
-    Return frames that show all points, whatever the order of the table.
+    Return the frames (n_chosen,) from which the model of a large table is found.
 
-    They are spread evenly over the shares of the energy that the frames have in x, and
-    so are those that are added for points that they hardly show.
+    They are spread evenly over the order of `order_by_halves`, so that they do not
+    depend on the order of the table. For each point that too few of them show, frames
+    that show it are added, spread in the same way.
     """
     order = order_by_halves(rows)
     chosen = np.zeros(len(order), dtype=bool)
@@ -207,12 +212,12 @@ def _telling_frames(rows: FrameBlocks, n_points: int) -> NDArray:
 
 
 def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:
-    """Return which points the chosen frames of a block show."""
+    """Return which points (n_chosen, n_points) the chosen frames of a block show."""
     return ~np.isnan(rows[chosen, 0])
 
 
 def _sees(rows: NDArray, point: int) -> NDArray:
-    """Return which frames of a block show a point."""
+    """Return which frames (n_frames,) of a block show a point."""
     return ~np.isnan(rows[:, 0, point])
 
 
@@ -251,7 +256,7 @@ def completion_model(
 
 def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Completion:
     """
-    Return tracks with their missing points as a low-rank model expects them.
+    Return tracks with the posterior means of a low-rank model as missing points.
 
     Parameters
     ----------
@@ -282,7 +287,7 @@ def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Compl
 
 def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
     """
-    Return the mean square of what no rigid object explains of tracks.
+    Return the mean square residual of tracks after the fit of a rigid object.
 
     Parameters
     ----------
@@ -303,14 +308,20 @@ def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
 
 
 def _possible_rank(rank: int, n_points: int) -> int:
-    """Return a rank that leaves one of n_points - 1 directions to the noise."""
+    """Return the rank, limited to n_points - 2.
+
+    Centred points have n_points - 1 directions, of which the noise needs one.
+    """
     return max(1, min(rank, n_points - 2))
 
 
 def _by_pattern(
     centred: NDArray, seen: NDArray, sizes: NDArray
 ) -> tuple[_Frames, NDArray]:
-    """Return frames ordered by their sets of seen points, and that order."""
+    """Return frames sorted by pattern, and the order (n_frames,) that sorts them.
+
+    Tracks are (n_frames, n_points, 2), `seen` (n_frames, n_points), sizes (n_frames,).
+    """
     _, first, pattern = np.unique(
         np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
     )
@@ -322,7 +333,8 @@ def _by_pattern(
 
 
 def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionModel:
-    """Return the model of frames, grown from the rank of a rigid object."""
+    """Return the model of frames by EM, the rank raised from that of a rigid object."""
+    # The rank at most doubles from one to the next.
     ranks = [rank]
     while ranks[0] > RIGID_RANK:
         ranks.insert(0, max(RIGID_RANK, (ranks[0] + 1) // 2))
@@ -342,7 +354,10 @@ def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionMod
 def _grown(
     model: CompletionModel, rank: int, residual: NDArray, frames: _Frames
 ) -> CompletionModel:
-    """Return the model with the principal axes of its residual as further rows of B."""
+    """Return the model with further rows of B, the principal axes of its residual.
+
+    The residual is (n_frames, 2, n_points). The first model is that of the rows.
+    """
     is_first = not len(model.B)
     moment = _second_moment(residual, frames, is_first)
     n_points = len(moment)
@@ -358,12 +373,15 @@ def _grown(
 
 def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
     """
-    Return the second moment of centred rows (n_points, n_points) from pairs of points.
+    Return the second moment (n_points, n_points) of rows (n_frames, 2, n_points).
 
-    The distance of two points in a row does not depend on its translation, so every
-    row that sees both tells it, and the mean squared distances give the second moment
-    (classical scaling, Torgerson 1952). Of points that no frame sees together those of
-    an object are likely to be far from each other, and residuals to be uncorrelated.
+    The difference of two points in a row does not depend on the row's translation. Its
+    mean square is taken over all rows that see both points. Double centring turns these
+    mean squares into the second moment (classical scaling, Torgerson 1952).
+
+    Where no frame sees both points the mean square is guessed. For rows of an object it
+    is the largest one, because such points are likely to be far apart. Residuals are
+    taken as uncorrelated: it is the sum of their two mean squares.
     """
     seen = frames.patterns[frames.pattern]
     counts = 2.0 * seen.T @ seen
@@ -385,7 +403,13 @@ def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
 def _posteriors(
     frames: _Frames, model: CompletionModel
 ) -> Iterator[tuple[slice, _Posterior, NDArray]]:
-    """Yield blocks of frames, what the model says of them, and their seen points."""
+    """
+    Yield blocks of frames, their posteriors, and their seen points (n, n_points).
+
+    With B_c the seen columns of B, its rows centred over them, ``C = (B_c B_c^T +
+    ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
+    C``, ``t = -z . mean(B)`` are the posterior means.
+    """
     B, ridge = model.B, model.ridge
     rank = len(B)
     upper = np.triu_indices(rank)
@@ -398,8 +422,7 @@ def _posteriors(
         seen = frames.patterns[pattern[0] : pattern[-1] + 1]
         pattern = pattern - pattern[0]
         n_seen = seen.sum(axis=1)
-        # B B^T over the seen points, each row of B centred over them: that takes
-        # account of the translation.
+        # B_c B_c^T for each pattern. Centring integrates the translation out.
         sums = seen @ B.T
         means = sums / n_seen[:, None]
         gram = _symmetric(seen @ products, rank, upper)
@@ -415,7 +438,11 @@ def _posteriors(
 def _em_step(
     model: CompletionModel, frames: _Frames
 ) -> tuple[CompletionModel, NDArray, float]:
-    """Return the model after one step, the residual of the old one, its mean square."""
+    """
+    Return the model after one step of EM, and the residual before it.
+
+    The residual (n_frames, 2, n_points) is followed by its mean square.
+    """
     rows, ridge = frames.rows, model.ridge
     rank, n_points = model.B.shape
     upper = np.triu_indices(rank)
@@ -424,6 +451,9 @@ def _em_step(
     products = np.zeros((n_points, rank))
     moment = np.zeros(len(upper[0]))
     energy = n_fitted = 0.0
+    # E step: sufficient statistics. `squares` are sums of E[z z^T] over the rows of a
+    # pattern, packed; `moments` their sums over the patterns that show each point;
+    # `products` sums of E[(w - t) z] for each point.
     for block, (z, t, covariance, cross), seen in _posteriors(frames, model):
         moved = (rows[block] - t) * seen[:, None]
         residual[block] = moved - (z @ model.B) * seen[:, None]
@@ -431,9 +461,10 @@ def _em_step(
         pattern = frames.pattern[block]
         first = np.flatnonzero(np.diff(pattern, prepend=-1))
         n_rows = 2.0 * np.diff(first, append=len(pattern))
-        # Each row fits its translation and as many coefficients as the prior leaves it.
-        left = rank - ridge * np.trace(covariance, axis1=1, axis2=2)
-        n_fitted += float(n_rows @ (left + 1.0))
+        # Effective number of parameters of a row: the coefficients that its points
+        # rather than the prior determine, and the translation.
+        n_determined = rank - ridge * np.trace(covariance, axis1=1, axis2=2)
+        n_fitted += float(n_rows @ (n_determined + 1.0))
 
         noise = ridge * n_rows[:, None]
         squares = (z.swapaxes(1, 2) @ z)[:, upper[0], upper[1]]
@@ -446,21 +477,24 @@ def _em_step(
         products += of_pattern.T @ (noise * cross)
     n_numbers = 2.0 * np.bincount(frames.pattern) @ frames.patterns.sum(axis=1)
 
+    # M step: least squares for the column of B of each point. A point seen in fewer
+    # rows than the rank needs the ridge.
     mean_moment = _symmetric(moment[None], rank, upper)[0] / (2 * len(rows))
-    # Points seen in fewer frames than the rank need a trace of a ridge.
     per_point = _symmetric(moments, rank, upper)
     per_point[:, range(rank), range(rank)] += LEAST_RIDGE * len(rows)
     B = np.linalg.solve(per_point, products[..., None])[..., 0].T
     B -= B.mean(axis=1, keepdims=True)  # the translation takes what is common
-    # z gets unit variance again, the prior's (Liu, Rubin and Wu 1998: this is faster).
+    # Rescale so that the mean of E[z z^T] is I, as in the prior: parameter expansion,
+    # which makes EM faster (Liu, Rubin and Wu 1998).
     B = np.linalg.cholesky(mean_moment).T @ B
-    # The fixed point of EM's step for the variance, in one step (MacKay 1992).
+    # Noise variance: residual energy over degrees of freedom. This is the fixed point
+    # of EM's own step for the variance (MacKay 1992).
     freedom = max(n_numbers - n_fitted, LEAST_FREEDOM * n_numbers)
     return CompletionModel(B, energy / freedom), residual, energy / n_numbers
 
 
 def _symmetric(packed: NDArray, size: int, upper: tuple[NDArray, ...]) -> NDArray:
-    """Return symmetric matrices from the rows of their upper triangles."""
+    """Return symmetric matrices (n, size, size) from upper triangles (n, n_pairs)."""
     full = np.empty((len(packed), size, size))
     full[:, upper[0], upper[1]] = packed
     full[:, upper[1], upper[0]] = packed

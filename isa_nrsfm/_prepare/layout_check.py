@@ -1,4 +1,4 @@
-"""The layout that a table has, by its numbers: told where it is not the one given."""
+"""Compare the given layout of a table with the other one, by the numbers in it."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,32 +14,33 @@ from isa_nrsfm._tables.layout import (
 )
 from isa_nrsfm._tables.visibility import FEWEST_POINTS, seen_points
 
-# A warning is due when the other layout leaves less than this share of the energy that
-# the given one leaves unexplained. On real tables the right one leaves 0.04 to 0.5.
+# Warn if the energy that the other layout leaves unexplained is less than this share of
+# what the given one leaves. On real tables the right layout leaves 0.04 to 0.5.
 CLEARLY_BETTER = 0.6
-# So many frames, evenly spread, are enough to tell the layouts apart, and fewer of many
-# points: so many numbers, but not less than so many frames.
+# The layouts are compared on evenly spread frames: LAYOUT_SAMPLE of them, or fewer of
+# many points, LAYOUT_NUMBERS over the number of columns, but at least FEWEST_SAMPLE.
 LAYOUT_SAMPLE = 1000
 LAYOUT_NUMBERS = 2_000_000
 FEWEST_SAMPLE = 100
-# Smaller tables, in frames or points, do not tell the layouts apart.
+# With fewer frames or points than this the layouts are not compared.
 FEWEST_TO_TELL = 10
 # A share of unexplained energy below this is rounding errors.
 ROUNDING = 1e-12
 
 
 def layout_sample(n_frames: int, n_columns: int) -> slice:
-    """Return which frames, evenly spread, tell the layouts apart."""
+    """Return evenly spread frames on which the layouts are compared."""
     enough = max(min(LAYOUT_SAMPLE, LAYOUT_NUMBERS // n_columns), FEWEST_SAMPLE)
     return slice(None, None, max(-(-n_frames // enough), 1))
 
 
 def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None:
     """
-    Warn where the columns in the other layout are nearer to a rigid object.
+    Warn where a rigid object fits the other layout much better.
 
-    What no rigid object explains of the table is compared, not its share: in the wrong
-    layout the distance between the coordinates x and y adds energy that is explained.
+    The mean squares that a rigid fit leaves are compared, not their shares of the
+    total. The wrong layout mixes x and y, whose offset adds energy that a rigid object
+    explains.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
     layout : {"interleaved", "planar"}
         What is said to be the order of its columns.
     scale_frames : bool
-        Whether frames count alike.
+        Whether each frame is divided by its own size, or all by a common one.
 
     Warns
     -----
@@ -76,14 +77,18 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
 
 
 def _without_rarely_seen(both: list[NDArray]) -> list[NDArray]:
-    """Return the tracks of two layouts without points, then frames, rarely seen."""
+    """Return tracks (I, J, 2) of two layouts without sparse points and frames.
+
+    Points that few frames show are left out first, then frames that show few points in
+    one of the layouts.
+    """
     both = [t[:, seen_points(t).sum(axis=0) >= FEWEST_POINTS] for t in both]
     n_seen = np.min([seen_points(t).sum(axis=1) for t in both], axis=0)
     return [tracks[n_seen >= FEWEST_POINTS] for tracks in both]
 
 
 def _rigid_residual(centred: NDArray, sizes: NDArray) -> float:
-    """Return the mean square that no rigid object explains of tracks over sizes."""
+    """Return the mean square residual of a rigid fit of tracks (I, J, 2) over sizes."""
     if not seen_points(centred).all():
         return rigid_noise(centred, sizes)
     W = measurement_matrix(centred / sizes[:, None, None])

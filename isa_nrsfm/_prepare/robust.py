@@ -1,9 +1,9 @@
 """Robust losses: points far from the model count less.
 
-Each point has a weight that falls with the distance of the point from the model, in
-units of the noise, and is computed anew until fit and weights agree (iteratively
-reweighted least squares: Holland, Welsch, "Robust regression using iteratively
-reweighted least-squares", 1977).
+They are minimised by iteratively reweighted least squares (Holland, Welsch, "Robust
+regression using iteratively reweighted least-squares", 1977). The weight of a point
+falls with its distance from the model in units of the noise. Fit and weights alternate
+until they agree.
 """
 
 import numpy as np
@@ -12,20 +12,23 @@ from numpy.typing import NDArray
 from isa_nrsfm._tables.visibility import seen_points
 
 LOSSES = ("linear", "huber", "cauchy")
-# Standard deviations from which a loss leaves the parabola: with these a location in
-# the plane is estimated from normal noise with 95 percent of the least squares'
-# efficiency.
+# Tuning constant c of a loss, in standard deviations of a coordinate. With these, the
+# estimate of a location in the plane has 95 percent of the efficiency of least squares
+# if the noise is normal.
 TUNING = {"huber": 1.5011, "cauchy": 2.5486}
 # Median distance of normal noise in the plane, in standard deviations of a coordinate.
 MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
-# A point so many sizes of its frame from the median point does not belong to it.
+# A point farther from the spatial median of its frame than this many sizes of the frame
+# does not belong to it.
 DISTANT = 6.0
-# A point so many typical distances from the rigid object is an outlier to begin with.
+# A gross outlier is farther than this many typical distances from the rigid object.
 GROSS = 4.5
+# The most rounds of the search for gross outliers, and its convergence tolerance: the
+# largest change of a filled-in coordinate over the typical distance.
 GROSS_ROUNDS = 100
-# What is filled in for them has settled when it moves less than this share of that.
 SETTLED = 1e-2
-# In a frame with a larger share of them the frame is unusual, not its points.
+# If a larger share of a frame's points are gross outliers, the frame is unusual, and
+# none of its points is marked.
 LARGEST_SHARE = 0.4
 # Distances below this share of the size of a frame are rounding errors.
 ROUNDING = 1e-9
@@ -58,7 +61,7 @@ def robust_weights(loss: str, distance: NDArray) -> NDArray:
 
 
 def median_noise(distance: NDArray) -> float:
-    """Return the standard deviation of a coordinate, from the median of distances."""
+    """Return the noise of a coordinate, as the median of distances (n,) tells it."""
     return float(np.median(distance) / MEDIAN_DISTANCE)
 
 
@@ -82,22 +85,22 @@ def distant_points(tracks: NDArray) -> NDArray:
 
 
 def _squares(tracks: NDArray) -> NDArray:
-    """Return the squared distances of points from the median of their frame."""
-    tracks = np.ascontiguousarray(tracks)  # other strides are rounded otherwise
+    """Return squared distances (I, J) of points (I, J, 2) from their frame's median."""
+    tracks = np.ascontiguousarray(tracks)  # strides change the order of sums
     return np.sum((tracks - spatial_median(tracks)[:, None]) ** 2, axis=2)
 
 
 def _sizes(square: NDArray) -> NDArray:
-    """Return the sizes of frames that belong to squared distances."""
+    """Return the sizes (I,) of frames from the squared distances (I, J) of points."""
     median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
-    # Where half of the points are in one place, the median is rounding errors.
+    # If half of the points coincide the median is rounding error: take the mean.
     mean = np.nanmean(square, axis=1)
     return np.sqrt(np.where(median > ROUNDING * upper, median, mean) / 2)
 
 
 def spatial_median(tracks: NDArray) -> NDArray:
     """
-    Return the point of each frame with the least sum of distances, nearly.
+    Return the spatial median of each frame, the point with the least sum of distances.
 
     Parameters
     ----------
@@ -107,7 +110,8 @@ def spatial_median(tracks: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_frames, 2)
-        Reweighted means, from the mean on (Weiszfeld 1937): it turns with the image.
+        The iterate after a fixed number of steps of Weiszfeld (1937), which starts at
+        the mean. Unlike medians of x and y it rotates with the image.
     """
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
@@ -152,19 +156,21 @@ def gross_outliers(tracks: NDArray) -> NDArray:
     -------
     ndarray of bool, shape (n_frames, n_points)
         Points whose distance from a rigid factorisation of the others is more than 4.5
-        times what is typical of the table and of this point; none in frames with many
-        of them.
+        times the typical distance, the larger one of the table and of this point. None
+        in frames with many such points.
     """
     seen = seen_points(tracks)
     hidden = ~seen | distant_points(tracks)
     target = tracks - spatial_median(tracks)[:, None]
     filled = np.where(hidden[..., None], 0.0, target)
     for _ in range(GROSS_ROUNDS):
+        # Rigid factorisation, rank 3, of the filled tracks.
         translation = filled.mean(axis=1, keepdims=True)
         rows = (filled - translation).transpose(0, 2, 1).reshape(-1, tracks.shape[1])
         axes = np.linalg.eigh(rows.T @ rows)[1][:, -3:]
         rigid = (rows @ axes @ axes.T).reshape(len(tracks), 2, -1).transpose(0, 2, 1)
         rigid = rigid + translation
+        # Hide what is too far from it, and fill hidden points in from it.
         distance = np.linalg.norm(target - rigid, axis=2)
         typical = max(median_noise(distance[seen]), ROUNDING)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE

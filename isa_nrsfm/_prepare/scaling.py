@@ -32,7 +32,7 @@ from isa_nrsfm._tables.visibility import (
     seen_points,
 )
 
-# Tables with fewer points have no large products.
+# With fewer points matrix products are so small that single precision saves nothing.
 MANY_POINTS = 200
 
 
@@ -43,9 +43,9 @@ class ScaledTable(NamedTuple):
     Attributes
     ----------
     shown : ndarray of bool, shape (n_rows,)
-        Which rows of the table show any point: they are the frames.
+        Which rows of the table show any point. These rows are the frames.
     source : Table
-        These rows as they came.
+        These rows before centring and scaling.
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), x above y, centred over the points
         that are seen and divided by their sizes; NaN where a point is not seen. Single
@@ -61,7 +61,7 @@ class ScaledTable(NamedTuple):
     precision : float
         As of `relative_precision`.
     dtype : dtype
-        Type of the numbers of the table as it came.
+        Type of the numbers of the given table.
     """
 
     shown: NDArray
@@ -80,12 +80,12 @@ class ScaledTable(NamedTuple):
         return bool((self.n_seen == self.n_points).all())
 
     def of_all_rows(self, values: NDArray) -> NDArray:
-        """Return an array with a row for each frame with NaN for the other rows."""
+        """Return values (n_frames, ...) as (n_rows, ...), NaN for the other rows."""
         if self.shown.all():
             return values
-        every = np.full((len(self.shown), *values.shape[1:]), np.nan, values.dtype)
-        every[self.shown] = values
-        return every
+        all_rows = np.full((len(self.shown), *values.shape[1:]), np.nan, values.dtype)
+        all_rows[self.shown] = values
+        return all_rows
 
 
 def scaled_table(
@@ -111,7 +111,7 @@ def scaled_table(
     names : ndarray of shape (2 * n_points,) or None
         Names of the columns.
     scale_frames : bool
-        Whether each frame gets size one, or the table as a whole.
+        Whether each frame is divided by its own size, or all by a common one.
     robust : bool
         Whether sizes are those of `robust_sizes`, or root mean squares.
 
@@ -148,15 +148,15 @@ def scaled_table(
     check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
     check_places(report, n_points)
     n_frames = blocks.n_frames
-    every = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
-    warn_if_other_layout(blocks.take(every), layout, scale_frames)
+    sampled = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
+    warn_if_other_layout(blocks.take(sampled), layout, scale_frames)
     size = np.sqrt(report.square / (2 * report.n_seen))
     if robust:
         robust_size = partial(_robust_sizes, layout=layout)
         size = blocks.joined(robust_size, report.translation)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
-    # Of large tables, what takes most is the memory and the search for the subspace.
+    # Single precision for large complete tables: it saves memory, and time in the SVD.
     single = dtype == np.float32 and n_points >= MANY_POINTS and not robust
     single = single and bool((report.n_seen == n_points).all())
     unit_rows = partial(
@@ -191,13 +191,13 @@ def _warn_of_empty(shown: NDArray) -> None:
 def _examine(
     rows: NDArray, layout: Layout
 ) -> tuple[FrameReport, PointReport, HalfPoints]:
-    """Return what is to be known of all rows of a table before any is scaled."""
+    """Return what the checks need of some rows (n_rows, 2 * n_points) of a table."""
     tracks, half = without_half_points(table_to_tracks(rows, layout))
     return report_frames(tracks), PointReport.from_seen(seen_points(tracks)), half
 
 
 def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArray:
-    """Return the robust sizes of some rows of a table."""
+    """Return the robust sizes (n_rows,) of some rows (n_rows, 2 * n_points)."""
     tracks, _ = without_half_points(table_to_tracks(rows, layout))
     return robust_sizes(tracks - translation[:, None])
 
@@ -205,7 +205,10 @@ def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArra
 def _unit_rows(
     rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout, dtype: Any
 ) -> NDArray:
-    """Return frames, (n_frames, 2, n_points), centred and of size one."""
+    """Return rows of a table as frames (n_frames, 2, n_points) of size one, centred.
+
+    Rows are (n_frames, 2 * n_points), translation (n_frames, 2), sizes (n_frames,).
+    """
     tracks, _ = without_half_points(table_to_tracks(rows, layout))
     centred = np.array(tracks.transpose(0, 2, 1), dtype=np.float64, order="C")
     centred -= translation[:, :, None]

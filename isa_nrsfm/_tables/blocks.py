@@ -20,7 +20,8 @@ class FrameBlocks(ABC):
     """
     Consecutive blocks of the frames of a table.
 
-    A block is whatever a function made of it, rows of a table for instance.
+    A block holds what belongs to some consecutive frames: an array with a row for each
+    of them, or any object that a function given to `derive` has returned.
 
     Parameters
     ----------
@@ -62,35 +63,35 @@ class FrameBlocks(ABC):
     @abstractmethod
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """
-        Return the blocks that a function makes of these, where these are.
+        Return new blocks, the results of a function of each of these blocks.
 
-        Blocks in memory are computed at once and kept, those that are read from disk
-        are computed whenever they are needed.
+        They stay where these blocks are. In memory they are computed at once and kept.
+        Blocks from disk are computed anew each time they are read.
         """
 
     @abstractmethod
     def kept(self, frames: NDArray) -> Self:
         """
-        Return only some of the frames, of blocks that are arrays.
+        Return blocks of only some of the frames. These blocks must be arrays.
 
         Parameters
         ----------
         frames : ndarray of bool, shape (n_frames,)
-            Which ones, at least one.
+            Which frames are kept, at least one.
 
         Returns
         -------
         FrameBlocks
-            The blocks that a table of these frames alone would have.
+            The kept frames, in the order of the table.
         """
 
     def joined(self, function: Callable[..., NDArray], *by_frame: NDArray) -> NDArray:
-        """Return the arrays that a function makes of the blocks as one."""
+        """Return the arrays that a function makes of the blocks, concatenated."""
         return np.concatenate(list(self.map(function, *by_frame)))
 
     def take(self, frames: NDArray) -> NDArray:
         """
-        Return some of the frames, of blocks that are arrays.
+        Return some of the frames as one array. The blocks must be arrays.
 
         Parameters
         ----------
@@ -105,6 +106,7 @@ class FrameBlocks(ABC):
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
         found = self.joined(kept_rows, chosen)
+        # Here the frames increase. The order that was asked for is that of their ranks.
         order = np.empty(len(frames), dtype=int)
         order[np.argsort(frames)] = np.arange(len(frames))
         return found[order]
@@ -116,16 +118,17 @@ class FrameBlocks(ABC):
         dtype: Any,
     ) -> tuple[Any, ...]:
         """
-        Return arrays with what a function says of all frames.
+        Return the arrays that a function makes of the blocks, each for all frames.
 
         Parameters
         ----------
         function : callable
             Returns a tuple of arrays with a row for each frame of a block.
         shapes : tuple of tuple of int
-            Shapes of the rows of these arrays.
+            For each of these arrays, the shape of one row. It is needed where there are
+            no blocks, or where the arrays are not computed yet.
         dtype : dtype
-            Their type.
+            Type of the numbers of the arrays.
 
         Returns
         -------
@@ -140,7 +143,7 @@ class FrameBlocks(ABC):
         return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
     def spread(self, values: NDArray) -> Any:
-        """Return an array with a row for each frame as these blocks show arrays."""
+        """Return an array (n_frames, ...) as an array of the kind that `gather` has."""
         return values
 
     def whole(self) -> NDArray:
@@ -149,7 +152,7 @@ class FrameBlocks(ABC):
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
         """
-        Return larger blocks where these are many small ones in memory.
+        Return fewer and larger blocks. Blocks that are not in memory stay as they are.
 
         Parameters
         ----------
@@ -179,7 +182,7 @@ def read_rows(table: Any, rows: slice) -> NDArray:
     """Return rows of a table; the pages of a memory map do not stay in memory."""
     found = np.array(table[rows])
     mapped = getattr(table, "_mmap", None)
-    # What was written to a copy of a file in memory is nowhere else.
+    # Mode "c" is copy on write: pages that were changed are in memory only.
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
     return found
@@ -213,7 +216,7 @@ class MemoryBlocks(FrameBlocks):
 
     @classmethod
     def from_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
-        """Return an array (n_frames, ...) in blocks of so many frames."""
+        """Return the blocks of an array (n_frames, ...), block_frames frames each."""
         starts = range(0, len(array), block_frames)
         blocks = [array[start : start + block_frames] for start in starts]
         return cls(blocks, [len(block) for block in blocks], n_threads)
@@ -237,12 +240,12 @@ class MemoryBlocks(FrameBlocks):
         return type(self)(blocks, self.lengths, self.n_threads)
 
     def kept(self, frames: NDArray) -> Self:
-        """Return only some of the frames, of blocks that are arrays."""
+        """Return blocks of only some of the frames. These blocks must be arrays."""
         array = self.joined(kept_rows, frames)
         return self.from_array(array, max(self.lengths), self.n_threads)
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
-        """Return blocks of at most so many frames, made of as many as can be."""
+        """Return blocks of at most n_frames frames, each joined from as many as fit."""
         groups: list[list[int]] = []
         size = 0
         for number, length in enumerate(self.lengths):
@@ -274,7 +277,7 @@ class StoredBlocks(FrameBlocks):
 
     @classmethod
     def from_table(cls, table: Any, block_frames: int) -> Self:
-        """Return what can be sliced along its frames in blocks of so many."""
+        """Return the blocks of a table that can be sliced, block_frames frames each."""
         read = partial(read_rows, table)
         return cls(read, _block_lengths(table.shape[0], block_frames))
 
@@ -292,12 +295,12 @@ class StoredBlocks(FrameBlocks):
         return type(self)(read, self.lengths)
 
     def kept(self, frames: NDArray) -> Self:
-        """Return only some of the frames, of blocks that are arrays."""
+        """Return blocks of only some of the frames. These blocks must be arrays."""
         numbers, length = np.flatnonzero(frames), max(self.lengths)
 
         def read(rows: slice) -> NDArray:
             first, last = numbers[rows][[0, -1]]
-            # Never more at once than a block, however many frames are left out.
+            # Few kept frames may be far apart: read one block's length at a time.
             starts = range(int(first), int(last) + 1, length)
             parts = [slice(s, min(s + length, int(last) + 1)) for s in starts]
             return np.concatenate([self.read(part)[frames[part]] for part in parts])
@@ -306,6 +309,6 @@ class StoredBlocks(FrameBlocks):
 
 
 def _block_lengths(n_frames: int, block_frames: int) -> list[int]:
-    """Return the lengths of blocks of so many frames, the last one having the rest."""
+    """Return the lengths of blocks of block_frames frames. The last may be shorter."""
     starts = range(0, n_frames, block_frames)
     return [min(block_frames, n_frames - start) for start in starts]

@@ -17,9 +17,10 @@ def split_patterns(columns: str | Sequence[str]) -> list[str]:
 
 
 def columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
-    """Return the columns that match a pattern by what stands for its wildcards.
+    """Return the columns that match a pattern, with keys from its wildcards.
 
-    A column whose very name is the pattern is the only match.
+    A key is a tuple with one entry a wildcard: an int for ``#``, a text for ``*``. A
+    column whose name is the pattern itself is the only match, with the key ``()``.
     """
     exact = [
         name for name in names if isinstance(name, str) and name.strip() == pattern
@@ -48,7 +49,7 @@ def columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str
 
 
 def covers(pattern: str, other: str) -> bool:
-    """Tell whether every name of one pattern also belongs to another."""
+    """Tell whether `pattern` matches every name that `other` matches."""
     return _regular_expression(pattern).fullmatch(other) is not None
 
 

@@ -15,9 +15,8 @@ class DaskBlocks(FrameBlocks):
     """
     Blocks on the workers of whatever dask scheduler is active.
 
-    Blocks that are derived stay where they are, so that only results of the size that
-    functions return come back. Where a worker is lost the scheduler computes its blocks
-    again, from the table on.
+    Derived blocks stay on the workers. Only `map` brings results back. If a worker is
+    lost, the scheduler computes its blocks again, beginning with the table.
 
     Parameters
     ----------
@@ -41,23 +40,23 @@ class DaskBlocks(FrameBlocks):
 
     @classmethod
     def _filled(cls, blocks: Sequence[Any], lengths: Sequence[int]) -> Self:
-        """Return those blocks that have frames."""
+        """Return the blocks without those of length zero."""
         filled = [number for number, length in enumerate(lengths) if length]
         return cls([blocks[k] for k in filled], [lengths[k] for k in filled])
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Yield what a function makes of each block, in order."""
         dask = import_optional("dask", extra="dask")
-        yield from _sent(dask.compute, self._tasks(function, by_frame))
+        yield from _run_quietly(dask.compute, self._tasks(function, by_frame))
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return the blocks that a function makes of these."""
         dask = import_optional("dask", extra="dask")
-        blocks = _sent(dask.persist, self._tasks(function, by_frame))
+        blocks = _run_quietly(dask.persist, self._tasks(function, by_frame))
         return type(self)(blocks, self.lengths)
 
     def kept(self, frames: NDArray) -> Self:
-        """Return only some of the frames, of blocks that are arrays."""
+        """Return blocks of only some of the frames. These blocks must be arrays."""
         lengths = [int(frames[rows].sum()) for rows in self.slices]
         return self._filled(self.derive(kept_rows, frames).blocks, lengths)
 
@@ -81,7 +80,7 @@ class DaskBlocks(FrameBlocks):
         )
 
     def spread(self, values: NDArray) -> Any:
-        """Return an array with a row for each frame as a dask array in these blocks."""
+        """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
         array = import_optional("dask.array", extra="dask")
         chunks = (tuple(self.lengths), *values.shape[1:])
         return array.from_array(values, chunks=chunks)
@@ -98,8 +97,8 @@ class DaskBlocks(FrameBlocks):
         ]
 
 
-def _sent(run: Callable[..., Any], tasks: list[Any]) -> Any:
-    """Return what dask makes of tasks, without a word about their size."""
+def _run_quietly(run: Callable[..., Any], tasks: list[Any]) -> Any:
+    """Run dask.compute or dask.persist on tasks, without a warning of their size."""
     with warnings.catch_warnings():
         # Cameras and coefficients of the frames of a block go with each task.
         warnings.filterwarnings("ignore", "Sending large graph")

@@ -199,7 +199,7 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
             keys = members.setdefault(patterns, [set(), set(), set()])
             keys[coordinate.axis].add(key)
     sizes = {patterns: len(x | y) for patterns, (x, y, _) in members.items() if x and y}
-    # A set with "*" is worth a mention where it is more than a numbered set alone.
+    # Leave out a "*" set that has no more points than a "#" set inside it.
     return {
         ",".join(patterns[:2]): size
         for patterns, size in sizes.items()
@@ -248,7 +248,8 @@ def names_layout(
         if coordinate is None:
             return None
         (x, y, _), key = coordinate.memberships[0]
-        # The pattern without its axis letter: that of x and y may differ in case.
+        # What x and y of a point share: the key, and the pattern without its axis
+        # letter (at the first place where the patterns of x and y differ).
         letter = next(i for i, (a, b) in enumerate(zip(x, y, strict=True)) if a != b)
         coordinates.append((coordinate.axis, (x[:letter], x[letter + 1 :], key)))
     axes = [axis for axis, _ in coordinates]

@@ -115,13 +115,13 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
     centred : ndarray of shape (n_frames, n_points, 2)
         Centred tracks, NaN where a point is not seen. Each frame shows some.
     scale_frames : bool
-        Whether each frame counts alike.
+        True for a size of its own for each frame, False for one size for all.
 
     Returns
     -------
     ndarray of shape (n_frames,)
-        The root mean square of the seen coordinates of each frame, or the root of the
-        mean of these squares for all.
+        The root mean square of the seen coordinates of each frame. With one size for
+        all it is the root of the mean of these mean squares.
     """
     seen = seen_points(centred)
     centred = _zero_where_unseen(centred, seen)
@@ -131,7 +131,7 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
 
 def relative_precision(report: FrameReport, dtype: np.dtype, sizes: NDArray) -> float:
     """
-    Return how precisely the numbers of a table say where the points are.
+    Return the rounding error of the coordinates of a table, relative to its frames.
 
     Parameters
     ----------
@@ -145,8 +145,8 @@ def relative_precision(report: FrameReport, dtype: np.dtype, sizes: NDArray) -> 
     Returns
     -------
     float
-        Spacing of the largest coordinate of a frame relative to its size, root mean
-        square over the frames.
+        Spacing of floating-point numbers at the largest coordinate of a frame, divided
+        by the size of the frame: the root mean square over the frames.
     """
     spacing = np.finfo(dtype).eps * report.largest.astype(np.float64)
     return float(np.sqrt(np.mean((spacing / sizes) ** 2)))

@@ -1,4 +1,4 @@
-"""Orders of frames that do not depend on the one in which they come."""
+"""Orders of frames that stay the same when the rows of a table are permuted."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 def order_by_halves(rows: FrameBlocks) -> NDArray:
     """
-    Return an order of frames that does not depend on the one in which they come.
+    Return an order of frames that stays the same when the frames are permuted.
 
     Parameters
     ----------
@@ -19,13 +19,17 @@ def order_by_halves(rows: FrameBlocks) -> NDArray:
     Returns
     -------
     ndarray of int, shape (n_frames,)
-        Frames by the share of their energy that is in their first half, x for instance.
+        Frames sorted by the share of their energy that is in the first half of their
+        entries. For rows (2, n_points) of a scaled table that is the share of x.
     """
     return np.argsort(rows.joined(_first_half), kind="stable")
 
 
 def _first_half(rows: NDArray) -> NDArray:
-    """Return the share of the energy of frames that is in the first half of them."""
+    """Return the share of the energy that the first half of each row has: (n_frames,).
+
+    Rows are (n_frames, ...). NaN counts as zero.
+    """
     flat = rows.reshape(len(rows), -1)
     if np.isnan(flat.sum()):
         flat = np.nan_to_num(flat)
@@ -34,5 +38,5 @@ def _first_half(rows: NDArray) -> NDArray:
 
 
 def spread(order: NDArray, n: int) -> NDArray:
-    """Return n of the frames at equal distances in an order."""
+    """Return n entries of an order (n_frames,) at equal distances, ends included."""
     return order[np.linspace(0, len(order) - 1, n).round().astype(int)]

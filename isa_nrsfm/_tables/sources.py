@@ -13,10 +13,11 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks, StoredBlocks
 from isa_nrsfm._tables.dask_blocks import DaskBlocks
 
-# Numbers and frames of a block of a table in memory: products of large blocks are fast.
+# The most numbers, and the most frames, in a block of a table in memory. Products of
+# large matrices are fast.
 BLOCK_NUMBERS = 2**21
 BLOCK_FRAMES = 2048
-# Numbers that are in memory, at most, for each number of a block that is read.
+# A block that is read needs at most this many times its own memory, copies included.
 COPIES = 8
 MEGABYTE = 2**20
 # What a table has to be, besides that its numbers are float32 or float64.
@@ -46,14 +47,14 @@ class Table(NamedTuple):
 
     @classmethod
     def in_memory(cls, X: NDArray, n_jobs: int | None = 1) -> "Table":
-        """Return an array, in blocks that threads may work on."""
+        """Return the table of an array (n_frames, 2 * n_points) in memory."""
         length = min(max(BLOCK_NUMBERS // max(X.shape[1], 1), 1), BLOCK_FRAMES)
         blocks = MemoryBlocks.from_array(X, length, effective_n_jobs(n_jobs))
         return cls(blocks, X.shape[1], X.dtype)
 
     @classmethod
     def stored(cls, X: Any, working_memory: float | None) -> "Table":
-        """Return a table that is read in blocks, with so many megabytes at a time."""
+        """Return a table that is read in blocks, using working_memory megabytes."""
         _check_dimensions(X)
         if working_memory is None:
             working_memory = get_config()["working_memory"]
@@ -64,7 +65,7 @@ class Table(NamedTuple):
 
     @classmethod
     def on_dask(cls, X: Any) -> "Table":
-        """Return a dask array, computed where dask does it."""
+        """Return the table of a dask array, whose chunks stay on dask's workers."""
         _check_dimensions(X)
         blocks = DaskBlocks.from_table(X).derive(checked_rows)
         return cls(blocks, X.shape[1], _floating(X.dtype))
@@ -80,7 +81,7 @@ def _check_dimensions(X: Any) -> None:
 
 
 def _floating(dtype: Any) -> np.dtype:
-    """Return the type of numbers that a table of a type is read as."""
+    """Return float32 for a table of float32, and float64 for any other type."""
     single = np.dtype(dtype) == np.float32
     return np.dtype(np.float32 if single else np.float64)
 
@@ -101,7 +102,7 @@ def checked_rows(rows: Any) -> NDArray:
 
 
 def column_sample(X: Any) -> Any:
-    """Return a table without rows that has the columns, and their names, of another."""
+    """Return an empty table (0, n_columns) with the column names of X, if any."""
     empty = np.empty((0, X.shape[1] if X.ndim == 2 else 0))
     if getattr(X, "columns", None) is None:
         return empty

@@ -5,10 +5,11 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-# Points that a frame must show: each gives two equations, an affine camera has eight
-# unknowns. The coefficients need no more, their prior determines what is left.
+# Least number of points that a frame must show. Each point gives two equations; an
+# affine camera with its translation has eight unknowns. Coefficients need no further
+# points: their prior determines what the points do not.
 FEWEST_POINTS = 4
-# Coordinates that differ by so many units in the last place of the largest are equal.
+# Coordinates count as equal up to this many units in the last place of the largest one.
 EQUAL = 4
 
 
@@ -21,9 +22,9 @@ class FrameReport(NamedTuple):
     translation : ndarray of shape (n_frames, 2)
         Centroids of the seen points, NaN for frames without any.
     square : ndarray of shape (n_frames,)
-        Sum of the squares of the coordinates relative to these.
+        Sum of the squares of the centred coordinates.
     largest : ndarray of shape (n_frames,)
-        Largest magnitude of a coordinate as it came, zero for frames without any.
+        Largest magnitude of a coordinate before centring, zero for frames without any.
     n_seen : ndarray of int, shape (n_frames,)
         Number of points that are seen.
     in_one_place : ndarray of bool, shape (n_frames,)
@@ -59,7 +60,7 @@ def seen_points(tracks: NDArray) -> NDArray:
     ndarray of bool, shape (n_frames, n_points)
         Whether both coordinates are there.
     """
-    if not np.isnan(tracks.sum()):  # faster than to look at each
+    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
         return np.ones(tracks.shape[:2], dtype=bool)
     missing = np.isnan(tracks)
     return ~(missing[..., 0] | missing[..., 1])
@@ -190,7 +191,10 @@ def _zero_where_unseen(tracks: NDArray, seen: NDArray) -> NDArray:
 
 
 def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return centred tracks, zero where not seen, centroids and the mask of seen."""
+    """Return centred tracks (I, J, 2), centroids (I, 2) and the mask of seen (I, J).
+
+    The tracks are zero where a point is not seen.
+    """
     # The same memory order, so that sums are the same to the last bit.
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     seen = seen_points(tracks)
@@ -205,7 +209,10 @@ def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 def _coincide(
     square: NDArray, translation: NDArray, n_seen: NDArray, dtype: np.dtype
 ) -> NDArray:
-    """Tell in which frames all seen points are equal, up to rounding."""
+    """Tell in which frames all seen points are equal, up to rounding: (n_frames,).
+
+    The arguments are as in `FrameReport`, with the type of the numbers of the table.
+    """
     rounding = EQUAL * np.finfo(dtype).eps * np.linalg.norm(translation, axis=1)
     return (n_seen > 0) & (square <= n_seen * rounding**2)
 
@@ -213,12 +220,16 @@ def _coincide(
 def _collinear(
     centred: NDArray, translation: NDArray, seen: NDArray, dtype: np.dtype
 ) -> NDArray:
-    """Tell which frames miss points and show the others on a line, up to rounding."""
+    """Tell which frames miss points and show the others on a line, up to rounding.
+
+    The arrays are those of `_centre`, the result is (n_frames,).
+    """
     on_line = np.asarray(~seen.all(axis=1))
     centred, translation = centred[on_line], translation[on_line]
     n_seen = seen[on_line].sum(axis=1)
     x, y = centred[..., 0], centred[..., 1]
-    # The angle of the principal axis; what is left across it is not squared before.
+    # The principal axis by its angle. Eigenvalues of the 2x2 second moment would square
+    # the distances from it, and lose half of their digits.
     angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
     across = np.cos(angle)[:, None] * y - np.sin(angle)[:, None] * x
     extent = np.linalg.norm(translation, axis=1) + np.abs(centred).max(axis=(1, 2))

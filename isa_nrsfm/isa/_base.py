@@ -15,7 +15,9 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
 
-# Signals whose smallest variance is below this share of the largest are dependent.
+# Signals are linearly dependent if the smallest eigenvalue of their correlation matrix
+# is below this share of the largest. A signal is constant if its standard deviation is
+# below this share of its largest magnitude.
 DEPENDENT = 1e-14
 
 
@@ -25,7 +27,7 @@ class BaseSubspaceAnalysis(
     BaseEstimator,
     metaclass=ABCMeta,
 ):
-    """Whitening, validation and projection; a strategy adds `_unmix`."""
+    """Validation, whitening and projection. A strategy adds `_unmix`."""
 
     components_: NDArray
     mean_: NDArray
@@ -66,7 +68,12 @@ class BaseSubspaceAnalysis(
 
     @abstractmethod
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
-        """Return the orthogonal matrix that unmixes white signals Z, one a row."""
+        """
+        Return the orthogonal matrix that unmixes white signals.
+
+        Z is (n_signals, n_samples). The result and `whitening`, with ``Z = whitening @
+        (signals - mean_).T``, are (n_signals, n_signals).
+        """
 
     def transform(self, signals: Any) -> NDArray:
         """
@@ -89,9 +96,10 @@ class BaseSubspaceAnalysis(
 
 def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return uncorrelated signals of unit variance, as near to the given as can be.
+    Return uncorrelated signals of unit variance, near to the given ones.
 
-    Signals that are white already stay as they are, up to rounding.
+    This is ZCA whitening of the standardised signals. Signals that are white already
+    stay as they are, up to rounding.
 
     Parameters
     ----------
@@ -103,8 +111,8 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     Z : ndarray of shape (n_signals, n_samples)
         White signals, ``Z Z^T = n_samples I``.
     whitening : ndarray of shape (n_signals, n_signals)
-        ``Z = whitening @ centred.T``; symmetric after the signals have been divided by
-        their standard deviations.
+        ``Z = whitening @ centred.T``: the inverse square root of the correlation
+        matrix, each column divided by the standard deviation of its signal.
     """
     n_samples, n_signals = centred.shape
     scale = centred.std(axis=0)

@@ -24,7 +24,8 @@ from isa_nrsfm.isa._grouping import (
 # Starts that are iterated together: enough to make numpy's overhead small, few enough
 # that their arrays stay in the cache.
 BATCH_SIZE = 16
-# The single components are a start only: inside a subspace they may not be determined.
+# Least tolerance of the FastICA that makes a start. It need not converge further:
+# inside a subspace the components may not be determined.
 ICA_TOL = 1e-4
 
 
@@ -213,15 +214,23 @@ def _run(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return unmixing, likelihood, steps and convergence of a batch of starts."""
+    """
+    Return unmixing, likelihood, steps and convergence of a batch of starts.
+
+    Starts and unmixing are (n_batch, n_signals, n_signals), Z is (n_signals,
+    n_samples), the other results are (n_batch,).
+    """
+    # FastICA: subspaces of size one.
     W, n_iter_ica, _ = iterate(
         starts, Z, 1, density, max_iter=max_iter, tol=max(tol, ICA_TOL)
     )
+    # Group the components into subspaces.
     n_signals = len(Z)
     first = np.repeat(np.arange(n_signals // subspace_size), subspace_size)
     for r in range(len(W)):
         assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
         W[r] = W[r][rows_by_subspace(assignment)]
+    # FastISA.
     W, n_iter, converged = iterate(
         W, Z, subspace_size, density, max_iter=max_iter, tol=tol
     )

@@ -5,11 +5,12 @@ from numpy.typing import NDArray
 
 from isa_nrsfm.isa._density import SubspaceDensity
 
-# A start whose subspaces have not come closer to standing still for this many steps
-# goes round in a cycle: its steps are halved.
+# A start cycles if its smallest change has not fallen for this many steps. Its step
+# length is then halved, down to SHORTEST_STEP.
 PATIENCE = 10
 SHORTEST_STEP = 1.0 / 16.0
-# Least ratio of the squared singular values of a matrix whose Gram matrix will do.
+# If the smallest eigenvalue of W W^T over the largest is below this, `orthogonalise`
+# takes the SVD of W.
 SMALLEST_RATIO = 1e-8
 
 
@@ -17,9 +18,9 @@ def orthogonalise(W: NDArray) -> NDArray:
     """
     Return the orthogonal matrices nearest to the given ones.
 
-    The eigenvectors of ``W W^T`` take two thirds of the time of an SVD of W, and a
-    Newton step (Higham 2008, chapter 8) makes up for the precision that squaring
-    costs; where W is too near to singular for that it takes the SVD.
+    The result comes from the eigenvectors of ``W W^T``, in two thirds of the time of an
+    SVD of W. Squaring costs precision, which one Newton step restores (Higham 2008,
+    chapter 8). Where W is nearly singular the SVD is taken instead.
 
     Parameters
     ----------
@@ -110,8 +111,8 @@ def fixed_point_step(
     density : SubspaceDensity
         Gives g = F' and g'.
     length : float or ndarray of shape (n_batch,), default=1.0
-        Below 1.0 each row keeps more of its direction, which shortens the step to
-        about this share and leaves the fixed points where they are.
+        Step length. Below 1.0 a multiple of w is added to each new row, so that it
+        turns by about this share of the full step. The fixed points are the same.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
     """
     Return how far the subspaces of two orthogonal matrices are apart.
 
-    Rows may rotate inside their subspace for ever, so the projectors are compared.
+    Projectors are compared, not rows: rows may rotate inside their subspace for ever.
 
     Parameters
     ----------
@@ -148,8 +149,9 @@ def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
     Returns
     -------
     ndarray of shape (n_batch,)
-        The largest mean square sine of the principal angles over the subspaces,
-        ``||P_k - P_new,k||_F^2 / (2 d)`` with projectors ``P_k = W_k^T W_k``.
+        The largest value over the subspaces k of ``||P_k - P_new,k||_F^2 / (2 d)``,
+        with projectors ``P_k = W_k^T W_k``. It is the mean square sine of the d
+        principal angles.
     """
     shape = (len(W), -1, subspace_size, W.shape[-1])
     cosines = W.reshape(shape) @ W_new.reshape(shape).swapaxes(-1, -2)
@@ -166,11 +168,10 @@ def iterate(
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Repeat `fixed_point_step` on each start until its subspaces stand still.
+    Repeat `fixed_point_step` on each start until it converges.
 
-    With few samples the published iteration ends in cycles more often than not, so
-    the steps of a start that goes round are shortened, which leaves its fixed points
-    where they are.
+    With few samples the published iteration mostly ends in cycles. The step length of a
+    start that cycles is halved, which does not change its fixed points.
 
     Parameters
     ----------
@@ -185,8 +186,7 @@ def iterate(
     max_iter : int
         The most steps of a start.
     tol : float
-        A start has converged when a whole step would turn no subspace by more than
-        this mean square sine of the principal angles.
+        Convergence tolerance on `subspace_change` by a step of length 1.
 
     Returns
     -------
@@ -205,12 +205,14 @@ def iterate(
     least_change = np.full(len(W), np.inf)
     waited = np.zeros(len(W), dtype=int)
     for _ in range(max_iter):
-        part = length[running]
-        new = fixed_point_step(W[running], Z, subspace_size, density, part)
-        change = subspace_change(W[running], new, subspace_size) / part**2
+        # A step of each running start. Its change is scaled to a step of length 1.
+        lengths = length[running]
+        new = fixed_point_step(W[running], Z, subspace_size, density, lengths)
+        change = subspace_change(W[running], new, subspace_size) / lengths**2
         W[running] = new
         n_iter[running] += 1
 
+        # Halve the step length of starts that cycle.
         nearer = change < least_change[running]
         least_change[running[nearer]] = change[nearer]
         waited[running] = np.where(nearer, 0, waited[running] + 1)
@@ -218,6 +220,7 @@ def iterate(
         length[cycling] = np.maximum(length[cycling] / 2, SHORTEST_STEP)
         waited[cycling] = 0
 
+        # Starts that have converged stop.
         still = change < tol
         converged[running[still]] = True
         running = running[~still]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm.isa._density import SubspaceDensity
 
-# A swap must gain more than rounding errors, relative to the size of the objective.
+# A swap must raise the objective by more than this share of its size: rounding errors.
 LEAST_GAIN = 1e-12
 
 
@@ -22,8 +22,9 @@ def swap_until_best(
     assignment : ndarray of int, shape (n_signals,)
         The subspace of each signal at the start.
     gains : callable
-        Returns for an assignment the gains (n_signals, n_signals), symmetric, of the
-        swap of any two signals, and the size of the objective.
+        Takes an assignment. Returns how much the swap of any two signals raises the
+        objective, a symmetric matrix (n_signals, n_signals), and the size of the
+        objective, to which `LEAST_GAIN` is relative.
 
     Returns
     -------
@@ -41,7 +42,10 @@ def swap_until_best(
 
 
 def rows_by_subspace(assignment: NDArray) -> NDArray:
-    """Return the signals by subspaces, those in the order of their first signals."""
+    """Return an order (n_signals,) of the signals that makes subspaces consecutive.
+
+    Subspaces are in the order of their first signals.
+    """
     _, first, group = np.unique(assignment, return_index=True, return_inverse=True)
     return np.argsort(first[group], kind="stable")
 
@@ -52,8 +56,8 @@ def covariance_gains(
     """
     Return the gains for pooling by covariance.
 
-    The objective is the energy of the covariance inside the diagonal blocks of the
-    subspaces (Brandt et al. 2018, section 3.3).
+    The objective is the energy (sum of squares) of the covariance inside the diagonal
+    blocks of the subspaces (Brandt et al. 2018, section 3.3).
 
     Parameters
     ----------
@@ -71,10 +75,12 @@ def covariance_gains(
 
     def gains(assignment: NDArray) -> tuple[NDArray, float]:
         member = assignment[:, None] == np.arange(assignment.max() + 1)
-        shared = energy @ member  # of a signal with each subspace
-        there = shared[:, assignment]  # of signal a with the subspace of b
-        leave = diagonal - np.diag(there)
-        gain = there - energy + leave[:, None]
+        # Half the gain by signal a of a swap with b: it then shares energy with the
+        # others of b's subspace (without b), and no more with the others of its own.
+        with_subspace = energy @ member  # (n_signals, n_subspaces)
+        with_b = with_subspace[:, assignment]  # of a with the subspace of b
+        minus_own = diagonal - np.diag(with_b)
+        gain = with_b - energy + minus_own[:, None]
         return gain + gain.T, total
 
     return gains
@@ -89,8 +95,9 @@ def value_gains(
     Parameters
     ----------
     value : callable
-        Takes groups of signals, ndarray of int of shape (n_groups, subspace_size), and
-        returns the value of each as a subspace, whatever the order in the group.
+        Takes groups of signals, ndarray of int of shape (n_groups, subspace_size).
+        Returns the value of each group as a subspace, ndarray of shape (n_groups,). The
+        order inside a group must not matter.
     n_signals : int
         Number of signals.
 
@@ -99,8 +106,9 @@ def value_gains(
     callable
         For `swap_until_best`.
     """
-    # with_b[a, b]: value of the subspace of a with a replaced by b. It depends only
-    # on who shares the subspace with a: one swap changes two subspaces.
+    # with_b[a, b] is the value of the subspace of a with a replaced by b. Row a depends
+    # only on the mates of a, the signals of its subspace. A swap changes the mates of
+    # two subspaces, so only their rows are computed again.
     with_b = np.zeros((n_signals, n_signals))
     mates_before = np.zeros((n_signals, n_signals), dtype=bool)
     everyone = np.arange(n_signals)
@@ -108,7 +116,7 @@ def value_gains(
     def gains(assignment: NDArray) -> tuple[NDArray, float]:
         mates = assignment[:, None] == assignment
         for a in np.flatnonzero((mates != mates_before).any(axis=1)):
-            rest = np.flatnonzero(mates[a] & (everyone != a))
+            rest = np.flatnonzero(mates[a] & (everyone != a))  # the mates of a
             instead = np.flatnonzero(~mates[a] | (everyone == a))
             groups = np.column_stack([np.tile(rest, (len(instead), 1)), instead])
             with_b[a, instead] = value(groups)

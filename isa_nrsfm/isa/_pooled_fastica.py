@@ -24,7 +24,8 @@ from isa_nrsfm.isa._grouping import (
     value_gains,
 )
 
-# Groupings from which the greedy pooling starts, the first as the components come.
+# Number of groupings from which the greedy swaps start. The first takes the components
+# in order, the others are random.
 N_GROUPINGS = 8
 
 Criterion = Callable[[NDArray], NDArray]
@@ -64,7 +65,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
     mean_ : ndarray of shape (n_signals,)
         Mean of the signals.
     criteria_ : ndarray of shape (n_init,)
-        Value of every run; the largest is kept.
+        Value of each run by the criterion of `fit`. The run of largest value is kept.
     n_iter_ : int
         Steps of FastICA in the run that is kept.
     n_features_in_ : int
@@ -235,7 +236,11 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
 def _pool_by_covariance(
     W: NDArray, covariance: NDArray, groupings: list[NDArray]
 ) -> tuple[NDArray, float]:
-    """Return the rows of W by subspaces, and the share of energy inside the blocks."""
+    """Return the rows of W by subspaces, and the share of energy inside the blocks.
+
+    W and the covariance of its signals are (n_signals, n_signals), each grouping is
+    (n_signals,).
+    """
     gains = covariance_gains(covariance)
     energy = covariance**2
     total = float(energy.sum())
@@ -250,7 +255,10 @@ def _pool_by_covariance(
 def _pool_by_likelihood(
     W: NDArray, Z: NDArray, groupings: list[NDArray], subspace_size: int
 ) -> tuple[NDArray, float]:
-    """Return the rows of W by subspaces, and the log-likelihood."""
+    """Return the rows of W by subspaces, and the log-likelihood.
+
+    W is (n_signals, n_signals), Z (n_signals, n_samples), each grouping (n_signals,).
+    """
     density = SqrtDensity()
     gains = likelihood_gains(W @ Z, density)
 
@@ -265,7 +273,11 @@ def _pool_by_likelihood(
 def _regroup(
     W: NDArray, components: NDArray, assignment: NDArray, criterion: Criterion
 ) -> NDArray:
-    """Return the rows of W after all swaps between subspaces that raise the value."""
+    """Return the rows of W after all swaps between subspaces that raise the criterion.
+
+    W is orthogonal, `components` is W with the whitening, which the criterion takes.
+    Both are (n_signals, n_signals), the assignment (n_signals,).
+    """
 
     def value(groups: NDArray) -> NDArray:
         return criterion(components[groups])

@@ -1,9 +1,9 @@
 """Independent signals whose samples are vectors, all coordinates mixed alike.
 
-Independent subspace analysis lets each subspace have a basis of its own. Here the
-mixing of the signals is the same for all coordinates, K x K numbers instead of
-(dK) x (dK). Basis shapes that fit equally well are mixed so, with points of three
-coordinates as samples; with one coordinate it is plain ICA, as for coefficients.
+A sample of a signal is a vector of d coordinates. Independent subspace analysis mixes
+all dK coordinates of K signals, by a dK x dK matrix. Here the same K x K matrix mixes
+each of the coordinates. This is the freedom that a fit leaves to its basis shapes: the
+samples are points, d is 3. With d = 1 it is plain ICA, as for coefficients.
 """
 
 from typing import NamedTuple
@@ -18,37 +18,42 @@ from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
 
-# A direction whose singular value is below this share of the first is null.
+# Singular values below this share of the first count as zero.
 NULL_DIRECTION = 1e-10
 
-# Densities for each signal to choose from: Student's with these degrees of freedom, and
-# one with tails lighter than a Gaussian's.
+# The densities among which each signal chooses, by their *tail*: degrees of freedom of
+# Student's t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).
 LIGHT = 0.0
 TAILS = (LIGHT, 16.0, 8.0, 4.0, 2.0)
-# All densities fall at least like a Gaussian of this inverse variance. Otherwise the
+# Each density is multiplied by a Gaussian of this inverse variance. Otherwise the
 # likelihood has no bound where a signal vanishes at a large share of the samples.
 TEMPER = 1e-3
 
-# The fixed point has few local optima with mild tails. A few steps lead to a basin.
-# More would go astray where signals are Gaussian, and magnify rounding errors.
+# FastICA makes the starts: its density, with mild tails, has few local optima. A few
+# steps lead to a basin of attraction. More would go astray where signals are Gaussian,
+# and magnify rounding errors.
 FIRST_TAIL = 8.0
 FIXED_POINT_STEPS = 8
-# Orthogonal matrices are in one basin if their rows agree in pairs to this cosine.
+# Two orthogonal matrices are in one basin if each row of one has a row of the other
+# with at least this cosine, up to sign.
 SAME_BASIN = 0.97
-# Starts from which the likelihood is maximised, those likeliest at their basin.
+# Number of basins, the likeliest ones, from which the likelihood is maximised.
 N_FINALISTS = 2
-# With more samples than the one number so many of them lead near the maximum.
+# With more than MANY_SAMPLES samples the likelihood is first maximised on
+# FIRST_SAMPLES.
 MANY_SAMPLES, FIRST_SAMPLES = 3000, 1500
-TURNS = 10  # between mixing and densities
-SCALE_STEPS = 5
-NEWTON_STEPS = 100
-# Converged when no entry of the relative gradient is above this share of the size.
+TURNS = 10  # alternations of mixing and densities
+SCALE_STEPS = 5  # Newton steps for the scale of a density
+NEWTON_STEPS = 100  # for the mixing
+# Convergence tolerance: the largest entry of the relative gradient, divided by `size`.
 GRADIENT_TOL = 1e-11
-# A longer step, in any entry of E, would turn past the next maximum.
+# Largest entry of a step E. A longer one would turn past the next maximum.
 LONGEST_STEP = 1.0
-# What is taken off the Hessian, relative to the size, where a Newton step fails.
+# Levenberg-Marquardt shift of the Hessian, relative to `size`: bounds, and the factor
+# by which it rises when a Newton step fails and falls when one succeeds.
 SMALLEST_SHIFT, LARGEST_SHIFT, SHIFT_FACTOR = 1e-3, 1e8, 4.0
-# A step must gain this share of its slope, rounding errors of the likelihood apart.
+# A step is accepted if it gains this share of what the gradient predicts (Armijo). The
+# second number is the rounding error of the likelihood.
 LEAST_GAIN, ROUNDING = 1e-3, 1e-13
 
 
@@ -60,11 +65,11 @@ def shared_mixing(
     """
     Return the mixing, the same for all coordinates, that makes signals independent.
 
-    The signals are whitened. From several starts, orthogonal mixings are improved by
-    the fixed point of FastICA for vectors. From the best of them the likelihood of
+    The signals are whitened. From several orthogonal starts, a few steps of FastICA for
+    vectors lead to basins of attraction. From the best of these the likelihood of
     independent spherical signals, ``sum_k E log p_k(||y_k||) + size * log |det W|``
-    with y = W signals, is maximised by Newton steps over all matrices W, each signal
-    having the likeliest of a few densities, heavy and light tailed.
+    with ``y = W signals``, is maximised over all invertible W by Newton steps. Each
+    density p_k is the likeliest of a few, with heavy or light tails.
 
     Parameters
     ----------
@@ -81,11 +86,11 @@ def shared_mixing(
     -------
     ndarray of shape (n_signals, n_signals)
         W, invertible: ``tensordot(W, signals, 1)`` are the independent signals, each
-        with mean square 1 over its ``n_samples * size`` numbers. The least Gaussian
-        comes first (in terms of the likelihood), and each has a third moment, over all
-        its numbers, that is not negative. Where the signals have a rank r below their
-        number, the first r rows give the independent signals and the others signals of
-        zeros: linear dependencies are taken out, signals of zeros stay.
+        with mean square 1 over its ``n_samples * size`` numbers. They are sorted by
+        likelihood, the least Gaussian one first. The third moment of each, over all of
+        its numbers, is not negative. Where the signals have a rank r below their
+        number, only the first r rows give independent signals. The other rows give
+        signals of zeros.
 
     Notes
     -----
@@ -111,6 +116,7 @@ def shared_mixing(
         return np.eye(n_signals)
     Z = np.tensordot(whitening, signals, 1)
 
+    # Basins of attraction, and the likelihood's maximum in the likeliest of them.
     some = _some_samples(Z)
     basins = _distinct(_fixed_point(_starts(some, n_starts, random_state), some))
     if len(basins) > N_FINALISTS:
@@ -121,9 +127,10 @@ def shared_mixing(
     if some is not Z:
         W, fit = _maximise(W, Z)
 
+    # Scale, sign and order. Of all signals of unit mean square, Gaussian ones are the
+    # least likely.
     Y = np.tensordot(W, Z, 1).reshape(len(W), -1)
     scale = np.sqrt(np.mean(Y**2, axis=1))
-    # Of all signals of unit mean square, Gaussian ones are the least likely.
     order = np.argsort(-(fit.of_signals + size * np.log(scale)), kind="stable")
     W = (W * (orientations(Y) / scale)[:, None])[order]
     return np.vstack([W @ whitening, null])
@@ -177,7 +184,7 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     null : ndarray of shape (n_rows - rank, n_rows)
         ``null @ rows`` vanishes up to rounding; orthogonal to `whitening`.
     """
-    # The triangular factor has the singular values, and not their squares.
+    # The triangular factor keeps the precision that rows @ rows.T would lose.
     R = np.linalg.qr(rows.T, mode="r") / np.sqrt(rows.shape[1])
     U, S, _ = np.linalg.svd(R.T)
     rank = int(np.sum(S > NULL_DIRECTION * S[0]))
@@ -188,9 +195,10 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
 
 def _some_samples(Z: NDArray) -> NDArray:
     """
-    Return samples that are spread from the smallest to the largest, if there are many.
+    Return some of many samples, spread evenly from the smallest to the largest.
 
-    They are the same in whatever order and basis Z (n_signals, n_samples, size) came.
+    Z is (n_signals, n_samples, size). Neither the order of the samples nor an
+    orthogonal mixing of the signals changes which samples are taken.
     """
     if Z.shape[1] <= MANY_SAMPLES:
         return Z
@@ -200,18 +208,20 @@ def _some_samples(Z: NDArray) -> NDArray:
 
 def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
     """
-    Return orthogonal matrices that give the same signals in whatever basis Z came.
+    Return orthogonal matrices (n_starts, n_signals, n_signals) to start from.
 
-    The first are the axes of a fourth-order moment (FOBI, Cardoso 1989) with bounded
-    weights, the others fixed rotations of these. Axes have no sign, so they are turned
-    to one side, whatever the rotation of the coordinates. Z are white signals
-    (n_signals, n_samples, size).
+    ``W Z`` is the same for any orthogonal mixing of the white signals Z (n_signals,
+    n_samples, size). The first W has the axes of a fourth-order moment (FOBI, Cardoso
+    1989) with bounded weights. The others are random rotations of it, from a seed.
     """
     n_signals = len(Z)
     energy = np.einsum("kjc,kjc->j", Z, Z)
     weighted = (energy / (energy + energy.mean()))[:, None] * Z
     moment = weighted.reshape(n_signals, -1) @ Z.reshape(n_signals, -1).T
     axes = np.linalg.eigh(moment)[1].T
+    # Fix the signs of the axes relative to each other. The weighted mean of each signal
+    # is a vector of `size` coordinates. All of them get a positive product with the
+    # principal direction of these vectors, which turns with the coordinates.
     side = axes @ weighted.mean(axis=1)
     axes[side @ np.linalg.svd(side)[2][0] < 0] *= -1.0
 
@@ -222,11 +232,11 @@ def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
 
 def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
     """
-    Repeat the fixed point of symmetric FastICA for vectors.
+    Return the iterates after some steps of symmetric FastICA for vectors.
 
-    ``w+ = E[sum_c z_c y_c g(u)] - E[size g(u) + 2 u g'(u)] w`` with u = ||y||^2 and
-    g = F', then symmetric orthogonalisation, for orthogonal W (n_starts, n_signals,
-    n_signals) and white signals Z (n_signals, n_samples, size).
+    A step is ``w+ = E[sum_c z_c y_c g(u)] - E[size g(u) + 2 u g'(u)] w`` with ``u =
+    ||y||^2`` and ``g = F'``, followed by symmetric orthogonalisation. W is (n_starts,
+    n_signals, n_signals), orthogonal, and Z (n_signals, n_samples, size), white.
     """
     n_signals, n_samples, size = Z.shape
     flat = Z.reshape(n_signals, -1)
@@ -241,7 +251,7 @@ def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
 
 
 def _distinct(W: NDArray) -> list[NDArray]:
-    """Return the first of the orthogonal matrices of each basin."""
+    """Return one orthogonal matrix of each basin, from W (n_starts, n, n)."""
     kept: list[NDArray] = []
     for candidate in W:
         cosines = [np.abs(candidate @ other.T).max(axis=1).min() for other in kept]
@@ -251,7 +261,10 @@ def _distinct(W: NDArray) -> list[NDArray]:
 
 
 def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
-    """Return F(u), the logarithm of a density of `TAILS` up to a constant."""
+    """Return F(u), the logarithm of a density of `TAILS` up to a constant.
+
+    u are squared norms (..., n_samples), `tail` is broadcast to them.
+    """
     light = tail == LIGHT
     F = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
     if light.any():
@@ -260,7 +273,7 @@ def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
 
 
 def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
-    """Return F'(u) and F''(u)."""
+    """Return F'(u) and F''(u), for u and `tail` as in `_log_density`."""
     light = tail == LIGHT
     nearness = 1.0 / (np.where(light, 1.0, tail) + u)
     g = -0.5 * (tail + size) * nearness
@@ -273,7 +286,7 @@ def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
 
 def _log_integral(tail: float, size: int) -> float:
     """Return the logarithm of the integral of ``exp F(||y||^2)`` over all vectors y."""
-    # Over the logarithm of the radius the trapezoidal rule is exact to rounding.
+    # In the logarithm of the radius the trapezoidal rule is accurate to rounding.
     log_radius = np.linspace(-40.0, 8.0, 1001)
     F = _log_density(np.exp(2.0 * log_radius), np.array(tail), size)
     radial = np.exp(F + size * log_radius).sum() * (log_radius[1] - log_radius[0])
@@ -290,7 +303,7 @@ class DensityFit(NamedTuple):
     tails : ndarray of shape (n_signals,)
         Which of `TAILS`.
     variance : ndarray of shape (n_signals,)
-        Square of the signal's scale in the units of the density.
+        Squared scale: signal k divided by its scale has the density `tails` names.
     of_signals : ndarray of shape (n_signals,)
         ``E log p_k(||y_k||)`` of the signals y = W z.
     total : float
@@ -304,7 +317,10 @@ class DensityFit(NamedTuple):
 
 
 def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
-    """Return the likeliest density and scale of each of the signals ``W z``."""
+    """Return the likeliest density and scale of each signal ``W z``.
+
+    W is (n_signals, n_signals), Z is (n_signals, n_samples, size).
+    """
     size = Z.shape[2]
     Y = np.tensordot(W, Z, 1)
     u = np.einsum("kjc,kjc->kj", Y, Y)
@@ -314,7 +330,8 @@ def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
         for _ in range(SCALE_STEPS):
             v = u * np.exp(-log_variance)[:, None]
             g, dg = _slopes(v, np.array(tail), size)
-            # The likelihood is largest where E[-2 g(v) v] = size.
+            # Newton step for the scale. The likelihood is largest where
+            # E[-2 g(v) v] = size, with v = u / variance.
             excess = -2.0 * np.mean(g * v, axis=1) - size
             slope = 2.0 * np.mean((g + dg * v) * v, axis=1)
             log_variance = log_variance - np.clip(excess / slope, -1.0, 1.0)
@@ -331,7 +348,10 @@ def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
 
 
 def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, DensityFit]:
-    """Return a local maximum of the likelihood, over mixings and densities in turns."""
+    """Return a local maximum of the likelihood near W, by alternating maximisation.
+
+    The mixing and the densities take turns, until the densities stay the same.
+    """
     fit = _fit_densities(W, Z)
     for _ in range(TURNS):
         W = _newton(W / np.sqrt(fit.variance)[:, None], Z, fit.tails)
@@ -343,11 +363,12 @@ def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, DensityFit]:
 
 def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
     """
-    Maximise the likelihood for fixed densities over all mixings.
+    Maximise the likelihood over all mixings W for fixed densities `tails` (n_signals,).
 
-    The steps are relative, ``W <- exp(E) W``, so that a long one still rotates. Where
-    the Hessian is not negative definite, or a step is too long or does not raise the
-    likelihood, a multiple of the identity is taken off the Hessian.
+    The Newton steps are relative, ``W <- exp(E) W``, so that long ones keep W
+    invertible. Where the Hessian is not negative definite, or a step is too long or
+    does not raise the likelihood enough, a multiple of the identity is subtracted from
+    the Hessian (Levenberg-Marquardt).
     """
     size = Z.shape[2]
     tail = tails[:, None]
@@ -364,6 +385,7 @@ def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
         gradient, hessian = _relative_derivatives(Y, *_slopes(u, tail, size))
         if np.abs(gradient).max() < GRADIENT_TOL * size:
             break
+        # Raise the shift until a step succeeds.
         while shift < LARGEST_SHIFT:
             E = _ascent(gradient, hessian, shift * size)
             if E is not None:
@@ -384,15 +406,20 @@ def _relative_derivatives(
     Y: NDArray, g: NDArray, dg: NDArray
 ) -> tuple[NDArray, NDArray]:
     """
-    Return the derivatives G and H of the likelihood by a relative step E.
+    Return the gradient G and the Hessian H of the likelihood in a relative step E.
 
-    To second order ``W <- (I + E) W`` raises it by ``<G, E> + <E, H E> / 2``, with
-    ``G_ka = 2 E[g_k y_k.y_a] + size delta_ka`` and
-    ``H_ka,kb = 2 E[g_k y_a.y_b] + 4 E[g'_k (y_k.y_a) (y_k.y_b)]``, and ``-size`` added
-    to ``H_ka,ak`` (Ablin, Cardoso and Gramfort 2018, here for vectors).
+    To second order ``W <- (I + E) W`` raises it by ``<G, E> + <E, H E> / 2``. With
+    means over the samples written as E[],
+
+        G_ka = 2 E[g_k y_k.y_a] + size delta_ka
+        H_ka,kb = 2 E[g_k y_a.y_b] + 4 E[g'_k (y_k.y_a) (y_k.y_b)]
+
+    and ``-size`` is added to ``H_ka,ak`` (Ablin, Cardoso and Gramfort 2018, here for
+    vectors). G is (n, n), H (n, n, n, n) for n signals; Y is (n, n_samples, size), g
+    and dg are (n, n_samples).
     """
     n_signals, n_samples, size = Y.shape
-    Y = np.ascontiguousarray(Y.transpose(0, 2, 1))  # long rows are fast
+    Y = np.ascontiguousarray(Y.transpose(0, 2, 1))  # samples last: long rows are fast
     flat = Y.reshape(n_signals, -1)
     gradient = 2.0 / n_samples * (g[:, None] * Y).reshape(n_signals, -1) @ flat.T
     gradient += size * np.eye(n_signals)
@@ -409,7 +436,10 @@ def _relative_derivatives(
 
 
 def _ascent(gradient: NDArray, hessian: NDArray, shift: float) -> NDArray | None:
-    """Return ``(shift I - H)^-1 G`` if that is an ascent, and not too long."""
+    """Return the step ``E = (shift I - H)^-1 G`` (n_signals, n_signals).
+
+    None if the matrix is not positive definite, or the step too long.
+    """
     matrix = shift * np.eye(gradient.size) - hessian.reshape(gradient.size, -1)
     try:
         factor = cho_factor(matrix)
