@@ -2,12 +2,13 @@
 
 1. The table is checked, scaled and, where points are missing, completed.
 2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
-3. and 4. The paper's pipeline: independent subspaces, block structure, refinement.
-5. The joint refinement, where it is wanted.
+3. and 4. The paper's pipeline: independent subspaces, then block structure and
+   refinement. With the joint refinement its result is only a start.
+5. The joint refinement, with `refinement="joint"`.
 6. Gauge, and camera and coefficients of every frame.
 
-The first and the last stage see all frames. The others see those of the sample, but for
-the last steps of the joint refinement.
+The first and the last stage use all frames. So do the last steps of the joint
+refinement. All others use the frames of the sample.
 """
 
 import warnings
@@ -52,16 +53,17 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm._tables.sources import Table
 
-# Tolerances where none is given: for each frame, of minus twice the log likelihood, and
-# for the paper's refinement, of the energy that it explains.
+# Convergence tolerances by default. JOINT_TOL: decrease of the objective of the joint
+# refinement for each frame. PAPER_TOL: gain of the paper's refinement, as a share of
+# the energy that it explains.
 JOINT_TOL, PAPER_TOL = 0.025, 1e-10
-# Steps and tolerance of the paper's refinement where the result is only a start.
+# Largest number of steps, and tolerance, of the paper's refinement before a joint one.
 START_STEPS, START_TOL = 200, 1e-5
-# Basis shapes of which "auto" takes the relevant ones.
+# Largest number of basis shapes that n_components="auto" tries.
 MOST_COMPONENTS = 12
-# Coefficients of frames from which the fit of a frame starts besides zero.
+# Number of starts of the fit of a frame besides zero: coefficients of other frames.
 N_STARTS = 8
-# The joint refinement is a stage only where it is wanted.
+# Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
 STAGES = (
     "table",
@@ -80,9 +82,9 @@ class FitOptions(NamedTuple):
     Attributes
     ----------
     isa : object
-        The unfitted strategy, with nothing left open.
+        The unfitted strategy, with all its parameters set.
     default_isa : bool
-        Whether the strategy is not the user's.
+        Whether the strategy is the default one, not given by the user.
     block_recovery, refinement, camera, independence, loss, layout, max_iter, tol
         As of `AffineNRSfM`.
     scale_frames : bool
@@ -116,7 +118,11 @@ class FitOptions(NamedTuple):
 
 
 class JointNumbers(NamedTuple):
-    """What only the joint refinement tells; public attributes of the same names."""
+    """
+    Results of the joint refinement alone.
+
+    They become public attributes of the same names with an underscore.
+    """
 
     noise_variance: float
     camera_noise_ratio: float
@@ -127,7 +133,7 @@ class JointNumbers(NamedTuple):
 
 class Refined(NamedTuple):
     """
-    The model and the frames, before they are described.
+    The fitted model and the fit of the frames, without error and energies.
 
     Attributes
     ----------
@@ -138,9 +144,9 @@ class Refined(NamedTuple):
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
         As of `AffineNRSfM`.
     n_iter : int
-        Steps of the refinement.
+        Number of steps of the last refinement.
     converged : bool
-        Whether they were enough.
+        Whether the refinement has converged.
     numbers : JointNumbers or None
         None for the paper's refinement.
     """
@@ -206,14 +212,14 @@ def fit_table(
     n_components : int or "auto"
         K.
     options : FitOptions
-        How.
+        How the table is fitted.
     progress : FitProgress
-        Is told of each stage that has ended, and of the steps of the joint refinement.
+        Called after each stage, and before each step of the joint refinement.
 
     Returns
     -------
     Fit
-        The fitted model, and what is said of the fit.
+        The fitted model, the fit of the frames, and measures of the fit.
     """
     if n_components == "auto":
         n_components = _count_components(source, options)
@@ -247,7 +253,7 @@ def fit_table(
             "increase max_iter or tol",
             ConvergenceWarning,
         )
-    # 6. What is said of the frames
+    # 6. Measures of the fit; the gauge is taken at the end of the refinement
     cameras = refined.frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, refined.model.basis, refined.frames.alpha)
     frames = refined.frames.astype(table.dtype)
@@ -276,7 +282,7 @@ def fit_table(
 def _count_components(source: Table, options: FitOptions) -> int:
     """Return the number of basis shapes that a table supports."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the fit will say the same
+        warnings.simplefilter("ignore")  # the fit itself warns again
         table = _scaled(source, 1, options)
     most = largest_n_components(table.n_points)
     most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
@@ -318,7 +324,11 @@ def _scaled(source: Table, n_components: int, options: FitOptions) -> ScaledTabl
 def _completed(
     table: ScaledTable, n_components: int, loss: str
 ) -> tuple[NDArray | None, FrameBlocks]:
-    """Return gross outliers, with a robust loss, and frames without gaps."""
+    """
+    Return gross outliers (n_frames, n_points) or None, and completed frames.
+
+    Outliers are looked for with a robust loss only. They count as missing points.
+    """
     outliers, used, complete = None, table.rows, table.complete
     if loss != "linear":
         outliers = gross_outliers(table.rows.whole().transpose(0, 2, 1))
@@ -332,7 +342,7 @@ def _completed(
 def _factors(
     table: ScaledTable, used: FrameBlocks, n_components: int, joint: bool
 ) -> tuple[Triplets, Sample, Factorisation]:
-    """Return the singular triplets of a table, and the factors of a sample."""
+    """Return the singular triplets of completed frames, a sample, and its factors."""
     shape = 2 * len(table.sizes), table.n_points
     triplets = block_triplets(used, shape, 3 * n_components + 3)
     if joint:
@@ -354,7 +364,7 @@ def _paper_result(
     tol = PAPER_TOL if options.tol is None else options.tol
     with warnings.catch_warnings():
         if joint and options.default_isa:
-            # It makes no difference to the joint refinement, which starts there.
+            # The joint refinement only starts from this result.
             warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
         result = run_paper_pipeline(
             factors,
@@ -377,16 +387,18 @@ def _refined_by_paper(
     options: FitOptions,
     unit: float,
 ) -> Refined:
-    """Return the shapes of the paper's pipeline, and frames with its model of them."""
+    """Return the model and the frames of the paper's pipeline; W is completed."""
     dtype, sizes = table.dtype, table.sizes[:, None, None]
     completed = W.reshape(len(sizes), 2, -1).transpose(0, 2, 1) * sizes
     shapes = _stacked_shapes(paper)
     if options.camera != "affine":
         scaled = options.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
+    # Rigid cameras and least squares coefficients, for the gauge
     mean_shape, basis = shapes[0].T, shapes[1:].transpose(0, 2, 1)
     rigid = RigidFrames(mean_shape, basis, options.camera).fit(completed, table.sizes)
     motion = rigid.motion / sizes
+    # Gauge
     if options.camera == "affine":
         space = canonical_space(mean_shape, motion)
     else:
@@ -399,7 +411,7 @@ def _refined_by_paper(
     )
     return Refined(
         model,
-        # The coefficients are those that transform gives, from the stored shapes.
+        # Fitted again with the stored (rounded) shapes, so that transform agrees.
         model.decompose(table.source),
         reorder_blocks(paper.mode_covariance, gauge.order),
         paper.n_iter,
@@ -435,6 +447,7 @@ def _refined_jointly(
         on_step=progress.step,
     )
     progress(JOINT_STAGE)
+    # Posterior of every frame
     frames = PosteriorFrames(
         fitted.shapes,
         fitted.noise_variance,
@@ -445,6 +458,7 @@ def _refined_jointly(
     )
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
+    # Gauge of shapes, cameras and coefficients
     gauge = independent_gauge(
         fitted.shapes,
         motion,
@@ -485,7 +499,8 @@ def _model(
     options: FitOptions,
     unit: float,
 ) -> TableModel:
-    """Return the fitted model of tables."""
+    """Return the fitted model as a function of tables."""
+    # With scale_frames each frame has a size of its own.
     one_unit = None if options.scale_frames else unit
     return TableModel(
         frames, mean_shape, basis, options.layout, options.names, one_unit
@@ -493,7 +508,7 @@ def _model(
 
 
 def _inverse_snr(table: ScaledTable, refined: Refined, cameras: NDArray) -> float:
-    """Return the inverse SNR of all frames."""
+    """Return the inverse SNR of all frames, for cameras (n, 2, 3) in scaled units."""
     model, frames = refined.model, refined.frames
     position = (frames.translation - table.translation) / table.sizes[:, None]
     shapes = np.concatenate([model.mean_shape[None], model.basis]).transpose(0, 2, 1)
@@ -501,7 +516,7 @@ def _inverse_snr(table: ScaledTable, refined: Refined, cameras: NDArray) -> floa
 
 
 def _reference(cameras: NDArray, table: ScaledTable, camera: str) -> NDArray:
-    """Return the camera (2, 3) that sees the mean shape as the frames do on average."""
+    """Return the mean view (2, 3) of cameras (n, 2, 3), of the same camera model."""
     reference = reference_camera(cameras, table.sizes)
     if camera != "affine":
         row, scale = nearest_calibrated(reference[None])

@@ -24,7 +24,7 @@ from isa_nrsfm._tables.visibility import seen_points, usable_frames
 
 class TableModel(NamedTuple):
     """
-    All that the fit of the frames of a new table depends on.
+    What the fit of a new table depends on: model of a frame, shapes and layout.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class TableModel(NamedTuple):
         return table.blocks.gather(shape, (self.mean_shape.shape,), table.dtype)[0]
 
     def reproject(self, table: Table) -> NDArray:
-        """Return a table as the model sees it."""
+        """Return the images of the fitted shapes, in the layout of the table."""
         image = partial(_images, model=self, dtype=table.dtype)
         return table.blocks.gather(image, ((table.n_columns,),), table.dtype)[0]
 
@@ -93,13 +93,13 @@ class TableModel(NamedTuple):
         return float(noise / signal) if signal > 0 else float("nan")
 
     def usable(self, rows: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the tracks of some rows, and which of their frames are usable."""
+        """Return tracks (n, n_points, 2) of some rows, and which are usable (n,)."""
         tracks = table_to_tracks(rows, self.layout)
         tracks = clean_tracks(tracks, self.layout, self.names)
         return tracks, usable_frames(tracks)
 
     def sizes(self, centred: NDArray) -> NDArray:
-        """Return the sizes of frames."""
+        """Return the sizes (n,) of frames, given as centred tracks (n, n_points, 2)."""
         if self.unit is not None or not len(centred):
             return np.full(len(centred), self.unit)
         if isinstance(self.frames, PosteriorFrames) and self.frames.loss != "linear":
@@ -108,7 +108,7 @@ class TableModel(NamedTuple):
 
 
 def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
-    """Return the fit of some rows of a table."""
+    """Return the fit of some rows (n, 2 * n_points); NaN for those not usable."""
     tracks, usable = model.usable(rows)
     frames = FrameFit.unknown(len(tracks), len(model.basis))
     if usable.any():
@@ -127,7 +127,7 @@ def _shapes(
     scaled: bool,
     dtype: Any,
 ) -> tuple[NDArray]:
-    """Return the shapes of some rows of a table."""
+    """Return the shapes (n, n_points, 3) of some rows (n, 2 * n_points)."""
     motion, _, alpha, _ = _fit(rows, model, dtype)
     if metric is None:
         return (compose(model.mean_shape, model.basis, alpha),)
@@ -139,21 +139,22 @@ def _shapes(
 
 
 def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
-    """Return some rows of a table as the model sees them."""
+    """Return the images (n, 2 * n_points) of the fitted shapes of some rows."""
     motion, translation, alpha, _ = _fit(rows, model, dtype)
     shapes = compose(model.mean_shape, model.basis, alpha)
     return (tracks_to_table(project(shapes, motion, translation), model.layout),)
 
 
 def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
-    """Return what the error of points held out adds up for some rows of a table."""
+    """Return the energies of `held_out_energies` for some rows (n, 2 * n_points)."""
     tracks, usable = model.usable(rows)
     tracks = tracks[usable]
     sizes = model.sizes(centred_tracks(tracks)[0])
     return held_out_energies(model.frames, model.mean_shape, model.basis, tracks, sizes)
 
 
-# Parts of the points that are held out in turn, and what draws them: always the same.
+# Number of parts of the points that are held out in turn, and the fixed random seed of
+# the partition.
 N_FOLDS = 5
 FOLD_SEED = 0
 
@@ -188,9 +189,9 @@ def held_out_energies(
     Returns
     -------
     noise, signal : float
-        ``sum ||m - mhat||^2`` and ``sum ||m - centroid_i||^2`` over the points, in
-        units of the sizes. Points whose frame is not determined by the others are left
-        out.
+        ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the points, each
+        divided by the squared size of its frame. Points are left out if the others of
+        the frame do not determine its fit.
     """
     n_points = tracks.shape[1]
     folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
@@ -198,11 +199,13 @@ def held_out_energies(
     noise = signal = 0.0
     for fold in range(N_FOLDS):
         held = folds == fold
+        # Fit without the held-out points
         visible = np.where(held[:, None], np.nan, tracks)
         usable = np.flatnonzero(usable_frames(visible) & seen[:, held].any(axis=1))
         if not len(usable):
             continue
         fit = frames.fit(visible[usable], sizes[usable])
+        # Prediction of the held-out points, and its error
         shapes = compose(mean_shape[held], basis[:, held], fit.alpha)
         model = project(shapes, fit.motion, fit.translation)
         part = tracks[usable]

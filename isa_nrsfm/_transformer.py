@@ -40,8 +40,8 @@ class Decomposition(NamedTuple):
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the basis shapes.
     alpha_std : ndarray of shape (n_frames, n_components)
-        Their standard deviations given the frame; NaN where the model of the frames
-        knows no noise, as that of the paper's refinement.
+        Their posterior standard deviations. NaN for models of the paper's refinement,
+        which have no noise variance.
     """
 
     motion: NDArray
@@ -56,7 +56,7 @@ class TableTransformer(
     """
     The methods of `AffineNRSfM` that need a fit.
 
-    They need the attributes that `fit` sets, of which `_model` is the fitted model.
+    They use attributes that `fit` sets. The fitted model itself is `_model`.
     """
 
     mean_shape_: NDArray
@@ -125,13 +125,14 @@ class TableTransformer(
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
         camera : {"orthographic", "weak_perspective"} or None, default=None
-            What is known of the cameras, for a model with affine ones. None returns the
-            affine shapes, in the space of `mean_shape_`: angles and proportions in
-            depth are not those of the object. Otherwise shapes are Euclidean, up to
-            rotation and mirror image, which are the same for all frames.
-            "weak_perspective" lets each camera have a scale of its own, so that the
-            sizes of the shapes mean nothing; "orthographic" has one scale for all, so
-            that shapes are in the units of the table.
+            The calibrated cameras that took the images, for a model that was fitted
+            with affine ones. None returns affine shapes, in the space of `mean_shape_`:
+            their angles and proportions in depth are not those of the object.
+            Otherwise shapes are Euclidean. One rotation and one mirror image, the same
+            for all frames, remain unknown. With "weak_perspective" each camera has a
+            scale of its own, and the sizes of the shapes have no meaning. With
+            "orthographic" all cameras have one scale, and shapes are in the units of
+            the table.
 
         Returns
         -------
@@ -142,14 +143,15 @@ class TableTransformer(
         Raises
         ------
         ValueError
-            If `camera` is something else, if the cameras of the fitted table see less
-            than three directions of space, or if the model has other calibrated cameras
-            than those that are asked for.
+            If `camera` is none of these, if the cameras of the fitted table see fewer
+            than three directions of space, or if the model was fitted with calibrated
+            cameras other than `camera`.
 
         Warns
         -----
         UserWarning
-            If the cameras of the fitted table turn too little to tell its metric.
+            If the cameras of the fitted table rotate too little to determine the metric
+            of space.
 
         See Also
         --------
@@ -159,8 +161,8 @@ class TableTransformer(
         -----
         The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
         `motion_` and `alpha_`, the cameras of the fitted table, whatever X is. Models
-        that were fitted with calibrated cameras have Euclidean shapes as they are: no
-        shape is turned, and `scales_` and `rotations_` belong to them.
+        that were fitted with calibrated cameras have Euclidean shapes already. These
+        are not turned, so that `scales_` and `rotations_` are those of their cameras.
         """
         if camera is not None and camera not in CAMERA_MODELS:
             raise ValueError(
@@ -183,10 +185,10 @@ class TableTransformer(
         """
         Turn the model into its mirror image in depth, which fits as well.
 
-        Neither affine nor calibrated cameras tell an object from its mirror image: the
-        fit takes the one of which the mean shape has a depth of positive third moment.
-        Where it is the wrong one, for instance a face whose nose points away, this
-        takes the other one. Coefficients, reprojection and score stay as they are.
+        Neither affine nor calibrated cameras tell an object from its mirror image. The
+        fit chooses the one whose mean shape has a positive third moment of its depths.
+        If that is the wrong one, such as a face whose nose points away, this method
+        takes the other. Coefficients, reprojection and score stay as they are.
 
         Returns
         -------
@@ -225,7 +227,7 @@ class TableTransformer(
 
     def reproject(self, X: Any) -> NDArray:
         """
-        Return a table as the model sees it, missing points filled in.
+        Return the images of the fitted shapes, also of missing points.
 
         Parameters
         ----------
@@ -285,9 +287,8 @@ class TableTransformer(
         Return minus the inverse SNR of points held out of the fit of their frame.
 
         The points are divided into five parts, always the same. Each is predicted from
-        the others, frame by frame. Unlike the reprojection of the points that are
-        fitted, this gets worse with too many basis shapes, and so it serves to choose
-        `n_components`.
+        the others, frame by frame. Unlike the reprojection error of fitted points, this
+        error rises with too many basis shapes. So the score can choose `n_components`.
 
         Parameters
         ----------
@@ -299,16 +300,16 @@ class TableTransformer(
         Returns
         -------
         float
-            ``-sum ||m - mhat||^2 / sum ||m - centroid_i||^2`` over all points, frames
-            scaled as in the fit; larger is better. Points whose frame the others do not
-            determine are left out.
+            ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
+            frames scaled as in the fit. Larger is better. Points are left out if the
+            others of the frame do not determine its fit.
         """
         table = self._opened(X)
         return -self._model.held_out_error(table)
 
     def diagnostics(self) -> Diagnostics:
         """
-        Tell how far the fitted table determines the answer.
+        Return how well the fitted table determines shapes and coefficients.
 
         Returns
         -------
@@ -319,7 +320,8 @@ class TableTransformer(
         Raises
         ------
         ValueError
-            If the model was not refined jointly: the paper's pipeline knows no noise.
+            If the model was not refined jointly: the paper's pipeline has no noise
+            variance.
 
         Warns
         -----
@@ -347,7 +349,11 @@ class TableTransformer(
         )
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
-        """Return a table, for the fit or for the fitted model, in blocks."""
+        """
+        Return a table in blocks, checked.
+
+        With reset it is the table of a fit. Without it has to match the fitted one.
+        """
         if not reset:
             check_is_fitted(self)
         if is_stored(X) or is_on_dask(X):
@@ -361,7 +367,7 @@ class TableTransformer(
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
-    """Return a finite array of one of the allowed shapes, or say what came."""
+    """Return values as a finite array of one of the allowed shapes, or raise."""
     array = check_array(
         values,
         dtype=[np.float64, np.float32],

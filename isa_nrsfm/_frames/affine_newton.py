@@ -5,20 +5,21 @@ For each frame by itself, with weights ``w_ij`` (zero for missing points), shape
 
     f(M, t, a) = sum_j w_ij || m_ij - M S_j(a) - t ||^2 + s2 |a|^2,
 
-``2 s2`` times minus the log posterior of coefficients with the prior N(0, I). Position
-and camera are eliminated: with ``A = S S^T`` and ``Y = W S^T`` (points and shapes
-centred over the points that the frame sees) the camera is ``M = Y A^-1`` and
+the negative log posterior times ``2 s2``, where a has the prior N(0, I). Position and
+camera are eliminated. With ``A = S S^T`` and ``Y = W S^T``, points and shapes centred
+over the points that the frame sees, the camera is ``M = Y A^-1`` and
 
     f(a) = ||W||^2 - <M, Y> + s2 |a|^2.
 
-With ``P_k = W B_k^T`` and ``H_kl = <M B_k, M B_l>`` half its gradient is ``s2 a_k +
-sum_l H_kl c_l - <P_k, M>``, c = (1, a), and half its Hessian is the Schur complement
+Write ``P_k = B_k W^T``, ``H_kl = <M B_k, M B_l>`` and c = (1, a). Half the gradient is
+``s2 a_k + sum_l H_kl c_l - <P_k^T, M>``. Half the Hessian is the Schur complement
 
-    H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k.
+    H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k^T.
 
-The first step from a start is that of alternation, with ``H + s2 I`` alone, the others
-are Newton steps. Where the Schur complement is not positive definite, or a step would
-raise f, a multiple of ``H + s2 I`` is added: f never rises, up to rounding.
+The first step from a start takes ``H + s2 I`` in its place, half the Hessian with the
+camera held. The others are Newton steps. Where the Schur complement is not positive
+definite, or a step raised f, it is damped: a multiple of ``H + s2 I`` is added. So f
+never rises, up to rounding.
 """
 
 from typing import NamedTuple, Self
@@ -40,23 +41,24 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpacked,
 )
 
-# Prior precision of cameras, as a share of the second moment of the shapes, and of
-# coefficients, as a share of the energy of the frame: they keep the result finite for
-# degenerate shapes and are too small to matter to others.
+# Ridge of ``A = S S^T``, as a share of the second moment of the shapes, and lower bound
+# of s2, as a share of the energy of the frame. They keep the result finite for
+# degenerate shapes, and are too small to change it for others.
 RIDGE = 1e-13
-# A frame has converged when a Newton step gains less than this share of its energy;
-# the next one would gain about the square.
+# Convergence tolerance: a frame has converged when a Newton step gains less than this
+# share of its energy. Convergence is quadratic: the next step would gain far less.
 TOLERANCE = 1e-12
-# f may rise by this share of the energy: rounding errors.
+# A rise of f by less than this share of the energy counts as rounding error.
 ROUNDING = 1e-14
-# Below the one a step is not damped any more; with the other it does not move.
+# Damping below SMALLEST_DAMPING is set to zero. With LARGEST_DAMPING a step no longer
+# moves, and the search of the frame ends.
 SMALLEST_DAMPING = 0.05
 LARGEST_DAMPING = 1e8
 
 
 class AffineSearch:
     """
-    The search for affine cameras that see given shapes.
+    The search for affine cameras and coefficients of frames, for given shapes.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ class AffineSearch:
         self.shapes, self._space = whitened(np.ascontiguousarray(shapes))
 
     def cameras(self, motion: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) for the shapes as they were given."""
+        """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
         return motion @ self._space
 
     def fit(
@@ -127,16 +129,17 @@ class AffineSearch:
         """Return cameras (2, 3, n_frames) by two steps from coefficients of zero."""
         problem = _problem(products, variance, n_points)
         state = _evaluate(problem, np.zeros((len(self.shapes) - 1, len(variance))))
-        alpha, _ = solve_positive(state.known, state.slope)
+        # A step with the camera held, then a Newton step
+        alpha, _ = solve_positive(state.held, state.slope)
         step, _ = _newton_step(_evaluate(problem, alpha), np.zeros(len(variance)))
         camera = _eliminated(problem, with_one(alpha + step))[-1]
         return camera.transpose(1, 0, 2)
 
 
 class _Problem(NamedTuple):
-    """What the search for n frames needs, shapes in white space."""
+    """What the search for n frames needs, for `whitened` shapes."""
 
-    cross: NDArray  # P (n_shapes, 3, 2, n)
+    cross: NDArray  # P_k (n_shapes, 3, 2, n)
     gram: SharedGram | FrameGram
     energy: NDArray  # ||W||^2 (n,)
     ridge: NDArray  # s2, not zero (n,)
@@ -154,12 +157,13 @@ class _Problem(NamedTuple):
 
 
 def _problem(products: FrameSums, variance: NDArray, n_points: float) -> _Problem:
-    """Return the problem with its ridges, each relative to the frame."""
+    """Return the problem with its ridges. The noise variances are (n_frames,)."""
     energy, weight = products.energy, products.weight
     ridge = np.maximum(variance, RIDGE * energy)
-    # Where all points of a frame are equal any ridge will do: alpha is zero.
+    # A frame of zero energy: alpha is zero for any ridge.
     ridge = np.where(ridge > 0, ridge, 1.0)
     precision = np.zeros((6, len(ridge)))
+    # A ridge on the diagonal: the shapes are white.
     precision[:3] = RIDGE * weight / n_points
     return _Problem(products.cross, products.gram, energy, ridge, precision)
 
@@ -170,9 +174,9 @@ class _State(NamedTuple):
     alpha: NDArray  # (K, n)
     camera: NDArray  # M^T (3, 2, n)
     explained: NDArray  # ||W||^2 - f (n,)
-    slope: NDArray  # minus half the gradient (K, n)
-    known: NDArray  # H + s2 I, half the Hessian if the camera is known, packed
-    schur: NDArray  # half the Hessian, packed
+    slope: NDArray  # minus half the gradient of f(a) (K, n)
+    held: NDArray  # H + s2 I, half the Hessian with the camera held, packed
+    schur: NDArray  # half the Hessian of f(a), packed
 
     def take(self, frames: NDArray) -> Self:
         """Return the state of some of the frames."""
@@ -185,7 +189,7 @@ class _State(NamedTuple):
 
 
 def with_one(alpha: NDArray) -> NDArray:
-    """Return ``c = (1, alpha)``."""
+    """Return ``c = (1, alpha)`` (n_components + 1, n) of alpha (n_components, n)."""
     return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
 
 
@@ -193,10 +197,10 @@ def _eliminated(
     problem: _Problem, c: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """
-    Return what follows from c when the camera is eliminated.
+    Eliminate the cameras for coefficients c (n_shapes, n).
 
-    That is ``B_k S^T + S B_k^T``, the inverse factor R of ``A = (R^T R)^-1``, ``R Y^T``
-    and the camera ``M^T = A^-1 Y^T``.
+    Returned are ``B_k S^T + S B_k^T`` (n_shapes, 3, 3, n), R (3, 3, n) with ``R^T R =
+    A^-1``, ``R Y^T`` (3, 2, n) and the cameras ``M^T = A^-1 Y^T`` (3, 2, n).
     """
     T = problem.gram.products(c)
     A = 0.5 * np.einsum("ki,kabi->abi", c, T)[ROWS, COLUMNS] + problem.precision
@@ -207,41 +211,47 @@ def _eliminated(
 
 
 def _evaluate(problem: _Problem, alpha: NDArray) -> _State:
-    """Return the objective and its derivatives, as in the head of this module."""
+    """Return f(a) and its derivatives at alpha (K, n), see the docstring on top."""
     P, ridge = problem.cross, problem.ridge
     c = with_one(alpha)
     T, R, half, camera = _eliminated(problem, c)
+    # ||W||^2 - f = ||R Y^T||^2 - s2 |a|^2
     explained = np.einsum("ari,ari->i", half, half)
     explained -= ridge * np.einsum("ki,ki->i", alpha, alpha)
 
+    # H + s2 I, from M^T M
     images = np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :])
-    known = problem.gram.energies(images)[len(c) :]
-    known[diagonal_of(known)] += ridge
+    held = problem.gram.energies(images)[len(c) :]
+    held[diagonal_of(held)] += ridge
+    # F_k^T, then R F_k^T for the Schur complement
     F = np.einsum("kabi,bri->kari", T[1:], camera)
     F -= P[1:]
     slope = 0.5 * np.einsum("kari,ari->ki", P[1:] - F, camera) - ridge * alpha
     F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(ridge))
-    return _State(alpha, camera, explained, slope, known, known - packed_gram(F))
+    return _State(alpha, camera, explained, slope, held, held - packed_gram(F))
 
 
 def _descend(
     problem: _Problem, alpha: NDArray, max_steps: int
 ) -> tuple[NDArray, NDArray]:
-    """Return the minima reached from alpha (K, n), and whether they are reached."""
+    """Return the last iterates from alpha (K, n), and whether they have converged."""
     found, converged = alpha.copy(), np.zeros(alpha.shape[1], dtype=bool)
     running, damping = np.arange(alpha.shape[1]), np.zeros(alpha.shape[1])
     state = _evaluate(problem, alpha)
-    step, _ = solve_positive(state.known, state.slope)
+    step, _ = solve_positive(state.held, state.slope)
     for _ in range(max_steps):
+        # Trial step, refused where f rises
         energy = problem.energy
         trial = _evaluate(problem, state.alpha + step)
         worse = np.flatnonzero(trial.explained < state.explained - ROUNDING * energy)
         if len(worse):
             trial.put(worse, state.take(worse))
         state = trial
+        # Damping: less after a good step, more after a refused one
         eased = np.where(damping > SMALLEST_DAMPING, damping / 8.0, 0.0)
         eased[worse] = np.maximum(4.0 * damping[worse], 0.5)
 
+        # Next step, and convergence test by the decrease that it predicts
         step, damping = _newton_step(state, eased)
         gain = np.einsum("ki,ki->i", state.slope, step)
         small = (damping == 0) & (gain <= TOLERANCE * energy)
@@ -249,6 +259,7 @@ def _descend(
         leaving = small | stuck
         if not leaving.any():
             continue
+        # Frames that have ended leave the problem, converged ones with a last step.
         step[:, stuck] = 0.0
         done = running[leaving]
         found[:, done] = (state.alpha + step)[:, leaving]
@@ -263,10 +274,14 @@ def _descend(
 
 
 def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
-    """Return damped Newton steps, and the damping, raised where it has to be."""
+    """
+    Return damped Newton steps (K, n), and the damping (n,).
+
+    It is at least SMALLEST_DAMPING where the damped matrix is not positive definite.
+    """
     matrix = state.schur
     if damping.any():
-        matrix = matrix + damping * state.known
+        matrix = matrix + damping * state.held
     step, positive = solve_positive(matrix, state.slope)
     failing = np.flatnonzero(~positive)
     if len(failing):
@@ -279,15 +294,16 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
     """
     Return steps for frames whose Hessian is not positive definite.
 
-    In coordinates where ``H + s2 I`` is the identity the gradient is divided by the
-    magnitudes of the curvatures, and the damping: downhill along each axis (the
-    saddle-free Newton method of Dauphin et al., "Identifying and attacking the saddle
-    point problem in high-dimensional non-convex optimization", 2014).
+    In coordinates where ``H + s2 I`` is the identity, the step along each principal
+    axis of the Hessian is ``slope / (|curvature| + damping)``: downhill, also where the
+    curvature is negative (the saddle-free Newton method of Dauphin et al., "Identifying
+    and attacking the saddle point problem in high-dimensional non-convex optimization",
+    2014).
     """
-    known, schur = (
-        unpacked(each).transpose(2, 0, 1) for each in (state.known, state.schur)
+    held, schur = (
+        unpacked(each).transpose(2, 0, 1) for each in (state.held, state.schur)
     )
-    size, axes = np.linalg.eigh(known)
+    size, axes = np.linalg.eigh(held)
     size = np.maximum(size, SMALLEST_PIVOT * size[:, -1:])
     whitening = axes / np.sqrt(size)[:, None]
     curvature, modes = np.linalg.eigh(whitening.swapaxes(1, 2) @ schur @ whitening)
@@ -301,15 +317,15 @@ def _inverse_schur(state: _State) -> NDArray:
     """
     Return the inverse of the Schur complement, packed.
 
-    Where it is not positive definite, which it is wherever a frame determines its
-    minimum, as much of ``H + s2 I`` is added as makes it so.
+    It is positive definite at a minimum that the frame determines. Elsewhere a multiple
+    of ``H + s2 I`` is added that is large enough.
     """
     inverse, _, positive = invert_positive(state.schur)
     failing = np.flatnonzero(~positive)
     damping = 1.0
     while len(failing) and damping < LARGEST_DAMPING:
         part = state.take(failing)
-        matrix = part.schur + damping * part.known
+        matrix = part.schur + damping * part.held
         inverse[..., failing], _, positive = invert_positive(matrix)
         failing = failing[~positive]
         damping *= 10.0

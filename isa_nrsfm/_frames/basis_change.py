@@ -13,7 +13,8 @@ class FrameMap(NamedTuple):
     Attributes
     ----------
     mixing : ndarray of shape (n_components + 1, n_components + 1)
-        Takes ``(1, alpha)`` to new coefficients, up to a factor for each frame.
+        Takes ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale, different for
+        each frame, goes to its camera.
     space : ndarray of shape (3, 3)
         Affinity of space, ``new shape = shape @ space.T``.
     """
@@ -53,6 +54,7 @@ class FrameMap(NamedTuple):
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
+        # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))

@@ -1,22 +1,22 @@
 """Most probable calibrated camera of frames and their coefficients, by Newton's method.
 
-For each frame by itself, given shapes and noise variance s2, this minimises minus two
-log marginal likelihoods of its camera, the coefficients being integrated out ::
+For each frame by itself, given shapes and noise variance s2, this minimises minus twice
+the log marginal likelihood of its camera, with the coefficients integrated out ::
 
     F(M) = f(M) / s2 + log det(I + H / s2),  f(M) = min_a ||W - M S(a)||^2 + s2 |a|^2,
 
 over scaled rotations ``M(w, l) = exp(l) M exp(hat(w))`` or, where scales are known,
-over rotations. The gradient is that of `coefficient_posterior`'s moments, as in
-expectation maximisation, ``dF/dM = 2 G / s2`` with ``G = M A - sum_k c_k P_k^T`` and
-``A = sum_kl E_kl B_k B_l^T``. The Hessian is, divided by 2 / s2 and along the tangents
-D_c of a camera ::
+over rotations. With the posterior moments c and E of `coefficient_posterior` the
+gradient is, as in expectation maximisation, ``dF/dM = 2 G / s2``, ``G = M A - sum_k c_k
+P_k^T``, ``A = sum_kl E_kl B_k B_l^T``. Along the tangents D_c of a camera, ``s2 / 2``
+times the Hessian is ::
 
     tr(D_c A D_d^T) + <G, D_cd> - sum_kl <D_c, F_k> Q_kl <D_d, F_l>,
 
 with ``F_k = M (B_k S^T + S B_k^T) - P_k^T``, ``Q = (H + s2 I)^-1`` and the second
-derivative D_cd of the camera: exact but for the logarithm of the determinant, of which
-A has a bound. Where it is not positive definite, or a step would raise F, a multiple of
-``tr(D_c A D_d^T)`` is added.
+derivative D_cd of the camera. This is exact but for the log determinant, whose second
+derivative is replaced by the bound that A contains. Where the matrix is not positive
+definite, or a step raised F, it is damped: a multiple of ``tr(D_c A D_d^T)`` is added.
 """
 
 from typing import NamedTuple, Self
@@ -49,25 +49,28 @@ from isa_nrsfm._linalg.packed_symmetric import (
 RIDGE = 1e-13
 # A frame has converged when a Newton step gains less than this share of its energy.
 TOLERANCE = 1e-12
-# The objective may rise by this share of the energy: rounding errors.
+# A rise of the objective by less than this share of the energy is rounding error.
 ROUNDING = 1e-13
 # Objectives that differ by less than this share of the energy are equal.
 EQUAL = 1e-10
-# The damping that a failing step raises, the factors of a failing and of a good step,
-# the value below which there is none, and that with which a step does not move.
+# Damping: least value after a step that fails (FIRST_DAMPING), factors after a step
+# that fails (RAISED) and after a good one (EASED). Below SMALLEST_DAMPING it is set to
+# zero. With LARGEST_DAMPING a step no longer moves, and the search of the frame ends.
 FIRST_DAMPING = 0.1
 RAISED, EASED = 8.0, 0.1
 SMALLEST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e8
-# A search that has so many times as far to go as a step promises leads nowhere better.
+# A search with a limit is given up when the objective has to fall by more than so many
+# times the predicted gain of the next step.
 PROMISED = 10.0
+# Largest number of steps for rough cameras, and of those from reversed cameras.
 ROUGH_STEPS = 3
 REVERSED_STEPS = 6
 
 
 class CalibratedSearch:
     """
-    The search for scaled rotations that see given shapes.
+    The search for calibrated cameras of frames, for given shapes.
 
     Parameters
     ----------
@@ -83,7 +86,8 @@ class CalibratedSearch:
         The shapes, turned to the principal axes of the mean shape.
     """
 
-    first_steps = MAX_STEPS  # frames that have converged do not take part
+    # Converged frames leave the search, so that no second round is needed.
+    first_steps = MAX_STEPS
 
     def __init__(self, shapes: NDArray, scaled: bool):
         self._models = CalibratedCameras(scaled)
@@ -93,7 +97,7 @@ class CalibratedSearch:
         self.shapes[0, size <= FLAT * size[0]] = 0.0
 
     def cameras(self, motion: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) for the shapes as they were given."""
+        """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
         return motion @ self._axes.T
 
     def fit(
@@ -116,8 +120,8 @@ class CalibratedSearch:
         n_points : float
             Not used.
         initial : ndarray of shape (n_components, n_frames)
-            Coefficients to start from: with the calibrated cameras that are nearest to
-            the affine ones which see these shapes best.
+            Coefficients that give the first cameras. These are near the affine cameras
+            of least squares for the shapes with these coefficients.
         max_steps : int
             The most steps.
 
@@ -137,7 +141,7 @@ class CalibratedSearch:
         self, products: FrameSums, noise: float, motion: NDArray
     ) -> tuple[NDArray, NDArray]:
         """
-        Return the cameras that frames reach from reversed ones, where they are better.
+        Search from the cameras reversed in depth, too, and return the better cameras.
 
         Parameters
         ----------
@@ -157,7 +161,7 @@ class CalibratedSearch:
         """
         turned = np.ascontiguousarray((motion @ self._axes).transpose(1, 2, 0))
         problem = _problem(products, np.full(len(motion), noise), self._models)
-        # Cameras may not be at their minimum yet: that of both sides is compared.
+        # The cameras may not be at their minimum yet. Compare minima with minima.
         turned, _ = _descend(problem, turned, REVERSED_STEPS)
         other, better, _ = _better_reversed(problem, turned, REVERSED_STEPS)
         motion = motion.copy()
@@ -197,10 +201,16 @@ def _problem(
 
 
 def _first_cameras(problem: _Problem, alpha: NDArray) -> NDArray:
-    """Return calibrated cameras next to the affine ones that see given shapes best."""
+    """
+    Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
+
+    Of two candidates for each frame, the nearest camera and that of `_completed`, the
+    one with the lower objective is taken.
+    """
     products = problem.products
     c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
     seen = np.einsum("ki,kari->rai", c, products.cross)  # W S^T
+    # Affine cameras of least squares, M = W S^T (S S^T)^-1
     T = products.gram.products(c)
     inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, _packed3(T)))
     affine = np.einsum("rbi,bai->rai", seen, inverse).transpose(2, 0, 1)
@@ -217,11 +227,12 @@ def _first_cameras(problem: _Problem, alpha: NDArray) -> NDArray:
 
 def _completed(affine: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return orthonormal rows, and scales, by what is seen of the two widest axes.
+    Return orthonormal rows and scales from the first two columns of affine cameras.
 
-    Of thin objects the third column of an affine camera is not determined. The first
-    two, ``A = U diag(s_1, s_2) V^T``, are those of a scaled rotation whose third column
-    is ``sqrt(s_1^2 - s_2^2) u_2``.
+    The cameras (n, 2, 3) belong to the principal axes of the mean shape. For thin
+    objects their third column, of the thinnest axis, is not determined. The first two
+    are ``U diag(s_1, s_2) V^T``. In a scaled rotation they go with the third column
+    ``+- sqrt(s_1^2 - s_2^2) u_2``. Its sign is taken from the affine camera.
     """
     U, values, Vt = np.linalg.svd(affine[:, :, :2])
     scale = np.where(values[:, 0] > 0, values[:, 0], 1.0)
@@ -237,9 +248,10 @@ def _reversed(motion: NDArray) -> NDArray:
     """
     Return cameras (2, 3, n) that see the mean shape reversed in depth.
 
-    The images of a flat object are the same after a reflection at its plane, and so are
-    orthographic images of any object and of its mirror image (Necker reversal). The
-    plane is that across the thinnest axis of the mean shape, the last one.
+    The images of a flat object do not change when it is reflected at its plane. Those
+    of other objects change the less the thinner they are (Necker reversal). The plane
+    is taken perpendicular to the thinnest axis of the mean shape, the last one: the
+    third column changes its sign.
     """
     return motion * np.array([1.0, 1.0, -1.0])[:, None]
 
@@ -247,7 +259,11 @@ def _reversed(motion: NDArray) -> NDArray:
 def _better_reversed(
     problem: _Problem, motion: NDArray, max_steps: int
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the better ones of cameras and the reversed ones' minima, and which."""
+    """
+    Return the better cameras (2, 3, n) of those given and of minima from reversed ones.
+
+    Also returned are which of them are new (n,), and which searches converged (n,).
+    """
     value = _value(problem, _posterior(problem, motion))
     limit = value - EQUAL * (problem.products.energy + problem.noise)
     other, converged = _descend(problem, _reversed(motion), max_steps, limit)
@@ -266,9 +282,9 @@ class _State(NamedTuple):
 
     motion: NDArray  # (2, 3, n)
     value: NDArray  # s2 F (n,)
-    slope: NDArray  # minus half of its gradient along the tangents (p, n)
-    known: NDArray  # tr(D_c A D_d^T), packed (n_pairs, n)
-    hessian: NDArray  # half the Hessian, packed (n_pairs, n)
+    slope: NDArray  # minus half the gradient of s2 F along the tangents (p, n)
+    definite: NDArray  # tr(D_c A D_d^T), positive semidefinite, packed (n_pairs, n)
+    hessian: NDArray  # half the Hessian of s2 F, packed (n_pairs, n)
 
     def take(self, frames: NDArray) -> Self:
         """Return the state of some of the frames."""
@@ -281,12 +297,12 @@ class _State(NamedTuple):
 
 
 def _value(problem: _Problem, posterior: CoefficientPosterior) -> NDArray:
-    """Return the objective F times s2."""
+    """Return ``s2 F`` (n,)."""
     return posterior.objective + problem.noise * posterior.log_determinant
 
 
 def _posterior(problem: _Problem, motion: NDArray) -> CoefficientPosterior:
-    """Return the posterior of the coefficients."""
+    """Return the posterior of the coefficients for cameras (2, 3, n)."""
     return coefficient_posterior(problem.products, motion, problem.noise)
 
 
@@ -305,7 +321,12 @@ def _coupling(
 def _curvature(
     motion: NDArray, A: NDArray, G: NDArray, gradient: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return ``tr(D_c A D_d^T)`` and ``<G, D_cd>``, packed; the gradient: <G, D_c>."""
+    """
+    Return ``tr(D_c A D_d^T)`` and ``<G, D_cd>``, packed (n_pairs, n).
+
+    The arrays are motion and G (2, 3, n), A (6, n), packed, and the gradient
+    ``<G, D_c>`` (n_parameters, n).
+    """
     turns, across, scale = tangent_curvature(motion, A)
     # D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd for rotations, row by row.
     mixed = np.einsum("rai,rbi->abi", G, motion)
@@ -331,44 +352,46 @@ def _curvature(
 
 
 def _evaluate(problem: _Problem, motion: NDArray) -> _State:
-    """Return the objective and its derivatives, as in the head of this module."""
+    """Return F and its derivatives at motion (2, 3, n), see the docstring on top."""
     return _state(problem, motion, _posterior(problem, motion))
 
 
 def _state(
     problem: _Problem, motion: NDArray, posterior: CoefficientPosterior
 ) -> _State:
-    """Return the objective and its derivatives where the posterior is known."""
+    """Return F and its derivatives at motion (2, 3, n), whose posterior is given."""
     noise, cameras = problem.noise, problem.cameras
     A = problem.products.gram.moments(posterior.second_moments(noise))
     G = np.einsum("rbi,bai->rai", motion, unpack3(A))
     G -= np.einsum("ki,kari->rai", posterior.c, problem.products.cross)
     gradient = cameras.gradient(motion, G)
-    known, bent = _curvature(motion, A, G, gradient)
+    definite, bent = _curvature(motion, A, G, gradient)
+    # - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
     Q = -unpacked(posterior.inverse)[1:, 1:]
     coupling = _coupling(problem, motion, posterior)
     through = np.einsum("kli,cli->cki", Q, coupling)
-    hessian = known + bent
+    hessian = definite + bent
     rows, columns = np.triu_indices(cameras.n_parameters)
     hessian -= np.einsum("pki,pki->pi", through[rows], coupling[columns])
     value = _value(problem, posterior)
-    return _State(motion, value, -gradient, known, hessian)
+    return _State(motion, value, -gradient, definite, hessian)
 
 
 def _descend(
     problem: _Problem, motion: NDArray, max_steps: int, limit: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
     """
-    Return the minima reached from cameras, and whether they are reached.
+    Return the last iterates from cameras (2, 3, n), and whether they have converged.
 
-    Frames whose objective will not fall below their limit, by what a step promises, are
-    left where they are.
+    With a limit (n,) the search of a frame is given up where the predicted gain says
+    that the objective will not fall below its limit.
     """
     found, converged = motion.copy(), np.zeros(motion.shape[2], dtype=bool)
     running, damping = np.arange(motion.shape[2]), np.zeros(motion.shape[2])
     limit = np.full(len(running), np.inf) if limit is None else limit
     state = _evaluate(problem, motion)
     for _ in range(max_steps):
+        # Damped Newton step, and convergence test by the decrease that it predicts
         step, damping = _newton_step(state, damping)
         step = problem.cameras.limited(step)
         energy = problem.products.energy + problem.noise
@@ -376,6 +399,7 @@ def _descend(
         small = (damping == 0) & (gain <= TOLERANCE * energy)
         leaving = small | (damping >= LARGEST_DAMPING)
         leaving |= state.value - PROMISED * gain > limit
+        # Frames that have ended leave the problem, converged ones with a last step.
         if leaving.any():
             last = problem.cameras.moved(state.motion, np.where(small, step, 0.0))
             found[:, :, running[leaving]] = last[:, :, leaving]
@@ -387,6 +411,7 @@ def _descend(
             limit = limit[left]
             problem, state = problem.take(left), state.take(left)
             energy = energy[left]
+        # Trial step, refused where the objective rises, and the next damping
         trial = _evaluate(problem, problem.cameras.moved(state.motion, step))
         worse = np.flatnonzero(~(trial.value <= state.value + ROUNDING * energy))
         eased = EASED * damping
@@ -400,32 +425,38 @@ def _descend(
 
 
 def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
-    """Return damped Newton steps, and the damping, raised where it has to be."""
+    """
+    Return damped Newton steps (p, n), and the damping (n,).
+
+    It is raised until the damped matrix is positive definite.
+    """
     damping = damping.copy()
-    step, positive = solve_positive(state.hessian + damping * state.known, state.slope)
+    matrix = state.hessian + damping * state.definite
+    step, positive = solve_positive(matrix, state.slope)
     failing = np.flatnonzero(~positive)
     while len(failing):
         damping[failing] = np.maximum(RAISED * damping[failing], FIRST_DAMPING)
         part = state.take(failing)
-        matrix = part.hessian + damping[failing] * part.known
+        matrix = part.hessian + damping[failing] * part.definite
         step[:, failing], positive = solve_positive(matrix, part.slope)
         failing = failing[~positive & (damping[failing] < LARGEST_DAMPING)]
     return step, damping
 
 
 def _found(problem: _Problem, motion: NDArray, converged: NDArray) -> FoundFrames:
-    """Return what follows from the cameras of frames."""
+    """Return the minima of a search from their cameras (2, 3, n)."""
     noise = problem.noise
     posterior = _posterior(problem, motion)
     state = _state(problem, motion, posterior)
-    # The covariance of the coefficients, the camera being unknown: s2 times the inverse
-    # of H + s2 I - C^T X^-1 C is s2 (Q + Q C^T Y^-1 C Q), Y the Hessian by the camera.
+    # Covariance of the coefficients with the uncertainty of the camera, by the inverse
+    # of the joint Hessian of both: s2 (Q + Q C^T Y^-1 C Q). C is the coupling, and Y
+    # the Hessian by the camera with the coefficients eliminated.
     Q = -unpacked(posterior.inverse)[1:, 1:]
     through = np.einsum("kli,cli->kci", Q, _coupling(problem, motion, posterior))
     inverse, _, positive = invert_positive(state.hessian)
     bad = np.flatnonzero(~positive)
     if len(bad):
-        inverse[:, bad] = invert_positive(state.known[:, bad])[0]
+        inverse[:, bad] = invert_positive(state.definite[:, bad])[0]
     inverse = unpacked(inverse)
     covariance = Q + np.einsum("kci,cdi,ldi->kli", through, inverse, through)
     rows, columns = np.triu_indices(len(Q))

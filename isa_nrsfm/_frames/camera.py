@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-# A mean camera whose smaller singular value is below this share of the root mean
-# square camera does not say where the object is seen from.
+# Cameras have a common view if the smaller singular value of their mean is at least
+# this share of the root mean square of a camera's row.
 DEGENERATE_MEAN = 0.2
 
 
@@ -63,9 +63,9 @@ def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (2, 3)
-        The mean camera, or where the cameras have no common view the one whose rows
-        are the two principal axes of space, each as long as a camera's row along it;
-        times the root mean square size of the frames.
+        The mean camera times the root mean square size of the frames. If the cameras
+        have no common view, the view along the third axis of the canonical space takes
+        its place, each axis scaled by its root mean square length in the cameras.
     """
     camera = mean_view(motion)
     if camera is None:

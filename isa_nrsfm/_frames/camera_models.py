@@ -2,17 +2,19 @@
 
 A camera M_i of a frame is a free 2x3 matrix (affine), the first two rows of a rotation
 times a scale (weak perspective), or such rows with a scale that is known
-(orthographic). Everything else treats cameras alike: it knows the derivative ``G_i =
-dF/dM_i`` of an objective and its curvature ``A_i`` by the rows of M_i, and a model
-takes both to its own parameters.
+(orthographic). All other modules treat cameras alike. They compute the derivative
+``G_i = dF/dM_i`` of an objective F and its curvature ``A_i`` by the rows of M_i. A
+model of cameras transforms both to its own parameters.
 
-A calibrated camera moves along its tangents ``D_c = M hat(e_c)``, c = x, y, z, of
-rotation vectors w, and ``D_4 = M`` of the logarithm of the scale ::
+A step of a calibrated camera is a rotation vector w and a change l of the logarithm of
+its scale ::
 
-    M(w, l) = exp(l) M exp(hat(w)),   hat(w) v = w x v,
+    M(w, l) = exp(l) M exp(hat(w)),   hat(w) v = w x v.
 
-so that with rows m_r of M the gradient is ``sum_r G_r x m_r`` and ``<M, G>``, and the
-curvature ``tr(D_c A D_d^T)``. Cameras are (2, 3, n_frames) here, frames last.
+Its tangents are the derivatives by w, ``D_c = M hat(e_c)`` for c = x, y, z, and by l,
+``D_4 = M``. With the rows m_r of M and G_r of G the gradient is ``sum_r G_r x m_r`` by
+w and ``<M, G>`` by l. The curvature is ``tr(D_c A D_d^T)``. Cameras are (2, 3,
+n_frames) here, frames last.
 """
 
 from typing import Protocol
@@ -25,8 +27,8 @@ from isa_nrsfm._linalg.polar import polar
 
 # Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
 RIDGE = 1e-9
-# No camera turns by more than that, in radians, in one step, and no logarithm of a
-# scale changes by more.
+# Largest rotation of a camera in one step, in radians, and largest change of the
+# logarithm of its scale.
 LARGEST_TURN = 1.0
 
 
@@ -37,9 +39,9 @@ class CameraModel(Protocol):
     Attributes
     ----------
     name : str
-        What users call it.
+        The value of the parameter `camera`.
     n_parameters : int
-        Of a camera.
+        Number of parameters p of a step of one camera.
     calibrated : bool
         Whether cameras are scaled rotations.
     scaled : bool
@@ -61,16 +63,16 @@ class CameraModel(Protocol):
         """Return dF/dparameters (n_parameters, n) from dF/dM (2, 3, n)."""
 
     def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
-        """Return the inverse curvature for packed curvatures (6, n) of the rows."""
+        """Return the inverse curvature that `product` takes, from curvatures (6, n)."""
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
         """Return vectors (n_parameters, n) times an inverse curvature."""
 
     def largest_length(self, step: NDArray) -> float:
-        """Return how many times a step may be made at once."""
+        """Return the largest step length, one for all cameras, along a direction."""
 
     def limited(self, step: NDArray) -> NDArray:
-        """Return steps (n_parameters, n), shortened to what may be made at once."""
+        """Return steps (n_parameters, n), each shortened to the largest allowed one."""
 
 
 class AffineCameras:
@@ -86,7 +88,7 @@ class AffineCameras:
         return motion + step.reshape(motion.shape)
 
     def tangents(self, motion: NDArray) -> NDArray:
-        """Return matrices with one entry that is one."""
+        """Return the unit matrices (6, 2, 3, n), each with a single entry one."""
         entries = np.eye(6).reshape(6, 2, 3, 1)
         return np.broadcast_to(entries, (6, *motion.shape))
 
@@ -95,7 +97,7 @@ class AffineCameras:
         return slope.reshape(6, -1)
 
     def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
-        """Return the inverses (3, 3, n) of the curvatures by each row."""
+        """Return the inverse curvature (3, 3, n) by a row, the same for both rows."""
         return inverse3(curvature)
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
@@ -113,7 +115,7 @@ class AffineCameras:
 
 
 class HeldCameras:
-    """Cameras that are known."""
+    """Cameras that are held: they have no parameters, and no step moves them."""
 
     name = "held"
     n_parameters = 0
@@ -168,7 +170,7 @@ class CalibratedCameras:
         self.n_parameters = 4 if scaled else 3
 
     def moved(self, motion: NDArray, step: NDArray) -> NDArray:
-        """Return cameras (2, 3, n) after rotation vectors and log scales."""
+        """Return cameras (2, 3, n) after steps w (3, n), or w and l (4, n)."""
         turned = rotated(motion, step[:3])
         return np.exp(step[3]) * turned if self.scaled else turned
 
@@ -195,7 +197,8 @@ class CalibratedCameras:
         inverse = inverse3(C)
         if not self.scaled:
             return inverse
-        # The inverse of [[C, c], [c^T, d]] by its Schur complement.
+        # Inverse of [[C, c], [c^T, d]], c across and d scale, by the Schur complement
+        # d - c^T C^-1 c. Where it is zero the scale does not move.
         turn = np.einsum("abn,bn->an", inverse, across)
         rest = scale - np.einsum("an,an->n", across, turn)
         rest = np.maximum(rest, RIDGE * scale)
@@ -211,7 +214,7 @@ class CalibratedCameras:
         return np.einsum("abn,bn->an", inverse, vector)
 
     def largest_length(self, step: NDArray) -> float:
-        """Return what moves no camera by more than a radian or a factor of e."""
+        """Return the step length at which a camera moves by a radian or a factor e."""
         size = self._sizes(step).max(initial=0.0)
         return LARGEST_TURN / size if size > 0 else np.inf
 
@@ -247,12 +250,12 @@ def tangent_curvature(
     Returns
     -------
     turns : ndarray of shape (6, n_frames)
-        That of rotations, ``sum_r hat(m_r)^T A hat(m_r) = (tr A tr N - tr A N) I -
-        tr(A) N - tr(N) A + A N + N A`` with ``N = M^T M``, packed.
+        The block of rotations, packed: ``sum_r hat(m_r)^T A hat(m_r) = (tr A tr N - tr
+        A N) I - tr(A) N - tr(N) A + A N + N A`` with ``N = M^T M``.
     across : ndarray of shape (3, n_frames)
-        That of rotations and the logarithm of the scale, ``sum_r A m_r x m_r``.
+        The column across rotations and logarithm of the scale, ``sum_r A m_r x m_r``.
     scale : ndarray of shape (n_frames,)
-        That of the logarithm of the scale, ``tr(A N)``.
+        The entry of the logarithm of the scale, ``tr(A N)``.
     """
     N = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])
     full_A, full_N = unpack3(curvature), unpack3(N)

@@ -1,12 +1,13 @@
 """Posterior of the coefficients of frames whose cameras are known.
 
-With ``c = (1, a)``, ``a ~ N(0, I)`` and noise of variance s2 it is normal, with ::
+Let ``c = (1, a)`` with the prior ``a ~ N(0, I)`` and noise of variance s2. The
+posterior of a is normal, with ::
 
     Q = (H + s2 I)^-1,  mean Q (q - h),  covariance s2 Q,
 
-``H_kl = <M B_k, M B_l>``, ``h_k = H_k0`` and ``q_k = <P_k, M>``, k, l >= 1 (Bishop,
-"Pattern recognition and machine learning", 2006, section 12.2). Frames are the last
-index of all arrays.
+where ``H_kl = <M B_k, M B_l>`` for k, l >= 1, ``h_k = H_k0`` and ``q_k = <P_k^T, M>``
+(Bishop, "Pattern recognition and machine learning", 2006, section 12.2). Frames are the
+last index of all arrays.
 """
 
 from typing import NamedTuple
@@ -32,15 +33,16 @@ class CoefficientPosterior(NamedTuple):
     Attributes
     ----------
     c : ndarray of shape (n_shapes, n_frames)
-        One, and the means of the coefficients.
+        One, and the posterior means of the coefficients.
     inverse : ndarray of shape (n_pairs, n_frames)
-        Minus Q, packed; in the rows of all shapes, of which the first says nothing.
+        Minus Q, packed, with a row and a column for the mean shape as well. Those have
+        no meaning.
     objective : ndarray of shape (n_frames,)
         ``min_a ||W - M S(a)||^2 + s2 |a|^2``.
     log_determinant : ndarray of shape (n_frames,)
         ``log det(I + H / s2)``.
     image_energy : ndarray of shape (n_components, n_frames)
-        ``H_kk``, what the basis shapes move in the image.
+        ``H_kk``, the energy of the images of the basis shapes.
     """
 
     c: NDArray
@@ -59,7 +61,11 @@ class CoefficientPosterior(NamedTuple):
         return self.objective - noise * np.einsum("ki,ki->i", self.alpha, self.alpha)
 
     def spread(self, noise: NDArray | float) -> NDArray:
-        """Return ``tr(H s2 Q)``, what the uncertainty moves in the image."""
+        """
+        Return ``tr(H s2 Q)``, the expected energy of posterior deviations in the image.
+
+        With ``H Q = I - s2 Q`` it is ``s2 (K - s2 tr Q)``.
+        """
         diagonal = diagonal_of(self.inverse)[1:]
         return noise * (len(diagonal) + noise * self.inverse[diagonal].sum(axis=0))
 
@@ -98,8 +104,8 @@ def coefficient_posterior(
     noise : float or ndarray of shape (n_frames,)
         s2.
     refined : bool, default=False
-        Whether the equations are solved once more for what the first solution leaves:
-        divided by a tiny noise, what rounding leaves of them counts.
+        Whether to make one step of iterative refinement. Without it rounding errors
+        would count where they are divided by a tiny noise variance.
 
     Returns
     -------
@@ -111,7 +117,8 @@ def coefficient_posterior(
     n_shapes = len(seen)
     diagonal = diagonal_of(H)[1:]
     image_energy = H[diagonal]
-    # [[||W - M B_0||^2, (q - h)^T], [q - h, H + s2 I]], then swept.
+    # [[||W - M B_0||^2, (q - h)^T], [q - h, H + s2 I]], packed. The sweep operator
+    # replaces it by [[objective, mean^T], [mean, -Q]].
     H[diagonal] += noise
     H[0] += products.energy - 2 * seen[0]
     H[1:n_shapes] = seen[1:] - H[1:n_shapes]
@@ -119,6 +126,7 @@ def coefficient_posterior(
     log_determinant, _ = sweep(H, 1)
     objective, alpha = H[0], H[1:n_shapes]
     if equations is not None:
+        # Iterative refinement with the residual of the normal equations
         left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
         alpha -= _product(H[n_shapes:], left)
         objective -= np.einsum("ki,ki->i", alpha, left)

@@ -1,8 +1,9 @@
 """Camera, position and coefficients of single frames for given shapes.
 
 Each frame is fitted by itself: the result of a frame does not depend on the others.
-There are two models of a frame: `RigidFrames`, the paper's, takes the camera of the
-rigid fit, `PosteriorFrames` the most probable camera and coefficients.
+There are two models of a frame. `RigidFrames`, the paper's, takes the camera of the
+mean shape alone, and then coefficients of least squares. `PosteriorFrames`, that of the
+joint refinement, takes the most probable camera and coefficients together.
 """
 
 from collections.abc import Iterable
@@ -26,12 +27,12 @@ from isa_nrsfm._tables.visibility import seen_points
 if TYPE_CHECKING:
     import os
 
-# A basis shape whose image has less than this share of the energy that the camera could
-# show of it is seen end on: its image is rounding errors.
+# A camera does not see a basis shape if its image has less than this share of the
+# energy ``||M||^2 ||B_k||^2``: such an image is rounding errors.
 UNSEEN = 1e-28
-# What mirrors shapes and cameras in depth.
+# Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])
-# Rounds of a robust fit, and the change of the weights that ends them.
+# Largest number of rounds of a robust fit, and convergence tolerance of the weights.
 REWEIGHTINGS = 50
 SETTLED = 1e-4
 
@@ -49,7 +50,7 @@ class FrameFit(NamedTuple):
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the basis shapes.
     alpha_std : ndarray of shape (n_frames, n_components)
-        Their standard deviations; NaN where the model of the frames knows no noise.
+        Their posterior standard deviations. NaN for `RigidFrames`, which has no noise.
     """
 
     motion: NDArray
@@ -81,7 +82,7 @@ class FrameFit(NamedTuple):
 
     @classmethod
     def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":
-        """Return a fit that is NaN."""
+        """Return a fit of NaN, to be filled in."""
         return cls(
             np.full((n_frames, 2, 3), np.nan),
             np.full((n_frames, 2), np.nan),
@@ -103,8 +104,8 @@ class RigidFrames(NamedTuple):
         paper's are: ``B_k B_l^T = 0`` (3x3) for different k and l. The least squares
         then separate where no point is missing.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        What cameras may be: the nearest ones to the affine cameras of the rigid fit.
-        Orthographic ones have the scale one.
+        Model of the cameras. Calibrated ones are the nearest to the affine cameras of
+        the rigid fit. Orthographic ones have the scale one.
     """
 
     mean_shape: NDArray
@@ -144,7 +145,11 @@ class RigidFrames(NamedTuple):
         return fit
 
     def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the fit of complete frames."""
+        """
+        Return the fit of complete frames, one coefficient at a time.
+
+        The results are motion (n, 2, 3), translation (n, 2) and alpha (n, K).
+        """
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
         motion, alpha = self.fit_rows(W)
@@ -157,8 +162,8 @@ class RigidFrames(NamedTuple):
         Parameters
         ----------
         W : ndarray of shape (2 * n_frames, n_points)
-            Measurement matrix, rows centred, or its products and those of the shapes
-            with orthonormal directions that the shapes are made of.
+            Measurement matrix, rows centred. It may also be given by its products with
+            orthonormal directions that span the shapes, if those are given so, too.
 
         Returns
         -------
@@ -172,7 +177,8 @@ class RigidFrames(NamedTuple):
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
         P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
         along = np.einsum("irkc,irc->ik", P, motion)
-        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q R: squaring B_k would cost precision.
+        # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q_k R_k. The Gram matrix of B_k would
+        # do as well, but with half the digits.
         R = np.linalg.qr(self.basis, mode="r")
         images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
         energy = np.einsum("ikrd,ikrd->ik", images, images)
@@ -181,7 +187,7 @@ class RigidFrames(NamedTuple):
         return motion, np.divide(along, energy, where=visible, out=np.zeros_like(along))
 
     def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) that see a rigid shape best."""
+        """Return cameras (n_frames, 2, 3) for W (2 n_frames, J) and a shape (J, 3)."""
         motion = rigid_cameras(W, mean_shape)
         if self.camera == "affine":
             return motion
@@ -191,10 +197,15 @@ class RigidFrames(NamedTuple):
     def _together(
         self, points: NDArray, seen: NDArray
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the fit of a frame of which some points are seen."""
+        """
+        Return the fit of one frame from its seen points, all coefficients at once.
+
+        The points are (n_seen, 2), and seen (n_points,) says which ones they are.
+        """
         centre, centroid = points.mean(axis=0), self.mean_shape[seen].mean(axis=0)
         W = (points - centre).T
         motion = self._cameras(W, self.mean_shape[seen] - centroid)
+        # Least squares for what the mean shape leaves of the frame
         basis = self.basis[:, seen]
         middles = basis.mean(axis=1)
         images = (basis - middles[:, None]) @ motion[0].T
@@ -206,22 +217,23 @@ class RigidFrames(NamedTuple):
 
 class PosteriorFrames(NamedTuple):
     """
-    The joint refinement's model of a frame: all of it at once, with a prior.
+    The joint refinement's model of a frame: its posterior, camera and coefficients.
 
     Attributes
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Shapes with coefficients that are drawn from N(0, I), rows centred.
     noise_variance : float
-        Variance of a coordinate of a frame of size one.
+        Noise variance of a coordinate, for frames of size one.
     starts : ndarray of shape (n_starts, n_components)
-        Coefficients to start from where zero leads nowhere.
+        Further coefficients to start from, for frames that the fit from zero explains
+        badly.
     loss : {"linear", "huber", "cauchy"}
         How points count that are far from the model.
     gauge : FrameMap
-        Takes the coefficients to the basis that is shown.
+        Takes cameras and coefficients to those of the public shapes.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        What cameras may be; orthographic ones have the scale one.
+        Model of the cameras. Orthographic ones have the scale one.
     """
 
     shapes: NDArray
@@ -232,7 +244,7 @@ class PosteriorFrames(NamedTuple):
     camera: str = "affine"
 
     def mirrored(self) -> "PosteriorFrames":
-        """Return the model with shapes that are shown mirrored in depth."""
+        """Return the model whose public shapes are mirrored in depth."""
         space = MIRROR[:, None] * self.gauge.space
         return self._replace(gauge=self.gauge._replace(space=space))
 
@@ -250,14 +262,14 @@ class PosteriorFrames(NamedTuple):
         Returns
         -------
         FrameFit
-            As of `fit_posterior`, in the gauge; with a robust loss the weights agree
-            with the fit.
+            That of `fit_posterior`, in the gauge. With a robust loss the weights are
+            those of the residuals of the fit.
         """
         return self.shown(self.posterior(tracks / sizes[:, None, None]), sizes)
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> FrameFit:
         """
-        Return a fit of frames of size one in their sizes and in the gauge.
+        Take a fit of frames of size one to the units of the table and to the gauge.
 
         Parameters
         ----------
@@ -279,13 +291,13 @@ class PosteriorFrames(NamedTuple):
 
     def prepared_posterior(self, block: list[FrameTracks]) -> FramePosterior:
         """
-        Return the fit of frames that are ready for products, before the gauge.
+        Return the fit of prepared frames, before the gauge.
 
         Parameters
         ----------
         block : list of FrameTracks
-            Frames of size one, in the coordinates of the shapes, of which each point
-            counts alike.
+            Frames of size one, by points or directions as the shapes are. Their weights
+            are zero or one.
 
         Returns
         -------
@@ -307,8 +319,8 @@ class PosteriorFrames(NamedTuple):
         return FramePosterior(*map(np.concatenate, zip(*fits, strict=True)))
 
     def posterior(self, tracks: NDArray) -> FramePosterior:
-        """Return the fit of frames of size one, before the gauge."""
-        # Sums over other strides are rounded otherwise.
+        """Return the fit of frames (n, n_points, 2) of size one, before the gauge."""
+        # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
         fitted = partial(
             fit_posterior,
@@ -318,10 +330,12 @@ class PosteriorFrames(NamedTuple):
         )
         if self.loss == "linear":
             return fitted(tracks, starts=self.starts)
+        # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
         seen = seen_points(tracks)
         changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
+        # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(REWEIGHTINGS):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
@@ -343,6 +357,6 @@ class PosteriorFrames(NamedTuple):
 
 
 def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:
-    """Set camera, position and coefficients of some frames."""
+    """Set motion, translation and alpha of some frames, but not alpha_std."""
     for whole, part in zip(fit, values, strict=False):
         whole[frames] = part

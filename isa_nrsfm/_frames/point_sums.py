@@ -1,10 +1,15 @@
-"""Sums over the points of each frame: all that a fit of given shapes needs to know.
+"""Sums over the points of each frame: sufficient statistics of a fit of given shapes.
 
-Frames enter the fit of cameras and coefficients to given shapes ``B_k`` (3, J) only
-through ``P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T`` and through the Gram matrices
-``G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T`` with the weighted means of a
-frame's points. The index of the frame is the last one of all arrays, so that each sum
-is one matrix product for all frames.
+The fit of cameras and coefficients to shapes ``B_k`` (3, J) depends on frame i only
+through its energy, the products ``P_ik`` of its points with the shapes, and the Gram
+matrices ``G_i,kl`` of the shapes over its points ::
+
+    P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T,
+    G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T.
+
+Here ``mean_i`` is the weighted mean of the frame's points, and ``mean_ik`` that of the
+points of shape k with the same weights. The index of the frame is the last one of all
+arrays, so that each sum is one matrix product for all frames.
 """
 
 from typing import NamedTuple, Self
@@ -21,9 +26,11 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpacked,
 )
 
-# <S, Q> of packed symmetric matrices counts the entries beside the diagonal twice.
+# Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
+# the diagonal count twice.
 TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-# Directions in which shapes are thinner than this share of their width are flat.
+# Shapes are flat along a direction if they extend by less than this share of their
+# largest extent.
 FLAT = 1e-10
 # Frames whose points cover less than this share of the variance of the mean shape
 # along some direction do not determine a camera.
@@ -31,7 +38,11 @@ LEAST_COVER = 1e-10
 
 
 def _pair_index(n_pairs: int) -> tuple[NDArray, NDArray]:
-    """Return where each (k, l) is among the pairs, and how often each pair counts."""
+    """
+    Return the position of each (k, l) among the pairs (n, n), and multiplicities.
+
+    The multiplicities (n_pairs,) are 2 for pairs with k < l, which stand for two.
+    """
     index = unpacked(np.arange(n_pairs)).astype(np.intp)
     first, second = pair_indices(len(index))
     return index, np.where(first == second, 1.0, 2.0)
@@ -44,8 +55,8 @@ class SharedGram:
     Parameters
     ----------
     pairs : ndarray of shape (n_pairs, 6)
-        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`: what is not
-        symmetric in a G_kl has no part in the fit.
+        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`. The fit
+        depends only on this symmetric part.
     """
 
     def __init__(self, pairs: NDArray) -> None:
@@ -107,13 +118,13 @@ class SharedGram:
         return self._energies @ Q
 
     def take(self, frames: NDArray) -> Self:
-        """Return the Gram matrix of some of the frames."""
+        """Return the Gram matrix of some of the frames: it is that of all."""
         return self
 
 
 class FrameGram:
     """
-    The Gram matrices of shapes of which each frame sees its own points.
+    The Gram matrices of shapes over the weighted points of each frame.
 
     The methods are those of `SharedGram`.
 
@@ -156,7 +167,7 @@ class FrameTracks(NamedTuple):
     weights : ndarray of shape (n_points, n_frames) or None
         w_ij; None where all are 1.
     centroid : ndarray of shape (2, n_frames)
-        ``mean_i``, the weighted mean of the points; zero for frames without any.
+        ``mean_i``, the weighted mean of the points. Zero for frames without points.
     weight : ndarray of shape (n_frames,)
         ``sum_j w_ij``.
     energy : ndarray of shape (n_frames,)
@@ -222,8 +233,8 @@ def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks
     Parameters
     ----------
     tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks, in any place. What they hold where the weight is zero, NaN for
-        instance, does not matter.
+        Tracks, centred or not. Points of weight zero may have any coordinates, also
+        NaN.
     weights : ndarray of shape (n_frames, n_points), optional
         Not negative, zero for points that are missing; by default all are 1.
 
@@ -240,6 +251,7 @@ def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks
         energy = np.einsum("jri,jri->i", centred, centred)
         weight = np.full(n_frames, float(n_points))
         return FrameTracks(centred, None, centroid, weight, energy)
+    # W (n_points, n_frames) has the weights, weight (n_frames,) their sums.
     W = np.array(weights.T, dtype=np.float64, order="C")
     np.copyto(centred, 0.0, where=(W == 0)[:, None])
     weight = W.sum(axis=0)
@@ -291,7 +303,7 @@ def frame_sums(
     shapes : ndarray of shape (n_shapes, 3, n_points)
         Mean shape and basis shapes, rows centred.
     gram : SharedGram, optional
-        That of the shapes, where it is at hand already.
+        Gram matrix of the shapes, if it has been computed already.
 
     Returns
     -------
@@ -309,7 +321,8 @@ def frame_sums(
     means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
     products = _pair_products(rows.reshape(shapes.shape))
     pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
-    # The rows are centred over all points, so that little is subtracted.
+    # G = sum_j w b b^T - weight mean mean^T. As the rows are centred over all points
+    # the second term is small: no cancellation.
     pairs -= _pair_products(means * np.sqrt(weight))
     return FrameSums(cross, FrameGram(pairs), means, centroid, weight, energy)
 
@@ -325,7 +338,7 @@ def _pair_products(rows: NDArray) -> NDArray:
 
 def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return shapes in the space in which they are as wide in all directions.
+    Return shapes in the coordinates of space in which they are white.
 
     Parameters
     ----------
@@ -335,12 +348,13 @@ def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
     Returns
     -------
     white : ndarray of shape (n_shapes, 3, n_points)
-        ``T B_k``, with rows of zeros for directions in which all shapes are flat, and
-        in the mean shape also for those in which it is flat itself.
+        ``T B_k``. A row is zero in all shapes if all are flat along it, and in the mean
+        shape if that one is flat along it.
     space : ndarray of shape (3, 3)
-        T such that ``sum_k T B_k B_k^T T^T`` (the second moment of a shape whose
-        coefficients are N(0, I)) is the identity, or has zeros on the diagonal. The
-        axes are the principal axes of the white mean shape.
+        T such that ``sum_k T B_k B_k^T T^T`` is the identity, with zeros on the
+        diagonal where all shapes are flat. The sum is the second moment of a shape
+        whose coefficients are N(0, I). The axes are the principal axes of the mean
+        shape ``T B_0``.
     """
     across = np.concatenate(list(shapes), axis=1)
     U, size, _ = np.linalg.svd(across, full_matrices=False)
@@ -367,13 +381,14 @@ def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     Returns
     -------
     ndarray of bool, shape (n_frames,)
-        Whether the frame has points and the mean shape is, among them, not flat along
-        a direction in which it is not flat as a whole.
+        Whether the frame has points, and these extend along each direction along which
+        the mean shape as a whole extends: LEAST_COVER of its variance or more.
     """
     variance = np.einsum("aj,aj->a", mean_shape, mean_shape) / mean_shape.shape[1]
     inside = variance > 0
     scale = 1.0 / np.sqrt(variance[inside])
     weight = np.where(products.weight > 0, products.weight, 1.0)
+    # Variance over the points of a frame, relative to that over all points
     seen = unpack3(products.gram.pairs[0] / weight)[inside][:, inside]
     cover = np.linalg.eigvalsh((seen.T * scale).swapaxes(1, 2) * scale)
     return (products.weight > 0) & (cover > LEAST_COVER).all(axis=1)

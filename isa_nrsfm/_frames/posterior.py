@@ -1,8 +1,8 @@
 """Camera, position and coefficients of single frames, for given shapes and noise.
 
-Frames are fitted by themselves, in blocks, by the search of their camera model. Where
-the first start leads to a fit that is much worse than the noise explains, others
-follow.
+Each frame is fitted by itself, in blocks of frames, by the search for its model of the
+camera. The search starts from coefficients of zero. Frames whose objective is much
+larger than the noise explains start again from other coefficients.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,7 +30,7 @@ COMPLETE_BLOCK = 2048
 WEIGHTED_BLOCK = 512
 # Objectives that differ by less than this share of them are equal.
 EQUAL = 1e-10
-# An objective so many times what the noise explains may be a minimum too high.
+# An objective above this multiple of its expectation may be a local minimum only.
 SUSPICIOUS = 3.0
 
 SEARCHES: dict[str, Callable[[NDArray], FrameSearch]] = {
@@ -58,15 +58,15 @@ class FramePosterior(NamedTuple):
         the inverse of the Schur complement.
     objective : ndarray of shape (n_frames,)
         ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2`` at the optimum, in squared
-        units of the tracks, to 1e-12 of the energy of the frame (of its centred
-        tracks).
+        units of the tracks. Its error is below 1e-12 of the energy of the centred
+        frame.
     residual : ndarray of shape (n_frames,)
-        ``sum_j w_ij ||m_ij - M S_j - t||^2``, as precise as that.
+        ``sum_j w_ij ||m_ij - M S_j - t||^2``, with the same error.
     converged : ndarray of bool, shape (n_frames,)
-        Whether the search ended in a minimum, by a Newton step too small to matter.
+        Whether the last Newton step was below the convergence tolerance.
     start : ndarray of int, shape (n_frames,)
-        Which of the extra starts led there, -1 for the start from zero. Starts that
-        lead nowhere on many frames are not needed for others like them.
+        Number of the extra start that led to the fit, -1 for the first start. A start
+        that no frame of many needs can be left out for others like them.
     """
 
     motion: NDArray
@@ -102,7 +102,7 @@ def fit_posterior(
         Variance of a coordinate, in squared units of the tracks. At least 1e-13 of the
         energy of a frame is taken.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        What cameras may be; orthographic ones have the scale one.
+        Model of the cameras. Orthographic ones have the scale one.
     weights : ndarray of shape (n_frames, n_points), optional
         Not negative, zero for missing points; by default 1 for all that are not NaN.
     initial : ndarray of shape (n_frames, n_components), optional
@@ -115,11 +115,15 @@ def fit_posterior(
     -------
     FramePosterior
         The best fit of each frame. It does not depend on the other frames beyond
-        rounding errors. Affine cameras are zero across shapes that are all flat. If
-        only the mean shape is, zero can be a saddle point of the objective: where the
-        search goes from there is up to rounding, and a start helps. Frames whose
-        points, those of positive weight, leave the mean shape flat along a direction in
-        which it is not (always fewer than four points of a solid) have NaN.
+        rounding errors. It is NaN for frames whose points of positive weight do not
+        determine a camera (`determines_camera`), such as fewer than four points of a
+        solid.
+
+    Notes
+    -----
+    Along a direction in which all shapes are flat, affine cameras are zero. If only the
+    mean shape is flat, coefficients of zero can be a saddle point of the objective:
+    rounding decides where the search goes from there, and further starts help.
     """
     tracks = np.asarray(tracks)
     missing = np.isnan(tracks[..., 0]) | np.isnan(tracks[..., 1])
@@ -148,10 +152,9 @@ def fit_prepared(
     Parameters
     ----------
     frames : FrameTracks
-        The frames. They may be given in other coordinates than points: what counts is
-        their inner products with the shapes.
+        The frames, by their points or by their products with directions.
     shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes in these coordinates; centred if they are points.
+        Mean shape and basis shapes, by points (centred) or directions as the frames.
     noise_variance, camera, initial, starts
         As of `fit_posterior`.
 
@@ -219,7 +222,11 @@ class _Tracks(NamedTuple):
         return type(self)(self.tracks[frames], self.weights[frames])
 
     def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
-        """Yield blocks of the frames that determine a camera, and their products."""
+        """
+        Yield the numbers of frames that determine a camera, and their sums.
+
+        Complete frames come first: they share one Gram matrix.
+        """
         tracks, weights = self
         complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
@@ -240,7 +247,7 @@ class _Prepared(NamedTuple):
 
     @property
     def n_points(self) -> float:
-        """Number of points of a frame, also where it is given in other coordinates."""
+        """Number of points of a frame, also if it is given by directions."""
         if self.frames.weights is None:
             return self.frames.weight[0]
         return len(self.frames.weights)
@@ -255,7 +262,7 @@ class _Prepared(NamedTuple):
         return type(self)(self.frames.take(frames))
 
     def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
-        """Yield blocks of the frames that determine a camera, and their products."""
+        """Yield the numbers of frames that determine a camera, and their sums."""
         complete = self.frames.weights is None
         length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
         for first in range(0, len(self.weight), length):
@@ -270,7 +277,7 @@ class _Prepared(NamedTuple):
 def _determined(
     frames: NDArray, products: FrameSums, shapes: NDArray
 ) -> tuple[NDArray, FrameSums]:
-    """Return those of some frames that determine a camera, and their products."""
+    """Return those of the frames (n,) that determine a camera, and their sums."""
     usable = np.flatnonzero(determines_camera(products, shapes[0]))
     return frames[usable], products.take(usable)
 
@@ -283,7 +290,11 @@ def _best_fits(
     initial: NDArray | None,
     starts: NDArray | None,
 ) -> FramePosterior:
-    """Return the best fits of `fit_posterior`."""
+    """
+    Return the best fit of each frame over all starts, as of `fit_posterior`.
+
+    The arrays initial and starts are (n_frames, K) and (n_starts, K).
+    """
     weight, n_components = frames.weight, len(search.shapes) - 1
     n_frames = len(weight)
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
@@ -291,15 +302,18 @@ def _best_fits(
     extra = np.zeros((0, n_components)) if starts is None else np.asarray(starts)
 
     def fit(chosen: NDArray, initial: NDArray, max_steps: int) -> FramePosterior:
+        # All frames need no copy.
         every = len(chosen) == n_frames and (chosen == np.arange(n_frames)).all()
         part = frames if every else frames.take(chosen)
         return _fit(part, search, variance[chosen], initial, max_steps)
 
+    # First round, block by block
     fits = fit(np.arange(n_frames), first, search.first_steps)
-    # The few frames that take longer are brought together: short rows are slow.
+    # Second round: the few frames that have not converged, collected from all blocks
     slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
     if len(slow):
         _put(fits, slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+    # Further starts for frames that are explained badly, all starts at once
     poor = np.flatnonzero(_poorly_explained(fits, weight, variance))
     if len(extra) and len(poor):
         number = np.repeat(np.arange(len(extra)), len(poor))
@@ -322,7 +336,7 @@ def _fit(
     initial: NDArray,
     max_steps: int,
 ) -> FramePosterior:
-    """Return the minima that frames reach from given coefficients."""
+    """Return the minima that frames reach from coefficients initial (n_frames, K)."""
     n_frames, n_components = initial.shape
     fits = FramePosterior(
         motion=np.full((n_frames, 2, 3), np.nan),
@@ -373,9 +387,9 @@ def _poorly_explained(
     """
     Return whether objectives are much larger than the noise explains.
 
-    Minimised over alpha, f / s2 is the squared Mahalanobis distance of a frame from the
-    model. With the true camera and shape it is chi-squared with two degrees of freedom
-    a point, less the eight of camera and position.
+    At the minimum over alpha, ``f / s2`` is the squared Mahalanobis distance of a frame
+    from the model. It is chi-squared distributed, with two degrees of freedom for each
+    point less the eight of camera and position.
     """
     freedom = np.maximum(2.0 * weight - 8.0, 1.0)
     return fits.objective > SUSPICIOUS * variance * freedom
@@ -383,7 +397,7 @@ def _poorly_explained(
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
     """
-    Return coefficients that are far from zero and from each other.
+    Return coefficients far from zero and from each other (farthest point sampling).
 
     Parameters
     ----------
@@ -399,6 +413,7 @@ def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
         farthest from zero and from those before it.
     """
     alpha = alpha[np.isfinite(alpha).all(axis=1)]
+    # Squared distance from zero and from the rows chosen so far
     distance = np.einsum("ik,ik->i", alpha, alpha)
     chosen: list[int] = []
     while len(chosen) < n_starts and distance.max(initial=0.0) > 0:

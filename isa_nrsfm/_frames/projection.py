@@ -35,7 +35,8 @@ def reprojection_error(
     Returns
     -------
     float
-        ``||W - What||_F^2 / ||W||_F^2`` over the points that are seen.
+        ``||W - W_hat||_F^2 / ||W||_F^2`` over the points that are seen, with the images
+        W_hat of the shapes.
     """
     stacked = shapes.reshape(-1, shapes.shape[2])
     found = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
@@ -46,7 +47,11 @@ def reprojection_error(
 def _energies(
     rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
 ) -> tuple[float, float]:
-    """Return the energy of what shapes leave of frames, and that of the frames."""
+    """
+    Return the energy of the residuals of frames, and that of the frames.
+
+    The shapes are stacked (3 n_components + 3, n_points), rows (n_frames, 2, n_points).
+    """
     images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
     images += position[:, :, None]
     np.subtract(rows, images, out=images)
@@ -54,7 +59,7 @@ def _energies(
 
 
 def _energy(rows: NDArray) -> float:
-    """Return the sum of the squares of numbers, of those that are not NaN."""
+    """Return the sum of the squares of all numbers that are not NaN."""
     energy = float(energies(rows).sum())
     return float(np.nansum(rows**2)) if np.isnan(energy) else energy
 

@@ -1,4 +1,4 @@
-"""What a search for the camera and the coefficients of frames finds."""
+"""What the searches for camera and coefficients of frames have in common."""
 
 from typing import NamedTuple, Protocol
 
@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameSums
 
-# The most steps of a search.
+# Largest number of steps of a search.
 MAX_STEPS = 60
 
 
@@ -21,13 +21,14 @@ class FoundFrames(NamedTuple):
     alpha : ndarray of shape (n_components, n_frames)
         Coefficients.
     covariance : ndarray of shape (n_pairs, n_frames)
-        Posterior covariance of the coefficients, packed, the camera being unknown.
+        Posterior covariance of the coefficients, packed. It contains the uncertainty of
+        the camera.
     objective : ndarray of shape (n_frames,)
         ``||W - M S||^2 + s2 |a|^2``.
     residual : ndarray of shape (n_frames,)
         ``||W - M S||^2``.
     converged : ndarray of bool, shape (n_frames,)
-        Whether the search ended in a minimum.
+        Whether the search has converged.
     """
 
     motion: NDArray
@@ -47,15 +48,15 @@ class FrameSearch(Protocol):
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         The shapes in the coordinates of the search.
     first_steps : int
-        Steps after which frames of all blocks that have not converged are better
-        brought together.
+        Largest number of steps of a first round, block by block. Frames that have not
+        converged then are collected from all blocks for a second round.
     """
 
     shapes: NDArray
     first_steps: int
 
     def cameras(self, motion: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) for the shapes as they were given."""
+        """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
 
     def fit(
         self,
@@ -65,7 +66,12 @@ class FrameSearch(Protocol):
         initial: NDArray,
         max_steps: int,
     ) -> FoundFrames:
-        """Return the minima that frames reach from given coefficients."""
+        """
+        Return the minima that frames reach from given coefficients.
+
+        The noise variances are (n_frames,), the coefficients initial (n_components,
+        n_frames).
+        """
 
     def rough_cameras(
         self, products: FrameSums, variance: NDArray, n_points: float

@@ -1,13 +1,13 @@
 """The joint fit: from the paper's result to the shapes of greatest likelihood.
 
-1. Calibrated cameras to start from (`starts`), the choice of them by the objective.
-2. The fit of calibrated cameras, shapes and noise, from the best starts. While the
-   model may be wrong the noise has a floor: what a few basis shapes leave of an object
-   is not noise, and would be explained by depths and cameras that are not there.
-3. For affine cameras, the same with cameras that are free, from there or from the
-   paper's result, whichever leads to the lower objective.
-4. A model that leaves no more than any table of its rank is right: floor and prior are
-   left away.
+1. Starts with calibrated cameras (`starts`). The objective chooses the best of them.
+2. The fit of calibrated cameras, shapes and noise from these. While the model may be
+   wrong the noise variance has a floor: deformation that the basis shapes do not span
+   is not noise, and the fit would explain it by wrong depths and cameras.
+3. The fit of affine cameras, from the result of 2 and from the paper's result. The
+   lower objective counts. For calibrated cameras it serves for comparison only.
+4. The judgement of the model. It is right if it leaves no more than the noise that the
+   spectrum tells. Then floor and prior are left out.
 
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
@@ -38,34 +38,38 @@ from isa_nrsfm._prepare.robust import ROUNDING
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
-# The steps on a sample end at this share of what its shapes explain by chance alone, a
-# unit of the objective for each number, if it is above the tolerance.
+# Convergence tolerance on a sample, if it is larger than the user's. Each number that
+# is fitted lowers the objective by about one by chance. Steps on a sample end when they
+# gain less than this share of that, for all numbers of the shapes together.
 BY_CHANCE = 0.03
-# Tables of few frames are refined to this share of the tolerance, and to its square
-# where the model is right: it costs little.
+# Tables of at most FEW_FRAMES frames are refined to POLISH times the tolerance, and to
+# POLISH^2 times where the model is right: more steps cost little there.
 POLISH = 0.1
 FEW_FRAMES = 2000
-# A model is right if its noise is at most so many times that of the table's spectrum.
-# Artificial tables with the true K or more have 0.8 to 1.0, with fewer 1.3 to 1.8;
-# motion capture and cloth, where K cuts a full spectrum off, 1.9 and more (``python -m
-# benchmarks.accuracy noise``). Without others than 3K + 3 singular values the noise has
-# to be below the second number, a share of the mean square, as in tables without noise.
+# A model is right if its noise variance is at most RIGHT times that of the spectrum.
+# The ratio is 0.8 to 1.0 for artificial tables with the true K or more, and 1.3 to 1.8
+# with fewer basis shapes. It is 1.9 and more for motion capture and cloth, where K cuts
+# a full spectrum off (``python -m benchmarks.accuracy noise``). A model is also right
+# if its noise variance is below the share EXACT of the mean square, as in tables
+# without noise: the spectrum tells no noise if it has only 3K + 3 singular values.
 RIGHT = 1.4
 EXACT = 1e-10
-# Noise within this share of the least counts as that.
+# A noise variance is at the floor if it exceeds it by less than this share.
 SLACK = 1e-3
-# Steps without floor and prior, as long as they lower the noise to this share of it.
+# Without floor and prior the fit makes RELEASED_STEPS steps at a time, as long as they
+# lower the noise variance to less than FALLING times its value.
 RELEASED_STEPS = 60
 FALLING = 0.95
-# Noise variance for what K basis shapes leave of a table that has more, per share of
-# the energy beyond K + 3 singular values (``python -m benchmarks.accuracy noise``).
-# It is at most the second number: the spectrum is that of motion that is large, too.
+# Floor of the noise variance for a model with too few basis shapes and calibrated
+# cameras: CUT_OFF times the share of the energy beyond K + 3 singular values
+# (``python -m benchmarks.accuracy noise``), but at most MOST_NOISE. Without that bound
+# the floor would be too high for large motion, which adds to the spectrum, too.
 CUT_OFF = 3.0
 MOST_NOISE = 5e-4
-# Rounds in which frames that are reversed in depth are turned.
+# Largest number of rounds in which frames that are reversed in depth are turned back.
 REVERSALS = 5
-# Steps of the fit that is only compared, and of those of a sample among which one is
-# chosen.
+# Largest number of steps of an affine fit that is only compared with the calibrated
+# one, and of the two affine fits of a sample of which the better one goes on.
 COMPARED_STEPS = 60
 RACE_STEPS = 5
 
@@ -77,14 +81,14 @@ class Spectrum(NamedTuple):
     Attributes
     ----------
     noise : float
-        Noise variance, a share of the mean square, if the table without noise has the
-        rank 3K + 3: the mean of the other squared singular values (Tipping, Bishop,
-        "Probabilistic principal component analysis", 1999, eq. 8). Zero where there
-        are no others.
+        Maximum likelihood estimate of the noise variance if the table without noise has
+        the rank 3K + 3, as a share of the mean square: the mean of the squared singular
+        values beyond (Tipping, Bishop, "Probabilistic principal component analysis",
+        1999, eq. 8). Zero if there are none.
     missing : float
-        Share of the energy beyond the K + 3 largest singular values. Of motion capture
-        that is about what the best K basis shapes leave of the shapes: each takes at
-        least one direction of the row space.
+        Share of the energy beyond the K + 3 largest singular values. Each basis shape
+        takes at least one direction of the row space. For motion capture this is about
+        the share of the shapes that the best K basis shapes leave.
     """
 
     noise: float
@@ -100,7 +104,7 @@ class Spectrum(NamedTuple):
         n_seen: NDArray,
     ) -> "Spectrum":
         """
-        Return what the 3K + 3 largest singular values and the rest say.
+        Return the spectrum for the 3K + 3 largest singular values and the rest.
 
         Parameters
         ----------
@@ -120,9 +124,11 @@ class Spectrum(NamedTuple):
         Spectrum
             Of the table.
         """
+        # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
         seen = float(np.mean(n_seen))
         n_others = seen - 1 - (3 * n_components + 3)
         noise = rest_share * (seen - 1) / n_others if n_others > 0 else 0.0
+        # Points that were filled in add to the energy of the table, but have no noise.
         noise *= n_points / seen
         energy = np.sum(values**2)
         beyond = np.sum(values[n_components + 3 :] ** 2) / (energy or 1.0)
@@ -136,17 +142,17 @@ class JointFit(NamedTuple):
     Attributes
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
-        B_0, ..., B_K, centred, in coordinates in which alpha is drawn from N(0, I).
+        B_0, ..., B_K, centred, scaled and mixed such that alpha ~ N(0, I).
     alpha : ndarray of shape (n_chosen, n_components)
-        Means of the coefficients in these coordinates, of the frames of the sample.
+        Posterior means of the coefficients of the frames of the sample.
     noise_variance : float
-        Variance of the noise of a coordinate, for the degrees of freedom that cameras
-        and shapes leave.
+        Variance of the noise of a coordinate, corrected for the degrees of freedom that
+        cameras and shapes take.
     camera_noise_ratio : float
-        Noise variance with calibrated cameras, divided by that with affine ones, of
-        the frames of the sample.
+        Noise variance with calibrated cameras divided by that with affine ones, for the
+        frames of the sample.
     history : ndarray of shape (n_iter + 1,)
-        The objective at the start and after each step, of the last refinement.
+        The objective at the start and after each step of the last refinement.
     gradient_norm : float
         As in `JointResult`.
     converged : bool
@@ -165,7 +171,7 @@ class JointFit(NamedTuple):
     frames: JointFrames
 
 
-# The products are of small blocks: more threads would wait for each other.
+# The matrix products are small: more BLAS threads would only wait for each other.
 @one_blas_thread
 def fit_jointly(
     rows: FrameBlocks,
@@ -183,7 +189,7 @@ def fit_jointly(
     on_step: Callable[[], None] | None = None,
 ) -> JointFit:
     """
-    Start and run the joint fit.
+    Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
     Parameters
     ----------
@@ -203,12 +209,12 @@ def fit_jointly(
     camera : {"affine", "weak_perspective", "orthographic"}
         What cameras may be.
     outliers : ndarray of bool, shape (n_frames, n_points), optional
-        Points that are left out at first and that a robust loss takes in again; to be
-        given with such a loss.
+        Points that a robust loss leaves out at first. Its weights decide later how much
+        they count. To be given with such a loss.
     loss : {"linear", "huber", "cauchy"}
         How points count that are far from the model.
     max_iter : int
-        The most steps.
+        Largest number of steps.
     tol, on_step
         As in `refine_joint`.
 
@@ -221,6 +227,7 @@ def fit_jointly(
     steps = Steps(max_iter, tol, on_step)
     ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
+    # Fit of the sample (of all frames if it is the table), and judgement of the model
     result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
     result, least_noise, right = judged(first, result, start, cameras, spectrum)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
@@ -228,19 +235,23 @@ def fit_jointly(
     if right:
         problems = [each.with_penalty(0.0) for each in problems]
         problem = problems[-1]
-    if right and not sample.parts:  # to the end, now that it is safe
+    # For a right model it is safe to go on to a smaller tolerance.
+    if right and not sample.parts:
         tol = POLISH**2 * problem.steps.tol
         result = refined(problem, result.state, tol=tol)
+    # Fits of larger samples, and of all frames
     for larger in problems[1:]:
         result = refined(larger, larger.aligned(result.state, camera))
+    # Further directions, or robust weights
     if ready.wide:
         result, problem = in_all_points(result, problem, rows, refined)
     noise, n_fitted = result.state.noise, 0
     if ready.used is not None:
-        # The scale of the noise is that of the residual with the coefficients fitted.
+        # This noise variance is the residual's after the coefficients were fitted.
         result, noise = reweighted(problem, rows, ready.used, result, loss, refined)
         n_fitted = n_shapes - 1
     shapes = problem.frames.points(result.state.shapes)
+    # Coefficients of the sample, and degrees of freedom of the noise
     state = result.state._replace(shapes=first.frames.coordinates(shapes))
     if sample.parts:
         state = state._replace(motion=state.motion[:, :, sample.parts[0]])
@@ -298,9 +309,9 @@ def count_components(
 class _Ready(NamedTuple):
     """A table that is ready for the joint fit."""
 
-    problems: list[JointProblem]  # of the samples and of all frames
+    problems: list[JointProblem]  # of larger and larger samples, and of all frames
     wide: bool  # whether frames are given by directions
-    used: NDArray | None  # points that count at first, with a robust loss
+    used: NDArray | None  # (n_frames, n_points), points without outliers; robust losses
 
 
 def _ready(
@@ -331,6 +342,8 @@ def _ready(
         frames = JointFrames.from_points(rows, complete, weights)
     steps = steps._replace(to_the_end=n_frames <= FEW_FRAMES)
     problem = JointProblem(frames, steps, 0.0)
+    # Penalty of sum_i ||M_i B_k||^2 for the prior BASIS_STD of frames of mean square
+    # energy / n_numbers. The prior counts once, not for each frame.
     n_numbers, energy = problem.totals
     problem = problem.with_penalty(n_numbers / (BASIS_STD**2 * energy * n_frames))
     by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
@@ -348,12 +361,16 @@ def _first_fit(
     paper_shapes: NDArray,
     camera: str,
 ) -> tuple[JointResult, float, JointState]:
-    """Return the fit of the sample, the ratio of noises of `JointFit`, and a start."""
+    """
+    Return the fit of the sample, its `camera_noise_ratio`, and one of its starts.
+
+    A calibrated and an affine fit are made in any case: the ratio needs both.
+    """
+    # Calibrated cameras, from the best starts
     calibrated = CAMERAS["weak_perspective" if camera == "affine" else camera]
     starts = best_starts(problem, sample.W, factors, paper_shapes, calibrated)
     result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
-    # Free cameras, from there and from the paper's result: the fit itself, or only to
-    # be compared.
+    # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, sample.W, paper_shapes)
     states = [
         problem.aligned(result.state, "affine"),
@@ -363,18 +380,18 @@ def _first_fit(
     max_iter = problem.steps.max_iter
     if camera != "affine":
         max_iter = min(max_iter, COMPARED_STEPS)
-    if not problem.steps.to_the_end:
+    if not problem.steps.to_the_end:  # only the better one goes on
         first = _least(refined(s, max_iter=min(max_iter, RACE_STEPS)) for s in states)
         states = [first.state]
-    free = _least(refined(state, max_iter=max_iter) for state in states)
-    ratio = result.left / min(free.left, result.left)
+    affine = _least(refined(state, max_iter=max_iter) for state in states)
+    ratio = result.left / min(affine.left, result.left)
     if camera == "affine":
-        return free, ratio, rigid
+        return affine, ratio, rigid
     return result, ratio, starts[0]
 
 
 def _least(results: Iterable[JointResult]) -> JointResult:
-    """Return the refinement of the least objective."""
+    """Return the refinement with the lowest objective at its end."""
     return min(results, key=lambda result: result.history[-1])
 
 
@@ -386,7 +403,7 @@ def _calibrated_fit(
 ) -> JointResult:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
     result = _refined(problem, state, cameras, least_noise)
-    # What is found of a sample is only a start.
+    # Only for small tables: the fit of a sample is no more than a start.
     for _ in range(REVERSALS if problem.steps.to_the_end else 0):
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
@@ -402,7 +419,7 @@ def _refined(
     least_noise: float = LEAST_NOISE,
     **steps: Any,
 ) -> JointResult:
-    """Return a refinement of all frames of a problem."""
+    """Return the refinement of a state, with a smaller tolerance for small tables."""
     if problem.steps.to_the_end:
         steps = {"tol": problem.steps.tol * POLISH, **steps}
     return problem.refined(state, cameras, least_noise, **steps)
@@ -416,26 +433,28 @@ def judged(
     spectrum: Spectrum,
 ) -> tuple[JointResult, float, bool]:
     """
-    Return the fit of a sample for what its model is: right, or with shapes missing.
+    Return the fit for the judgement of its model, the least noise, and the judgement.
 
-    A model is right if it leaves no more than any table of its rank does. Then what is
-    left is noise, however little, and greatest likelihood needs neither a floor of the
-    noise nor a prior of the basis shapes. If a model that is not right leaves less than
-    the floor, something else takes the place of the basis shapes that are missing:
-    calibrated cameras are told how much these would explain. Deformations below the
-    floor vanish there: they are looked for from the start.
+    A model is right if its residual is no larger than the noise that the spectrum
+    tells. Then the maximum of the likelihood needs neither floor nor prior, and the fit
+    without them is returned (released). Deformation below the floor has vanished from
+    the result, so that the released fit is tried from the start of the fit as well.
 
-    The least noise and whether the model is right are returned, too.
+    A model that is not right has too few basis shapes. If its noise is at the floor all
+    the same, cameras or depths explain the deformation that is missing. With calibrated
+    cameras it is fitted again, with a floor as high as that deformation.
     """
     n_seen, energy = problem.totals
     mean_square = energy / n_seen
-    right = max(RIGHT * spectrum.noise, EXACT) * mean_square
+    right_noise = max(RIGHT * spectrum.noise, EXACT) * mean_square
     at_floor = result.state.noise < (1 + SLACK) * LEAST_NOISE * mean_square
-    if at_floor or result.state.noise < right:
+    # Right: without floor and prior
+    if at_floor or result.state.noise < right_noise:
         for state in (result.state, start):
-            free = unregularised(problem, state, cameras)
-            if free.state.noise < right:
-                return free, NOISE_FLOOR, True
+            released = unregularised(problem, state, cameras)
+            if released.state.noise < right_noise:
+                return released, NOISE_FLOOR, True
+    # Not right: with a floor as high as the missing deformation
     least_noise = LEAST_NOISE
     if at_floor and cameras.calibrated and spectrum.noise > 0:
         least_noise = np.clip(CUT_OFF * spectrum.missing, LEAST_NOISE, MOST_NOISE)
@@ -446,7 +465,7 @@ def judged(
 def unregularised(
     problem: JointProblem, state: JointState, cameras: CameraModel
 ) -> JointResult:
-    """Return the fit without prior and floor, as long as the noise falls."""
+    """Return the fit without prior and floor. It ends when the noise hardly falls."""
     problem = problem.with_penalty(0.0)
     state = with_prior(problem, state)
     steps = min(RELEASED_STEPS, problem.steps.max_iter)
@@ -465,12 +484,13 @@ def _freedom_correction(
     n_seen: NDArray, n_points: int, n_shapes: int, n_pose: int, n_fitted: int
 ) -> float:
     """
-    Return numbers seen divided by the degrees of freedom of the residual.
+    Return the number of seen coordinates N over the residual's degrees of freedom.
 
-    Each frame has the unknowns of a camera and a position; the shapes have three each a
-    point, but for the affinity and the mixing. Coefficients that have been integrated
-    out take none, those that are fitted to a frame take one each. At least a tenth of
-    the numbers counts as free.
+    Each frame has n_pose unknowns of camera and position, and n_fitted coefficients:
+    those that are integrated out do not count. The n centred shapes of J points have
+    ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: n^2 of the mixing with
+    the mean shape and nine of the affinity of space, which share one scale. At least
+    ``N / 10`` degrees of freedom are assumed.
     """
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
     unknowns = (

@@ -1,9 +1,9 @@
-"""Frames ready for the passes of the joint refinement, by points or by directions.
+"""Frames as the joint refinement passes over them: by points or by directions.
 
-The shapes of greatest likelihood are combinations of the rows of the measurement
-matrix. Of a table with many points and none missing, frames need to be known only by
-their inner products with directions that the shapes are made of, and by their energy:
-a pass over them then costs the same for any number of points.
+The shapes of greatest likelihood are linear combinations of the rows of the measurement
+matrix. If no point is missing, the objective depends on a frame only through its
+energy and its inner products with directions that span the shapes. With these a pass
+over the frames costs the same for any number of points.
 """
 
 from functools import partial
@@ -28,8 +28,8 @@ class JointFrames(NamedTuple):
     blocks : FrameBlocks
         Blocks as of `prepared_frames`.
     directions : ndarray of shape (n_directions, n_points) or None
-        Orthonormal rows: the frames are given by their inner products with these, and
-        by their energy; None where they are given by their points.
+        Orthonormal rows. Frames are given by their inner products with them, and by
+        their energy. None if frames are given by their points.
     """
 
     blocks: FrameBlocks
@@ -86,11 +86,11 @@ class JointFrames(NamedTuple):
         return cls(blocks.regrouped(_joined, BLOCK_FRAMES), directions)
 
     def coordinates(self, shapes: NDArray) -> NDArray:
-        """Return shapes (..., n_points) in the coordinates of the frames."""
+        """Return shapes (..., n_points) by directions, if the frames are given so."""
         return shapes if self.directions is None else shapes @ self.directions.T
 
     def points(self, shapes: NDArray) -> NDArray:
-        """Return the points of shapes in the coordinates of the frames."""
+        """Return shapes (..., n_points) from what `coordinates` returns."""
         return shapes if self.directions is None else shapes @ self.directions
 
     def take(self, frames: NDArray) -> Self:
@@ -104,18 +104,23 @@ class JointFrames(NamedTuple):
 
 
 def _plain_frames(rows: NDArray, complete: bool) -> list[FrameTracks]:
-    """Return frames ready for passes, points that are missing having weight zero."""
+    """Return frames of rows (n_frames, 2, n_points), missing points of weight zero."""
     tracks = rows.transpose(0, 2, 1)
     return prepared_frames(tracks, None if complete else seen_points(tracks) * 1.0)
 
 
 def _weighted_frames(rows: NDArray, weights: NDArray) -> list[FrameTracks]:
-    """Return frames ready for passes, with weights."""
+    """Return frames of rows (n_frames, 2, n_points), weights (n_frames, n_points)."""
     return prepared_frames(rows.transpose(0, 2, 1), weights)
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
-    """Return complete frames ready for passes, by products with some directions."""
+    """
+    Return complete frames (n_frames, 2, n_points) by their products with directions.
+
+    The directions (n_directions, n_points) take the place of points, whose centroid is
+    zero. The number of points and the energy are those of the frames themselves.
+    """
     n_frames, _, n_points = rows.shape
     products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
     frames = FrameTracks(
@@ -130,7 +135,7 @@ def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
 
 
 def _taken(block: list[FrameTracks], chosen: NDArray) -> list[FrameTracks]:
-    """Return the chosen frames of a block."""
+    """Return the frames of a block for which chosen (n_frames,) is true."""
     ends = np.cumsum([len(part.weight) for part in block])
     parts = zip(block, np.split(chosen, ends[:-1]), strict=True)
     return [part.take(np.flatnonzero(which)) for part, which in parts if which.any()]

@@ -1,22 +1,26 @@
 """Marginal likelihood of cameras and shapes, with the coefficients integrated out.
 
-The coefficients of a frame are drawn from ``N(0, I)`` and every coordinate has noise of
-variance s2. With ``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1) minus two
-log likelihoods of all frames are, up to a constant ::
+The coefficients of a frame are drawn from ``N(0, I)``. Every coordinate has noise of
+variance s2. Write ``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then
+minus twice the log likelihood of all frames is, up to a constant ::
 
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
                        + log det(I + H_i / s2) ]
 
 with N the number of coordinates that were seen. The objective is that plus ``penalty
-* sum_i tr H_i``, a price for what the basis shapes move the points in the images.
-Positions are those of least squares: tracks and shapes are centred over the points of a
-frame (shapes have to be centred where no weights are given). The gradient follows from
-the first two moments of the coefficients given the frame, as in expectation
-maximisation (Tipping, Bishop, "Probabilistic principal component analysis", 1999;
-Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
+* sum_i tr H_i``, minus twice the log prior of the basis shapes: it penalises what they
+move in the images. So the objective is minus twice a log posterior.
 
-Frames are the last index of all arrays here, and everything is a sum over blocks of
-frames: how they are split makes no difference.
+Positions are eliminated by least squares: tracks and shapes are centred over the seen
+points of each frame. Without weights all frames see all points, and the shapes that are
+passed have to be centred already.
+
+The gradient follows from the first two posterior moments of the coefficients, as in
+expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
+1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
+
+Frames are the last index of all arrays here. All terms are sums over blocks of frames:
+how the frames are split makes no difference but for rounding.
 """
 
 from collections.abc import Callable
@@ -39,14 +43,14 @@ from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
-# With noise below this share of the mean square of the tracks the equations of the
-# coefficients are solved once more for what the first solution leaves.
+# With a noise variance below this share of the mean square of the tracks, the normal
+# equations of the coefficients get one step of iterative refinement.
 TINY_NOISE = 1e-7
 
 
 class LikelihoodTerms(NamedTuple):
     """
-    What a pass over frames gives.
+    The objective, its derivatives and posterior moments, from one pass over the frames.
 
     Attributes
     ----------
@@ -59,15 +63,16 @@ class LikelihoodTerms(NamedTuple):
     noise_gradient : float
         Its derivative by the logarithm of the noise variance.
     shape_curvature : ndarray of shape (n_points or 1, 3 * n_shapes, 3 * n_shapes)
-        ``sum_i w_ij E_i (x) M_i^T M_i`` with the second moments E_i of (1, alpha): half
-        of s2 times the second derivative by point j of the shapes, the coefficients and
-        positions held. One matrix for all points where all weights are one.
+        ``sum_i w_ij E_i (x) M_i^T M_i`` with the posterior second moments E_i of
+        (1, alpha). Times ``2 / s2`` it is the Hessian by point j of the shapes, with
+        the posterior and the positions held fixed. One matrix stands for all points
+        where all weights are one.
     motion_curvature : ndarray of shape (6, n_frames)
-        The same for the rows of the cameras, ``sum_kl E_kl B_k B_l^T``, packed.
+        ``sum_kl E_kl B_k B_l^T``, packed: the same for each row of the cameras.
     alpha : ndarray of shape (n_components, n_frames)
-        Means of the coefficients.
+        Posterior means of the coefficients.
     residual : float
-        Energy of the tracks that the shapes with these coefficients leave.
+        Sum of squared residuals of the tracks at these means.
     """
 
     value: float
@@ -142,11 +147,12 @@ class MarginalLikelihood:
     Parameters
     ----------
     frames : FrameBlocks
-        Blocks as of `prepared_frames`, either all with weights or none.
-    penalty : float
-        Factor of ``sum_i tr H_i``.
+        Blocks as of `prepared_frames`. All of them have weights, or none has.
+    penalty : float or ndarray of shape (n_components,)
+        Regularisation weight: factor of ``sum_i tr H_i``, or one factor for the
+        diagonal entry of each basis shape.
     known : tuple of float, optional
-        What `totals` returns for these blocks, where it is known.
+        What `totals` returns for these blocks, if it has been computed already.
 
     Attributes
     ----------
@@ -194,16 +200,17 @@ class MarginalLikelihood:
         alpha = np.empty((n_shapes - 1, self.n_frames))
         motion_gradient = np.empty((2, 3, self.n_frames))
         motion_curvature = np.empty((6, self.n_frames))
-        totals: Any = (0.0,) * 5
+        sums: Any = (0.0,) * 5
         cameras = motion.transpose(2, 0, 1)
         passes = self.frames.map(over_block, cameras)
         for frames, part in zip(self.frames.slices, passes, strict=True):
             alpha[:, frames] = part.alpha
             motion_gradient[:, :, frames] = part.motion_gradient
             motion_curvature[:, frames] = part.motion_curvature
-            totals = [a + b for a, b in zip(totals, _sums(part), strict=True)]
-        value, shape_gradient, noise_gradient, packed, residual = totals
+            sums = [a + b for a, b in zip(sums, _sums(part), strict=True)]
+        value, shape_gradient, noise_gradient, packed, residual = sums
         curvature = kronecker_matrices(packed, n_shapes)
+        # What is common to all frames: 2 / s2 curvature B, N log s2 and its derivative.
         rows = shapes.reshape(3 * n_shapes, -1).T[:, :, None]
         pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
         return LikelihoodTerms(
@@ -219,7 +226,7 @@ class MarginalLikelihood:
 
     def coefficients(self, shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
         """
-        Return the means of the coefficients alone.
+        Return the posterior means of the coefficients.
 
         Parameters
         ----------
@@ -242,7 +249,7 @@ class MarginalLikelihood:
     def _over_block(
         self, shapes: NDArray, noise: float
     ) -> Callable[..., LikelihoodTerms]:
-        """Return what goes over a block, given the cameras of its frames."""
+        """Return the function of a block and its cameras that computes the terms."""
         return partial(
             _block_terms,
             shapes=shapes,
@@ -286,7 +293,7 @@ def _totals(block: list[FrameTracks]) -> tuple[float, float]:
 
 
 def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]:
-    """Return what is a sum over the frames."""
+    """Return those terms that are sums over the frames."""
     return (
         part.value,
         part.shape_gradient,
@@ -305,7 +312,11 @@ def _block_terms(
     penalty: NDArray | float,
     tiny_noise: bool,
 ) -> LikelihoodTerms:
-    """Return the terms of a block, the sums and arrays of those of its parts."""
+    """
+    Return the terms of a block, from those of its parts.
+
+    Here motion is (n_frames, 2, 3): the blocks of frames are cut along the first axis.
+    """
     motion, start, parts = motion.transpose(1, 2, 0), 0, []
     for frames in block:
         end = start + len(frames.weight)
@@ -340,10 +351,11 @@ def _frame_terms(
     tiny_noise: bool,
 ) -> LikelihoodTerms:
     """
-    Return the parts of `LikelihoodTerms` for one block, but for what is common to all.
+    Return the terms of frames of one block, motion (2, 3, n_frames).
 
-    Left out are ``N log s2`` and what the curvature adds to the gradient by the shapes;
-    the curvature is packed: (n_pairs, 6, n_points or 1).
+    Left out is what the caller adds for all frames at once: ``N log s2``, and the term
+    ``2 / s2 curvature B`` of the gradient by the shapes. The curvature by the shapes is
+    packed: (n_pairs, 6, n_points or 1).
     """
     n_shapes, _, n_points = shapes.shape
     products = frame_sums(block, shapes, gram)
@@ -354,14 +366,16 @@ def _frame_terms(
     residual = float(posterior.residual(noise).sum())
     spread = float(posterior.spread(noise).sum())
 
-    # Second moments of c, with what the prior of the basis shapes adds to them.
+    # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
     moments = posterior.second_moments(noise)
     moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
     cameras = camera_gram(motion)
+    # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
     motion_curvature = products.gram.moments(moments)
     A = unpack3(motion_curvature)
     motion_gradient = np.einsum("rbi,bai->rai", motion, A)
     motion_gradient -= np.einsum("ki,kari->rai", c, products.cross)
+    # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
     X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
     shape_gradient = X @ block.weighted.reshape(n_points, -1).T
     if block.weights is None:
@@ -369,7 +383,7 @@ def _frame_terms(
     else:
         pairs = (moments[:, None] * cameras).reshape(6 * len(moments), -1)
         shape_curvature = (pairs @ block.weights.T).reshape(-1, 6, n_points)
-        # The position of a frame follows the weighted means of its points.
+        # The eliminated position of a frame depends on weighted means of the shapes.
         mixed = np.einsum("kli,lbi->kbi", unpacked(moments), products.shape_centroid)
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
@@ -386,6 +400,10 @@ def _frame_terms(
 
 
 def kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
-    """Return (n, 3 n_shapes, 3 n_shapes) of packed pairs of shapes and of axes."""
+    """
+    Return the matrices (n, 3 n_shapes, 3 n_shapes) of packed curvatures.
+
+    They come as (n_pairs, 6, n), packed over pairs of shapes and pairs of axes.
+    """
     size = 3 * n_shapes
     return unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)

@@ -1,9 +1,10 @@
 """The joint fit of tables with many points, along few directions.
 
-The shapes of greatest likelihood are combinations of the rows of the measurement
-matrix. Complete frames with many points are given by their products with directions,
-those of the factorisation at first. Along the directions that are missing one step of
-expectation maximisation in all points leads; they are added until it gains nothing.
+The shapes of greatest likelihood are linear combinations of the rows of the measurement
+matrix. Complete frames with many points are given by their products with directions. At
+first these are the directions of the factorisation. One step of expectation
+maximisation in all points then gives shapes that may leave their span. The directions
+that it needs are added, and the fit goes on, until such a step gains nothing.
 """
 
 from collections.abc import Callable
@@ -18,13 +19,13 @@ from isa_nrsfm._joint.quasi_newton import JointResult, regular
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Frames with more points than that, and than so many times the rows of all shapes, are
-# given by directions.
+# Frames are given by directions if they have more than LEAST_POINTS points, and more
+# than WIDE times the number of rows of all shapes.
 LEAST_POINTS = 200
 WIDE = 8
-# So many times at most directions are added.
+# Largest number of times that directions are added.
 WIDENINGS = 20
-# Singular values of shapes below this share of the largest are rounding errors.
+# Singular values of shapes below this share of the largest count as zero.
 FLAT = 1e-12
 
 
@@ -34,7 +35,11 @@ def has_many_points(n_points: int, n_shapes: int) -> bool:
 
 
 def leading_directions(factors: Factorisation) -> NDArray:
-    """Return orthonormal directions (n_directions, n_points) of all factors."""
+    """
+    Return orthonormal directions (n_directions, n_points) that span the right factors.
+
+    Their rows, of the rigid shape and of the signals, are orthogonal. Some can be zero.
+    """
     shapes = np.concatenate([factors.rigid_shape, factors.signals])
     shapes = shapes[shapes.any(axis=1)]
     return shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
@@ -47,7 +52,7 @@ def in_all_points(
     refined: Callable[..., JointResult],
 ) -> tuple[JointResult, JointProblem]:
     """
-    Return the refinement in all points of one along some directions.
+    Continue a refinement along some directions until it is one in all points.
 
     Parameters
     ----------
@@ -63,39 +68,47 @@ def in_all_points(
     Returns
     -------
     result : JointResult
-        The refinement, along directions of which no others gain anything.
+        The refinement, along directions to which no other need be added.
     problem : JointProblem
         The problem along these directions.
     """
     for _ in range(WIDENINGS):
         state = result.state
         before = problem.frames.points(state.shapes)
-        # The shapes of a step of expectation maximisation: N B = R.
+        # Expectation maximisation in all points: solve curvature B = sum_i X_i^T W_i.
         passed = problem.likelihood(*state)
         curvature = regular(passed.shape_curvature)[0]
         right = sum(
             rows.map(_right_side, state.motion.transpose(2, 0, 1), passed.alpha.T)
         ).reshape(len(curvature), -1)
         after = np.linalg.solve(curvature, right)
+        # Predicted gain of the objective
         change = after - before.reshape(after.shape)
         gain = float(np.vdot(change, curvature @ change)) / state.noise
         if gain < problem.steps.tol * problem.n_frames:
             break
+        # Directions that span the shapes before and after that step
         both = np.concatenate([after, before.reshape(after.shape)])
         _, size, directions = np.linalg.svd(both, full_matrices=False)
         frames = JointFrames.from_directions(rows, directions[size > FLAT * size[0]])
         problem = problem.with_frames(frames)
+        # Further refinement, with the steps that are left
         shapes = frames.coordinates(after.reshape(before.shape))
         n_left = problem.steps.max_iter - (len(result.history) - 1)
         if not n_left:
             break
         further = refined(problem, state._replace(shapes=shapes), max_iter=n_left)
-        # It goes on where the refinement along fewer directions has ended.
+        # One history: the first value of the further one repeats the last.
         history = np.concatenate([result.history, further.history[1:]])
         result = further._replace(history=history)
     return result, problem
 
 
 def _right_side(rows: NDArray, motion: NDArray, alpha: NDArray) -> NDArray:
-    """Return ``sum_i (c_i (x) M_i)^T W_i`` of a block."""
+    """
+    Return ``sum_i X_i^T W_i`` of a block, ``X_i = c_i^T (x) M_i``.
+
+    The arrays are rows (n_frames, 2, n_points), motion (n_frames, 2, 3) and alpha
+    (n_frames, n_components).
+    """
     return stacked_motion(motion, alpha).T @ rows.reshape(2 * len(rows), -1)

@@ -1,33 +1,36 @@
 """Shapes of a table without noise, by Gauss-Newton steps on the reprojection residual.
 
-Without noise all that the marginal likelihood asks for is a residual of zero. The
-search for its maximum comes there slowly: along directions that hardly change the
-images it gains no faster than the noise is small. Here the residual itself,
+Without noise the marginal likelihood is greatest where the residual is zero. A gradient
+method on the likelihood converges slowly there: it is badly conditioned along
+directions that hardly change the images. Here the residual itself,
 
     sum_i || W_i - M_i sum_k c_ik B_k ||^2,   c_i = (1, alpha_i),
 
 is minimised. With ``X_i = c_i^T (x) M_i`` (2 x (3K + 3)) and all shapes stacked as b
-it is that of ``W_i - X_i b``. Camera and coefficients of a frame are eliminated: its
-residual is projected off the tangent space of ``M_i S_i``, spanned by ``dM S_i`` and
-``M_i B_k`` (variable projection: Golub, Pereyra, "The differentiation of
+(3K + 3 rows) the residual of a frame is ``R_i = W_i - X_i b``. Camera and coefficients
+of a frame are eliminated: its residual is projected off the tangent space of
+``M_i S_i``, ``S_i = sum_k c_ik B_k``. That space is spanned by ``dM S_i`` and ``M_i
+B_k`` (variable projection: Golub, Pereyra, "The differentiation of
 pseudo-inverses and nonlinear least squares problems whose variables separate", 1973;
 the derivative of the projector is left out, as by Kaufman, "A variable projection
-method for solving separable nonlinear least squares problems", 1975). With Q_i an
-orthonormal basis of that space and ``E = sum_i X_i^T X_i`` a step d of the shapes is
+method for solving separable nonlinear least squares problems", 1975). Let Q_i be an
+orthonormal basis of that space, ``P_i R_i = R_i - Q_i Q_i^T R_i`` the projected
+residual and ``E = sum_i X_i^T X_i``. A step d of the shapes solves
 
     (I - sum_i G_i G_i^T + damping I) vec(E^1/2 d) = vec(E^-1/2 sum_i X_i^T P_i R_i),
-    G_i = (E^-1/2 X_i^T (x) I) Q_i,   P_i R_i = R_i - Q_i Q_i^T R_i
+    G_i = (E^-1/2 X_i^T (x) I) Q_i
 
-(Levenberg-Marquardt: Nocedal, Wright, "Numerical optimization", 2006, chapter 10). The
-matrix has eigenvalues from 0 to 1, zero for changes of the basis that images do not
-tell: the damping holds those still. The steps do not depend on the basis of space or
-of the shapes, but go along with it.
+(Levenberg-Marquardt: Nocedal, Wright, "Numerical optimization", 2006, chapter 10). Any
+square root of E will do: the code takes its Cholesky factor. The matrix without the
+damping has eigenvalues from 0 to 1. They are zero for changes of the basis that leave
+the images as they are: the damping suppresses those. The steps are equivariant: they
+do not depend on the basis of space or of the shapes.
 
-The rows of the shapes lie in the row space of W, which has no more dimensions than
-there are rows. Tables are taken to a basis of it, so that the number of points does
-not matter. Where points are missing the row space comes from alternating least squares
-over frames whose seen points determine the others. Without noise a part of the frames
-is as good as all: only as many are taken as keep a step short.
+The rows of the shapes lie in the row space of W, which has at most as many dimensions
+as the shapes have rows. The tracks are given in a basis of it, so that the number of
+points does not matter. Where points are missing the row space comes from alternating
+least squares over frames whose seen points determine the others. Without noise some of
+the frames tell as much as all: their number is limited by the cost of a step.
 """
 
 from functools import partial
@@ -43,25 +46,29 @@ from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Multiplications of a step: it takes a part of a second.
+# Largest number of multiplications of one step, less than a second. It limits how many
+# frames are used.
 STEP_COST = 2e9
 MAX_STEPS = 50
-# The damping at the start, its bounds, and how a step changes it.
+# Levenberg-Marquardt damping: at the start, its bounds, and its factors after a step
+# that lowers the residual (EASED) and after one that does not (RAISED).
 FIRST_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-14
 LARGEST_DAMPING = 1e2
 EASED, RAISED = 0.05, 8.0
-# A residual that is this share of the tracks is rounding errors.
+# A residual whose norm is below this share of that of the tracks is rounding errors.
 ROUNDING = 1e-15
-# A step that lowers the sum of squares by less than this share gains little; two of
-# them, one after the other, end the search.
+# Convergence tolerance: the iteration ends after two consecutive steps that lower the
+# sum of squares by less than this share of it.
 LITTLE = 1e-2
-# A change of a frame of which the others leave less than this share is none.
+# A tangent whose part orthogonal to those before it is below this share of its norm
+# counts as linearly dependent, and is left out.
 DEPENDENT = 1e-9
-# Points with at least this weight are seen.
+# Points with at least this weight count as seen, with weight one; others as missing.
 COUNTED = 0.5
-# The seen points of a frame determine the others if they keep this share of the energy
-# of each direction of the row space.
+# The seen points of a frame determine the others if the Gram matrix of the basis of the
+# row space over these points has no eigenvalue below this. Over all points it is the
+# identity.
 DETERMINED = 1e-3
 COMPLETION_STEPS = 60
 # Ridge, relative to the trace, for matrices that can be singular.
@@ -109,10 +116,10 @@ def fit_without_noise(
         Cameras to start from.
     alpha : ndarray of shape (n_components, n_frames)
         Coefficients to start from.
-    penalty : float
+    penalty : float or ndarray of shape (n_components,)
         As in `MarginalLikelihood`.
     cameras : CameraModel
-        How cameras may move.
+        The cameras that are allowed.
 
     Returns
     -------
@@ -121,23 +128,28 @@ def fit_without_noise(
     motion : ndarray of shape (2, 3, n_frames)
         Cameras. Those of frames whose points do not determine one are as they came.
 
-    None is returned where a step would take too long for a number of frames that tells
-    the shapes, or where too few frames determine their missing points.
+    Notes
+    -----
+    None is returned in two cases: if a step with enough frames to determine the shapes
+    would cost too much, or if too few frames determine their missing points.
     """
     n_shapes, _, n_points = shapes.shape
     b = shapes.reshape(3 * n_shapes, n_points)
+    # Frames to fit: as many as the cost of a step allows
     n_frames = int(STEP_COST / (len(b) ** 4 * (5 + n_shapes)))
     if n_frames < len(b):
         return None
     W, frames = complete_frames(blocks, b, n_frames)
     if len(frames) < min(len(b), alpha.shape[1]):
         return None
+    # Gauss-Newton steps in a basis V of the row space
     rows, V = compressed(W, b)
     start = FramesAndShapes(
         b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
     )
     found = minimise(rows, start, cameras)
     shapes = (found.shapes @ V.T).reshape(shapes.shape)
+    # Cameras and coefficients of all frames for these shapes
     alpha = alpha.copy()
     alpha[:, frames] = found.alpha.T
     motion, alpha = _all_frames(blocks, shapes, motion, alpha, cameras.name)
@@ -148,7 +160,7 @@ def complete_frames(
     blocks: FrameBlocks, shapes: NDArray, n_frames: int
 ) -> tuple[NDArray, NDArray]:
     """
-    Return frames without missing points, and which ones they are.
+    Return some frames with their missing points filled in, and which ones they are.
 
     Parameters
     ----------
@@ -187,7 +199,7 @@ def complete_frames(
 def _chosen(
     block: list[FrameTracks], V: NDArray, share: float
 ) -> list[tuple[NDArray, NDArray | None, NDArray]]:
-    """Return tracks, seen points and numbers of a share of the frames of a block."""
+    """Return tracks, seen points and numbers of evenly spread frames of each part."""
     found, first = [], 0
     for part in block:
         W, seen = _tracks_of(part)
@@ -205,9 +217,11 @@ def _chosen(
 
 def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray | None]:
     """
-    Return tracks (n_frames, 2, n_points), zero where missing, and 1.0 where seen.
+    Return tracks (n_frames, 2, n_points) and which points are seen.
 
-    The second is None for frames without weights. They need not be given by points.
+    Missing points are zero. The second array (n_frames, n_points) is 1.0 for seen
+    points and 0.0 for others. It is None for frames without weights, which may be given
+    by directions instead of points.
     """
     weighted = block.weighted.transpose(2, 1, 0)
     if block.weights is None:
@@ -219,7 +233,7 @@ def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray | None]:
 
 
 def _determined(seen: NDArray, V: NDArray) -> NDArray:
-    """Return the frames whose seen points determine position and coefficients of V."""
+    """Return the frames whose seen points determine their position and factors of V."""
     n_points = len(V)
     rows = np.hstack([V, np.full((n_points, 1), n_points**-0.5)])
     gram = (seen @ _squares(rows)).reshape(len(seen), rows.shape[1], -1)
@@ -233,24 +247,32 @@ def _squares(rows: NDArray) -> NDArray:
 
 
 def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
-    """Return tracks with the missing points of the nearest table of low rank."""
+    """
+    Return tracks with missing points from a low rank fit, by alternating least squares.
+
+    The model of a frame is ``z_i V^T`` plus its position. W is (n_frames, 2, n_points),
+    zero where a point is missing, seen (n_frames, n_points), and V (n_points, rank) the
+    row space to start from.
+    """
     n_points, rank = V.shape
     n_seen = max(2.0 * seen.sum(), 1.0)
     square, filled = np.inf, W
     for _ in range(COMPLETION_STEPS):
+        # Coefficients z_i and positions of the frames for given V
         rows = np.hstack([V, np.ones((n_points, 1))])
         gram = (seen @ _squares(rows)).reshape(-1, rank + 1, rank + 1)
-        # Where W has a lower rank, a column of V can be anything.
+        # A ridge: if the rank of W is lower, a column of V is arbitrary.
         size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
         gram += RIDGE * size * np.eye(rank + 1)
         factors = np.linalg.solve(gram, (W @ rows).swapaxes(1, 2)).swapaxes(1, 2)
+        # Residual of the seen points, and convergence test
         model = factors @ rows.T
         previous = square
         filled = np.where(seen[:, None] > 0, W, model)
         square = np.sum((filled - model) ** 2) / n_seen
         if not LITTLE * previous > 0 or square > (1 - LITTLE) * previous:
             break
-        # The points of least squares for the coefficients of the frames.
+        # V for given coefficients z_i and positions
         z, place = factors[..., :rank], factors[..., rank:]
         moments = np.einsum("irk,irl->ikl", z, z).reshape(len(z), -1)
         moments = (seen.T @ moments).reshape(n_points, rank, rank)
@@ -282,14 +304,14 @@ def compressed(W: NDArray, shapes: NDArray) -> tuple[NDArray, NDArray]:
     """
     flat = W.reshape(-1, W.shape[2])
     V = np.linalg.qr(shapes.T)[0]
-    # Subspace iteration converges at once: what is outside of the row space is tiny.
+    # Subspace iteration: two rounds do, as the part of W outside of the span is tiny.
     for _ in range(2):
         V = np.linalg.qr(flat.T @ np.linalg.qr(flat @ V)[0])[0]
     return W @ V, V
 
 
 def motion_rows(motion: NDArray, alpha: NDArray) -> NDArray:
-    """Return ``X_i = c_i^T (x) M_i`` (n_frames, 2, 3 * n_shapes)."""
+    """Return ``X_i = c_i^T (x) M_i`` (n_frames, 2, 3 * n_shapes), frames first."""
     return stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
 
 
@@ -300,15 +322,15 @@ def frame_tangents(state: FramesAndShapes, cameras: CameraModel) -> NDArray:
     Parameters
     ----------
     state : FramesAndShapes
-        Where.
+        The state at which they are taken.
     cameras : CameraModel
-        How cameras may move.
+        The cameras that are allowed.
 
     Returns
     -------
     ndarray of shape (n_frames, 2 * n_directions, n_parameters + n_components)
-        Of ``M_i S_i``, rows one after the other, by the parameters of M_i and by
-        alpha_i.
+        The derivatives of ``M_i S_i``, its two rows one after the other, by the
+        parameters of M_i and by alpha_i.
     """
     b, motion, alpha = state
     n_frames, n_components = alpha.shape
@@ -323,22 +345,23 @@ def frame_tangents(state: FramesAndShapes, cameras: CameraModel) -> NDArray:
 
 
 class _Frames(NamedTuple):
-    """Frames at a state: residuals, and what cameras and coefficients do about them."""
+    """Residuals of frames at a state, and the QR factors of their tangents."""
 
-    rest: NDArray  # W_i - X_i b (n, 2 n_directions)
+    rest: NDArray  # R_i = W_i - X_i b (n, 2 n_directions)
     tangent: NDArray  # Q_i (n, 2 n_directions, n_parameters + K)
-    factor: NDArray  # of the tangents, Q_i times it
+    factor: NDArray  # triangular factor: tangents = Q_i factor_i
     cameras: CameraModel
 
     @classmethod
     def at(
         cls, rows: NDArray, state: FramesAndShapes, cameras: CameraModel
     ) -> "_Frames":
-        """Return the frames with their residual and their tangent space."""
+        """Return the frames with their residual and tangents; rows (n, 2, n_dirs)."""
         rest = rows - motion_rows(state.motion, state.alpha) @ state.shapes
         tangents = frame_tangents(state, cameras)
         size = np.linalg.norm(tangents, axis=1)
         Q, R = np.linalg.qr(tangents)
+        # Dependent tangents: their columns of Q are zero, their steps are zero, too.
         diagonal = np.arange(R.shape[-1])
         kept = np.abs(R[:, diagonal, diagonal]) > DEPENDENT * size
         Q *= kept[:, None]
@@ -347,7 +370,11 @@ class _Frames(NamedTuple):
         return cls(rest.reshape(len(rows), -1), Q, R, cameras)
 
     def moved(self, state: FramesAndShapes, rest: NDArray) -> FramesAndShapes:
-        """Return cameras and coefficients after the step that a residual asks for."""
+        """
+        Return the state after a Gauss-Newton step of cameras and coefficients.
+
+        It is the least squares solution for a residual, rest (n, 2 n_directions).
+        """
         along = self.tangent.swapaxes(1, 2) @ rest[..., None]
         step = np.linalg.solve(self.factor, along)[..., 0]
         n = self.cameras.n_parameters
@@ -361,21 +388,21 @@ def minimise(
     rows: NDArray, start: FramesAndShapes, cameras: CameraModel
 ) -> FramesAndShapes:
     """
-    Return the state of least residual that Levenberg-Marquardt steps lead to.
+    Minimise the residual by Levenberg-Marquardt steps.
 
     Parameters
     ----------
     rows : ndarray of shape (n_frames, 2, n_directions)
         Tracks of the frames.
     start : FramesAndShapes
-        Where to start.
+        The first iterate.
     cameras : CameraModel
-        How cameras may move.
+        The cameras that are allowed.
 
     Returns
     -------
     FramesAndShapes
-        Where it ended. The residual is never larger than that of the start.
+        The last iterate. Its residual is never larger than that of the start.
     """
     state = start
     energy = float(np.vdot(rows, rows))
@@ -383,12 +410,14 @@ def minimise(
     square = float(np.vdot(frames.rest, frames.rest))
     damping, small_steps, system = FIRST_DAMPING, 0, None
     for _ in range(MAX_STEPS):
+        # Convergence tests
         if square <= ROUNDING**2 * energy or small_steps == 2:
             break
         if damping > LARGEST_DAMPING:
             break
         if system is None:
             system = normal_equations(frames, state)
+        # Trial step: refused, with more damping, unless it lowers the residual
         trial = _stepped(rows, state, frames, system, damping)
         after = _Frames.at(rows, trial, cameras)
         reached = float(np.vdot(after.rest, after.rest))
@@ -402,25 +431,28 @@ def minimise(
 
 
 class _System(NamedTuple):
-    """Equations of a step of the shapes, frames eliminated."""
+    """Normal equations of a step of the shapes, cameras and coefficients eliminated."""
 
-    matrix: NDArray  # I - sum_i G_i G_i^T
+    matrix: NDArray  # I - sum_i G_i G_i^T, rows and columns as the raveled slope
     slope: NDArray  # E^-1/2 sum_i X_i^T P_i R_i (3 n_shapes, n_directions)
-    root: NDArray  # upper triangular factor of E
+    root: NDArray  # upper triangular, root^T root = E: stands for E^1/2
 
 
 def normal_equations(frames: _Frames, state: FramesAndShapes) -> _System:
-    """Return the equations of a step, as in the head of this module."""
+    """Return the normal equations of a step, as in the docstring of this module."""
     X = motion_rows(state.motion, state.alpha)
     n_frames, _, size = X.shape
     n_directions = state.shapes.shape[1]
     E = np.tensordot(X, X, axes=([0, 1], [0, 1]))
     E += RIDGE * np.trace(E) * np.eye(size)
     root = np.linalg.cholesky(E).T
+    # X_i E^-1/2
     X = solve_triangular(root, X.reshape(-1, size).T, trans="T").T.reshape(X.shape)
+    # Projected residuals P_i R_i
     Q, rest = frames.tangent, frames.rest[..., None]
     rest = rest - Q @ (Q.swapaxes(1, 2) @ rest)
     rest = rest.reshape(2 * n_frames, n_directions)
+    # G_i of all frames beside each other
     G = X.swapaxes(1, 2) @ Q.reshape(n_frames, 2, -1)
     G = G.reshape(n_frames, size * n_directions, -1).swapaxes(0, 1)
     G = G.reshape(size * n_directions, -1)
@@ -435,14 +467,16 @@ def _stepped(
     system: _System,
     damping: float,
 ) -> FramesAndShapes:
-    """Return the state after a step of the shapes, and two of the frames."""
+    """Return the state after a damped step of the shapes, and two of each frame."""
     matrix = system.matrix + damping * np.eye(len(system.matrix))
     step = np.linalg.solve(matrix, system.slope.ravel()).reshape(state.shapes.shape)
     step = solve_triangular(system.root, step)
+    # Residual after the step of the shapes, cameras and coefficients held
     X = motion_rows(state.motion, state.alpha)
     rest = frames.rest - (X @ step).reshape(len(rows), -1)
     moved = state._replace(shapes=state.shapes + step)
     moved = _better(rows, moved, frames.moved(moved, rest))
+    # Gauss-Newton step of each frame, shapes held
     frames = _Frames.at(rows, moved, frames.cameras)
     return _better(rows, moved, frames.moved(moved, frames.rest))
 
@@ -450,7 +484,7 @@ def _stepped(
 def _better(
     rows: NDArray, first: FramesAndShapes, second: FramesAndShapes
 ) -> FramesAndShapes:
-    """Return the cameras and coefficients of each frame that leave less."""
+    """Return for each frame the camera and coefficients of the smaller residual."""
     left = [
         np.sum((rows - motion_rows(s.motion, s.alpha) @ s.shapes) ** 2, axis=(1, 2))
         for s in (first, second)
@@ -470,7 +504,7 @@ def _all_frames(
     alpha: NDArray,
     camera: str,
 ) -> tuple[NDArray, NDArray]:
-    """Return cameras and coefficients of all frames for given shapes."""
+    """Return motion (2, 3, n_frames) and alpha (K, n_frames) of all frames."""
     motion, alpha = motion.copy(), alpha.copy()
     fitted = partial(_fitted, shapes=shapes, camera=camera)
     fits = blocks.map(fitted, alpha.T.copy())
@@ -485,7 +519,7 @@ def _all_frames(
 def _fitted(
     block: list[FrameTracks], initial: NDArray, shapes: NDArray, camera: str
 ) -> tuple[NDArray, NDArray]:
-    """Return cameras and coefficients of a block, from given coefficients."""
+    """Return cameras (n, 2, 3) and coefficients of a block; initial (n, K)."""
     fits, first = [], 0
     for part in block:
         W, seen = _tracks_of(part)
@@ -510,13 +544,16 @@ def likely_basis(
     """
     Return the same shapes in the basis of greatest marginal likelihood.
 
-    Without noise it is free to shift the mean shape, and to mix the basis shapes by any
-    A: alpha becomes ``A^-1 (alpha - mean)``, and the objective changes by
+    Without noise neither a shift of the mean shape along the basis shapes nor a mixing
+    A of these changes the residual: alpha becomes ``A^-1 (alpha - mean)``. Of the
+    objective there remains, with n frames and ``H_kl = sum_i <M_i B_k, M_i B_l>``,
 
-        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A)
+        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A).
 
-    with H the sum over the frames of ``<M B_k, M B_l>``. Where the covariance of the
-    coefficients is the identity and H is diagonal, A is diagonal, too.
+    First a basis is taken in which the covariance of the coefficients is the identity
+    and H is diagonal. There the minimum is the diagonal A with
+
+        a_k^2 = 2 / (1 + sqrt(1 + 4 penalty H_kk / n)).
 
     Parameters
     ----------
@@ -535,12 +572,15 @@ def likely_basis(
         Mean shape and basis shapes.
     """
     n_frames = motion.shape[2]
+    # Coefficients of mean zero
     mean = alpha.mean(axis=1)
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
+    # Coefficients of covariance one
     rest = alpha - mean[:, None]
     covariance = rest @ rest.T / n_frames
     covariance += (RIDGE * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
+    # Diagonal H / n, and the scales a_k
     cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
     energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
     price = penalty * np.maximum(energy, 0.0)

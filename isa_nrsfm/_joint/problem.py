@@ -1,4 +1,4 @@
-"""The joint fit of some frames of a table, with the settings of all its stages."""
+"""The joint fit as a problem: frames, penalty, and how long to iterate."""
 
 from collections.abc import Callable
 from functools import cached_property, partial
@@ -15,30 +15,32 @@ from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState, refine_joint
 
-# Standard deviation, as a share of the frame size, of the coordinates of the image of a
-# basis shape, one deviation of its coefficient: the prior of the basis shapes.
+# Prior of the basis shapes: standard deviation of the coordinates of the image of a
+# basis shape whose coefficient is one, as a share of the size of the frame.
 # (``python -m benchmarks.accuracy prior``)
 BASIS_STD = 0.008
-# The noise variance is at least this share of the mean square: what K basis shapes
-# leave of the object is not noise, and does not tell its depth.
+# Floor of the noise variance while the model may be wrong, as a share of the mean
+# square of the tracks. Deformation that K basis shapes do not span is not noise: with
+# less noise the fit would explain it by wrong depths.
 # (``python -m benchmarks.accuracy prior``)
 LEAST_NOISE = 5e-5
 
 
 class Steps(NamedTuple):
     """
-    How long the steps of a fit go on.
+    When the iteration of a fit ends.
 
     Attributes
     ----------
     max_iter : int
-        The most steps.
+        Largest number of steps.
     tol : float
-        As of `refine_joint`.
+        Convergence tolerance, as of `refine_joint`.
     on_step : callable or None
         As of `refine_joint`.
     to_the_end : bool
-        Whether the frames are few and all of the table, so that more steps cost little.
+        Whether to compare more starts and to take a smaller tolerance. It is true only
+        for small tables, where more steps cost little.
     """
 
     max_iter: int
@@ -49,14 +51,14 @@ class Steps(NamedTuple):
 
 class JointProblem:
     """
-    The joint fit of some frames.
+    The objective of the joint fit of some frames, and the steps that minimise it.
 
     Parameters
     ----------
     frames : JointFrames
         The frames.
     steps : Steps
-        How long its steps go on.
+        When its iteration ends.
     penalty : float or ndarray of shape (n_components,)
         As of `MarginalLikelihood`.
     """
@@ -70,7 +72,7 @@ class JointProblem:
         self.frames, self.steps, self.penalty = frames, steps, penalty
 
     def part(self, chosen: NDArray, **changed: Any) -> Self:
-        """Return the problem of some of the frames, with other steps."""
+        """Return the problem of some of the frames, with some fields of `Steps` set."""
         steps = self.steps._replace(**changed)
         return type(self)(self.frames.take(chosen), steps, self.penalty)
 
@@ -81,7 +83,7 @@ class JointProblem:
     def with_penalty(self, penalty: NDArray | float) -> Self:
         """Return the problem with another penalty, or one for each basis shape."""
         problem = type(self)(self.frames, self.steps, penalty)
-        problem.totals = self.totals  # a pass over all frames
+        problem.totals = self.totals  # saves a pass over all frames
         return problem
 
     @property
@@ -100,11 +102,16 @@ class JointProblem:
         return MarginalLikelihood(self.frames.blocks, self.penalty, self.totals)
 
     def coefficients(self, state: JointState) -> NDArray:
-        """Return the means of the coefficients (n_frames, n_components)."""
+        """Return the posterior means of the coefficients (n_frames, n_components)."""
         return self.likelihood.coefficients(*state)
 
     def aligned(self, state: JointState, camera: str) -> JointState:
-        """Return a state with cameras close to the best for its shapes and noise."""
+        """
+        Return a state with approximately optimal cameras for its shapes and noise.
+
+        The shapes are centred. The cameras come from a few steps of the search for each
+        frame, not from the state.
+        """
         shapes = state.shapes
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
@@ -130,8 +137,8 @@ class JointProblem:
         Returns
         -------
         state : JointState
-            With the cameras that frames reach from reversed ones where the objective is
-            lower there.
+            The search for each frame is repeated from its camera reversed in depth. The
+            camera that it finds is taken where the objective is lower.
         n_reversed : int
             The number of these frames.
         """
@@ -159,11 +166,11 @@ class JointProblem:
         Parameters
         ----------
         state : JointState
-            Where to start.
+            The first iterate.
         cameras : CameraModel
-            How its cameras may move.
+            The cameras that are allowed.
         least_noise : float
-            The least noise variance, a share of the mean square.
+            Lower bound of the noise variance, as a share of the mean square.
         **changed : object
             Settings of `Steps` that are different.
 
@@ -191,7 +198,11 @@ def _reversed_back(
     noise: float,
     scaled: bool,
 ) -> tuple[NDArray, NDArray]:
-    """Return cameras (n_frames, 2, 3) of a block, and which of them are new."""
+    """
+    Return the better cameras (n_frames, 2, 3) of a block, and which were reversed.
+
+    The cameras that come, motion, are (n_frames, 2, 3), too.
+    """
     search, parts, first = CalibratedSearch(shapes, scaled), [], 0
     for part in block:
         products = frame_sums(part, search.shapes)
@@ -205,6 +216,6 @@ def _reversed_back(
 def _aligned_cameras(
     block: list[FrameTracks], shapes: NDArray, noise: float, camera: str
 ) -> NDArray:
-    """Return cameras (n_frames, 2, 3) close to the best for given shapes."""
+    """Return nearly optimal cameras (n_frames, 2, 3) for shapes (n_shapes, 3, n)."""
     parts = [approximate_cameras(part, shapes, noise, camera=camera) for part in block]
     return np.concatenate(parts)

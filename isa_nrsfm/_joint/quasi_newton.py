@@ -2,10 +2,11 @@
 
 Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a limited
 memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
-7.2). Its first metric is the curvature that expectation maximisation would use, so that
-a step without memory is a step of that, and it is brought up to date at each step.
-Tables without noise, where it is slow, are taken over by Gauss-Newton steps once the
-noise is small enough to tell.
+7.2). The initial inverse Hessian of each step is the inverse of the curvature that
+expectation maximisation uses, at the current iterate. A step without remembered pairs
+is thus a generalised step of expectation maximisation. On tables without noise the
+method converges slowly: once the noise variance is small enough to tell, Gauss-Newton
+steps on the residual take over (`noise_free`).
 """
 
 from collections import deque
@@ -20,27 +21,32 @@ from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.noise_free import fit_without_noise
 
-# Steps whose curvature is remembered, of tables with so many frames that these would be
-# more numbers than that at least so many.
+# L-BFGS memory: the number of pairs (step, change of the gradient) that are kept. Fewer
+# are kept if all pairs would exceed MEMORY_NUMBERS numbers, but never fewer than
+# LEAST_MEMORY.
 MEMORY = 20
 MEMORY_NUMBERS = 2**25
 LEAST_MEMORY = 3
-# The noise variance is at least this share of the mean square of the tracks: tables
-# without noise are fitted, too.
+# Lower bound of the noise variance, as a share of the mean square of the tracks. It
+# keeps the objective finite for tables without noise.
 NOISE_FLOOR = 1e-11
-# With less than this share Gauss-Newton steps are tried, and once more each time that
-# the noise has fallen to a part of that.
+# Gauss-Newton steps are tried once the noise variance is below the share EXACT of the
+# mean square of the tracks. Where they lead nowhere, they are tried again when it has
+# fallen to the share CLOSER of its value at the last trial.
 EXACT = 1e-7
 CLOSER = 0.1
 # The logarithm of the noise variance changes by at most so much in a step.
 LARGEST_NOISE_STEP = 1.5
-# A step has to gain this share of what the slope promises.
+# Armijo condition: a step has to gain this share of the decrease that the slope
+# predicts.
 SUFFICIENT_DECREASE = 1e-4
-# A step shorter than this finds nothing but rounding errors.
+# Least step length of the line search, as a share of the whole step. A shorter step
+# changes the objective by rounding errors only.
 SHORTEST_STEP = 1e-8
-# The sum of squares in the objective is precise to this share of that of the tracks.
+# Relative rounding error of the sum of squares in the objective.
 ROUNDING = 1e-15
-# Ridge, relative to the mean diagonal, for shapes that the table does not determine.
+# Ridge of the curvature by the shapes, relative to its mean diagonal. The curvature is
+# singular where the table does not determine the shapes.
 RIDGE = 1e-12
 
 
@@ -74,15 +80,16 @@ class JointResult(NamedTuple):
     history : ndarray of shape (n_iter + 1,)
         The objective at the start and after each step; it never rises.
     gradient_norm : float
-        Norm of the gradient at the end in the metric of the curvature, relative to the
-        number of coordinates: about the gain of the objective per coordinate that is
-        still possible, under the root.
+        ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D of the
+        approximate Hessian and the number N of coordinates. Its square is, up to a
+        factor of about two, the decrease of the objective for each coordinate that is
+        still possible.
     converged : bool
-        Whether it stopped by itself.
+        Whether it stopped by the convergence tolerance, not by the number of steps.
     residual : float
-        Mean square of what the shapes with the means of the coefficients leave.
+        Mean square residual of the shapes with the posterior means of the coefficients.
     left : float
-        The noise variance, or the residual where that is more.
+        The larger one of noise variance and residual.
     """
 
     state: JointState
@@ -111,12 +118,16 @@ def refine_joint(
     likelihood : MarginalLikelihood
         The objective.
     start : JointState
-        Where to start.
+        The first iterate.
+    cameras : CameraModel
+        The cameras that are allowed, and how a step changes them.
+    least_noise : float
+        Lower bound of the noise variance, as a share of the mean square of the tracks.
     max_iter : int
-        The most steps.
+        Largest number of steps.
     tol : float
-        It has converged when two steps one after the other each lower the objective,
-        minus twice the log likelihood, by less than tol for each frame.
+        Convergence tolerance: the iteration ends when two consecutive steps each lower
+        the objective by less than tol times the number of frames.
     on_step : callable, optional
         Called before each step.
 
@@ -127,88 +138,103 @@ def refine_joint(
     """
     floor = least_noise * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
-    point = _Iterate(likelihood, cameras, start, floor)
-    remembered = min(MEMORY_NUMBERS // (2 * point.gradient.size), MEMORY)
+    iterate = _Iterate(likelihood, cameras, start, floor)
+    remembered = min(MEMORY_NUMBERS // (2 * iterate.gradient.size), MEMORY)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(
         maxlen=max(remembered, LEAST_MEMORY)
     )
-    history = [point.value]
+    history = [iterate.value]
     small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
     if not cameras.n_parameters:
         exact = 0.0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
             on_step()
-        if point.left < exact:
-            reached = _without_noise(likelihood, point, floor)
-            # Once is enough. Where it leads nowhere it may from closer by.
-            exact = 0.0 if reached else CLOSER * point.left
+        # Gauss-Newton steps where hardly any noise is left
+        if iterate.left < exact:
+            reached = _without_noise(likelihood, iterate, floor)
+            # One success is enough. After a failure they are tried again with less.
+            exact = 0.0 if reached else CLOSER * iterate.left
             if reached:
                 memory.clear()
-                point = reached
-                history.append(point.value)
+                iterate = reached
+                history.append(iterate.value)
                 continue
-        step = -_inverse_hessian_product(point, memory)
-        if not point.gradient @ step < 0:
+        # L-BFGS direction, or the preconditioned gradient if that is no descent
+        direction = -_inverse_hessian_product(iterate, memory)
+        if not iterate.gradient @ direction < 0:
             memory.clear()
-            step = -point.precondition(point.gradient)
-        reached, moved = _line_search(likelihood, point, step, floor)
+            direction = -iterate.precondition(iterate.gradient)
+        # Armijo line search
+        reached, step = _line_search(likelihood, iterate, direction, floor)
         if reached is None:
-            if not memory:  # not even downhill: rounding errors are left
+            if not memory:  # the gradient itself fails: rounding errors are left
                 small_steps = 2
             memory.clear()
             continue
-        _remember(memory, moved, reached.gradient - point.gradient)
-        gain = point.value - reached.value
+        # Update of the memory
+        _remember(memory, step, reached.gradient - iterate.gradient)
+        # Convergence test
+        gain = iterate.value - reached.value
         rounding = ROUNDING * likelihood.square / reached.state.noise
         small = gain < max(tol * likelihood.n_frames, rounding)
         small_steps = small_steps + 1 if small else 0
-        point = reached
-        history.append(point.value)
+        iterate = reached
+        history.append(iterate.value)
     memory.clear()
-    slope = point.gradient @ point.precondition(point.gradient)
+    slope = iterate.gradient @ iterate.precondition(iterate.gradient)
     return JointResult(
-        point.state,
+        iterate.state,
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
-        small_steps >= 2 and bool(np.isfinite(point.value)),
-        point.residual,
-        point.left,
+        small_steps >= 2 and bool(np.isfinite(iterate.value)),
+        iterate.residual,
+        iterate.left,
     )
 
 
 def _remember(
-    memory: deque[tuple[NDArray, NDArray, float]], moved: NDArray, change: NDArray
+    memory: deque[tuple[NDArray, NDArray, float]], step: NDArray, change: NDArray
 ) -> None:
-    """Remember the curvature along a step, if it is positive."""
-    curvature = float(moved @ change)
-    if curvature > 1e-10 * np.linalg.norm(moved) * np.linalg.norm(change):
-        memory.append((moved, change, curvature))
+    """
+    Add a pair to the L-BFGS memory, if the curvature along the step is positive.
+
+    Both are vectors of all unknowns: the step ``s`` and the change ``y`` of the
+    gradient. The curvature is ``s^T y``.
+    """
+    curvature = float(step @ change)
+    if curvature > 1e-10 * np.linalg.norm(step) * np.linalg.norm(change):
+        memory.append((step, change, curvature))
 
 
 def _without_noise(
-    likelihood: MarginalLikelihood, point: "_Iterate", floor: float
+    likelihood: MarginalLikelihood, iterate: "_Iterate", floor: float
 ) -> "_Iterate | None":
-    """Return where Gauss-Newton steps lead to, None if it is no better."""
-    shapes, motion, _ = point.state
-    if not np.isfinite(point.value):
+    """Return the iterate after Gauss-Newton steps, None if it is no better."""
+    shapes, motion, _ = iterate.state
+    if not np.isfinite(iterate.value):
         return None
-    alpha = likelihood.coefficients(*point.state).T
+    alpha = likelihood.coefficients(*iterate.state).T
     found = fit_without_noise(
-        likelihood.frames, shapes, motion, alpha, likelihood.penalty, point.cameras
+        likelihood.frames, shapes, motion, alpha, likelihood.penalty, iterate.cameras
     )
     if found is None:
         return None
     left = likelihood(*found, floor).residual / likelihood.n_seen
-    if left > point.left:
+    if left > iterate.left:
         return None
     state = JointState(*found, max(left, floor))
-    reached = _Iterate(likelihood, point.cameras, state, floor)
-    return reached if reached.value < point.value else None
+    reached = _Iterate(likelihood, iterate.cameras, state, floor)
+    return reached if reached.value < iterate.value else None
 
 
 class _Iterate:
-    """A state with the objective, its gradient and its curvature there."""
+    """
+    A state with the objective, its gradient and its approximate curvature there.
+
+    The unknowns as one vector: shapes, parameters of the cameras, and the logarithm of
+    the noise variance last.
+    """
 
     def __init__(
         self,
@@ -222,13 +248,13 @@ class _Iterate:
         self.n_seen = likelihood.n_seen
         self.value = passed.value
         self.residual = passed.residual / likelihood.n_seen
-        # What the noise says, or the residual where it says more.
+        # The noise variance, or the mean square residual where that is larger.
         self.left = max(state.noise, self.residual)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             passed.shape_gradient,
             cameras.gradient(state.motion, passed.motion_gradient),
-            # Noise that is least already does not fall.
+            # At its lower bound the noise variance may only rise.
             min(passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
         self.curvature = passed.shape_curvature, passed.motion_curvature
@@ -241,7 +267,12 @@ class _Iterate:
         return np.linalg.inv(regular(by_shapes)), inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
-        """Return a vector times the inverse of the curvature."""
+        """
+        Return a vector times the inverse of the approximate Hessian.
+
+        The Hessian is ``2 / s2`` times the curvature by shapes and cameras, and N, the
+        number of coordinates, by ``log s2``. It has no blocks across these three.
+        """
         half = self.state.noise / 2
         shapes, motion, noise = self.split(vector)
         by_shapes, by_motion = self.metric
@@ -254,7 +285,7 @@ class _Iterate:
         return _stacked(half * stacked, half * motion, noise / self.n_seen)
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
-        """Return the parts of a vector, shapes, cameras and noise."""
+        """Return shapes (n, 3, J), parameters of cameras (p, I), and log noise."""
         first = self.state.shapes.size
         return (
             vector[:first].reshape(self.state.shapes.shape),
@@ -265,7 +296,7 @@ class _Iterate:
         )
 
     def moved(self, step: NDArray, floor: float) -> JointState:
-        """Return the state after a step."""
+        """Return the state after a step; the noise variance is at least floor."""
         shapes, motion, noise = self.split(step)
         return JointState(
             self.state.shapes + shapes,
@@ -275,7 +306,7 @@ class _Iterate:
 
 
 def regular(curvature: NDArray) -> NDArray:
-    """Return curvatures (n, m, m) of shapes with a trace of a ridge."""
+    """Return curvatures (n, m, m) by the shapes with a small ridge added."""
     size = curvature.shape[-1]
     # Points that no frame shows have no curvature, and no gradient either.
     ridge = RIDGE * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
@@ -288,41 +319,47 @@ def _stacked(shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
 
 
 def _inverse_hessian_product(
-    point: _Iterate, memory: deque[tuple[NDArray, NDArray, float]]
+    iterate: _Iterate, memory: deque[tuple[NDArray, NDArray, float]]
 ) -> NDArray:
-    """Return the gradient times the inverse Hessian of the remembered steps."""
-    vector = point.gradient.copy()
+    """Return the L-BFGS inverse Hessian times the gradient (two-loop recursion)."""
+    vector = iterate.gradient.copy()
     weights = []
-    for moved, change, curvature in reversed(memory):
-        weight = moved @ vector / curvature
+    for step, change, curvature in reversed(memory):
+        weight = step @ vector / curvature
         vector -= weight * change
         weights.append(weight)
-    vector = point.precondition(vector)
-    for (moved, change, curvature), weight in zip(
+    vector = iterate.precondition(vector)
+    for (step, change, curvature), weight in zip(
         memory, reversed(weights), strict=True
     ):
-        vector += (weight - change @ vector / curvature) * moved
+        vector += (weight - change @ vector / curvature) * step
     return vector
 
 
 def _line_search(
-    likelihood: MarginalLikelihood, point: _Iterate, step: NDArray, floor: float
+    likelihood: MarginalLikelihood, iterate: _Iterate, direction: NDArray, floor: float
 ) -> tuple[_Iterate | None, NDArray]:
-    """Return the first point along a step that is low enough, and the way to it."""
-    slope = point.gradient @ step
+    """
+    Return the first iterate along a direction that meets the Armijo condition.
+
+    The step that leads there is returned, too. The iterate is None if none is found.
+    """
+    slope = iterate.gradient @ direction
+    # Largest step length that the parametrisation of noise and cameras allows
     length = min(
         1.0,
-        LARGEST_NOISE_STEP / max(abs(step[-1]), 1e-300),
-        point.cameras.largest_length(point.split(step)[1]),
+        LARGEST_NOISE_STEP / max(abs(direction[-1]), 1e-300),
+        iterate.cameras.largest_length(iterate.split(direction)[1]),
     )
     while length > SHORTEST_STEP:
-        moved = length * step
-        state = point.moved(moved, floor)
-        reached = _Iterate(likelihood, point.cameras, state, floor)
-        if reached.value <= point.value + SUFFICIENT_DECREASE * length * slope:
-            moved[-1] = np.log(reached.state.noise / point.state.noise)
-            return reached, moved
-        # The minimum of the parabola through what is known, kept within bounds.
-        excess = reached.value - point.value - length * slope
+        step = length * direction
+        state = iterate.moved(step, floor)
+        reached = _Iterate(likelihood, iterate.cameras, state, floor)
+        if reached.value <= iterate.value + SUFFICIENT_DECREASE * length * slope:
+            # The lower bound may have shortened the change of the noise.
+            step[-1] = np.log(reached.state.noise / iterate.state.noise)
+            return reached, step
+        # Backtracking by quadratic interpolation of both values and the slope
+        excess = reached.value - iterate.value - length * slope
         length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
-    return None, step
+    return None, direction

@@ -1,14 +1,15 @@
 """How many basis shapes a table supports: those that it determines.
 
-Each basis shape has a prior of its own, ``B_k ~ N(0, v_k)`` in the images, whose
-variance is estimated (automatic relevance determination: MacKay, "Bayesian
-interpolation", 1992; Bishop, "Bayesian PCA", 1999). With the posterior covariance of
-B_k for given moments of the frames, and ``C = mean_i M_i^T M_i``,
+Each basis shape has a prior of its own: its 3J numbers, as the images show them, have
+the variance v_k. That variance is estimated (automatic relevance determination: MacKay,
+"Bayesian interpolation", 1992; Bishop, "Bayesian PCA", 1999). With the posterior
+covariance ``cov B_k``, the coefficients' moments held fixed, and ``C = mean_i M_i^T
+M_i`` the iteration is
 
     g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
 
-g_k is the share of the 3J numbers of B_k that the table determines, not the prior.
-Shapes that fit noise get smaller with each round, and less determined.
+g_k is the share of the 3J numbers of B_k that the table determines rather than the
+prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
 import numpy as np
@@ -25,7 +26,7 @@ STEPS = 30
 # artificial tables with 2 % noise true shapes have 0.998 and more, others 0.83 and less
 # (``python -m benchmarks.recovery components``).
 LEAST_DETERMINED = 0.95
-# Shares and variances, relative to the largest, are at least this.
+# Lower bound of the shares g_k, and of the variances v_k relative to the largest.
 SMALLEST = 1e-9
 
 
@@ -40,7 +41,7 @@ def relevant_components(
     problem : JointProblem
         The frames.
     state : JointState
-        A fit with enough basis shapes.
+        A fit with more basis shapes than are expected to be relevant.
     cameras : CameraModel
         How its cameras may move.
 
@@ -49,13 +50,14 @@ def relevant_components(
     int
         The number.
     """
-    n_numbers = state.shapes[0].size
+    n_numbers = state.shapes[0].size  # 3J
     penalty = np.full(len(state.shapes) - 1, problem.penalty)
     determined = np.ones(len(penalty))
     for _ in range(ROUNDS):
         part = problem.with_penalty(penalty)
         start = _orthogonal(state)
         state = part.refined(start, cameras, LEAST_NOISE, max_iter=STEPS).state
+        # g_k and v_k, with penalty = 1 / (v_k n_frames)
         energy, uncertain = _image_energies(part, state)
         determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
         determined = np.clip(determined, SMALLEST, 1.0)
@@ -67,7 +69,7 @@ def relevant_components(
 
 
 def _camera_moments(state: JointState) -> NDArray:
-    """Return ``mean_i M_i^T M_i``."""
+    """Return ``C = mean_i M_i^T M_i`` (3, 3)."""
     return np.einsum("rai,rbi->ab", state.motion, state.motion) / state.motion.shape[2]
 
 
@@ -89,6 +91,7 @@ def _image_energies(
     C, basis = _camera_moments(state), state.shapes[1:]
     energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)
     curvature = problem.likelihood(*state).shape_curvature
+    # Posterior covariance of each point: half the Hessian is curvature / s2.
     covariance = state.noise * np.linalg.inv(regular(curvature))
     # One matrix stands for all points where all weights are one.
     total = covariance.sum(axis=0) * (basis.shape[2] / len(covariance))

@@ -13,7 +13,7 @@ from isa_nrsfm._prepare.robust import ROUNDING, median_noise, robust_weights
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
-# Rounds of reweighting, and the change of the weights that ends them.
+# Largest number of rounds of reweighting, and convergence tolerance of the weights.
 ROUNDS = 20
 SETTLED_WEIGHTS = 1e-2
 
@@ -27,12 +27,12 @@ def reweighted(
     refined: Callable[[JointProblem, JointState], JointResult],
 ) -> tuple[JointResult, float]:
     """
-    Return the refinement whose weights agree with what it leaves.
+    Iterate refinement and weights until the weights agree with the residuals.
 
     Parameters
     ----------
     problem : JointProblem
-        The problem, with the weights of before.
+        The problem, with the weights of `result`.
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
     used : ndarray of bool, shape (n_frames, n_points)
@@ -49,12 +49,13 @@ def reweighted(
     result : JointResult
         The refinement.
     noise_variance : float
-        Of a coordinate, by the median.
+        Variance of a coordinate, from the median of the residuals.
     """
     tracks = rows.whole().transpose(0, 2, 1)
     seen = seen_points(tracks)
     counted, weights = used * 1.0, np.zeros(seen.shape)
     for _ in range(ROUNDS):
+        # Residuals of the seen points
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
         alpha = problem.coefficients(result.state)
@@ -64,14 +65,17 @@ def reweighted(
             np.zeros(2),
         )
         rest = np.where(seen[..., None], tracks - model, 0.0)
+        # less the weighted mean of each frame, its position
         position = np.einsum("ij,ijc->ic", counted, rest)
         rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
         distance = np.linalg.norm(rest, axis=2)
+        # Weights from the residuals, and convergence test
         deviation = max(median_noise(distance[seen]), ROUNDING)
         previous, weights = weights, np.zeros(seen.shape)
         weights[seen] = robust_weights(loss, distance[seen] / deviation)
         if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
             break
+        # Refinement with the new weights
         problem = problem.with_frames(JointFrames.from_points(rows, False, weights))
         counted = weights
         result = refined(problem, result.state)

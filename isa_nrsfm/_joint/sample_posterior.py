@@ -1,4 +1,4 @@
-"""The posterior of the frames that were fitted, in their blocks."""
+"""The fit of each frame of the table, block by block, after the joint fit."""
 
 from functools import partial
 
@@ -22,7 +22,7 @@ def posterior_blocks(
     model : PosteriorFrames
         The model of a frame.
     frames : JointFrames
-        The frames as the joint refinement took them.
+        The frames in the form that the joint refinement used.
     rows : FrameBlocks
         The frames themselves (n_frames, 2, n_points), NaN where a point is missing.
 
@@ -38,13 +38,13 @@ def posterior_blocks(
 
 
 def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
-    """Return the fit of frames (n_frames, 2, n_points) of size one."""
+    """Return the fit of scaled frames (n_frames, 2, n_points)."""
     return model.posterior(rows.transpose(0, 2, 1))
 
 
 def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return what a gauge needs to know of the fits of frames.
+    Return cameras, coefficients and mean covariance of the fits of frames.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArra
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
     covariance : ndarray of shape (n_components, n_components)
-        Mean of their covariances.
+        Posterior covariance of the coefficients, mean over the frames.
     """
     motion, alpha, covariance = zip(*posteriors.map(_moments), strict=True)
     total = np.sum(covariance, axis=0) / posteriors.n_frames

@@ -1,9 +1,9 @@
 """Where the joint fit starts: calibrated cameras, and the shapes that they see.
 
-The cameras of an object that deforms are mixtures of few columns of the motion factor
-of its table (Xiao, Chai, Kanade 2006). How many, the cost of the mixture does not tell:
-with more columns it always falls. So mixtures of more and more columns are tried, after
-the rigid cameras, as long as the objective of the fit says that they are better.
+The cameras of a deforming object are linear combinations of few columns of the motion
+factor of its table (Xiao, Chai, Kanade 2006). The cost of such a mixture does not tell
+how many columns are needed: it always falls with more. So the rigid cameras are tried
+first, then mixtures of more and more columns, until the objective of the fit rises.
 """
 
 from collections.abc import Iterator
@@ -32,13 +32,14 @@ from isa_nrsfm._tables.ordering import spread
 
 # Columns of the mixtures: three for the rigid object and as many for each basis shape.
 WIDTHS = (6, 9, 12, 18, 24, 36)
-# Most Levenberg-Marquardt steps of each mixture.
+# Largest number of Levenberg-Marquardt steps of each mixture.
 MIXING_STEPS = 20
-# Steps of all starts with their cameras held, and of the best with cameras that move.
+# Largest number of steps of every start with its cameras held, and then of the best
+# ones with their cameras freed.
 HELD_STEPS = 6
 FREED_STEPS = 30
-# They end when they gain less than that for each frame: starts that lead elsewhere
-# differ by tens.
+# Convergence tolerance of these steps, for each frame. It may be large: the objectives
+# of starts that lead to different minima differ by tens for each frame.
 COMPARED_TOL = 0.5
 # Share of what the mean shape leaves that counts as noise at the start.
 FIRST_NOISE = 0.1
@@ -60,8 +61,8 @@ class Comparison(NamedTuple):
     n_finalists: int
 
 
-# Tables of few frames have several minima (motion capture), and time; samples of large
-# tables are of many people or things, and the same minimum is found from all starts.
+# Small tables, such as motion capture, have several minima, and comparing them costs
+# little. Large tables show many people or things: all starts find the same minimum.
 SMALL, LARGE = Comparison(400, 3), Comparison(200, 1)
 
 
@@ -83,8 +84,8 @@ def rigid_start(
     Returns
     -------
     motion : ndarray of shape (n_frames, 2, 3)
-        The calibrated cameras that are nearest to the rigid ones, in the metric of
-        space in which these are most nearly calibrated.
+        The calibrated cameras that are nearest to the rigid ones. They are compared in
+        the metric of space in which the rigid cameras are most nearly calibrated.
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         The shapes in that metric.
     """
@@ -107,8 +108,8 @@ def mixed_cameras(
     rows : ndarray of shape (n_frames, 2, n_points)
         Complete frames, centred.
     scales : ndarray of shape (n_frames,) or None
-        Rough scales of the cameras, by which the frames are divided; None for cameras
-        of scale one.
+        Rough scales of the cameras: each frame is divided by its own before the
+        mixture. None for cameras of scale one.
     chosen : ndarray of int, shape (n_chosen,)
         Frames from which the mixtures are found.
 
@@ -123,6 +124,7 @@ def mixed_cameras(
         return
     few = P[chosen].reshape(2 * len(chosen), -1)
     mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=MIXING_STEPS)
+    # Each width starts from the mixture of the one before.
     rank = P.shape[2]
     for n in sorted({min(n, rank) for n in WIDTHS if n < rank + 3}):
         mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=MIXING_STEPS)
@@ -146,17 +148,21 @@ def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
     Returns
     -------
     ndarray of shape (n_components + 1, 3, n_points)
-        The mean shape of least squares, and the principal directions of what it leaves,
-        lifted to the image plane in space, ``M^+ (W - M B_0)``: one standard deviation
-        of their coefficients each. Zeros where there are not as many.
+        The mean shape B_0 of least squares, and the first principal components of the
+        residuals ``M_i^+ (W_i - M_i B_0)``, lifted to space parallel to the image
+        plane. Each is as long as the standard deviation of its coefficient. Zeros if
+        there are fewer than K.
     """
+    # Mean shape: (sum_i M_i^T M_i) B_0 = sum_i M_i^T W_i
     gram = np.einsum("ira,irb->ab", motion, motion)
     right = np.einsum("ira,irj->aj", motion, rows)
     mean_shape = np.linalg.lstsq(gram, right)[0]
+    # Lifted residuals, M^+ = M^T / scale^2
     size = np.einsum("irc,irc->i", motion, motion) / 2
     size = np.where(size > 0, size, 1.0)
     rest = (rows - motion @ mean_shape) / size[:, None, None]
     lifted = (motion.swapaxes(1, 2) @ rest).reshape(len(rows), -1)
+    # Principal components
     values, axes = _leading(lifted, n_components)
     basis = np.zeros((n_components, *mean_shape.shape))
     basis[: len(values)] = (values[:, None] * axes).reshape(-1, *mean_shape.shape)
@@ -164,7 +170,7 @@ def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
 
 
 def _leading(rows: NDArray, n: int) -> tuple[NDArray, NDArray]:
-    """Return the largest n singular values of a matrix and the right vectors."""
+    """Return the n largest singular values of a matrix, and their right vectors."""
     tall = len(rows) > rows.shape[1]
     square, vectors = np.linalg.eigh(rows.T @ rows if tall else rows @ rows.T)
     values = np.sqrt(np.maximum(square[::-1][:n], 0.0))
@@ -192,7 +198,8 @@ def affine_start(
     Returns
     -------
     JointState
-        Shapes, each one deviation of its coefficient, cameras and noise.
+        Cameras, noise, and shapes of which each is as long as the standard deviation of
+        its coefficient.
     """
     shapes = problem.frames.coordinates(paper_shapes)
     W = problem.frames.coordinates(W)
@@ -220,11 +227,11 @@ def settled(
     Returns
     -------
     JointState
-        Where the steps lead, in the basis that the prior makes likeliest.
+        The last iterate, in the basis of greatest posterior density.
     """
-    free = problem.with_penalty(0.0)
-    state = free.refined(state, cameras, LEAST_NOISE, max_iter=HELD_STEPS).state
-    return with_prior(problem, state)
+    unpenalised = problem.with_penalty(0.0)
+    result = unpenalised.refined(state, cameras, LEAST_NOISE, max_iter=HELD_STEPS)
+    return with_prior(problem, result.state)
 
 
 def best_starts(
@@ -255,14 +262,16 @@ def best_starts(
     list of JointState
         Shapes, cameras of all frames, and noise.
     """
+    # Frames that are compared: evenly from the most to the least rigid one
     rows = problem.frames.coordinates(W).reshape(problem.n_frames, 2, -1)
     order = np.argsort(
         rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape))
     )
     comparison = SMALL if problem.steps.to_the_end else LARGE
     few = np.sort(spread(order, min(comparison.n_frames, len(order))))
-    # With the noise of a start the prior would make basis shapes vanish.
+    # No prior: with the large noise of a start it would make basis shapes vanish.
     part = problem.part(few, tol=COMPARED_TOL).with_penalty(0.0)
+    # Rigid cameras, with the paper's and with lifted basis shapes
     motion, shapes = rigid_start(
         factors, problem.frames.coordinates(paper_shapes), cameras.scaled
     )
@@ -272,12 +281,14 @@ def best_starts(
         _trial(part, rows, motion, few, given)
         for given in (shapes, lifted_shapes(rows[few], motion[few], n_components))
     ]
+    # Mixtures of more and more columns, until the objective rises
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
     for mixed in mixed_cameras(rows, scales if cameras.scaled else None, few):
         given = lifted_shapes(rows[few], mixed[few], n_components)
         trials.append(_trial(part, rows, mixed, few, given))
         if len(trials) > 3 and trials[-1].value > trials[-2].value:
             break
+    # The best ones, with their cameras freed
     trials.sort(key=lambda trial: trial.value)
     finalists = trials[: comparison.n_finalists]
     starts = [_freed(part, trial, few, cameras) for trial in finalists]
@@ -287,7 +298,7 @@ def best_starts(
 class _Trial(NamedTuple):
     """A start after the first steps with its cameras held."""
 
-    value: float
+    value: float  # of the objective
     state: JointState  # of the compared frames
     motion: NDArray  # of all frames (n_frames, 2, 3)
 
@@ -295,7 +306,11 @@ class _Trial(NamedTuple):
 def _trial(
     part: JointProblem, rows: NDArray, motion: NDArray, few: NDArray, shapes: NDArray
 ) -> _Trial:
-    """Return a start after some steps of the shapes of the compared frames."""
+    """
+    Return a start after some steps of the shapes, for the compared frames few.
+
+    The arrays rows (n_frames, 2, n_points) and motion (n_frames, 2, 3) have all frames.
+    """
     state = _first_state(part, rows[few], motion[few], shapes)
     result = part.refined(state, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS)
     return _Trial(result.history[-1], result.state, motion)
@@ -304,7 +319,7 @@ def _trial(
 def _freed(
     part: JointProblem, trial: _Trial, few: NDArray, cameras: CameraModel
 ) -> JointState:
-    """Return a start after some steps of the cameras of the compared frames."""
+    """Return a start after some steps of shapes and cameras of the compared frames."""
     result = part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS)
     motion = frames_last(trial.motion)
     motion[:, :, few] = result.state.motion
@@ -314,7 +329,12 @@ def _freed(
 def _first_state(
     problem: JointProblem, rows: NDArray, motion: NDArray, shapes: NDArray
 ) -> JointState:
-    """Return cameras and shapes, with part of what the mean shape leaves as noise."""
+    """
+    Return a state whose noise is a share of the residual of the mean shape.
+
+    The arrays are rows (n_frames, 2, n_points), motion (n_frames, 2, 3) and shapes
+    (n_shapes, 3, n_points).
+    """
     rest = rows - motion @ shapes[0]
     n_seen, energy = problem.totals
     noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
@@ -323,7 +343,7 @@ def _first_state(
 
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
     """
-    Return a state in the basis that the prior of a problem makes likeliest.
+    Return a state in the basis of greatest posterior density, as of `likely_basis`.
 
     Parameters
     ----------
@@ -335,7 +355,7 @@ def with_prior(problem: JointProblem, state: JointState) -> JointState:
     Returns
     -------
     JointState
-        With basis shapes that are mixed and scaled.
+        The state with its basis shapes mixed and scaled.
     """
     shapes, motion, _ = state
     alpha = problem.coefficients(state).T
@@ -344,7 +364,13 @@ def with_prior(problem: JointProblem, state: JointState) -> JointState:
 
 
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
-    """Return orthogonal shapes times the deviation of their coefficients."""
+    """
+    Return shapes scaled by the standard deviation of their coefficients.
+
+    The coefficients are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``: each by
+    itself, as the shapes are orthogonal. rows (n_frames, 2, n_points), motion
+    (n_frames, 2, 3), shapes (n_shapes, 3, n_points).
+    """
     images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
     along = np.einsum("ikrj,irj->ik", images, rows)
     energy = np.einsum("ikrj,ikrj->ik", images, images)
