@@ -40,6 +40,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     solve_positive,
     unpacked,
 )
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 
 # Ridge of ``A = S S^T``, as a share of the second moment of the shapes, and lower bound
 # of s2, as a share of the energy of the frame. They keep the result finite for
@@ -48,8 +49,6 @@ RIDGE = 1e-13
 # Convergence tolerance: a frame has converged when a Newton step gains less than this
 # share of its energy. Convergence is quadratic: the next step would gain far less.
 TOLERANCE = 1e-12
-# A rise of f by less than this share of the energy counts as rounding error.
-ROUNDING = 1e-14
 # Damping below SMALLEST_DAMPING is set to zero. With LARGEST_DAMPING a step no longer
 # moves, and the search of the frame ends.
 SMALLEST_DAMPING = 0.05
@@ -243,7 +242,7 @@ def _descend(
         # Trial step, refused where f rises
         energy = problem.energy
         trial = _evaluate(problem, state.alpha + step)
-        worse = np.flatnonzero(trial.explained < state.explained - ROUNDING * energy)
+        worse = np.flatnonzero(trial.explained < state.explained - OF_PRODUCTS * energy)
         if len(worse):
             trial.put(worse, state.take(worse))
         state = trial

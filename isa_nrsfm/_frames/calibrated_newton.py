@@ -44,13 +44,12 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpack3,
     unpacked,
 )
+from isa_nrsfm._linalg.rounding import OF_STEPS
 
 # The least noise variance, as a share of the energy of a frame.
 RIDGE = 1e-13
 # A frame has converged when a Newton step gains less than this share of its energy.
 TOLERANCE = 1e-12
-# A rise of the objective by less than this share of the energy is rounding error.
-ROUNDING = 1e-13
 # Objectives that differ by less than this share of the energy are equal.
 EQUAL = 1e-10
 # Damping: least value after a step that fails (FIRST_DAMPING), factors after a step
@@ -413,7 +412,7 @@ def _descend(
             energy = energy[left]
         # Trial step, refused where the objective rises, and the next damping
         trial = _evaluate(problem, problem.cameras.moved(state.motion, step))
-        worse = np.flatnonzero(~(trial.value <= state.value + ROUNDING * energy))
+        worse = np.flatnonzero(~(trial.value <= state.value + OF_STEPS * energy))
         eased = EASED * damping
         eased[eased < SMALLEST_DAMPING] = 0.0
         if len(worse):

@@ -32,9 +32,9 @@ from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
 from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._paper.sample import Sample
-from isa_nrsfm._prepare.robust import ROUNDING
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
@@ -260,7 +260,7 @@ def fit_jointly(
     return JointFit(
         shapes - shapes.mean(axis=2, keepdims=True),
         first.coefficients(state),
-        max(noise, ROUNDING**2),
+        max(noise, OF_DISTANCES**2),
         ratio,
         result.history,
         result.gradient_norm,

@@ -44,6 +44,7 @@ from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._linalg.rounding import OF_SUMS
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Largest number of multiplications of one step, less than a second. It limits how many
@@ -56,8 +57,6 @@ FIRST_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-14
 LARGEST_DAMPING = 1e2
 EASED, RAISED = 0.05, 8.0
-# A residual whose norm is below this share of that of the tracks is rounding errors.
-ROUNDING = 1e-15
 # Convergence tolerance: the iteration ends after two consecutive steps that lower the
 # sum of squares by less than this share of it.
 LITTLE = 1e-2
@@ -411,7 +410,7 @@ def minimise(
     damping, small_steps, system = FIRST_DAMPING, 0, None
     for _ in range(MAX_STEPS):
         # Convergence tests
-        if square <= ROUNDING**2 * energy or small_steps == 2:
+        if square <= OF_SUMS**2 * energy or small_steps == 2:
             break
         if damping > LARGEST_DAMPING:
             break

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.noise_free import fit_without_noise
+from isa_nrsfm._linalg.rounding import OF_SUMS
 
 # L-BFGS memory: the number of pairs (step, change of the gradient) that are kept. Fewer
 # are kept if all pairs would exceed MEMORY_NUMBERS numbers, but never fewer than
@@ -43,8 +44,6 @@ SUFFICIENT_DECREASE = 1e-4
 # Least step length of the line search, as a share of the whole step. A shorter step
 # changes the objective by rounding errors only.
 SHORTEST_STEP = 1e-8
-# Relative rounding error of the sum of squares in the objective.
-ROUNDING = 1e-15
 # Ridge of the curvature by the shapes, relative to its mean diagonal. The curvature is
 # singular where the table does not determine the shapes.
 RIDGE = 1e-12
@@ -176,7 +175,7 @@ def refine_joint(
         _remember(memory, step, reached.gradient - iterate.gradient)
         # Convergence test
         gain = iterate.value - reached.value
-        rounding = ROUNDING * likelihood.square / reached.state.noise
+        rounding = OF_SUMS * likelihood.square / reached.state.noise
         small = gain < max(tol * likelihood.n_frames, rounding)
         small_steps = small_steps + 1 if small else 0
         iterate = reached

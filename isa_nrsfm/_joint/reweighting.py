@@ -9,7 +9,8 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState
-from isa_nrsfm._prepare.robust import ROUNDING, median_noise, robust_weights
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._prepare.robust import median_noise, robust_weights
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
@@ -70,7 +71,7 @@ def reweighted(
         rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
         distance = np.linalg.norm(rest, axis=2)
         # Weights from the residuals, and convergence test
-        deviation = max(median_noise(distance[seen]), ROUNDING)
+        deviation = max(median_noise(distance[seen]), OF_DISTANCES)
         previous, weights = weights, np.zeros(seen.shape)
         weights[seen] = robust_weights(loss, distance[seen] / deviation)
         if np.abs(weights - previous).max() < SETTLED_WEIGHTS:

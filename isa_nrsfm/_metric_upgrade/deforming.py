@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._metric_upgrade.minimisation import exponential, refine_fit
 from isa_nrsfm._metric_upgrade.quadric import symmetric_power
 from isa_nrsfm._metric_upgrade.residuals import (
@@ -33,8 +34,6 @@ MAX_ROUNDS = 15
 SETTLED = 0.05
 # Convergence tolerance of the metric in these rounds, as `shortest_step`.
 ROUGH_STEP = 1e-4
-# Least standard deviation of the residuals: rounding errors.
-ROUNDING = 1e-12
 
 
 class DeformationMetric(NamedTuple):
@@ -271,7 +270,7 @@ def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit
     """
     size = len(strain_basis("weak_perspective"))
     n_equations = 2 * len(cameras)
-    noise = max(rigid.cost / n_equations, ROUNDING**2)
+    noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
     variance = STRAIN_DEVIATION**2
     blocks = frame_blocks(cameras, alpha)
     none = np.zeros((alpha.shape[1], 3, 3))
@@ -290,9 +289,9 @@ def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
-        noise = max(fit.cost / freedom, ROUNDING**2)
+        noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
         variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
-        variance = np.clip(variance, ROUNDING, STRAIN_DEVIATION**2)
+        variance = np.clip(variance, OF_DIFFERENCES, STRAIN_DEVIATION**2)
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < SETTLED:
             break
     return refine_fit(blocks, fit, "weak_perspective", ridge)

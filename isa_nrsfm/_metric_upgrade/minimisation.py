@@ -12,6 +12,7 @@ methods.
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._metric_upgrade.quadric import mean_gram, symmetric_power, unit_cameras
 from isa_nrsfm._metric_upgrade.residuals import (
     Block,
@@ -38,8 +39,6 @@ LONGEST_STEP = 2.0
 # The rank-one update is skipped if its direction has a smaller cosine with the step:
 # its denominator is then too near to zero.
 LEAST_ALONG = 1e-8
-# Rounding errors of the cost, relative to it.
-ROUNDING = 1e-14
 
 
 def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
@@ -158,7 +157,7 @@ def refine_fit(
         new = fit_at(blocks, new_Q, np.tensordot(changed, basis, 1), camera)
         new_value = new.cost + ridge * float(np.sum(changed**2))
         # Accept the step, or drop the estimated part of the Hessian, or damp more.
-        if new_value <= value * (1 + ROUNDING):
+        if new_value <= value * (1 + OF_PRODUCTS):
             second_order = _updated_second_order(second_order, step, fit, new, ridges)
             value, numbers, fit = new_value, changed, new
             damping *= EASED

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
+from isa_nrsfm._linalg.rounding import OF_STEPS
+
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3
 # A column is linearly dependent on those before it if less than this share of its norm
@@ -23,8 +25,7 @@ ROUGH_STEPS = 8
 FIRST_DAMPING = 1e-3
 EASED, RAISED = 0.1, 4.0
 SMALLEST_DAMPING, LARGEST_DAMPING = 1e-10, 1e8
-# Convergence tolerances: the cost itself, and the gain of a step relative to the cost.
-ROUNDING = 1e-26
+# Convergence tolerance: gain of a step relative to the cost.
 LEAST_GAIN = 1e-9
 # Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
 # by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2). On average over all cameras that is
@@ -234,7 +235,7 @@ def _minimised(
         # Accept it where the cost falls.
         better = running & (reached < cost)
         gain = np.where(better, cost - reached, np.inf)
-        ended = better & ((reached < ROUNDING) | (gain <= LEAST_GAIN * cost))
+        ended = better & ((reached < OF_STEPS**2) | (gain <= LEAST_GAIN * cost))
         damping = np.where(
             better, np.maximum(EASED * damping, SMALLEST_DAMPING), RAISED * damping
         )

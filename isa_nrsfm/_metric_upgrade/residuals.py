@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, eigh3
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 
 CameraModel = Literal["orthographic", "weak_perspective"]
 CAMERA_MODELS = ("orthographic", "weak_perspective")
 Block = tuple[NDArray, NDArray]
 
-# Eigenvalues of the curvature below this share of the largest are rounding errors.
-ROUNDING = 1e-14
 # Frames taken at a time, for which all that a step needs stays in the cache.
 BLOCK_FRAMES = 2048
 
@@ -71,7 +70,7 @@ class MetricFit(NamedTuple):
         """Condition number of the residuals as functions of the common metric."""
         size = len(self.gradient) // (len(self.strain) + 1)
         values = np.linalg.eigvalsh(self.curvature[:size, :size])
-        if values[0] <= ROUNDING * values[-1]:
+        if values[0] <= OF_PRODUCTS * values[-1]:
             return np.inf
         return float(np.sqrt(values[-1] / values[0]))
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
@@ -20,8 +21,6 @@ DENSE = 1500
 OVERSAMPLING = 10
 MOST_PASSES = 12
 CONVERGED = 1e-6
-# Least energy that is left, relative to that of the matrix: below are rounding errors.
-ROUNDING = 1e-14
 # Triangular factors are stacked up to this many times their width, then factorised.
 STACKED = 6
 
@@ -177,7 +176,7 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
         values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
         # Predict the gain of the next pass.
         before, found = found, float(values[-k:].sum())
-        least_gain = CONVERGED * max(energy - found, ROUNDING * energy)
+        least_gain = CONVERGED * max(energy - found, OF_PRODUCTS * energy)
         gains.append(max(found - before, least_gain))
         next_gain = gains[-1]
         if len(gains) > 2:  # the first gain is the whole energy found

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import rigid_noise
 from isa_nrsfm._tables.layout import (
     LAYOUTS,
@@ -24,8 +25,6 @@ LAYOUT_NUMBERS = 2_000_000
 FEWEST_SAMPLE = 100
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_TO_TELL = 10
-# A share of unexplained energy below this is rounding errors.
-ROUNDING = 1e-12
 
 
 def layout_sample(n_frames: int, n_columns: int) -> slice:
@@ -69,7 +68,7 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
     sizes = np.min([weighting_sizes(c, scale_frames) for c in centred], axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
     given, swapped = (_rigid_residual(c, sizes) for c in centred)
-    if given > ROUNDING and swapped < CLEARLY_BETTER * given:
+    if given > OF_DIFFERENCES and swapped < CLEARLY_BETTER * given:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
             f"what is not rigid has {swapped / given:.2g} times the energy",

@@ -9,6 +9,7 @@ until they agree.
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._tables.visibility import seen_points
 
 LOSSES = ("linear", "huber", "cauchy")
@@ -30,8 +31,6 @@ SETTLED = 1e-2
 # If a larger share of a frame's points are gross outliers, the frame is unusual, and
 # none of its points is marked.
 LARGEST_SHARE = 0.4
-# Distances below this share of the size of a frame are rounding errors.
-ROUNDING = 1e-9
 # Steps to the point with the least sum of distances.
 MEDIAN_STEPS = 20
 
@@ -95,7 +94,7 @@ def _sizes(square: NDArray) -> NDArray:
     median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
     # If half of the points coincide the median is rounding error: take the mean.
     mean = np.nanmean(square, axis=1)
-    return np.sqrt(np.where(median > ROUNDING * upper, median, mean) / 2)
+    return np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
 
 
 def spatial_median(tracks: NDArray) -> NDArray:
@@ -120,7 +119,7 @@ def spatial_median(tracks: NDArray) -> NDArray:
         share = weights / weights.sum(axis=1, keepdims=True)
         middle = np.einsum("ij,ijc->ic", share, points)
         distance = np.linalg.norm(points - middle[:, None], axis=2)
-        least = ROUNDING * np.max(seen * distance, axis=1, keepdims=True)
+        least = OF_DISTANCES * np.max(seen * distance, axis=1, keepdims=True)
         weights = seen / np.maximum(distance, np.where(least > 0, least, 1.0))
     return middle
 
@@ -172,7 +171,7 @@ def gross_outliers(tracks: NDArray) -> NDArray:
         rigid = rigid + translation
         # Hide what is too far from it, and fill hidden points in from it.
         distance = np.linalg.norm(target - rigid, axis=2)
-        typical = max(median_noise(distance[seen]), ROUNDING)
+        typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
         limit = GROSS * np.maximum(typical, of_point)
         previous, hidden = hidden, ~(distance <= limit)

@@ -12,14 +12,12 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.rounding import OF_SUMS
 from isa_nrsfm._tables.layout import measurement_matrix
 
 # Frames that are fitted at a time: their equations need little memory.
 BATCH = 2000
 MAX_STEPS = 200
-# A frame has converged when a step would lower its cost by less than this share of its
-# energy. That is what rounding errors change, too: steps do not have to gain more.
-ROUNDING = 1e-15
 # Damping of the first step, relative to the curvature, and the most of it.
 FIRST_DAMPING, LARGEST_DAMPING = 1e-3, 1e9
 
@@ -134,7 +132,7 @@ def _fit(
     for _ in range(MAX_STEPS):
         X, R, a = images[active], cameras[active], alpha[active]
         g, H, scale = _quadratic_model(X, shapes, ridge, R, a)
-        rounding = ROUNDING * energy[active]
+        rounding = OF_SUMS * energy[active]
         scale = damping[active, None] * scale + rounding[:, None]
         np.einsum("ijj->ij", H)[...] += scale
         step = np.linalg.solve(H, g[..., None])[..., 0]

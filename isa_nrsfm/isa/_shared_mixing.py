@@ -14,6 +14,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
 
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
+from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
@@ -52,9 +53,8 @@ LONGEST_STEP = 1.0
 # Levenberg-Marquardt shift of the Hessian, relative to `size`: bounds, and the factor
 # by which it rises when a Newton step fails and falls when one succeeds.
 SMALLEST_SHIFT, LARGEST_SHIFT, SHIFT_FACTOR = 1e-3, 1e8, 4.0
-# A step is accepted if it gains this share of what the gradient predicts (Armijo). The
-# second number is the rounding error of the likelihood.
-LEAST_GAIN, ROUNDING = 1e-3, 1e-13
+# A step is accepted if it gains this share of what the gradient predicts (Armijo).
+LEAST_GAIN = 1e-3
 
 
 # Threads cost more than they give on matrices of this size.
@@ -391,7 +391,7 @@ def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
             if E is not None:
                 trial = expm(E) @ W
                 raised, Y, u = likelihood(trial)
-                least = LEAST_GAIN * np.vdot(gradient, E) - ROUNDING * abs(value)
+                least = LEAST_GAIN * np.vdot(gradient, E) - OF_STEPS * abs(value)
                 if raised - value > least:
                     break
             shift = max(SHIFT_FACTOR * shift, SMALLEST_SHIFT)

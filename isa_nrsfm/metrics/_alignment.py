@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-# Vectors that are this much shorter than what they were computed from are zero.
-ROUNDING = 1e-13
+from isa_nrsfm._linalg.rounding import OF_STEPS
+
 MAX_NEWTON_STEPS = 100
 
 
@@ -20,7 +20,7 @@ def unit_shapes(shapes: NDArray) -> NDArray[np.float64]:
     # Shapes of unit size first: squares of very large or small numbers overflow.
     size = np.abs(shapes).max(axis=(1, 2), keepdims=True, initial=0.0)
     shapes = np.divide(shapes, size, out=np.zeros_like(shapes), where=size > 0)
-    return normalise(shapes - shapes.mean(axis=1, keepdims=True), ROUNDING)
+    return normalise(shapes - shapes.mean(axis=1, keepdims=True), OF_STEPS)
 
 
 def normalise(shapes: NDArray, smallest: float) -> NDArray[np.float64]:
@@ -50,7 +50,7 @@ class MatchedBases(NamedTuple):
 def match_basis(truth: NDArray, shapes: NDArray, affinity: NDArray) -> MatchedBases:
     """Match unit shapes, the second ones after an affinity, by squared cosines."""
     n_true = len(truth)
-    images = normalise(shapes @ affinity, ROUNDING * float(np.linalg.norm(affinity)))
+    images = normalise(shapes @ affinity, OF_STEPS * float(np.linalg.norm(affinity)))
     inner = truth.reshape(n_true, -1) @ images.reshape(len(images), -1).T
     cosines = np.minimum(np.abs(inner), 1.0)  # rounding may lead beyond 1
     rows, columns = linear_sum_assignment(cosines**2, maximize=True)
@@ -83,7 +83,7 @@ def without_mean_shape(shapes: NDArray, mean_shape: NDArray) -> NDArray:
     """
     dual = np.linalg.pinv(mean_shape).T
     multiples = np.sum(shapes * dual, axis=(1, 2)) / np.sum(mean_shape * dual)
-    return normalise(shapes - multiples[:, None, None] * mean_shape, ROUNDING)
+    return normalise(shapes - multiples[:, None, None] * mean_shape, OF_STEPS)
 
 
 def best_affinity(truth: NDArray, shapes: NDArray) -> NDArray[np.float64]:
@@ -95,7 +95,7 @@ def best_affinity(truth: NDArray, shapes: NDArray) -> NDArray[np.float64]:
     """
     # The mean scatter becomes the unit matrix; directions without scatter drop out.
     values, axes = np.linalg.eigh(np.mean(shapes.transpose(0, 2, 1) @ shapes, axis=0))
-    kept = values > ROUNDING * values[-1]
+    kept = values > OF_STEPS * values[-1]
     if not kept.any():
         return np.zeros((3, 3))
     whitener = axes[:, kept] / np.sqrt(values[kept])
@@ -160,7 +160,7 @@ def _squared_cosines(
 
 def quotient(numerator: NDArray, denominator: NDArray) -> NDArray[np.float64]:
     """Divide; zero where the denominator is zero up to rounding."""
-    usable = denominator > ROUNDING**2
+    usable = denominator > OF_STEPS**2
     return np.divide(
         numerator, denominator, out=np.zeros_like(denominator), where=usable
     )

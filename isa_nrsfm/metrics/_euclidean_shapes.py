@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm.metrics._alignment import ROUNDING
+from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm.metrics._checks import as_shapes, check_same_shape
 
 CONVENTIONS = ("sequence", "frame")
@@ -144,7 +144,7 @@ def _centred(shapes: NDArray) -> NDArray:
     centred = shapes - shapes.mean(axis=1, keepdims=True)
     size = np.abs(shapes).max(axis=(1, 2), keepdims=True)
     largest = np.abs(centred).max(axis=(1, 2), keepdims=True)
-    return np.where(largest > ROUNDING * size, centred, 0.0)
+    return np.where(largest > OF_STEPS * size, centred, 0.0)
 
 
 def _rest(truth: NDArray, shapes: NDArray, scale: bool) -> NDArray:

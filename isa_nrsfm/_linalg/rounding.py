@@ -1,0 +1,17 @@
+"""What counts as rounding errors, in double precision.
+
+Each limit is a share of the numbers that a result was computed from. The unit roundoff
+is 1.1e-16; a limit stands above it by what operations of its kind were seen to lose. A
+module takes the limit of the operations that it does.
+"""
+
+# Sums of squares, and what is compared with them: a few units of the last place.
+OF_SUMS = 1e-15
+# Products and decompositions of matrices.
+OF_PRODUCTS = 1e-14
+# Results of several such steps, as Schur complements and normalised differences.
+OF_STEPS = 1e-13
+# What is left where large numbers cancel.
+OF_DIFFERENCES = 1e-12
+# Square roots of what is left, as distances are.
+OF_DISTANCES = 1e-9
