@@ -90,7 +90,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         points, as the paper assumes, "coefficients" makes their coefficients
         independent over the frames, and None takes the principal axes of the
         deformation. Shapes of frames, reprojection and score do not depend on it. Only
-        for the joint refinement.
+        for the joint refinement, without which "coefficients" is refused.
     loss : {"linear", "huber", "cauchy"}, default="linear"
         How points count that are far from the model: with "huber" from 1.5 and with
         "cauchy" from 2.5 standard deviations of the noise, which is estimated from the
@@ -449,7 +449,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         only_joint = {
             "n_components": self.n_components == "auto",
             "loss": self.loss != "linear",
-            "independence": self.independence != "shapes",
+            "independence": self.independence == "coefficients",
         }
         for name, asked_for in only_joint.items():
             if asked_for and self.refinement != "joint":

@@ -877,7 +877,6 @@ def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
         {"loss": "huber"},
         {"loss": "cauchy"},
         {"independence": "coefficients"},
-        {"independence": None},
         {"n_components": "auto"},
     ],
 )
