@@ -21,6 +21,11 @@ from isa_nrsfm._tables.layout import (
 from isa_nrsfm._tables.sources import Table
 from isa_nrsfm._tables.visibility import seen_points, usable_frames
 
+# Number of parts of the points that are held out in turn, and the fixed random seed of
+# the partition.
+N_FOLDS = 5
+FOLD_SEED = 0
+
 
 class TableModel(NamedTuple):
     """
@@ -151,12 +156,6 @@ def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
     tracks = tracks[usable]
     sizes = model.sizes(centred_tracks(tracks)[0])
     return held_out_energies(model.frames, model.mean_shape, model.basis, tracks, sizes)
-
-
-# Number of parts of the points that are held out in turn, and the fixed random seed of
-# the partition.
-N_FOLDS = 5
-FOLD_SEED = 0
 
 
 def held_out_energies(

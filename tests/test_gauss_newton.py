@@ -12,13 +12,13 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, nearest_calibrated
 from isa_nrsfm._frames.point_sums import frame_tracks
 from isa_nrsfm._joint import noise_free as module
+from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.noise_free import (
     FramesAndShapes,
     complete_frames,
     compressed,
     fit_without_noise,
     frame_tangents,
-    likely_basis,
     minimise,
     motion_rows,
     normal_equations,

@@ -44,6 +44,7 @@ from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._linalg.rounding import OF_SUMS
 from isa_nrsfm._tables.blocks import FrameBlocks
 
@@ -535,54 +536,3 @@ def _fitted(
         first += len(W)
     motion = np.concatenate([fit.motion for fit in fits])
     return motion, np.concatenate([fit.alpha for fit in fits])
-
-
-def likely_basis(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: NDArray | float
-) -> NDArray:
-    """
-    Return the same shapes in the basis of greatest marginal likelihood.
-
-    Without noise neither a shift of the mean shape along the basis shapes nor a mixing
-    A of these changes the residual: alpha becomes ``A^-1 (alpha - mean)``. Of the
-    objective there remains, with n frames and ``H_kl = sum_i <M_i B_k, M_i B_l>``,
-
-        n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A).
-
-    First a basis is taken in which the covariance of the coefficients is the identity
-    and H is diagonal. There the minimum is the diagonal A with
-
-        a_k^2 = 2 / (1 + sqrt(1 + 4 penalty H_kk / n)).
-
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes.
-    motion : ndarray of shape (2, 3, n_frames)
-        Cameras.
-    alpha : ndarray of shape (n_components, n_frames)
-        Coefficients.
-    penalty : float
-        As in `MarginalLikelihood`.
-
-    Returns
-    -------
-    ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes.
-    """
-    n_frames = motion.shape[2]
-    # Coefficients of mean zero
-    mean = alpha.mean(axis=1)
-    mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
-    # Coefficients of covariance one
-    rest = alpha - mean[:, None]
-    covariance = rest @ rest.T / n_frames
-    covariance += (RIDGE * np.trace(covariance) or 1.0) * np.eye(len(mean))
-    basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
-    # Diagonal H / n, and the scales a_k
-    cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
-    energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
-    price = penalty * np.maximum(energy, 0.0)
-    scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))
-    basis = scale[:, None, None] * np.tensordot(axes.T, basis, 1)
-    return np.concatenate([mean_shape[None], basis])

@@ -18,7 +18,7 @@ from isa_nrsfm._frames.camera_models import (
     HeldCameras,
     nearest_calibrated,
 )
-from isa_nrsfm._joint.noise_free import likely_basis
+from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
