@@ -282,6 +282,16 @@ def test_what_stands_on_top_uses_public_attributes(folder):
             assert own or known or name in LOOKED_INTO, f"{file}: {name}"
 
 
+@pytest.mark.parametrize("file", source_files())
+def test_modules_take_public_names_of_each_other(file):
+    for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith(
+            "isa_nrsfm"
+        ):
+            private = [a.name for a in node.names if a.name.startswith("_")]
+            assert set(private) <= {"__version__"}, private
+
+
 def test_the_top_of_the_package_is_short():
     assert len([path for path in PACKAGE.iterdir() if path.is_file()]) <= 10
 

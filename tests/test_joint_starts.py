@@ -245,10 +245,10 @@ class TestLiftedShapes:
         assert np.isfinite(lifted_shapes(scene.rows, scene.motion, 2)).all()
 
 
-def problem_of(scene, to_the_end=True):
+def problem_of(scene, thorough=True):
     rows = MemoryBlocks.from_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
-    return JointProblem(frames, Steps(1000, 0.01, to_the_end=to_the_end), 0.0)
+    return JointProblem(frames, Steps(1000, 0.01, thorough=thorough), 0.0)
 
 
 def paper_shapes(factors):
@@ -300,13 +300,13 @@ class TestBestStarts:
         motion = started(scene, "orthographic")[0].motion.transpose(2, 0, 1)
         assert camera_error(motion, scene.motion) < 0.05
 
-    @pytest.mark.parametrize("to_the_end", [False, True])
-    def test_of_many_frames_has_cameras_of_all(self, to_the_end):
+    @pytest.mark.parametrize("thorough", [False, True])
+    def test_of_many_frames_has_cameras_of_all(self, thorough):
         # The comparison is of some of them.
         scene = random_scene(n_frames=450, noise=0.01)
-        problem = problem_of(scene, to_the_end)
+        problem = problem_of(scene, thorough)
         states = started(scene, "orthographic", problem)
-        assert len(states) == (3 if to_the_end else 1)
+        assert len(states) == (3 if thorough else 1)
         for state in states:
             assert state.motion.shape == (2, 3, 450)
             motion = state.motion.transpose(2, 0, 1)

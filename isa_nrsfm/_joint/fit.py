@@ -340,7 +340,7 @@ def _ready(
             used &= ~outliers
         weights = None if used.all() else used * 1.0
         frames = JointFrames.from_points(rows, complete, weights)
-    steps = steps._replace(to_the_end=n_frames <= FEW_FRAMES)
+    steps = steps._replace(thorough=n_frames <= FEW_FRAMES)
     problem = JointProblem(frames, steps, 0.0)
     # Penalty of sum_i ||M_i B_k||^2 for the prior BASIS_STD of frames of mean square
     # energy / n_numbers. The prior counts once, not for each frame.
@@ -348,7 +348,7 @@ def _ready(
     problem = problem.with_penalty(n_numbers / (BASIS_STD**2 * energy * n_frames))
     by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
     problems = [
-        problem.part(part, tol=max(steps.tol, by_chance / len(part)), to_the_end=False)
+        problem.part(part, tol=max(steps.tol, by_chance / len(part)), thorough=False)
         for part in sample.parts
     ]
     return _Ready([*problems, problem], wide, used)
@@ -380,7 +380,7 @@ def _first_fit(
     max_iter = problem.steps.max_iter
     if camera != "affine":
         max_iter = min(max_iter, COMPARED_STEPS)
-    if not problem.steps.to_the_end:  # only the better one goes on
+    if not problem.steps.thorough:  # only the better one goes on
         first = _least(refined(s, max_iter=min(max_iter, RACE_STEPS)) for s in states)
         states = [first.state]
     affine = _least(refined(state, max_iter=max_iter) for state in states)
@@ -404,7 +404,7 @@ def _calibrated_fit(
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
     result = _refined(problem, state, cameras, least_noise)
     # Only for small tables: the fit of a sample is no more than a start.
-    for _ in range(REVERSALS if problem.steps.to_the_end else 0):
+    for _ in range(REVERSALS if problem.steps.thorough else 0):
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
             break
@@ -420,7 +420,7 @@ def _refined(
     **steps: Any,
 ) -> JointResult:
     """Return the refinement of a state, with a smaller tolerance for small tables."""
-    if problem.steps.to_the_end:
+    if problem.steps.thorough:
         steps = {"tol": problem.steps.tol * POLISH, **steps}
     return problem.refined(state, cameras, least_noise, **steps)
 

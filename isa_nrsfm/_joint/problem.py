@@ -38,7 +38,7 @@ class Steps(NamedTuple):
         Convergence tolerance, as of `refine_joint`.
     on_step : callable or None
         As of `refine_joint`.
-    to_the_end : bool
+    thorough : bool
         Whether to compare more starts and to take a smaller tolerance. It is true only
         for small tables, where more steps cost little.
     """
@@ -46,7 +46,7 @@ class Steps(NamedTuple):
     max_iter: int
     tol: float
     on_step: Callable[[], None] | None = None
-    to_the_end: bool = False
+    thorough: bool = False
 
 
 class JointProblem:

@@ -267,7 +267,7 @@ def best_starts(
     order = np.argsort(
         rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape))
     )
-    comparison = SMALL if problem.steps.to_the_end else LARGE
+    comparison = SMALL if problem.steps.thorough else LARGE
     few = np.sort(spread(order, min(comparison.n_frames, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
     part = problem.part(few, tol=COMPARED_TOL).with_penalty(0.0)

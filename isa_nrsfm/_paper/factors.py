@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from isa_nrsfm._linalg.vectors import orientations
-from isa_nrsfm._paper.svd import Triplets, _complete, leading_triplets
+from isa_nrsfm._paper.svd import Triplets, leading_triplets
 
 # Singular values below this share of the first count as zero, however precise the table
 # is. They have less than 1e-20 of the energy.
@@ -90,7 +91,20 @@ def factorise(
     # The first three are the rigid shape, the next ones the signals.
     B_0 = np.zeros((3, n_points))
     B_0[: min(rank, 3)] = root * Vt[:3]
-    B = _complete(Vt, 3 * max(1, -(-(rank - 3) // 3))) * root
+    B = _completed(Vt, 3 * max(1, -(-(rank - 3) // 3))) * root
     M = W @ B.T / n_points
     M[:, max(rank - 3, 0) :] = 0.0
     return Factorisation(W @ B_0.T / n_points, B_0, M, B, S, rest)
+
+
+def _completed(Vt: NDArray, n_signals: int) -> NDArray:
+    """Return rows 3 onwards of Vt (rank, n_points), completed to n_signals rows.
+
+    The rows that are added are centred, orthonormal, and orthogonal to Vt.
+    """
+    rows = Vt[3:]
+    n_missing = n_signals - len(rows)
+    if n_missing:
+        ones = np.ones((1, Vt.shape[1]))
+        rows = np.vstack([rows, null_space(np.vstack([ones, Vt])).T[:n_missing]])
+    return rows

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import energies
@@ -196,16 +195,3 @@ def _squared(block: NDArray, V: NDArray) -> NDArray:
     """Return ``W^T W V`` (n_columns, width) for a block W of the matrix."""
     matrix = _matrix(block)
     return (matrix.T @ (matrix @ V.astype(matrix.dtype))).astype(np.float64)
-
-
-def _complete(Vt: NDArray, n_signals: int) -> NDArray:
-    """Return rows 3 onwards of Vt (rank, n_points), completed to n_signals rows.
-
-    The rows that are added are centred, orthonormal, and orthogonal to Vt.
-    """
-    rows = Vt[3:]
-    n_missing = n_signals - len(rows)
-    if n_missing:
-        ones = np.ones((1, Vt.shape[1]))
-        rows = np.vstack([rows, null_space(np.vstack([ones, Vt])).T[:n_missing]])
-    return rows

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._tables.visibility import (
     FrameReport,
-    _centre,
-    _coincide,
-    _refuse_one_place,
-    _zero_where_unseen,
+    centred_over_seen,
+    points_coincide,
+    refuse_one_place,
     seen_points,
+    zero_where_unseen,
 )
 
 Layout = Literal["interleaved", "planar"]
@@ -97,10 +97,10 @@ def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
     ValueError
         If all seen points of a frame are equal, up to rounding.
     """
-    centred, translation, seen = _centre(tracks)
+    centred, translation, seen = centred_over_seen(tracks)
     square = np.einsum("ijc,ijc->i", centred, centred)
-    coincide = _coincide(square, translation, seen.sum(axis=1), tracks.dtype)
-    _refuse_one_place(coincide, np.asarray(~seen.all(axis=1)))
+    coincide = points_coincide(square, translation, seen.sum(axis=1), tracks.dtype)
+    refuse_one_place(coincide, np.asarray(~seen.all(axis=1)))
     if not seen.all():
         centred[~seen] = np.nan
     return centred, translation
@@ -124,7 +124,7 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
         all it is the root of the mean of these mean squares.
     """
     seen = seen_points(centred)
-    centred = _zero_where_unseen(centred, seen)
+    centred = zero_where_unseen(centred, seen)
     square = np.einsum("ijc,ijc->i", centred, centred) / (2 * seen.sum(axis=1))
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
 

@@ -80,16 +80,16 @@ def report_frames(tracks: NDArray) -> FrameReport:
     FrameReport
         The report.
     """
-    centred, translation, seen = _centre(tracks)
+    centred, translation, seen = centred_over_seen(tracks)
     square = np.einsum("ijc,ijc->i", centred, centred)
     n_seen = seen.sum(axis=1)
-    filled = _zero_where_unseen(tracks, seen)
+    filled = zero_where_unseen(tracks, seen)
     return FrameReport(
         translation,
         square,
         np.maximum(filled.max(axis=(1, 2)), -filled.min(axis=(1, 2))),
         n_seen,
-        _coincide(square, translation, n_seen, tracks.dtype),
+        points_coincide(square, translation, n_seen, tracks.dtype),
         _collinear(centred, translation, seen, tracks.dtype),
     )
 
@@ -170,10 +170,10 @@ def check_places(report: FrameReport, n_points: int) -> None:
     ValueError
         If there are such frames.
     """
-    _refuse_one_place(report.in_one_place, report.n_seen < n_points)
+    refuse_one_place(report.in_one_place, report.n_seen < n_points)
 
 
-def _refuse_one_place(coincide: NDArray, incomplete: NDArray) -> None:
+def refuse_one_place(coincide: NDArray, incomplete: NDArray) -> None:
     """Refuse frames with all seen points in one place."""
     if coincide.any():
         which = "seen points" if incomplete[coincide].any() else "points"
@@ -183,14 +183,14 @@ def _refuse_one_place(coincide: NDArray, incomplete: NDArray) -> None:
         )
 
 
-def _zero_where_unseen(tracks: NDArray, seen: NDArray) -> NDArray:
+def zero_where_unseen(tracks: NDArray, seen: NDArray) -> NDArray:
     """Return tracks with zeros where points are not seen."""
     if seen.all():
         return tracks
     return np.where(seen[..., None], tracks, tracks.dtype.type(0))
 
 
-def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def centred_over_seen(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Return centred tracks (I, J, 2), centroids (I, 2) and the mask of seen (I, J).
 
     The tracks are zero where a point is not seen.
@@ -199,14 +199,14 @@ def _centre(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     seen = seen_points(tracks)
     n_seen = seen.sum(axis=1)[:, None]
-    filled = _zero_where_unseen(tracks, seen)
+    filled = zero_where_unseen(tracks, seen)
     translation = np.full((len(tracks), 2), np.nan)
     total = np.einsum("ijc->ic", filled)
     np.divide(total, n_seen, where=n_seen > 0, out=translation)
-    return _zero_where_unseen(tracks - translation[:, None], seen), translation, seen
+    return zero_where_unseen(tracks - translation[:, None], seen), translation, seen
 
 
-def _coincide(
+def points_coincide(
     square: NDArray, translation: NDArray, n_seen: NDArray, dtype: np.dtype
 ) -> NDArray:
     """Tell in which frames all seen points are equal, up to rounding: (n_frames,).
@@ -222,7 +222,7 @@ def _collinear(
 ) -> NDArray:
     """Tell which frames miss points and show the others on a line, up to rounding.
 
-    The arrays are those of `_centre`, the result is (n_frames,).
+    The arrays are those of `centred_over_seen`, the result is (n_frames,).
     """
     on_line = np.asarray(~seen.all(axis=1))
     centred, translation = centred[on_line], translation[on_line]

@@ -96,7 +96,7 @@ def fit_table(
         )
     folder = Path(args.output)
     clock = {"": time.perf_counter()}
-    frames = _read_frames(args)
+    frames = read_frames(args)
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
@@ -159,10 +159,10 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
             f"{estimator.refinement!r}, which does not know the standard deviations "
             "of its coefficients"
         )
-    frames = _read_frames(args, estimator)
+    frames = read_frames(args, estimator)
     for source in (args.table, args.model):
         refuse_overwriting(source, [output])
-    X = _as_fitted(estimator, frames.points[frames.usable])
+    X = as_fitted(estimator, frames.points[frames.usable])
     n_frames, n_components = len(X), len(estimator.basis_)
     none = np.empty((0, n_components))
     fit = Decomposition(np.empty((0, 2, 3)), np.empty((0, 2)), none, none)
@@ -184,7 +184,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
     return f"{title}\n\n{lay_out(sections)}"
 
 
-def _read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
+def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
     args.format = _format(args)
     table, chosen, failed = _read(args)
@@ -303,7 +303,7 @@ def _columns_of_model(
     )
 
 
-def _as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
+def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
     """Return a table of landmarks with the columns that the model was fitted to."""
     fitted = getattr(estimator, "feature_names_in_", None)
     if fitted is None:

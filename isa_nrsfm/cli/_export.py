@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.cli._commands import _as_fitted, _read_frames
+from isa_nrsfm.cli._commands import as_fitted, read_frames
 from isa_nrsfm.cli._export_options import SUFFIXES
 from isa_nrsfm.cli._outputs import refuse_overwriting
 from isa_nrsfm.cli._report import lay_out, table_lines, table_report
@@ -118,10 +118,10 @@ def _table_options(
     args: Namespace, estimator: AffineNRSfM, sections: dict[str, list[str]]
 ) -> dict[str, Any]:
     """Read the table that the viewer shows, and its labels."""
-    frames = _read_frames(args, estimator)
+    frames = read_frames(args, estimator)
     report = table_report(args.table, args.format, frames)
     sections["Table"] = table_lines(report, unusable="not shown")
-    options = {"X": _as_fitted(estimator, frames.points[frames.usable])}
+    options = {"X": as_fitted(estimator, frames.points[frames.usable])}
     if args.label is not None:
         other = {str(name).strip(): name for name in frames.other.columns}
         if args.label not in other:

@@ -17,7 +17,7 @@ from isa_nrsfm._tables.visibility import (
     usable_frames,
 )
 from isa_nrsfm.cli._parser import RowRule
-from isa_nrsfm.io._tables import _numbers
+from isa_nrsfm.io._tables import as_numbers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -81,9 +81,9 @@ def choose_frames(
     cells = table.loc[kept, names]
     # Messages about a row name its number in the table, so all rows are there.
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    tracks[rows] = np.stack([_numbers(cells[name]) for name in names], axis=1).reshape(
-        -1, len(columns.points), 2
-    )
+    tracks[rows] = np.stack(
+        [as_numbers(cells[name]) for name in names], axis=1
+    ).reshape(-1, len(columns.points), 2)
     if zeros_missing:
         tracks[(tracks == 0).all(axis=2)] = np.nan
     tracks = clean_tracks(tracks, names=np.array(stripped))[rows]

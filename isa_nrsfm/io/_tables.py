@@ -179,7 +179,7 @@ def landmark_table(
     found = find_landmark_columns(frame.columns, columns)
     names = found.interleaved
     _refuse_same_names([str(name) for name in frame.columns], "the table")
-    values = np.column_stack([_numbers(frame[name]) for name in names])
+    values = np.column_stack([as_numbers(frame[name]) for name in names])
     points = values.reshape(len(frame), len(names) // 2, 2)
     if missing == "zeros":
         points[(points == 0).all(axis=2)] = np.nan
@@ -299,7 +299,7 @@ def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
         return None
 
 
-def _numbers(column: "pd.Series") -> NDArray[np.float64]:
+def as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
     pd = import_optional("pandas", extra="io")
     types = pd.api.types
