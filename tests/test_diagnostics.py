@@ -1,11 +1,15 @@
 """What a fit says of itself: reliabilities and information, by their definitions."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import eigvals
 
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._diagnostics import reliabilities, weak_information
+from isa_nrsfm.datasets import make_face_tracks
 
 
 def random_coefficients(seed, n_frames=50, n_components=3):
@@ -87,3 +91,31 @@ class TestWeakInformation:
             expected += rest.T @ rest
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Return a model of faces."""
+    faces = make_face_tracks(n_frames=60, n_components=2, random_state=0)
+    return AffineNRSfM(2, camera="weak_perspective", random_state=0).fit(faces.data)
+
+
+class TestFigures:
+    def test_amplitude_is_that_of_the_deformations(self, model):
+        deformations = np.tensordot(model.alpha_, model.basis_, 1)
+        mean_square = np.mean(np.sum(deformations**2, axis=(1, 2)))
+        expected = np.sqrt(mean_square / np.sum(model.mean_shape_**2))
+        found = model.diagnostics()
+        assert_allclose(found.deformation_amplitude, expected, rtol=1e-9)
+
+    def test_cameras_are_those_of_all_frames(self, model):
+        sizes = model.diagnostics().camera_singular_values
+        assert sizes.shape == (3,)
+        assert np.all(np.diff(sizes) <= 0)
+
+    def test_covariance_of_the_mirror_image(self, model):
+        depth = np.tile([1.0, 1.0, -1.0], 2)
+        expected = model.mode_covariance_ * np.outer(depth, depth)
+        mirrored = deepcopy(model).mirror().mode_covariance_
+        assert np.abs(np.diff([expected, model.mode_covariance_], axis=0)).max() > 0
+        assert_allclose(mirrored, expected, rtol=0, atol=1e-15)
