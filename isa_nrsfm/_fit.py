@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.callbacks import FitProgress
@@ -360,7 +361,8 @@ def _paper_result(
     report: Callable[[str], None],
 ) -> tuple[Any, PaperResult]:
     """Return the fitted strategy and what the paper's pipeline finds with it."""
-    isa, joint = options.isa, options.joint
+    # A clone: the options stay as they are, also where K is looked for first.
+    isa, joint = clone(options.isa), options.joint
     tol = PAPER_TOL if options.tol is None else options.tol
     with warnings.catch_warnings():
         if joint and options.default_isa:

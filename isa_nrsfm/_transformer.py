@@ -14,6 +14,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.models import MIRROR
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
@@ -208,15 +209,14 @@ class TableTransformer(
         True
         """
         check_is_fitted(self)
-        depth = np.array([1.0, 1.0, -1.0])
         dtype = self.mean_shape_.dtype
         for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
             if hasattr(self, name):
-                setattr(self, name, getattr(self, name) * depth.astype(dtype))
+                setattr(self, name, getattr(self, name) * MIRROR.astype(dtype))
         if hasattr(self, "rotations_"):
-            turned = depth[:, None] * self.rotations_ * depth
+            turned = MIRROR[:, None] * self.rotations_ * MIRROR
             self.rotations_ = turned.astype(dtype, copy=False)
-        signs = np.tile(depth, len(self.basis_))
+        signs = np.tile(MIRROR, len(self.basis_))
         self.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
         self._model = self._model._replace(
             frames=self._model.frames.mirrored(),

@@ -4,9 +4,9 @@ Such a file names private classes and attributes of its time, which this module 
 the names of format 1. The modules of the classes do not matter.
 """
 
-import warnings
 from typing import Any
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.io._model_contents import ATTRIBUTES, FORMAT
 from isa_nrsfm.io._model_values import CLASSES
 from isa_nrsfm.io._skops_values import NamedValue
@@ -51,10 +51,9 @@ def contents_of_old(values: NamedValue) -> dict[str, Any]:
     frames = _frames(held.pop("_frames"))
     stiffness = held.pop("stiffness", None), held.pop("stiffness_", None)
     if any(stiffness):
-        warnings.warn(
+        warn_caller(
             f"the model was fitted with stiffness={stiffness[1]}, a parameter that "
-            "there is no more: a new fit will be another one",
-            stacklevel=3,
+            "there is no more: a new fit will be another one"
         )
     parts = _parts(held, ATTRIBUTES)
     parts["parameters"].setdefault("camera", "affine")
