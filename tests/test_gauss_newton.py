@@ -34,7 +34,7 @@ AFFINE = CAMERAS["affine"]
 def in_blocks(parts):
     """Return frames as the joint refinement has them."""
     lengths = [len(part.weight) for part in parts]
-    return MemoryBlocks([[part] for part in parts], lengths)
+    return MemoryBlocks(parts, lengths)
 
 
 class Scene(NamedTuple):

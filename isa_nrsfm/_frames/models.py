@@ -289,13 +289,13 @@ class PosteriorFrames(NamedTuple):
         translation = posterior.translation * sizes[:, None]
         return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
 
-    def prepared_posterior(self, block: list[FrameTracks]) -> FramePosterior:
+    def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """
         Return the fit of prepared frames, before the gauge.
 
         Parameters
         ----------
-        block : list of FrameTracks
+        block : FrameTracks
             Frames of size one, by points or directions as the shapes are. Their weights
             are zero or one.
 
@@ -304,19 +304,13 @@ class PosteriorFrames(NamedTuple):
         FramePosterior
             The fit, that of `posterior`.
         """
-        fits = [
-            fit_prepared(
-                part,
-                self.shapes,
-                self.noise_variance,
-                camera=self.camera,
-                starts=self.starts,
-            )
-            for part in block
-        ]
-        if len(fits) == 1:
-            return fits[0]
-        return FramePosterior(*map(np.concatenate, zip(*fits, strict=True)))
+        return fit_prepared(
+            block,
+            self.shapes,
+            self.noise_variance,
+            camera=self.camera,
+            starts=self.starts,
+        )
 
     def posterior(self, tracks: NDArray) -> FramePosterior:
         """Return the fit of frames (n, n_points, 2) of size one, before the gauge."""

@@ -12,6 +12,7 @@ points of shape k with the same weights. The index of the frame is the last one 
 arrays, so that each sum is one matrix product for all frames.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -179,6 +180,13 @@ class FrameTracks(NamedTuple):
     centroid: NDArray
     weight: NDArray
     energy: NDArray
+
+    def pieces(self, n_frames: int) -> Iterator[tuple[slice, Self]]:
+        """Yield consecutive frames, n_frames at most at a time, and which they are."""
+        total = len(self.weight)
+        for start in range(0, total, n_frames):
+            frames = slice(start, min(start + n_frames, total))
+            yield frames, self if total <= n_frames else self.take(frames)
 
     def take(self, frames: NDArray | slice) -> Self:
         """Return some of the frames."""

@@ -265,10 +265,11 @@ class _Prepared(NamedTuple):
         """Yield the numbers of frames that determine a camera, and their sums."""
         complete = self.frames.weights is None
         length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
-        for first in range(0, len(self.weight), length):
-            block = np.arange(first, min(first + length, len(self.weight)))
-            part = self.frames.take(slice(first, first + length))
-            products = frame_sums(part, shapes)
+        for piece, part in self.frames.pieces(length):
+            block, products = (
+                np.arange(piece.start, piece.stop),
+                frame_sums(part, shapes),
+            )
             yield (
                 (block, products) if complete else _determined(block, products, shapes)
             )

@@ -12,8 +12,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameTracks, joined_frames
-from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, prepared_frames
+from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
+from isa_nrsfm._joint.likelihood import BLOCK_FRAMES
 from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._tables.visibility import seen_points
@@ -26,7 +26,7 @@ class JointFrames(NamedTuple):
     Attributes
     ----------
     blocks : FrameBlocks
-        Blocks as of `prepared_frames`.
+        Blocks of FrameTracks.
     directions : ndarray of shape (n_directions, n_points) or None
         Orthonormal rows. Frames are given by their inner products with them, and by
         their energy. None if frames are given by their points.
@@ -83,7 +83,7 @@ class JointFrames(NamedTuple):
             The frames.
         """
         blocks = rows.derive(partial(_compressed_frames, directions=directions))
-        return cls(blocks.regrouped(_joined, BLOCK_FRAMES), directions)
+        return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
 
     def coordinates(self, shapes: NDArray) -> NDArray:
         """Return shapes (..., n_points) by directions, if the frames are given so."""
@@ -97,24 +97,24 @@ class JointFrames(NamedTuple):
         """Return some of the frames, in the order of the table."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        taken = [part for block in self.blocks.map(_taken, chosen) for part in block]
-        lengths = [len(part.weight) for part in taken]
-        blocks = MemoryBlocks([[part] for part in taken], lengths)
-        return type(self)(blocks.regrouped(_joined, BLOCK_FRAMES), self.directions)
+        taken = [part for part in self.blocks.map(_taken, chosen) if len(part.weight)]
+        blocks = MemoryBlocks(taken, [len(part.weight) for part in taken])
+        blocks = blocks.regrouped(joined_frames, BLOCK_FRAMES)
+        return type(self)(blocks, self.directions)
 
 
-def _plain_frames(rows: NDArray, complete: bool) -> list[FrameTracks]:
+def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
     """Return frames of rows (n_frames, 2, n_points), missing points of weight zero."""
     tracks = rows.transpose(0, 2, 1)
-    return prepared_frames(tracks, None if complete else seen_points(tracks) * 1.0)
+    return frame_tracks(tracks, None if complete else seen_points(tracks) * 1.0)
 
 
-def _weighted_frames(rows: NDArray, weights: NDArray) -> list[FrameTracks]:
+def _weighted_frames(rows: NDArray, weights: NDArray) -> FrameTracks:
     """Return frames of rows (n_frames, 2, n_points), weights (n_frames, n_points)."""
-    return prepared_frames(rows.transpose(0, 2, 1), weights)
+    return frame_tracks(rows.transpose(0, 2, 1), weights)
 
 
-def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
+def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
     """
     Return complete frames (n_frames, 2, n_points) by their products with directions.
 
@@ -123,24 +123,15 @@ def _compressed_frames(rows: NDArray, directions: NDArray) -> list[FrameTracks]:
     """
     n_frames, _, n_points = rows.shape
     products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
-    frames = FrameTracks(
+    return FrameTracks(
         np.ascontiguousarray(products.transpose(2, 1, 0)),
         None,
         np.zeros((2, n_frames)),
         np.full(n_frames, float(n_points)),
         energies(rows),
     )
-    starts = range(0, n_frames, BLOCK_FRAMES)
-    return [frames.take(slice(start, start + BLOCK_FRAMES)) for start in starts]
 
 
-def _taken(block: list[FrameTracks], chosen: NDArray) -> list[FrameTracks]:
+def _taken(block: FrameTracks, chosen: NDArray) -> FrameTracks:
     """Return the frames of a block for which chosen (n_frames,) is true."""
-    ends = np.cumsum([len(part.weight) for part in block])
-    parts = zip(block, np.split(chosen, ends[:-1]), strict=True)
-    return [part.take(np.flatnonzero(which)) for part, which in parts if which.any()]
-
-
-def _joined(blocks: list[list[FrameTracks]]) -> list[FrameTracks]:
-    """Return the frames of several blocks as one."""
-    return [joined_frames([part for block in blocks for part in block])]
+    return block.take(np.flatnonzero(chosen))

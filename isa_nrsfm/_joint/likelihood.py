@@ -85,35 +85,6 @@ class LikelihoodTerms(NamedTuple):
     residual: float
 
 
-def prepared_frames(
-    tracks: NDArray, weights: NDArray | None = None, block_frames: int = BLOCK_FRAMES
-) -> list[FrameTracks]:
-    """
-    Return tracks ready for the passes, in blocks whose small matrices fit the cache.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks; NaN where a point is missing.
-    weights : ndarray of shape (n_frames, n_points) or None
-        Weights of the points, zero for those that are missing; None for ones.
-    block_frames : int, default=2048
-        Frames of a block.
-
-    Returns
-    -------
-    list of FrameTracks
-        The blocks.
-    """
-    return [
-        frame_tracks(
-            tracks[start : start + block_frames],
-            None if weights is None else weights[start : start + block_frames],
-        )
-        for start in range(0, len(tracks), block_frames)
-    ]
-
-
 def likelihood_of(
     tracks: NDArray,
     weights: NDArray | None,
@@ -125,18 +96,21 @@ def likelihood_of(
 
     Parameters
     ----------
-    tracks, weights, block_frames
-        As of `prepared_frames`.
+    tracks, weights
+        As of `frame_tracks`.
     penalty : float
         As of `MarginalLikelihood`.
+    block_frames : int, default=2048
+        Frames of a block.
 
     Returns
     -------
     MarginalLikelihood
         The objective.
     """
-    blocks = [[block] for block in prepared_frames(tracks, weights, block_frames)]
-    lengths = [len(block.weight) for (block,) in blocks]
+    pieces = frame_tracks(tracks, weights).pieces(block_frames)
+    blocks = [block for _, block in pieces]
+    lengths = [len(block.weight) for block in blocks]
     return MarginalLikelihood(MemoryBlocks(blocks, lengths), penalty)
 
 
@@ -147,7 +121,7 @@ class MarginalLikelihood:
     Parameters
     ----------
     frames : FrameBlocks
-        Blocks as of `prepared_frames`. All of them have weights, or none has.
+        Blocks of FrameTracks. All of them have weights, or none has.
     penalty : float or ndarray of shape (n_components,)
         Regularisation weight: factor of ``sum_i tr H_i``, or one factor for the
         diagonal entry of each basis shape.
@@ -267,7 +241,7 @@ def totals(frames: FrameBlocks) -> tuple[float, float]:
     Parameters
     ----------
     frames : FrameBlocks
-        Blocks as of `prepared_frames`.
+        Blocks of FrameTracks.
 
     Returns
     -------
@@ -280,16 +254,12 @@ def totals(frames: FrameBlocks) -> tuple[float, float]:
     return float(n_seen), float(square)
 
 
-def _totals(block: list[FrameTracks]) -> tuple[float, float]:
+def _totals(block: FrameTracks) -> tuple[float, float]:
     """Return the number of coordinates that a block shows, and its energy."""
-    n_seen = square = 0.0
-    for frames in block:
-        if frames.weights is None:
-            n_seen += frames.weight.sum()
-        else:
-            n_seen += np.count_nonzero(frames.weights)
-        square += frames.energy.sum()
-    return 2.0 * n_seen, square
+    points = (
+        block.weight.sum() if block.weights is None else np.count_nonzero(block.weights)
+    )
+    return 2.0 * points, block.energy.sum()
 
 
 def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]:
@@ -304,7 +274,7 @@ def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]
 
 
 def _block_terms(
-    block: list[FrameTracks],
+    block: FrameTracks,
     motion: NDArray,
     shapes: NDArray,
     gram: SharedGram,
@@ -313,18 +283,17 @@ def _block_terms(
     tiny_noise: bool,
 ) -> LikelihoodTerms:
     """
-    Return the terms of a block, from those of its parts.
+    Return the terms of a block, from those of pieces whose matrices fit the cache.
 
     Here motion is (n_frames, 2, 3): the blocks of frames are cut along the first axis.
     """
-    motion, start, parts = motion.transpose(1, 2, 0), 0, []
-    for frames in block:
-        end = start + len(frames.weight)
-        part = motion[:, :, start:end]
-        parts.append(
-            _frame_terms(frames, shapes, gram, part, noise, penalty, tiny_noise)
+    motion = motion.transpose(1, 2, 0)
+    parts = [
+        _frame_terms(
+            piece, shapes, gram, motion[:, :, frames], noise, penalty, tiny_noise
         )
-        start = end
+        for frames, piece in block.pieces(BLOCK_FRAMES)
+    ]
     if len(parts) == 1:
         return parts[0]
     sums: Any = (sum(part) for part in zip(*map(_sums, parts), strict=True))

@@ -108,8 +108,8 @@ def fit_without_noise(
     Parameters
     ----------
     blocks : FrameBlocks
-        Blocks as of `prepared_frames`. Points with a weight below one half count as
-        missing, the others alike.
+        Blocks of FrameTracks. Points with a weight below one half count as missing, the
+        others alike.
     shapes : ndarray of shape (n_shapes, 3, n_points)
         B_0, ..., B_K to start from, close enough for the residual to be small.
     motion : ndarray of shape (2, 3, n_frames)
@@ -165,7 +165,7 @@ def complete_frames(
     Parameters
     ----------
     blocks : FrameBlocks
-        Blocks as of `prepared_frames`.
+        Blocks of FrameTracks.
     shapes : ndarray of shape (n_rows, n_points)
         Rows that nearly span the row space of the tracks.
     n_frames : int
@@ -183,10 +183,10 @@ def complete_frames(
     chosen = partial(_chosen, V=V, share=n_frames / blocks.n_frames)
     tracks, masks, frames = [], [], []
     for part, found in zip(blocks.slices, blocks.map(chosen), strict=True):
-        for W, seen, places in found:
-            tracks.append(W)
-            masks.append(seen)
-            frames.append(part.start + places)
+        W, seen, places = found
+        tracks.append(W)
+        masks.append(seen)
+        frames.append(part.start + places)
     W = np.concatenate(tracks)
     if masks[0] is not None:
         seen = np.concatenate(masks)
@@ -197,22 +197,16 @@ def complete_frames(
 
 
 def _chosen(
-    block: list[FrameTracks], V: NDArray, share: float
-) -> list[tuple[NDArray, NDArray | None, NDArray]]:
-    """Return tracks, seen points and numbers of evenly spread frames of each part."""
-    found, first = [], 0
-    for part in block:
-        W, seen = _tracks_of(part)
-        usable = np.arange(len(W))
-        if seen is not None and not seen.all():
-            usable = _determined(seen, V)
-        n = min(len(usable), int(np.ceil(share * len(W))))
-        places = np.linspace(0, len(usable) - 1, n).round().astype(int)
-        frames = usable[places]
-        seen = None if seen is None else seen[frames]
-        found.append((W[frames], seen, first + frames))
-        first += len(W)
-    return found
+    block: FrameTracks, V: NDArray, share: float
+) -> tuple[NDArray, NDArray | None, NDArray]:
+    """Return tracks, seen points and numbers of evenly spread frames of a block."""
+    W, seen = _tracks_of(block)
+    usable = np.arange(len(W))
+    if seen is not None and not seen.all():
+        usable = _determined(seen, V)
+    n = min(len(usable), int(np.ceil(share * len(W))))
+    frames = usable[np.linspace(0, len(usable) - 1, n).round().astype(int)]
+    return W[frames], None if seen is None else seen[frames], frames
 
 
 def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray | None]:
@@ -517,22 +511,15 @@ def _all_frames(
 
 
 def _fitted(
-    block: list[FrameTracks], initial: NDArray, shapes: NDArray, camera: str
+    block: FrameTracks, initial: NDArray, shapes: NDArray, camera: str
 ) -> tuple[NDArray, NDArray]:
     """Return cameras (n, 2, 3) and coefficients of a block; initial (n, K)."""
-    fits, first = [], 0
-    for part in block:
-        W, seen = _tracks_of(part)
-        start = initial[first : first + len(W)]
-        if seen is None:
-            fits.append(fit_prepared(part, shapes, 0.0, camera=camera, initial=start))
-        else:
-            tracks = W.swapaxes(1, 2)
-            fits.append(
-                fit_posterior(
-                    tracks, shapes, 0.0, camera=camera, weights=seen, initial=start
-                )
-            )
-        first += len(W)
-    motion = np.concatenate([fit.motion for fit in fits])
-    return motion, np.concatenate([fit.alpha for fit in fits])
+    W, seen = _tracks_of(block)
+    if seen is None:
+        fit = fit_prepared(block, shapes, 0.0, camera=camera, initial=initial)
+    else:
+        tracks = W.swapaxes(1, 2)
+        fit = fit_posterior(
+            tracks, shapes, 0.0, camera=camera, weights=seen, initial=initial
+        )
+    return fit.motion, fit.alpha

@@ -12,7 +12,7 @@ from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
+from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState, refine_joint
 
 # Prior of the basis shapes: standard deviation of the coordinates of the image of a
@@ -192,7 +192,7 @@ class JointProblem:
 
 
 def _reversed_back(
-    block: list[FrameTracks],
+    block: FrameTracks,
     motion: NDArray,
     shapes: NDArray,
     noise: float,
@@ -203,19 +203,17 @@ def _reversed_back(
 
     The cameras that come, motion, are (n_frames, 2, 3), too.
     """
-    search, parts, first = CalibratedSearch(shapes, scaled), [], 0
-    for part in block:
-        products = frame_sums(part, search.shapes)
-        some = motion[first : first + len(part.weight)]
-        parts.append(search.reversed_cameras(products, noise, some))
-        first += len(part.weight)
-    cameras, better = map(np.concatenate, zip(*parts, strict=True))
+    search = CalibratedSearch(shapes, scaled)
+    found = [
+        search.reversed_cameras(frame_sums(piece, search.shapes), noise, motion[frames])
+        for frames, piece in block.pieces(BLOCK_FRAMES)
+    ]
+    cameras, better = map(np.concatenate, zip(*found, strict=True))
     return cameras, better
 
 
 def _aligned_cameras(
-    block: list[FrameTracks], shapes: NDArray, noise: float, camera: str
+    block: FrameTracks, shapes: NDArray, noise: float, camera: str
 ) -> NDArray:
     """Return nearly optimal cameras (n_frames, 2, 3) for shapes (n_shapes, 3, n)."""
-    parts = [approximate_cameras(part, shapes, noise, camera=camera) for part in block]
-    return np.concatenate(parts)
+    return approximate_cameras(block, shapes, noise, camera=camera)
