@@ -61,6 +61,17 @@ class TableModel(NamedTuple):
         fit = partial(_fit, model=self, dtype=table.dtype)
         return FrameFit(*table.blocks.gather(fit, shapes, table.dtype))
 
+    def coefficient_posterior(self, table: Table) -> tuple[NDArray, NDArray]:
+        """
+        Return mean and covariance of the coefficients of each frame by itself.
+
+        They are those before the gauge, where the prior is N(0, I). NaN for frames that
+        are not usable.
+        """
+        found = table.blocks.map(partial(_posterior, model=self))
+        mean, covariance = map(np.concatenate, zip(*found, strict=True))
+        return mean, covariance
+
     def reconstruct(
         self, table: Table, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
@@ -123,6 +134,20 @@ def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
         for whole, part in zip(frames, fit, strict=True):
             whole[usable] = part
     return frames.astype(dtype)
+
+
+def _posterior(rows: NDArray, model: TableModel) -> tuple[NDArray, NDArray]:
+    """Return mean and covariance of the coefficients of rows (n, 2 * n_points)."""
+    tracks, usable = model.usable(rows)
+    K = len(model.basis)
+    mean, covariance = (np.full((len(tracks), *s), np.nan) for s in ((K,), (K, K)))
+    if usable.any():
+        assert isinstance(model.frames, PosteriorFrames)
+        centred, _ = centred_tracks(tracks[usable])
+        sizes = model.sizes(centred)
+        found = model.frames.posterior(centred / sizes[:, None, None])
+        mean[usable], covariance[usable] = found.alpha, found.covariance
+    return mean, covariance
 
 
 def _shapes(

@@ -1,5 +1,6 @@
 """A fitted model as a transformer of tables: all methods but `fit`."""
 
+from numbers import Integral, Real
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -9,12 +10,13 @@ from sklearn.base import (
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
 )
-from sklearn.utils import check_array
+from sklearn.utils import check_array, check_scalar
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
+from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.models import MIRROR
+from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
@@ -49,6 +51,28 @@ class Decomposition(NamedTuple):
     translation: NDArray
     alpha: NDArray
     alpha_std: NDArray
+
+
+class SmoothedCoefficients(NamedTuple):
+    """
+    Coefficients of frames, given all frames of their sequence.
+
+    Attributes
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Posterior means. Without dynamics they are those of `AffineNRSfM.transform`.
+        With dynamics, rows of which too little is seen are filled in.
+    alpha_std : ndarray of shape (n_frames, n_components)
+        Posterior standard deviations.
+    time_scales : ndarray of shape (n_components,) or (0,)
+        Times after which the shape of a frame is forgotten, the longest first, in the
+        units of `time`: ``-1 / log |l|`` with the eigenvalues l of the transition.
+        Infinite where |l| is one or more. Empty if the frames show no dynamics.
+    """
+
+    alpha: NDArray
+    alpha_std: NDArray
+    time_scales: NDArray
 
 
 class TableTransformer(
@@ -116,6 +140,87 @@ class TableTransformer(
         """
         table = self._opened(X)
         return Decomposition(*self._model.decompose(table))
+
+    def smooth(
+        self,
+        X: Any,
+        *,
+        time: Any = None,
+        groups: Any = None,
+        max_gap: int = 30,
+        max_iter: int = 100,
+        tol: float = 1e-3,
+    ) -> SmoothedCoefficients:
+        """
+        Return coefficients of the frames of a video, smoothed in time.
+
+        The coefficients follow a first-order autoregression that is estimated from the
+        table. Each frame counts by the posterior covariance of its coefficients: one in
+        which few points are seen counts little. The fit of the shapes does not depend
+        on the order of the frames: this is a step after it.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one. Within a group its rows are in
+            order of time.
+        time : array-like of shape (n_frames,), default=None
+            Times of the frames, numbers or dates (in seconds from the first). Their
+            median difference is a step of the autoregression. Other differences are
+            rounded to whole steps. None for frames one step apart.
+        groups : array-like of shape (n_frames,), default=None
+            Videos or scenes, between which nothing is carried on. None for one.
+        max_gap : int, default=30
+            After a gap of more steps nothing is carried on.
+        max_iter : int, default=100
+            Largest number of iterations of expectation maximisation.
+        tol : float, default=1e-3
+            The iteration ends when no coefficient changes by more than this share of
+            its prior standard deviation.
+
+        Returns
+        -------
+        SmoothedCoefficients
+            Named tuple of alpha, alpha_std (n_frames, n_components) and time_scales.
+
+        Raises
+        ------
+        ValueError
+            If times are missing or do not rise within a group, if no group has two
+            rows, or if the model was not refined jointly.
+
+        Notes
+        -----
+        A linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway, Stoffer, 1982)
+        that is observed through the likelihood of each frame. The transition has a
+        ridge of greatest evidence. Unless the evidence for dynamics is strong, as it is
+        not for photos in any order, the coefficients are those of `transform`.
+        """
+        check_scalar(max_gap, "max_gap", Integral, min_val=1)
+        check_scalar(max_iter, "max_iter", Integral, min_val=1)
+        check_scalar(tol, "tol", Real, min_val=0.0)
+        table = self._opened(X)
+        frames = self._model.frames
+        if not isinstance(frames, PosteriorFrames):
+            raise ValueError(
+                "smooth needs a model with refinement='joint', which knows how certain "
+                f"coefficients are; got refinement={self.refinement!r}"
+            )
+        mean, covariance, time_scales = smoothed_posterior(
+            *self._model.coefficient_posterior(table),
+            time,
+            groups,
+            max_gap=max_gap,
+            max_iter=max_iter,
+            tol=tol,
+        )
+        alpha, deviation, _ = frames.gauge.coefficients(mean, covariance)
+        dtype = table.dtype
+        return SmoothedCoefficients(
+            alpha.astype(dtype, copy=False),
+            deviation.astype(dtype, copy=False),
+            time_scales,
+        )
 
     def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """

@@ -51,11 +51,34 @@ class FrameMap(NamedTuple):
         deviation : ndarray of shape (n_frames, n_components)
             Their standard deviations, to first order.
         """
+        new, deviation, scale = self.coefficients(alpha, covariance)
+        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
+        return cameras, new, deviation
+
+    def coefficients(
+        self, alpha: NDArray, covariance: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """
+        Return coefficients, their standard deviations and the scales of the cameras.
+
+        Parameters
+        ----------
+        alpha, covariance
+            As of `apply`.
+
+        Returns
+        -------
+        alpha : ndarray of shape (n_frames, n_components)
+            New coefficients.
+        deviation : ndarray of shape (n_frames, n_components)
+            Their standard deviations, to first order.
+        scale : ndarray of shape (n_frames,)
+            Factors of the cameras.
+        """
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
-        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
-        return cameras, new, np.sqrt(variance) / np.abs(scale)[:, None]
+        return new, np.sqrt(variance) / np.abs(scale)[:, None], scale

@@ -1,0 +1,1 @@
+"""Coefficients of frames in order of time."""

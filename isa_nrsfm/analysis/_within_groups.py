@@ -1,0 +1,261 @@
+"""Coefficients relative to a person, and how much persons differ."""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
+from sklearn.utils import check_array
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm.analysis._labels import checked_column, group_numbers
+
+CHECKS: dict[str, Any] = {"ensure_all_finite": "allow-nan"}
+
+
+class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
+    """
+    Coefficients of frames relative to the mean of their group.
+
+    What a person looks like is in all of his or her frames; what is left when it is
+    taken away is what changes: expressions, gestures, poses. With `neutral` frames are
+    compared with the neutral frames of their group.
+
+    Groups are metadata: in a `Pipeline` they are routed to this step after
+    ``sklearn.set_config(enable_metadata_routing=True)`` and
+    ``WithinGroups().set_fit_request(groups=True).set_transform_request(groups=True)``.
+
+    Attributes
+    ----------
+    groups_ : ndarray of shape (n_groups,)
+        Names or numbers of the groups of the fit, sorted.
+    means_ : ndarray of shape (n_groups, n_features)
+        What is subtracted from their frames.
+    n_features_in_ : int
+        Number of features.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.analysis import WithinGroups
+    >>> alpha = [[1.0, 0.0], [3.0, 0.0], [0.0, 5.0], [0.0, 7.0]]
+    >>> WithinGroups().fit_transform(alpha, groups=["Ann", "Ann", "Bob", "Bob"])
+    array([[-1.,  0.],
+           [ 1.,  0.],
+           [ 0., -1.],
+           [ 0.,  1.]])
+    """
+
+    groups_: NDArray
+    means_: NDArray
+    n_features_in_: int
+
+    def fit(
+        self, X: Any, y: Any = None, *, groups: Any = None, neutral: Any = None
+    ) -> Self:
+        """
+        Learn the means of groups.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, n_features)
+            Coefficients; NaN where a frame has none.
+        y : None
+            Ignored.
+        groups : array-like of shape (n_frames,), default=None
+            Group of each frame; None for one group.
+        neutral : array-like of bool, shape (n_frames,), default=None
+            Frames whose mean is taken; None for all.
+
+        Returns
+        -------
+        WithinGroups
+            The transformer.
+
+        Raises
+        ------
+        ValueError
+            If groups are missing, or if a group has no neutral frame.
+        """
+        X = validate_data(self, X, dtype=[np.float64, np.float32], **CHECKS)
+        self.groups_, self.means_ = _group_means(X, groups, neutral)
+        return self
+
+    def transform(self, X: Any, groups: Any = None, neutral: Any = None) -> NDArray:
+        """
+        Return coefficients minus the mean of their group.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, n_features)
+            Coefficients; NaN where a frame has none.
+        groups : array-like of shape (n_frames,), default=None
+            Group of each frame; None for one group. Groups of the fit have the mean
+            that the fit found. Others have that of their frames in X.
+        neutral : array-like of bool, shape (n_frames,), default=None
+            Frames of new groups whose mean is taken; None for all.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_features)
+            The differences.
+
+        Raises
+        ------
+        ValueError
+            If groups are missing, or if a new group has no neutral frame.
+
+        Warns
+        -----
+        UserWarning
+            If a new group has one frame only, whose differences are zero.
+        """
+        check_is_fitted(self)
+        X = validate_data(
+            self, X, dtype=[np.float64, np.float32], reset=False, **CHECKS
+        )
+        names = _names(groups, len(X))
+        place = np.searchsorted(self.groups_, names)
+        place = np.minimum(place, len(self.groups_) - 1)
+        known = self.groups_[place] == names
+        means = np.asarray(self.means_[place], dtype=X.dtype)
+        if not known.all():
+            new = names[~known]
+            flags = None if neutral is None else np.asarray(neutral)[~known]
+            others, of_others = _group_means(X[~known], new, flags)
+            means[~known] = of_others[np.searchsorted(others, new)]
+            if neutral is None:
+                _warn_of_single_frames(new)
+        return np.asarray(X - means)
+
+    def fit_transform(
+        self, X: Any, y: Any = None, *, groups: Any = None, neutral: Any = None
+    ) -> NDArray:
+        """Fit to groups and return the differences, as `fit` and `transform`."""
+        fitted = self.fit(X, y, groups=groups, neutral=neutral)
+        if neutral is None and groups is not None:
+            _warn_of_single_frames(np.asarray(groups))
+        return fitted.transform(X, groups)
+
+    def __sklearn_tags__(self) -> Any:
+        """Return the tags of scikit-learn: NaN is allowed."""
+        tags = super().__sklearn_tags__()
+        tags.input_tags.allow_nan = True
+        return tags
+
+
+def _names(groups: Any, n_frames: int) -> NDArray:
+    """Return the group of each frame (n_frames,)."""
+    if groups is None:
+        return np.zeros(n_frames, dtype=int)
+    return checked_column("groups", groups, n_frames)
+
+
+def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArray]:
+    """Return the groups, sorted, and the means (n_groups, n_features) of each."""
+    names = _names(groups, len(X))
+    used = np.isfinite(X).all(axis=1)
+    if neutral is not None:
+        used &= checked_column("neutral", neutral, len(X)).astype(bool)
+    found, numbers = np.unique(names, return_inverse=True)
+    sizes = np.bincount(numbers[used], minlength=len(found))
+    if not sizes.all():
+        what = "a frame with coefficients" if neutral is None else "a neutral frame"
+        empty = [str(each) for each in found[sizes == 0]]
+        raise ValueError(
+            f"each group needs {what}; {len(empty)} of {len(found)} have none: "
+            f"{', '.join(empty[:5])}"
+        )
+    sums = np.stack(
+        [np.bincount(numbers[used], column, len(found)) for column in X[used].T], axis=1
+    )
+    return found, sums / sizes[:, None]
+
+
+def _warn_of_single_frames(names: NDArray) -> None:
+    """Warn of groups with one frame."""
+    single = int(np.sum(np.unique(names, return_counts=True)[1] == 1))
+    if single:
+        warn_caller(
+            f"{single} groups have one frame only: relative to their mean it is zero"
+        )
+
+
+class BetweenShare(NamedTuple):
+    """
+    How much of the variance of each coefficient lies between groups.
+
+    Attributes
+    ----------
+    between : ndarray of shape (n_components,)
+        Variance between groups divided by the whole variance, from 0 to 1.
+    within : ndarray of shape (n_components,)
+        The rest, that within groups.
+    n_groups : int
+        Number of groups.
+    n_frames : int
+        Number of frames with coefficients.
+    """
+
+    between: NDArray
+    within: NDArray
+    n_groups: int
+    n_frames: int
+
+
+def between_share(alpha: Any, groups: Any) -> BetweenShare:
+    """
+    Return how much of the variance of each coefficient lies between groups.
+
+    With people as groups, coefficients of identity have nearly all of their variance
+    between groups, and those of expression nearly all of it within.
+
+    Parameters
+    ----------
+    alpha : array-like of shape (n_frames, n_components)
+        Coefficients. Frames with NaN are left out.
+    groups : array-like of shape (n_frames,)
+        Group of each frame.
+
+    Returns
+    -------
+    BetweenShare
+        Named tuple of between, within (n_components,), n_groups and n_frames.
+
+    Raises
+    ------
+    ValueError
+        If groups are missing, if there is one group only, or if no group has two
+        frames.
+
+    Notes
+    -----
+    The intraclass correlation ICC(1): the variance components of one-way random effects
+    are estimated from the mean squares between and within groups (Searle, Casella,
+    McCulloch, "Variance components", 1992, section 3.6). So groups that differ by
+    chance only have a share of about zero, however few frames they have. Estimates
+    below zero count as zero.
+    """
+    X = check_array(alpha, dtype=np.float64, input_name="alpha", **CHECKS)
+    known = np.isfinite(X).all(axis=1)
+    numbers = group_numbers(groups, len(X))
+    assert numbers is not None
+    X, numbers = X[known], np.unique(numbers[known], return_inverse=True)[1]
+    sizes = np.bincount(numbers)
+    n_frames, n_groups = len(X), len(sizes)
+    if n_groups < 2 or n_frames == n_groups:
+        raise ValueError(
+            "variances between and within groups need two groups, and one with two "
+            f"frames; got {n_groups} groups of {n_frames} frames"
+        )
+    # Mean squares of the analysis of variance, and the typical size of a group
+    sums = np.stack([np.bincount(numbers, column) for column in X.T], axis=1)
+    means = sums / sizes[:, None]
+    within = np.sum((X - means[numbers]) ** 2, axis=0) / (n_frames - n_groups)
+    apart = sizes @ (means - X.mean(axis=0)) ** 2 / (n_groups - 1)
+    size = (n_frames - np.sum(sizes**2) / n_frames) / (n_groups - 1)
+    # Variance components
+    between = np.maximum(apart - within, 0.0) / size
+    total = between + within
+    share = np.divide(between, total, where=total > 0, out=np.zeros_like(total))
+    return BetweenShare(share, 1.0 - share, n_groups, n_frames)

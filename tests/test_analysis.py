@@ -1,0 +1,284 @@
+import numpy as np
+import pytest
+import sklearn
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import spearmanr
+from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
+
+from isa_nrsfm.analysis import (
+    AlignedFrames,
+    WithinGroups,
+    association,
+    between_share,
+    predictability,
+)
+
+rng_of = np.random.default_rng
+
+
+def related(seed=0, n=120, effect=1.5):
+    """Return three coefficients, of which the second goes with two classes."""
+    rng = rng_of(seed)
+    alpha, y = rng.normal(size=(n, 3)), rng.integers(2, size=n)
+    alpha[:, 1] += effect * y
+    return alpha, y
+
+
+class TestAssociation:
+    def test_eta_squared_is_r_squared_on_the_classes(self):
+        alpha, y = related()
+        y = np.where(y == 1, 1, rng_of(1).integers(2, 4, len(y)))
+        found = association(alpha, y, n_permutations=9, random_state=0)
+        dummies = (y[:, None] == np.unique(y)).astype(float)
+        for k, column in enumerate(alpha.T):
+            r2 = LinearRegression().fit(dummies, column).score(dummies, column)
+            assert found.statistic[k] == pytest.approx(r2)
+        assert found.kind == "classes"
+        assert found.n_frames == len(y)
+
+    def test_numbers_have_spearmans_correlation(self):
+        alpha, _ = related()
+        age = np.exp(alpha[:, 0]) + 0.1 * rng_of(3).normal(size=len(alpha))
+        found = association(alpha, age, n_permutations=99, random_state=0)
+        for k, column in enumerate(alpha.T):
+            assert found.statistic[k] == pytest.approx(spearmanr(column, age).statistic)
+        assert found.kind == "number"
+        assert found.p_value[0] == 0.01
+        assert found.p_value[1:].min() > 0.05
+
+    def test_whole_numbers_are_classes_unless_told_otherwise(self):
+        alpha, _ = related()
+        years = rng_of(0).integers(20, 30, len(alpha))
+        assert association(alpha, years, n_permutations=1).kind == "classes"
+        assert association(alpha, years, kind="number", n_permutations=1).kind == (
+            "number"
+        )
+
+    def test_p_values_are_uniform_without_association(self):
+        # The least corrected p-value of three coefficients is below 0.2 in a fifth.
+        least = []
+        for seed in range(100):
+            rng = rng_of(seed)
+            alpha, y = rng.normal(size=(30, 3)), rng.integers(3, size=30)
+            found = association(alpha, y, n_permutations=49, random_state=seed)
+            least.append(found.p_value.min())
+        assert 0.1 <= np.mean(np.array(least) <= 0.2) <= 0.3
+
+    def test_labels_of_people_are_permuted_among_people(self):
+        # Four people, two of each sex: of the six ways to deal the labels out two are
+        # as extreme. Frame by frame it would look certain.
+        rng = rng_of(0)
+        person = np.repeat(np.arange(4), 30)
+        alpha = np.array([0.0, 0.1, 5.0, 5.1])[person] + 0.01 * rng.normal(size=120)
+        sex = np.array(["m", "m", "f", "f"])[person]
+        found = association(alpha[:, None], sex, person, random_state=0)
+        assert found.p_value[0] == pytest.approx(1 / 3, abs=0.06)
+        assert association(alpha[:, None], sex, random_state=0).p_value[0] < 0.01
+
+    def test_labels_that_differ_within_people_are_permuted_there(self):
+        # Who is in a frame explains all; within people nothing goes with the label.
+        person = np.repeat(np.arange(6), 20)
+        y = (person % 3 > 0) ^ (np.arange(120) % 20 < 3)
+        alpha = 3.0 * (person % 3 > 0) + 0.1 * rng_of(1).normal(size=120)
+        found = association(alpha[:, None], y, person, random_state=0)
+        assert found.p_value[0] > 0.05
+        assert association(alpha[:, None], y, random_state=0).p_value[0] < 0.01
+
+    def test_frames_without_coefficients_are_left_out_and_counted(self):
+        alpha, y = related()
+        expected = association(alpha[10:], y[10:], random_state=0)
+        alpha[:10] = np.nan
+        found = association(alpha, y, random_state=0)
+        assert found.n_frames == len(y) - 10
+        assert_array_equal(found.statistic, expected.statistic)
+        assert_array_equal(found.p_value, expected.p_value)
+
+    def test_constant_coefficients_go_with_nothing(self):
+        alpha, y = related()
+        alpha[:, 2] = 1.0
+        found = association(alpha, y, random_state=0)
+        assert found.statistic[2] == 0
+        assert found.p_value[2] == 1
+
+    def test_table(self):
+        pytest.importorskip("pandas")
+        found = association(*related(), random_state=0)
+        frame = found.to_frame()
+        assert list(frame.columns) == ["eta_squared", "p_value"]
+        assert list(frame.index) == [1, 2, 3]
+        assert_array_equal(frame["p_value"], found.p_value)
+
+    @pytest.mark.parametrize(
+        ("y", "options", "message"),
+        [
+            (np.zeros(120), {}, "all 120 labels are.*nothing to compare"),
+            (np.arange(120), {}, "all different.*kind='number'"),
+            (["a"] * 119 + [None], {}, "missing in 1 of 120, the first is row 119"),
+            (np.r_[np.nan, np.ones(119)], {}, "missing in 1 of 120"),
+            (["a", "b"], {}, "each of the 120 frames; got 2"),
+            (["a", "b"] * 60, {"kind": "number"}, "numbers are expected; got"),
+            (["a", "b"] * 60, {"kind": "odd"}, "kind must be"),
+            (["a", "b"] * 60, {"groups": [1, 2]}, "groups must have one entry"),
+            (["a", "b"] * 60, {"n_permutations": 0}, "n_permutations"),
+        ],
+    )
+    def test_refusals(self, y, options, message):
+        with pytest.raises(ValueError, match=message):
+            association(related()[0], y, **options)
+
+    def test_refuses_a_table_without_coefficients(self):
+        with pytest.raises(ValueError, match="no frame has coefficients"):
+            association(np.full((4, 2), np.nan), [0, 0, 1, 1])
+
+
+class TestPredictability:
+    def test_accuracy_of_classes(self):
+        alpha, y = related(effect=8.0)
+        scores = predictability(alpha, y, random_state=0)
+        assert len(scores) == 5
+        assert scores.mean() > 0.98
+        assert predictability(alpha[:, :1], y, random_state=0).mean() < 0.7
+
+    def test_r_squared_of_numbers(self):
+        alpha, _ = related()
+        y = alpha @ [1.0, 2.0, 3.0]
+        assert predictability(alpha, y, random_state=0).min() > 0.99
+
+    def test_groups_stay_together(self):
+        # Each person has coefficients of one's own that tell the label, and no other's.
+        rng = rng_of(0)
+        person = np.repeat(np.arange(12), 10)
+        y = (np.arange(12) % 2)[person]
+        alpha = 10.0 * rng.normal(size=(12, 8))[person] + rng.normal(size=(120, 8))
+        alone = predictability(alpha, y, random_state=0).mean()
+        grouped = predictability(alpha, y, person, random_state=0).mean()
+        assert alone > grouped + 0.15
+
+    def test_fewer_folds_for_small_classes(self):
+        alpha, y = related(n=40)
+        y = np.where(np.arange(40) < 3, 5, y)
+        assert len(predictability(alpha, y, random_state=0)) == 3
+
+    @pytest.mark.parametrize(
+        ("y", "groups"),
+        [(np.r_[2, np.arange(119) % 2], None), (np.arange(120) % 2, np.zeros(120))],
+    )
+    def test_refuses_what_has_no_two_folds(self, y, groups):
+        with pytest.raises(ValueError, match="two folds need"):
+            predictability(related()[0], y, groups)
+
+
+class TestWithinGroups:
+    alpha = rng_of(0).normal(size=(30, 2))
+    people = np.repeat(["a", "b", "c"], 10)
+
+    def test_means_of_groups_are_zero(self):
+        got = WithinGroups().fit_transform(self.alpha, groups=self.people)
+        for person in "abc":
+            mine = self.people == person
+            assert_allclose(got[mine].mean(axis=0), 0, atol=1e-15)
+            difference = self.alpha[mine] - got[mine]
+            assert_allclose(difference, difference[:1].repeat(10, axis=0))
+
+    def test_neutral_frames(self):
+        neutral = np.arange(30) % 10 < 2
+        got = WithinGroups().fit_transform(
+            self.alpha, groups=self.people, neutral=neutral
+        )
+        for person in "abc":
+            assert_allclose(
+                got[(self.people == person) & neutral].mean(axis=0), 0, atol=1e-15
+            )
+
+    def test_groups_of_the_fit_keep_their_means(self):
+        step = WithinGroups().fit(self.alpha, groups=self.people)
+        got = step.transform([[1.0, 2.0]], groups=["b"])
+        assert_allclose(got[0], [1, 2] - self.alpha[10:20].mean(axis=0))
+
+    def test_new_groups_have_their_own(self):
+        step = WithinGroups().fit(self.alpha, groups=self.people)
+        got = step.transform(
+            [[1.0, 2.0], [3.0, 2.0], [0.0, 0.0]], groups=["x", "x", "a"]
+        )
+        assert_allclose(got[:2], [[-1, 0], [1, 0]])
+        assert_allclose(got[2], -self.alpha[:10].mean(axis=0))
+
+    def test_without_groups_all_frames_are_one(self):
+        got = WithinGroups().fit_transform(self.alpha)
+        assert_allclose(got, self.alpha - self.alpha.mean(axis=0))
+
+    def test_frames_without_coefficients_stay_without(self):
+        alpha = self.alpha.copy()
+        alpha[3] = np.nan
+        got = WithinGroups().fit_transform(alpha, groups=self.people)
+        assert np.isnan(got[3]).all()
+        assert_allclose(got[:10][np.arange(10) != 3].mean(axis=0), 0, atol=1e-15)
+
+    def test_in_a_pipeline(self):
+        with sklearn.config_context(enable_metadata_routing=True):
+            step = WithinGroups()
+            step.set_fit_request(groups=True, neutral=False)
+            step.set_transform_request(groups=True, neutral=False)
+            pipeline = make_pipeline(step)
+            got = pipeline.fit_transform(self.alpha, groups=self.people)
+        assert_allclose(
+            got, WithinGroups().fit_transform(self.alpha, groups=self.people)
+        )
+
+    def test_groups_without_neutral_frames_are_refused(self):
+        with pytest.raises(ValueError, match="neutral frame; 2 of 3 have none: b, c"):
+            WithinGroups().fit(
+                self.alpha, groups=self.people, neutral=self.people == "a"
+            )
+
+    def test_single_frames_are_told(self):
+        with pytest.warns(UserWarning, match="1 groups have one frame only"):
+            WithinGroups().fit_transform(self.alpha[:3], groups=["a", "a", "b"])
+        step = WithinGroups().fit(self.alpha, groups=self.people)
+        with pytest.warns(UserWarning, match="1 groups have one frame only"):
+            step.transform(self.alpha[:1], groups=["new"])
+
+
+class TestBetweenShare:
+    def test_of_a_random_effects_model(self):
+        rng = rng_of(0)
+        sizes = rng.integers(2, 12, 400)
+        person = np.repeat(np.arange(400), sizes)
+        share = np.array([0.0, 0.3, 0.9, 1.0])
+        alpha = np.sqrt(share) * rng.normal(size=(400, 4))[person]
+        alpha += np.sqrt(1 - share) * rng.normal(size=(len(person), 4))
+        found = between_share(alpha, person)
+        assert_allclose(found.between, share, atol=0.05)
+        assert_allclose(found.within, 1 - found.between)
+        assert found.n_groups == 400
+        assert found.n_frames == len(person)
+
+    def test_chance_alone_is_no_share(self):
+        # Eta squared would be about a half: two frames for each group.
+        alpha = rng_of(1).normal(size=(4000, 2))
+        assert between_share(alpha, np.arange(4000) // 2).between.max() < 0.08
+
+    @pytest.mark.parametrize("groups", [np.zeros(6), np.arange(6)])
+    def test_refusals(self, groups):
+        with pytest.raises(ValueError, match="need two groups, and one with two"):
+            between_share(np.ones((6, 2)), groups)
+
+
+class TestAlignedFrames:
+    @pytest.mark.parametrize("turn", [True, False])
+    def test_position_size_and_turn_are_taken_away(self, turn):
+        rng = rng_of(0)
+        shape = rng.normal(size=20) + 1j * rng.normal(size=20)
+        angles = 1j * (rng.normal(size=(9, 1)) if turn else np.zeros((9, 1)))
+        frames = np.exp(angles) * rng.uniform(1, 5, (9, 1)) * shape
+        frames = np.ascontiguousarray(frames + rng.normal(size=(9, 1)))
+        got = AlignedFrames(turn).fit_transform(frames.view(float))
+        assert_allclose(got, got[:1].repeat(9, axis=0), atol=1e-9)
+        points = got.view(complex)
+        assert_allclose(points.mean(axis=1), 0, atol=1e-12)
+        assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
+
+    def test_refuses_half_a_point(self):
+        with pytest.raises(ValueError, match="two columns a point; got 3"):
+            AlignedFrames().fit(np.ones((4, 3)))
