@@ -1,0 +1,305 @@
+"""Coefficients by class, against a number, or in time."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.analysis._labels import checked_column, kind_of
+from isa_nrsfm.plotting._axes import (
+    MINUS_COLOUR,
+    OBSERVED_COLOUR,
+    check_axes,
+    check_names,
+)
+from isa_nrsfm.plotting._page import PAGE_WIDTH
+
+Kind = Literal["classes", "number", "time"]
+# Inches: the height of a panel, and of the labels below the last one.
+PANEL_HEIGHT, LABEL_HEIGHT = 1.3, 0.5
+# Curves stop where the time between frames is more than this many times the median.
+BREAK = 3.0
+# Half the width of the band in which the frames of a class are scattered.
+JITTER = 0.18
+
+
+class CoefficientsDisplay:
+    """
+    Coefficients of frames: by class, against a number, or in time.
+
+    There is one panel for each basis shape. Classes are drawn as box plots over their
+    frames. Curves in time have a band of one standard deviation where it is known. It
+    is recommended to use `from_estimator` to create the display.
+
+    Parameters
+    ----------
+    alpha : array-like of shape (n_frames, n_components)
+        Coefficients; NaN where a frame has none.
+    alpha_std : array-like of shape (n_frames, n_components), default=None
+        Their standard deviations.
+    y : array-like of shape (n_frames,), default=None
+        A label for each frame: classes, or a number.
+    time : array-like of shape (n_frames,), default=None
+        Times of the frames. By default their numbers.
+    groups : array-like of shape (n_frames,), default=None
+        Videos or people: a curve does not go from one to another.
+    label : str, default=None
+        What `y` is, for the axis. By default "label".
+    component_names : list of str of length n_components, default=None
+        Names of the basis shapes. By default their numbers, from 1.
+
+    Attributes
+    ----------
+    alpha, alpha_std, y, time, groups, label, component_names
+        As given, as arrays.
+    axes_ : ndarray of matplotlib Axes, shape (n_components,)
+        The axes that were drawn on.
+    figure_ : matplotlib Figure
+        The figure that holds them.
+
+    Raises
+    ------
+    ValueError
+        If an array has not one row, or one entry, for each frame.
+
+    See Also
+    --------
+    BasisShapeDisplay : What the basis shapes look like.
+    isa_nrsfm.analysis.association : How coefficients go with a label, in numbers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.plotting import CoefficientsDisplay
+    >>> alpha = np.random.default_rng(0).normal(size=(20, 2))
+    >>> display = CoefficientsDisplay(alpha=alpha, y=["no", "yes"] * 10)
+    >>> display.plot().figure_
+    <Figure size ...>
+    """
+
+    def __init__(
+        self,
+        *,
+        alpha: ArrayLike,
+        alpha_std: ArrayLike | None = None,
+        y: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        label: str | None = None,
+        component_names: list[str] | None = None,
+    ) -> None:
+        self.alpha = np.asarray(alpha, dtype=float)
+        if self.alpha.ndim != 2:
+            raise ValueError(
+                "alpha must have a row for each frame and a column for each basis "
+                f"shape; got shape {self.alpha.shape}"
+            )
+        self.alpha_std = None if alpha_std is None else np.asarray(alpha_std, float)
+        if self.alpha_std is not None and self.alpha_std.shape != self.alpha.shape:
+            raise ValueError(
+                f"alpha_std must have the shape {self.alpha.shape} of alpha; "
+                f"got {self.alpha_std.shape}"
+            )
+        n_frames, n_components = self.alpha.shape
+        self.y, self.time, self.groups = (
+            None if values is None else checked_column(name, values, n_frames)
+            for name, values in (("y", y), ("time", time), ("groups", groups))
+        )
+        self.label = "label" if label is None else label
+        self.component_names = check_names(component_names, n_components)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        X: Any = None,
+        *,
+        y: ArrayLike | None = None,
+        time: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+        label: str | None = None,
+        component_names: list[str] | None = None,
+        ax: Any = None,
+        **kw: Any,
+    ) -> CoefficientsDisplay:
+        """
+        Draw the coefficients of a fitted estimator.
+
+        Parameters
+        ----------
+        estimator : AffineNRSfM
+            A fitted estimator.
+        X : array-like of shape (n_frames, 2 * n_points), default=None
+            A table with the points of the fitted one. By default the fitted table.
+        y, time, groups, label, component_names
+            As of `CoefficientsDisplay`.
+        ax : array of n_components matplotlib Axes, default=None
+            Axes to draw on. By default a new figure.
+        **kw : dict
+            Further arguments of `plot`.
+
+        Returns
+        -------
+        CoefficientsDisplay
+            The display, drawn.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            If the estimator is not fitted.
+        ValueError
+            As of `CoefficientsDisplay` and `plot`.
+        """
+        check_is_fitted(estimator, "alpha_" if X is None else None)
+        if X is None:
+            alpha, deviation = estimator.alpha_, getattr(estimator, "alpha_std_", None)
+        else:
+            _, _, alpha, deviation = estimator.decompose(X)
+        display = cls(
+            alpha=alpha,
+            alpha_std=deviation,
+            y=y,
+            time=time,
+            groups=groups,
+            label=label,
+            component_names=component_names,
+        )
+        return display.plot(ax, **kw)
+
+    def plot(
+        self, ax: Any = None, *, kind: Literal["auto"] | Kind = "auto"
+    ) -> CoefficientsDisplay:
+        """
+        Draw the coefficients.
+
+        Parameters
+        ----------
+        ax : array of n_components matplotlib Axes, default=None
+            Axes to draw on. By default a new figure.
+        kind : {"auto", "classes", "number", "time"}, default="auto"
+            Box plots for each class of `y`, points against the numbers of `y`, or
+            curves in time. "auto" is what `y` is, and "time" without `y`.
+
+        Returns
+        -------
+        CoefficientsDisplay
+            The display itself.
+
+        Raises
+        ------
+        ValueError
+            If `ax` has not one axes for each basis shape, or if `kind` needs `y`.
+        """
+        plt = import_optional("matplotlib.pyplot", extra="plot")
+        found = self._kind(kind)
+        n_components = self.alpha.shape[1]
+        if ax is None:
+            height = PANEL_HEIGHT * n_components + LABEL_HEIGHT
+            _, ax = plt.subplots(
+                n_components,
+                sharex=True,
+                figsize=(PAGE_WIDTH, height),
+                layout="constrained",
+            )
+        self.axes_ = check_axes(ax, n_components, "one for each basis shape")
+        self.figure_ = self.axes_[0].figure
+        draw = {
+            "classes": self._draw_classes,
+            "number": self._draw_number,
+            "time": self._draw_time,
+        }[found]
+        for k, axes in enumerate(self.axes_):
+            draw(axes, k)
+            axes.set_ylabel(self.component_names[k])
+            axes.axhline(0, color="0.85", linewidth=0.6, zorder=0)
+            axes.spines[["top", "right"]].set_visible(False)
+        time_label = "frame" if self.time is None else "time"
+        self.axes_[-1].set_xlabel(time_label if found == "time" else self.label)
+        return self
+
+    def _kind(self, kind: str) -> Kind:
+        """Return what to draw."""
+        if kind == "time" or (kind == "auto" and self.y is None):
+            return "time"
+        if self.y is None:
+            raise ValueError(f"kind={kind!r} needs y, a label for each frame")
+        return kind_of(self.y, kind)
+
+    def _draw_classes(self, axes: Any, k: int) -> None:
+        """Draw box plots and the frames of each class, scattered sideways."""
+        assert self.y is not None
+        classes, numbers = np.unique(self.y, return_inverse=True)
+        known = np.isfinite(self.alpha[:, k])
+        rng = np.random.default_rng(0)  # where points lie sideways means nothing
+        sideways = numbers + JITTER * rng.uniform(-1, 1, len(numbers))
+        axes.scatter(
+            sideways[known],
+            self.alpha[known, k],
+            s=4,
+            color=MINUS_COLOUR,
+            alpha=0.4,
+            linewidths=0,
+            rasterized=True,
+        )
+        axes.boxplot(
+            [self.alpha[known & (numbers == c), k] for c in range(len(classes))],
+            positions=range(len(classes)),
+            widths=0.6,
+            showfliers=False,
+            medianprops={"color": OBSERVED_COLOUR, "linewidth": 1.4},
+            boxprops={"linewidth": 0.7},
+            whiskerprops={"linewidth": 0.7},
+            capprops={"linewidth": 0.7},
+        )
+        names = [str(each) for each in classes]
+        slanted = max(map(len, names)) * len(names) > 60
+        axes.set_xticks(range(len(classes)), names, rotation=30 * slanted)
+
+    def _draw_number(self, axes: Any, k: int) -> None:
+        """Draw the frames as points against their number."""
+        axes.scatter(
+            self.y,
+            self.alpha[:, k],
+            s=5,
+            color=MINUS_COLOUR,
+            alpha=0.5,
+            linewidths=0,
+            rasterized=True,
+        )
+
+    def _draw_time(self, axes: Any, k: int) -> None:
+        """Draw a curve, broken at gaps and groups, with a band of one deviation."""
+        time: NDArray = np.arange(len(self.alpha)) if self.time is None else self.time
+        for rows in self._pieces(time):
+            axes.plot(
+                time[rows],
+                self.alpha[rows, k],
+                color=MINUS_COLOUR,
+                linewidth=0.9,
+                marker="." if len(rows) == 1 else None,
+            )
+            if self.alpha_std is not None:
+                axes.fill_between(
+                    time[rows],
+                    self.alpha[rows, k] - self.alpha_std[rows, k],
+                    self.alpha[rows, k] + self.alpha_std[rows, k],
+                    color=MINUS_COLOUR,
+                    alpha=0.25,
+                    linewidth=0,
+                )
+
+    def _pieces(self, time: NDArray) -> list[NDArray]:
+        """Return the rows of each curve, in the order of the table."""
+        groups = np.zeros(len(time), int) if self.groups is None else self.groups
+        pieces = []
+        for group in np.unique(groups):
+            rows = np.flatnonzero(groups == group)
+            apart = np.diff(time[rows])
+            typical = np.median(apart) if len(apart) else apart.sum()
+            cuts = np.flatnonzero((apart > BREAK * typical) | (apart < 0 * typical))
+            pieces += np.split(rows, cuts + 1)
+        return pieces
