@@ -21,22 +21,9 @@ length, the coordinate axes, and whether the depth has the right sign: the mirro
 of everything, ``z -> -z``, has the same images.
 """
 
-from isa_nrsfm._metric_upgrade.deforming import (
-    DeformationMetric,
-    EuclideanFrames,
-    deformation_metric,
-    euclidean_frames,
-)
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-    OrthonormalCameras,
-    orthonormal_cameras,
-)
-from isa_nrsfm._metric_upgrade.rigid import (
-    MetricUpgrade,
-    euclidean_shapes,
-    metric_upgrade,
-)
-from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "CanonicalPose",
@@ -51,3 +38,46 @@ __all__ = [
     "metric_upgrade",
     "orthonormal_cameras",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm._metric_upgrade.deforming import (
+        DeformationMetric,
+        EuclideanFrames,
+        deformation_metric,
+        euclidean_frames,
+    )
+    from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+        OrthonormalCameras,
+        orthonormal_cameras,
+    )
+    from isa_nrsfm._metric_upgrade.rigid import (
+        MetricUpgrade,
+        euclidean_shapes,
+        metric_upgrade,
+    )
+    from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm._metric_upgrade.deforming": [
+                "DeformationMetric",
+                "EuclideanFrames",
+                "deformation_metric",
+                "euclidean_frames",
+            ],
+            "isa_nrsfm._metric_upgrade.orthonormal_cameras": [
+                "OrthonormalCameras",
+                "orthonormal_cameras",
+            ],
+            "isa_nrsfm._metric_upgrade.rigid": [
+                "MetricUpgrade",
+                "euclidean_shapes",
+                "metric_upgrade",
+            ],
+            "isa_nrsfm.calibration._canonical_pose": [
+                "CanonicalPose",
+                "canonical_pose",
+            ],
+        },
+    )
