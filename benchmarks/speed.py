@@ -49,7 +49,7 @@ def seconds(function, repeats=1):
 
 
 def process_seconds(arguments, repeats=1):
-    """Return mean seconds of processor time, user and system, of processes of Python."""
+    """Return mean seconds of processor time, user and system, of runs of Python."""
 
     def used():
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
