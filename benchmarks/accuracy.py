@@ -34,12 +34,14 @@ from benchmarks._sets import SETS, is_present, load, shapes_in_camera
 from benchmarks.recovery import instance
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._joint import fit as joint_fit
-from isa_nrsfm._joint import problem as joint_problem
-from isa_nrsfm._joint import relevance
-from isa_nrsfm._joint import starts as joint_starts
+from isa_nrsfm._joint import (
+    fit as joint_fit,
+    problem as joint_problem,
+    relevance,
+    starts as joint_starts,
+)
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
-from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d

@@ -1,15 +1,22 @@
 """
-Time fits as ratios to an SVD in the same run, and new frames; one BLAS thread.
+Time fits as ratios to an SVD in the same run, new frames, and starts; one BLAS thread.
 
 Run ``python -m benchmarks.speed [section ...] [--seeds N] [--pairs N]``. Each ratio is
 taken pair by pair, reference and candidate in turn, so that it holds on a machine whose
 speed drifts.
 """
 
+import os
+import resource
+import subprocess
+import sys
 import time
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+import pandas as pd
 
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
@@ -22,6 +29,8 @@ from isa_nrsfm._tables.layout import (
     table_to_tracks,
     weighting_sizes,
 )
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import save_model, write_table
 
 # Random starts against which the fit of a frame is held, and how far they are spread,
 # in standard deviations of the coefficients.
@@ -39,10 +48,25 @@ def seconds(function, repeats=1):
     return (time.perf_counter() - start) / repeats
 
 
-def paired_ratio(candidate, reference, n_pairs, repeats=1):
+def process_seconds(arguments, repeats=1):
+    """Return mean seconds of processor time, user and system, of runs of Python."""
+
+    def used():
+        usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return usage.ru_utime + usage.ru_stime
+
+    before = used()
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, *arguments]
+    for _ in range(repeats):
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
+    return (used() - before) / repeats
+
+
+def paired_ratio(candidate, reference, n_pairs, repeats=1, measure=seconds):
     """Return ratios candidate / reference: minimum, median, maximum; and seconds."""
-    candidate(), reference()  # not counted
-    pairs = [(seconds(candidate), seconds(reference, repeats)) for _ in range(n_pairs)]
+    measure(candidate), measure(reference)  # not counted
+    pairs = [(measure(candidate), measure(reference, repeats)) for _ in range(n_pairs)]
     ratios = [a / b for a, b in pairs]
     return (*np.percentile(ratios, [0, 50, 100]), *np.median(pairs, axis=0))
 
@@ -203,7 +227,43 @@ def fastisa_iteration(options):
         )
 
 
+def start(options):
+    """Processor time of whole commands, relative to Python and to what they import.
+
+    The start of a command may take three times that of Python and 100 ms, and
+    ``transform`` of one frame 1.2 times the import of scikit-learn and pandas.
+    """
+    heading("", "ms", "ms of")
+    nothing = ["-c", "pass"]
+    imports = ["-c", "import sklearn.decomposition, pandas"]
+    package = ["-m", "isa_nrsfm"]
+    with TemporaryDirectory() as folder:
+        model, table, output = (
+            str(Path(folder, name)) for name in ("faces.skops", "one.csv", "alpha.csv")
+        )
+        faces = make_face_tracks(400, n_components=3, random_state=0)
+        X = pd.DataFrame(faces.data, columns=faces.feature_names)
+        save_model(AffineNRSfM(3, random_state=0).fit(X), model)
+        write_table(X.iloc[:1], table)
+        transform = [*package, "transform", model, table, "--output", output]
+        for title, command, against, reference in (
+            ("--version", [*package, "--version"], "python", nothing),
+            ("--help", [*package, "--help"], "python", nothing),
+            ("fit --help", [*package, "fit", "--help"], "python", nothing),
+            ("transform, one frame", transform, "imports", imports),
+        ):
+            least, median, most, own, other = paired_ratio(
+                command, reference, options.pairs, measure=process_seconds
+            )
+            print(
+                f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
+                f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {against}",
+                flush=True,
+            )
+
+
 SECTIONS = {
+    "start": start,
     "fits": fits,
     "new_frames": new_frames,
     "optima": optima,

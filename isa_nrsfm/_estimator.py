@@ -16,14 +16,17 @@ from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit
 from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, fit_table
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
     full_rotations,
 )
 from isa_nrsfm._frames.models import FrameFit
-from isa_nrsfm._gauge.independent import INDEPENDENCE
-from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
+from isa_nrsfm._parameters.choices import (
+    BLOCK_RECOVERIES,
+    CAMERA_NAMES,
+    INDEPENDENCE,
+    LOSSES,
+    REFINEMENTS,
+)
 from isa_nrsfm._prepare.checks import check_names
-from isa_nrsfm._prepare.robust import LOSSES
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm._tables.sources import (
@@ -285,8 +288,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         ],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
         "block_recovery": [StrOptions(set(BLOCK_RECOVERIES))],
-        "refinement": [StrOptions({"joint", "alternating"}), None],
-        "camera": [StrOptions(set(CAMERAS))],
+        "refinement": [StrOptions(set(REFINEMENTS)), None],
+        "camera": [StrOptions(set(CAMERA_NAMES))],
         "independence": [StrOptions(set(INDEPENDENCE)), None],
         "loss": [StrOptions(set(LOSSES))],
         "layout": [StrOptions(set(LAYOUTS))],

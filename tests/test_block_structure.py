@@ -12,7 +12,6 @@ from scenes import (
 )
 
 from isa_nrsfm._paper.block_structure import (
-    BLOCK_RECOVERIES,
     LIFT_RIDGE,
     leading_blocks,
     lifted_blocks,
@@ -25,6 +24,7 @@ from isa_nrsfm._paper.block_structure import (
     unpack,
 )
 from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
 

@@ -10,7 +10,7 @@ import pytest
 from export_models import face_model
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._prepare.robust import LOSSES
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scenes import random_rotation
 
 from isa_nrsfm._frames.basis_change import FrameMap
-from isa_nrsfm._gauge.independent import INDEPENDENCE, independent_gauge
+from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._parameters.choices import INDEPENDENCE
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 ALL = [*INDEPENDENCE, None]

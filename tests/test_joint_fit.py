@@ -12,8 +12,7 @@ from scenes import measurements, rotate_frames
 
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.posterior import fit_posterior
-from isa_nrsfm._joint import problem as problem_module
-from isa_nrsfm._joint import reweighting
+from isa_nrsfm._joint import problem as problem_module, reweighting
 from isa_nrsfm._joint.fit import (
     JointFit,
     Spectrum,

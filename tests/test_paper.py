@@ -14,10 +14,10 @@ from sklearn.base import BaseEstimator
 
 from isa_nrsfm import FastISA, PooledFastICA
 from isa_nrsfm._frames.camera import rigid_cameras
-from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.pipeline import SIGNAL_DECIMALS, run_paper_pipeline
 from isa_nrsfm._paper.svd import leading_triplets
+from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 OPTIONS = {
     "block_recovery": "generalized_eigen",

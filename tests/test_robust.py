@@ -6,10 +6,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import (
     DISTANT,
     LARGEST_SHARE,
-    LOSSES,
     TUNING,
     distant_points,
     gross_outliers,

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+import isa_nrsfm
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.calibration import canonical_pose, deformation_metric, euclidean_frames
@@ -46,6 +47,10 @@ def of_calibrated_cameras(table: Floats) -> tuple[Floats, str]:
     poses: Floats = model.rotations_ * model.scales_[:, None, None]
     ratio: float = model.camera_noise_ratio_
     return poses * ratio, model.diagnostics().camera_meaning
+
+
+def of_misspelt_names() -> None:
+    isa_nrsfm.AffineNRSFM  # type: ignore[attr-defined] # noqa: B018
 
 
 def main(folder: Path) -> float:

@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.asv_suite._measured import TABLES, Measured, Table, load
-from benchmarks.speed import measured as measurement_matrix
-from benchmarks.speed import with_holes
+from benchmarks.speed import measured as measurement_matrix, with_holes
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, fit_jointly

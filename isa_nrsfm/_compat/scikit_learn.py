@@ -25,9 +25,9 @@ except ImportError:
         HasMethods,
         Interval,
         StrOptions,
+        fit_context as _fit_context,
         validate_params,
     )
-    from isa_nrsfm._compat.plain_checks import fit_context as _fit_context
 
 try:
     from sklearn.utils._missing import is_pandas_na

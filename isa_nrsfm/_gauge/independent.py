@@ -20,7 +20,6 @@ from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
-INDEPENDENCE = ("shapes", "coefficients")
 # Alternation of the shifts u and v: its convergence tolerance, and the most rounds.
 SHIFTED = 1e-12
 MAX_SHIFTS = 200

@@ -185,12 +185,12 @@ def _explained(m: NDArray, energy: NDArray) -> NDArray:
     return m.T @ weighted
 
 
+# For each of `BLOCK_RECOVERIES`.
 _METHODS: dict[str, Callable[[NDArray, NDArray, NDArray], NDArray]] = {
     "generalized_eigen": _generalized_eigen,
     "eigen": _eigen,
     "irls": _irls,
 }
-BLOCK_RECOVERIES = tuple(_METHODS)
 
 
 def lifted_moments(products: MotionProducts) -> NDArray:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._tables.visibility import seen_points
 
-LOSSES = ("linear", "huber", "cauchy")
 # Tuning constant c of a loss, in standard deviations of a coordinate. With these, the
 # estimate of a location in the plane has 95 percent of the efficiency of least squares
 # if the noise is normal.

@@ -1,7 +1,21 @@
 """Other methods of non-rigid structure from motion, to compare with."""
 
-from isa_nrsfm.baselines._block_matrix import BlockMatrixNRSfM
-from isa_nrsfm.baselines._compressible import CompressibleNRSfM
-from isa_nrsfm.baselines._pseudo_inverse import PseudoInverseNRSfM
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = ["BlockMatrixNRSfM", "CompressibleNRSfM", "PseudoInverseNRSfM"]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.baselines._block_matrix import BlockMatrixNRSfM
+    from isa_nrsfm.baselines._compressible import CompressibleNRSfM
+    from isa_nrsfm.baselines._pseudo_inverse import PseudoInverseNRSfM
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.baselines._block_matrix": ["BlockMatrixNRSfM"],
+            "isa_nrsfm.baselines._compressible": ["CompressibleNRSfM"],
+            "isa_nrsfm.baselines._pseudo_inverse": ["PseudoInverseNRSfM"],
+        },
+    )

@@ -13,7 +13,8 @@ and cameras of other programs:
   find, too, what affine cameras hide of the deformation;
 - `orthonormal_cameras` finds orthographic cameras directly in the motion factor of a
   deforming shape, mixtures of as many of its columns as it takes;
-- `canonical_pose` turns a shape upright and frontal.
+- `canonical_pose` turns a shape upright and frontal, and `view_angles` says by how much
+  each frame is turned.
 
 In the image x points right and y points down; in space z points away from the camera,
 so that ``R`` with rows x, y and z is a rotation. What stays unknown is the unit of
@@ -21,22 +22,9 @@ length, the coordinate axes, and whether the depth has the right sign: the mirro
 of everything, ``z -> -z``, has the same images.
 """
 
-from isa_nrsfm._metric_upgrade.deforming import (
-    DeformationMetric,
-    EuclideanFrames,
-    deformation_metric,
-    euclidean_frames,
-)
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-    OrthonormalCameras,
-    orthonormal_cameras,
-)
-from isa_nrsfm._metric_upgrade.rigid import (
-    MetricUpgrade,
-    euclidean_shapes,
-    metric_upgrade,
-)
-from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "CanonicalPose",
@@ -44,10 +32,57 @@ __all__ = [
     "EuclideanFrames",
     "MetricUpgrade",
     "OrthonormalCameras",
+    "ViewAngles",
     "canonical_pose",
     "deformation_metric",
     "euclidean_frames",
     "euclidean_shapes",
     "metric_upgrade",
     "orthonormal_cameras",
+    "view_angles",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm._metric_upgrade.deforming import (
+        DeformationMetric,
+        EuclideanFrames,
+        deformation_metric,
+        euclidean_frames,
+    )
+    from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+        OrthonormalCameras,
+        orthonormal_cameras,
+    )
+    from isa_nrsfm._metric_upgrade.rigid import (
+        MetricUpgrade,
+        euclidean_shapes,
+        metric_upgrade,
+    )
+    from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+    from isa_nrsfm.calibration._view_angles import ViewAngles, view_angles
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm._metric_upgrade.deforming": [
+                "DeformationMetric",
+                "EuclideanFrames",
+                "deformation_metric",
+                "euclidean_frames",
+            ],
+            "isa_nrsfm._metric_upgrade.orthonormal_cameras": [
+                "OrthonormalCameras",
+                "orthonormal_cameras",
+            ],
+            "isa_nrsfm._metric_upgrade.rigid": [
+                "MetricUpgrade",
+                "euclidean_shapes",
+                "metric_upgrade",
+            ],
+            "isa_nrsfm.calibration._canonical_pose": [
+                "CanonicalPose",
+                "canonical_pose",
+            ],
+            "isa_nrsfm.calibration._view_angles": ["ViewAngles", "view_angles"],
+        },
+    )

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.cli._commands import as_fitted, read_frames
 from isa_nrsfm.cli._export_options import SUFFIXES
 from isa_nrsfm.cli._outputs import refuse_overwriting
+from isa_nrsfm.cli._reading import as_fitted, read_frames
 from isa_nrsfm.cli._report import lay_out, table_lines, table_report
 from isa_nrsfm.export import (
     point_distribution_model,
@@ -18,7 +18,7 @@ from isa_nrsfm.export import (
     write_shapes,
     write_viewer,
 )
-from isa_nrsfm.export._shape_arrays import names_of_points
+from isa_nrsfm.export._names import names_of_points
 from isa_nrsfm.io import load_model
 
 # The options that each content has.

@@ -67,9 +67,13 @@ def _run(args: Namespace, warned: list[str]) -> str:
         from isa_nrsfm.cli._export import run_export
 
         return run_export(args)
-    from isa_nrsfm.cli._commands import run_fit, run_transform
+    if args.command == "transform":
+        from isa_nrsfm.cli._transform import run_transform
 
-    return (run_fit if args.command == "fit" else run_transform)(args, warned)
+        return run_transform(args)
+    from isa_nrsfm.cli._commands import run_fit
+
+    return run_fit(args, warned)
 
 
 @contextlib.contextmanager

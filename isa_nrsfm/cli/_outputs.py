@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, Decomposition
+from isa_nrsfm import AffineNRSfM, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.cli._frames import Frames
-from isa_nrsfm.export import write_shapes, write_viewer
-from isa_nrsfm.export._shape_arrays import names_of_components
+from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
 
@@ -126,7 +125,7 @@ def write_results(
     cameras.insert(0, "row", cameras.index)
     write_table(cameras, folder / "cameras.csv")
 
-    write_shapes(estimator, folder / "shapes.npz")
+    export.write_shapes(estimator, folder / "shapes.npz")
     _write_page(folder / "viewer.html", estimator, X)
     save_model(estimator, folder / "model.skops")
 
@@ -136,10 +135,10 @@ def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            write_viewer(estimator, path, X=X)
+            export.write_viewer(estimator, path, X=X)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        write_viewer(estimator, path, X=X, camera=None)
+        export.write_viewer(estimator, path, X=X, camera=None)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":

@@ -1,16 +1,24 @@
-"""The options of the command line."""
+"""The options of the command line.
+
+Neither the estimator nor a reader of tables is imported here: ``--help`` does not wait
+for them. Defaults of `AffineNRSfM` and its strategies are written once more, and
+`tests/test_cli.py` holds them against each other.
+"""
 
 import argparse
 import re
 from typing import Any, NamedTuple
 
-from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA, __version__
-from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._gauge.independent import INDEPENDENCE
-from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
-from isa_nrsfm._prepare.robust import LOSSES
+from isa_nrsfm import __version__
+from isa_nrsfm._parameters.choices import (
+    BLOCK_RECOVERIES,
+    CAMERA_NAMES,
+    INDEPENDENCE,
+    LOSSES,
+    REFINEMENTS,
+)
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
-from isa_nrsfm.io import FORMATS
+from isa_nrsfm.io._format_names import FORMAT_NAMES, TABLE
 
 PROGRAM = "isa-nrsfm"
 # What stands for the number of basis shapes where the table is to tell it.
@@ -160,12 +168,13 @@ def _add_table_options(
     )
     group.add_argument(
         "--format",
-        choices=["auto", *FORMATS],
+        choices=["auto", *FORMAT_NAMES],
         default="auto",
         metavar="FORMAT",
         help="what has written the table: "
-        f"{', '.join(name for name in FORMATS if name != 'table')}, or table for any "
-        "with named columns (default: auto, the one whose files begin like this one)",
+        f"{', '.join(name for name in FORMAT_NAMES if name != TABLE)}, or "
+        f"{TABLE} for any with named columns (default: auto, the one whose files begin "
+        "like this one)",
     )
     group.add_argument(
         "--columns",
@@ -206,22 +215,21 @@ def _add_table_options(
 
 def _add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add the parameters of the factorisation."""
-    defaults = AffineNRSfM().get_params()
     group = parser.add_argument_group("method")
     group.add_argument(
         "-k",
         "--n-components",
         metavar="K",
         type=_numbers_of_shapes,
-        default=str(defaults["n_components"]),
+        default="3",
         help="number of basis shapes (default: %(default)s). Of several, such as 1-8 "
         "or 3,6,9, that is taken which best predicts held-out points of held-out "
         "frames; auto takes those of twelve that the table determines",
     )
     group.add_argument(
         "--camera",
-        choices=list(CAMERAS),
-        default=defaults["camera"],
+        choices=CAMERA_NAMES,
+        default=CAMERA_NAMES[0],
         help="what is known of the cameras: affine assumes nothing, weak_perspective "
         "ones are rotations with a scale for each frame, orthographic ones have one "
         "scale for all frames; with the last two shapes have true proportions "
@@ -238,33 +246,32 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
         "--n-init",
         metavar="N",
         type=_positive,
-        help=f"number of random starts (default: {PooledFastICA().n_init} of pooled, "
-        f"{FastISA().n_init} of fast)",
+        help="number of random starts (default: 16 of pooled, 30 of fast)",
     )
     group.add_argument(
         "--block-recovery",
-        choices=list(BLOCK_RECOVERIES),
-        default=defaults["block_recovery"],
+        choices=BLOCK_RECOVERIES,
+        default=BLOCK_RECOVERIES[0],
         help="how the block structure is found (default: %(default)s)",
     )
     group.add_argument(
         "--refinement",
-        choices=["joint", "alternating", "none"],
-        default=str(defaults["refinement"]).lower(),
+        choices=[*REFINEMENTS, "none"],
+        default=REFINEMENTS[0],
         help="joint: cameras, coefficients and basis shapes together; alternating: the "
         "paper's, with the cameras of the rigid part held (default: %(default)s)",
     )
     group.add_argument(
         "--independence",
         choices=[*INDEPENDENCE, "none"],
-        default=str(defaults["independence"]).lower(),
+        default=INDEPENDENCE[0],
         help="what is made independent in the joint refinement, the basis shapes over "
         "the points or their coefficients over the frames (default: %(default)s)",
     )
     group.add_argument(
         "--loss",
-        choices=list(LOSSES),
-        default=defaults["loss"],
+        choices=LOSSES,
+        default=LOSSES[0],
         help="how far-off points count in the joint refinement: huber and cauchy "
         "bound the influence of outliers (default: %(default)s)",
     )

@@ -62,11 +62,12 @@ def quality_report(
     estimator: AffineNRSfM, X: Any, fit: Decomposition
 ) -> dict[str, Any]:
     """Describe how well a model explains a table."""
-    off = fitted_table(estimator, fit) - np.asarray(X)
+    explained = fitted_table(estimator, fit)
+    off = explained - np.asarray(X)
     return {
         "inverse_snr": inverse_snr(
             X,
-            fitted_table(estimator, fit),
+            explained,
             layout=estimator.layout,
             scale_frames=estimator.frames_scaled_,
         ),

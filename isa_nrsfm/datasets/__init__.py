@@ -1,8 +1,23 @@
 """Tables of landmarks: artificial ones with all truths known, and public ones."""
 
-from isa_nrsfm.datasets._face import make_face_tracks
-from isa_nrsfm.datasets._muct import fetch_muct
-from isa_nrsfm.datasets._nonrigid import make_nonrigid_tracks
-from isa_nrsfm.datasets._shark import fetch_shark
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = ["fetch_muct", "fetch_shark", "make_face_tracks", "make_nonrigid_tracks"]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.datasets._face import make_face_tracks
+    from isa_nrsfm.datasets._muct import fetch_muct
+    from isa_nrsfm.datasets._nonrigid import make_nonrigid_tracks
+    from isa_nrsfm.datasets._shark import fetch_shark
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.datasets._face": ["make_face_tracks"],
+            "isa_nrsfm.datasets._muct": ["fetch_muct"],
+            "isa_nrsfm.datasets._nonrigid": ["make_nonrigid_tracks"],
+            "isa_nrsfm.datasets._shark": ["fetch_shark"],
+        },
+    )

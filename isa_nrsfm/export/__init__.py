@@ -5,15 +5,9 @@ glTF, and a page for a browser that lets anybody look at them. Shapes are Euclid
 as far as the cameras tell them (`isa_nrsfm.calibration`), upright and frontal.
 """
 
-from isa_nrsfm.export._gltf import write_glb
-from isa_nrsfm.export._point_distribution import (
-    PointDistributionModel,
-    point_distribution_model,
-    read_pdm,
-    write_pdm,
-)
-from isa_nrsfm.export._shape_arrays import ShapeArrays, shape_arrays, write_shapes
-from isa_nrsfm.export._viewer import write_viewer
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "PointDistributionModel",
@@ -26,3 +20,33 @@ __all__ = [
     "write_shapes",
     "write_viewer",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.export._gltf import write_glb
+    from isa_nrsfm.export._point_distribution import (
+        PointDistributionModel,
+        point_distribution_model,
+        read_pdm,
+        write_pdm,
+    )
+    from isa_nrsfm.export._shape_arrays import ShapeArrays, shape_arrays, write_shapes
+    from isa_nrsfm.export._viewer import write_viewer
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.export._gltf": ["write_glb"],
+            "isa_nrsfm.export._point_distribution": [
+                "PointDistributionModel",
+                "point_distribution_model",
+                "read_pdm",
+                "write_pdm",
+            ],
+            "isa_nrsfm.export._shape_arrays": [
+                "ShapeArrays",
+                "shape_arrays",
+                "write_shapes",
+            ],
+            "isa_nrsfm.export._viewer": ["write_viewer"],
+        },
+    )

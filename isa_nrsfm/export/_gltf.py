@@ -17,7 +17,7 @@ from isa_nrsfm.export._drawing import (
     frontal_triangles,
     vertex_normals,
 )
-from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
+from isa_nrsfm.export._names import names_of_components, names_of_points
 from isa_nrsfm.export._upright import (
     UPSIDE_DOWN,
     Camera,

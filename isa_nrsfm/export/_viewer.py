@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm.export._drawing import Links, choose_links, edges_of
-from isa_nrsfm.export._shape_arrays import names_of_components, names_of_points
+from isa_nrsfm.export._names import names_of_components, names_of_points
 from isa_nrsfm.export._upright import (
     UPSIDE_DOWN,
     Camera,

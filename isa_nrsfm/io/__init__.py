@@ -1,21 +1,8 @@
 """Read and open landmark tables, and save and load fitted models."""
 
-from isa_nrsfm.io._formats import (
-    FORMATS,
-    LandmarkFormat,
-    find_format,
-    read_landmarks,
-)
-from isa_nrsfm.io._landmarks import Landmarks
-from isa_nrsfm.io._models import TRUSTED_TYPES, load_model, save_model
-from isa_nrsfm.io._results import from_mediapipe, from_movement
-from isa_nrsfm.io._stored_tables import open_table
-from isa_nrsfm.io._tables import (
-    LandmarkTable,
-    landmark_table,
-    read_table,
-    write_table,
-)
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "FORMATS",
@@ -34,3 +21,43 @@ __all__ = [
     "save_model",
     "write_table",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.io._formats import (
+        FORMATS,
+        LandmarkFormat,
+        find_format,
+        read_landmarks,
+    )
+    from isa_nrsfm.io._landmarks import Landmarks
+    from isa_nrsfm.io._models import TRUSTED_TYPES, load_model, save_model
+    from isa_nrsfm.io._results import from_mediapipe, from_movement
+    from isa_nrsfm.io._stored_tables import open_table
+    from isa_nrsfm.io._tables import (
+        LandmarkTable,
+        landmark_table,
+        read_table,
+        write_table,
+    )
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.io._formats": [
+                "FORMATS",
+                "LandmarkFormat",
+                "find_format",
+                "read_landmarks",
+            ],
+            "isa_nrsfm.io._landmarks": ["Landmarks"],
+            "isa_nrsfm.io._models": ["TRUSTED_TYPES", "load_model", "save_model"],
+            "isa_nrsfm.io._results": ["from_mediapipe", "from_movement"],
+            "isa_nrsfm.io._stored_tables": ["open_table"],
+            "isa_nrsfm.io._tables": [
+                "LandmarkTable",
+                "landmark_table",
+                "read_table",
+                "write_table",
+            ],
+        },
+    )

@@ -18,6 +18,7 @@ from isa_nrsfm.io._face_tables import (
     read_openface,
     read_pyfeat,
 )
+from isa_nrsfm.io._format_names import TABLE
 from isa_nrsfm.io._landmarks import Landmarks, assemble, drop_unsure_points
 from isa_nrsfm.io._sleap import is_sleap, read_sleap
 from isa_nrsfm.io._tables import TABLE_SUFFIXES, landmark_table, read_table
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 # Stands for a folder where others have the suffix of a file.
 _FOLDER = "/"
-_TABLE = "table"
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ def find_format(path: "str | os.PathLike[str]") -> str:
     _check_exists(path)
     possible = [found for found in FORMATS.values() if _suffix(path) in found.suffixes]
     matching = [
-        found.name for found in possible if found.name != _TABLE and found.matches(path)
+        found.name for found in possible if found.name != TABLE and found.matches(path)
     ]
     if len(matching) > 1:
         raise ValueError(
@@ -249,8 +249,8 @@ def find_format(path: "str | os.PathLike[str]") -> str:
         )
     if matching:
         return matching[0]
-    if any(found.name == _TABLE for found in possible):
-        return _TABLE
+    if any(found.name == TABLE for found in possible):
+        return TABLE
     raise ValueError(
         f"{path} is of no known format. Expected "
         + "; ".join(
@@ -269,7 +269,7 @@ def _read_named_columns(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(points.columns[::2]),
         other,
-        format=_TABLE,
+        format=TABLE,
         columns=list(points.columns),
     )
 
@@ -363,7 +363,7 @@ _ALL = (
         ("category",),
     ),
     LandmarkFormat(
-        _TABLE,
+        TABLE,
         "a table with named columns",
         "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
         TABLE_SUFFIXES,

@@ -18,7 +18,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
-from isa_nrsfm._prepare.robust import LOSSES
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.layout import LAYOUTS
 from isa_nrsfm.io._model_values import (
     N_FEATURES,

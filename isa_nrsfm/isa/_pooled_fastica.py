@@ -7,7 +7,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
 
@@ -206,6 +205,9 @@ class PooledFastICA(BaseSubspaceAnalysis):
 
     def _fastica(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
         """Return unmixing, steps and convergence of one run on white signals."""
+        # With it come all linear models, for which `transform` need not wait.
+        from sklearn.decomposition import FastICA
+
         ica = FastICA(
             whiten=False,
             fun=self.fun,

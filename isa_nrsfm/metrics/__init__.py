@@ -1,9 +1,8 @@
 """Measures of a factorisation, blind to what the images cannot determine."""
 
-from isa_nrsfm.metrics._affine_shapes import affine_shape_error, basis_similarity
-from isa_nrsfm.metrics._euclidean_shapes import mean_shape_error_3d
-from isa_nrsfm.metrics._reprojection import inverse_snr
-from isa_nrsfm.metrics._subspaces import subspace_distance
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "affine_shape_error",
@@ -12,3 +11,22 @@ __all__ = [
     "mean_shape_error_3d",
     "subspace_distance",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.metrics._affine_shapes import affine_shape_error, basis_similarity
+    from isa_nrsfm.metrics._euclidean_shapes import mean_shape_error_3d
+    from isa_nrsfm.metrics._reprojection import inverse_snr
+    from isa_nrsfm.metrics._subspaces import subspace_distance
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.metrics._affine_shapes": [
+                "affine_shape_error",
+                "basis_similarity",
+            ],
+            "isa_nrsfm.metrics._euclidean_shapes": ["mean_shape_error_3d"],
+            "isa_nrsfm.metrics._reprojection": ["inverse_snr"],
+            "isa_nrsfm.metrics._subspaces": ["subspace_distance"],
+        },
+    )

@@ -1,9 +1,8 @@
 """Figures of a factorisation, drawn with matplotlib."""
 
-from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
-from isa_nrsfm.plotting._coefficients import CoefficientsDisplay
-from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
-from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "BasisShapeDisplay",
@@ -11,3 +10,19 @@ __all__ = [
     "ModeCovarianceDisplay",
     "ReprojectionDisplay",
 ]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
+    from isa_nrsfm.plotting._coefficients import CoefficientsDisplay
+    from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
+    from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.plotting._basis_shapes": ["BasisShapeDisplay"],
+            "isa_nrsfm.plotting._coefficients": ["CoefficientsDisplay"],
+            "isa_nrsfm.plotting._mode_covariance": ["ModeCovarianceDisplay"],
+            "isa_nrsfm.plotting._reprojection": ["ReprojectionDisplay"],
+        },
+    )

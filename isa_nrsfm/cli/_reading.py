@@ -1,0 +1,159 @@
+"""Read the table that a command is given, and take its landmark columns."""
+
+from argparse import Namespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.landmark_columns import (
+    LandmarkColumns,
+    find_landmark_columns,
+    parse_coordinate,
+    point_names,
+)
+from isa_nrsfm.cli._frames import Frames, choose_frames
+from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# Points and coordinates in the order of the columns.
+_SHAPES = {"interleaved": (-1, 2), "planar": (2, -1)}
+
+
+def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
+    """Read the table and take its frames, for a model those with its points."""
+    args.format = _format(args)
+    table, chosen, failed = _read(args)
+    if estimator is not None:
+        columns = _columns_of_model(estimator, table, chosen)
+    else:
+        columns = chosen or find_landmark_columns(table.columns)
+    frames = choose_frames(
+        table,
+        columns,
+        rules=args.skip_rows,
+        zeros_missing=args.zeros_missing,
+        failed=failed,
+    )
+    # A format says itself which of its columns are landmarks.
+    return frames if failed is None else frames._replace(not_used={})
+
+
+def _format(args: Namespace) -> str:
+    """Return the format of the table, and refuse options of another one."""
+    found = args.format
+    if found == "auto":
+        found = "table" if args.columns is not None else find_format(args.table)
+    if args.columns is not None and found != "table":
+        raise ValueError(f"--columns is for --format table; got --format {found}")
+    if args.image_size is not None and "image_size" not in FORMATS[found].options:
+        raise ValueError(
+            f"--image-size is for --format mediapipe; {args.table} is of format {found}"
+        )
+    if args.min_confidence is not None and found == "table":
+        raise ValueError(
+            f"--min-confidence: {args.table} is of format table, which has no "
+            "confidences"
+        )
+    return found
+
+
+def _read(
+    args: Namespace,
+) -> "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None]":
+    """Return the table, its landmark columns and its failed rows, where known."""
+    if args.format == "table":
+        table = read_table(args.table)
+        if args.columns is None:
+            return table, None, None
+        return table, find_landmark_columns(table.columns, args.columns), None
+    pd = import_optional("pandas", extra="io")
+    options = {} if args.image_size is None else {"image_size": args.image_size}
+    found = read_landmarks(
+        args.table, args.format, min_confidence=args.min_confidence, **options
+    )
+    table = pd.concat([found.frames, found.points], axis=1)
+    names = tuple(found.points)
+    columns = LandmarkColumns(
+        pattern=f"those of {args.format}",
+        points=found.point_names,
+        x=names[::2],
+        y=names[1::2],
+        z=(),
+        gaps=(),
+    )
+    return table, columns, found.failed
+
+
+def _columns_of_model(
+    estimator: AffineNRSfM, table: "pd.DataFrame", chosen: LandmarkColumns | None
+) -> LandmarkColumns:
+    """Return the columns of the points that a model was fitted to.
+
+    ``chosen`` are the landmarks of the table where more than their names tells them.
+    """
+    fitted = getattr(estimator, "feature_names_in_", None)
+    n_points = len(estimator.mean_shape_)
+    if fitted is None:
+        found = chosen or find_landmark_columns(table.columns)
+        if len(found.points) != n_points:
+            raise ValueError(
+                f"the model has {n_points} points, the table has {len(found.points)} "
+                f"({found.pattern})"
+            )
+        return found
+    tracks = np.array([str(name).strip() for name in fitted]).reshape(
+        _SHAPES[estimator.layout]
+    )
+    x, y = tracks if estimator.layout == "planar" else tracks.T
+    wanted = {*x, *y}
+    in_table = {str(name).strip(): name for name in table.columns}
+    # Columns that are coordinates or, where there are such, the chosen ones.
+    candidates = (
+        [name for name in table.columns if parse_coordinate(name) is not None]
+        if chosen is None
+        else chosen.interleaved
+    )
+    coordinates = {str(name).strip(): name for name in candidates}
+    present = in_table if chosen is None else coordinates
+    absent = [name for point in zip(x, y, strict=True) for name in point]
+    absent = [name for name in absent if name not in present]
+    surplus = [name for name in coordinates if name not in wanted]
+    if absent or (surplus and chosen is not None):
+        differences = [
+            f"{len(names)} columns are only in the {where} ({_shortened(names)})"
+            for names, where in ((absent, "model"), (surplus, "table"))
+            if names
+        ]
+        raise ValueError(
+            "the points of the table are not those of the model: "
+            + "; ".join(differences)
+        )
+    return LandmarkColumns(
+        pattern="those of the model",
+        points=point_names(x),
+        x=tuple(in_table[name] for name in x),
+        y=tuple(in_table[name] for name in y),
+        z=(),
+        gaps=(),
+    )
+
+
+def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
+    """Return a table of landmarks with the columns that the model was fitted to."""
+    fitted = getattr(estimator, "feature_names_in_", None)
+    if fitted is None:
+        x_then_y = points.to_numpy().reshape(len(points), -1, 2).swapaxes(1, 2)
+        planar = estimator.layout == "planar"
+        return x_then_y.reshape(points.shape) if planar else points.to_numpy()
+    in_order = points[[str(name).strip() for name in fitted]]
+    return in_order.set_axis(list(fitted), axis=1)
+
+
+def _shortened(names: list[str]) -> str:
+    """List the first names."""
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

@@ -1,0 +1,189 @@
+"""Public names that are imported when they are used, and what nobody waits for.
+
+What is held here is which modules are loaded. How long a start takes is measured by
+``python -m benchmarks.speed start``.
+"""
+
+import ast
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import isa_nrsfm
+from isa_nrsfm import AffineNRSfM, Decomposition
+from isa_nrsfm._compat.lazy import lazy_names
+from isa_nrsfm.cli._parser import build_parser
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import FORMATS, save_model, write_table
+from isa_nrsfm.isa import FastISA, PooledFastICA
+
+PACKAGES = [
+    "isa_nrsfm",
+    *(
+        f"isa_nrsfm.{folder.name}"
+        for folder in sorted(Path(isa_nrsfm.__file__).parent.iterdir())
+        if folder.is_dir() and folder.name[0].isalpha()
+    ),
+]
+# All that is slow to import: NumPy is the least of it.
+SLOW = {"numpy", "scipy", "sklearn", "pandas", "joblib", "matplotlib", "skops"}
+
+
+def for_type_checkers(package):
+    """Return the module from which type checkers take each public name."""
+    tree = ast.parse(Path(package.__file__).read_text(encoding="utf-8"))
+    return {
+        alias.name: node.module
+        for block in tree.body
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("isa_nrsfm")
+        for alias in node.names
+        if alias.name != "lazy_names"
+    }
+
+
+def loaded_by(code, **environment):
+    """Return the modules that a program has loaded at its end."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def command(*arguments):
+    """Return a program that runs the command line as ``python -m isa_nrsfm`` does."""
+    argv = ["isa_nrsfm", *map(str, arguments)]
+    return (
+        f"import runpy, sys\nsys.argv = {argv}\n"
+        "try:\n    runpy.run_module('isa_nrsfm', run_name='__main__')\n"
+        "except SystemExit as end:\n    assert not end.code, end.code\n"
+    )
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_names_are_those_that_type_checkers_see(name):
+    package = importlib.import_module(name)
+    seen = for_type_checkers(package)
+    assert set(package.__all__) <= {*seen, "__version__"}
+    assert {*seen, *package.__all__} <= set(dir(package))
+    for public, module in seen.items():
+        expected = getattr(importlib.import_module(module), public)
+        assert getattr(package, public) is expected
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_name_that_is_misspelt_is_an_error_at_once(name):
+    package = importlib.import_module(name)
+    with pytest.raises(AttributeError, match=rf"{name}.*'AffineNRSFM'") as error:
+        package.AffineNRSFM  # noqa: B018
+    assert error.value.name == "AffineNRSFM"
+    with pytest.raises(ImportError, match="AffineNRSFM"):
+        exec(f"from {name} import AffineNRSFM")
+
+
+def test_a_name_is_asked_for_once(monkeypatch):
+    package = importlib.import_module("isa_nrsfm.isa")
+    monkeypatch.delitem(vars(package), "FastISA", raising=False)
+    assert package.FastISA is FastISA
+    assert vars(package)["FastISA"] is FastISA
+
+
+def test_the_error_of_an_import_comes_through(monkeypatch):
+    monkeypatch.delenv("EAGER_IMPORT", raising=False)
+    find, _ = lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
+    with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
+        find("Absent")
+    monkeypatch.setenv("EAGER_IMPORT", "1")
+    with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
+        lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
+
+
+def test_classes_are_pickled_by_where_they_are_defined():
+    for kind in (AffineNRSfM, Decomposition):
+        assert pickle.loads(pickle.dumps(kind)) is kind
+
+
+@pytest.mark.subprocess
+@pytest.mark.parametrize("name", PACKAGES)
+def test_the_import_of_a_package_waits_for_nothing(name):
+    assert not loaded_by(f"import {name}; dir({name})", EAGER_IMPORT="") & SLOW
+
+
+@pytest.mark.subprocess
+def test_folders_of_the_package_need_no_import_of_their_own():
+    code = (
+        "import isa_nrsfm\n"
+        "assert 'isa_nrsfm.io' not in sys.modules\n"
+        "assert isa_nrsfm.io.load_model and isa_nrsfm.isa.FastISA\n"
+    )
+    loaded_by(f"import sys\n{code}", EAGER_IMPORT="")
+
+
+@pytest.mark.subprocess
+def test_all_names_are_imported_at_once_where_that_is_asked_for():
+    loaded = loaded_by("import isa_nrsfm", EAGER_IMPORT="1")
+    assert {"isa_nrsfm._estimator", "isa_nrsfm.io._sleap", "sklearn"} <= loaded
+
+
+@pytest.mark.subprocess
+def test_what_is_not_installed_is_an_error_of_the_import():
+    code = (
+        "import sys\nsys.modules['sklearn'] = None\nimport isa_nrsfm\ntry:\n"
+        "    from isa_nrsfm import AffineNRSfM\n"
+        "except ModuleNotFoundError as error:\n    assert 'sklearn' in str(error)\n"
+        "else:\n    raise AssertionError\n"
+    )
+    loaded_by(code, EAGER_IMPORT="")
+
+
+@pytest.mark.subprocess
+@pytest.mark.parametrize(
+    "arguments",
+    [["--version"], ["--help"], ["fit", "--help"], ["export", "--help"]],
+    ids=" ".join,
+)
+def test_help_waits_for_nothing(arguments):
+    assert not loaded_by(command(*arguments), EAGER_IMPORT="") & SLOW
+
+
+@pytest.mark.subprocess
+def test_transform_loads_no_more_than_it_uses(tmp_path):
+    faces = make_face_tracks(40, n_components=1, random_state=0)
+    table = pd.DataFrame(faces.data, columns=faces.feature_names)
+    save_model(AffineNRSfM(1, random_state=0).fit(table), tmp_path / "model.skops")
+    write_table(table.iloc[:1], tmp_path / "one.csv")
+    files = tmp_path / "model.skops", tmp_path / "one.csv"
+    run = command("transform", *files, "-o", tmp_path / "alpha.csv")
+    loaded = loaded_by(run, EAGER_IMPORT="")
+    assert (tmp_path / "alpha.csv").exists()
+    assert "isa_nrsfm._estimator" in loaded
+    not_used = {
+        "matplotlib",
+        "skops",
+        "scipy.io",
+        "sklearn.decomposition",
+        "sklearn.model_selection",
+        "isa_nrsfm.cli._commands",
+        "isa_nrsfm.export._viewer",
+        "isa_nrsfm.plotting._views",
+    }
+    assert not loaded & not_used
+
+
+def test_the_help_has_the_formats_and_defaults_that_there_are(capsys):
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(["fit", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"{', '.join(FORMATS).removesuffix(', table')}, or table" in text
+    pooled, fast = PooledFastICA().n_init, FastISA().n_init
+    assert f"(default: {pooled} of pooled, {fast} of fast)" in text
