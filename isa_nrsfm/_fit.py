@@ -40,6 +40,7 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
+from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
@@ -76,6 +77,19 @@ STAGES = (
 )
 
 
+class Limits(NamedTuple):
+    """
+    What steers the decisions of the stages, a tuple for each.
+
+    Attributes
+    ----------
+    joint : JointOptions
+        Of the joint refinement.
+    """
+
+    joint: JointOptions = JointOptions()
+
+
 class FitOptions(NamedTuple):
     """
     How a table is fitted: parameters of `AffineNRSfM`, checked.
@@ -92,6 +106,8 @@ class FitOptions(NamedTuple):
         Whether each frame gets size one. Orthographic cameras never scale frames.
     names : ndarray of shape (2 * n_points,) or None
         Names of the columns.
+    limits : Limits
+        What steers the stages.
     """
 
     isa: Any
@@ -106,6 +122,7 @@ class FitOptions(NamedTuple):
     max_iter: int
     tol: float | None
     names: NDArray | None
+    limits: Limits
 
     @property
     def joint(self) -> bool:
@@ -301,6 +318,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
         loss=options.loss,
         max_iter=options.max_iter,
         tol=options.joint_tol,
+        options=options.limits.joint,
     )
     if found == most:
         warn_caller(
@@ -447,6 +465,7 @@ def _refined_jointly(
         max_iter=options.max_iter,
         tol=options.joint_tol,
         on_step=progress.step,
+        options=options.limits.joint,
     )
     progress(JOINT_STAGE)
     # Posterior of every frame

@@ -393,27 +393,12 @@ def test_far_perspective_cameras_are_orthographic(tracks):
     np.testing.assert_allclose(shapes[..., :2], centred, atol=1e-10)
 
 
-def test_constants_of_the_prior_are_put_back():
-    before = _joint_constants()
-    least_noise = accuracy.joint_problem.LEAST_NOISE
-    with accuracy.prior_of(0.5, 0.25):
-        changed = _joint_constants()
-    assert {0.5, 0.25} <= set(changed)
-    assert least_noise not in changed
-    assert _joint_constants() == before
-    assert changed.count(0.25) == before.count(least_noise)
-
-
-def _joint_constants():
-    """Return the constants of the prior in the joint fit, also where they are given."""
-    constants = []
-    for module in accuracy.PRIOR_MODULES:
-        for name, known in vars(module).items():
-            if name in ("BASIS_STD", "LEAST_NOISE"):
-                constants.append(known)
-            elif getattr(known, "__module__", None) == module.__name__:
-                constants += getattr(known, "__defaults__", None) or ()
-    return constants
+def test_the_prior_can_be_varied():
+    X = make_nonrigid_tracks(60, 20, 2, noise=0.05, random_state=0).data
+    usual = accuracy.fit_set(X, "affine", 2).noise_variance_
+    other = accuracy.JOINT_OPTIONS._replace(basis_std=0.5, least_noise=0.25)
+    assert accuracy.fit_set(X, "affine", 2, other).noise_variance_ != usual
+    assert accuracy.fit_set(X, "affine", 2).noise_variance_ == usual
 
 
 def test_as_many_points_are_hidden_as_is_said():
