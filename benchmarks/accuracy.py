@@ -8,7 +8,6 @@ of Euclidean shapes are `mean_shape_error_3d`, of shapes in the axes of their ca
 """
 
 import warnings
-from contextlib import ExitStack, contextmanager
 from unittest import mock
 
 import numpy as np
@@ -33,13 +32,11 @@ from benchmarks._methods import Found, found_by_ours
 from benchmarks._sets import SETS, is_present, load, shapes_in_camera
 from benchmarks.recovery import instance
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._joint import (
-    fit as joint_fit,
-    problem as joint_problem,
-    relevance,
-    starts as joint_starts,
-)
+from isa_nrsfm._joint import fit as joint_fit
+from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
@@ -79,7 +76,6 @@ TURNING_ROUNDS = 10
 # Of the prior: deviations of the basis shapes, least noise variances.
 BASIS_STDS = (0.005, 0.008, 0.01, 0.015, 0.02)
 LEAST_NOISES = (1e-4, 5e-5, 3e-5)
-PRIOR_MODULES = (joint_problem, joint_fit, joint_starts, relevance)
 # Sets and K that cut a full spectrum off, and factors of what is left.
 CUT = {
     "yoga": (3, 6, 12),
@@ -317,10 +313,10 @@ def tolerances(options):
         print(f"  largest over smallest {max(errors) / min(errors):.4f}", flush=True)
 
 
-def fit_set(X, camera, n_components, **parameters):
-    """Return the fit of a table with a camera."""
+def fit_set(X, camera, n_components, joint=JOINT_OPTIONS, **parameters):
+    """Return the fit of a table with a camera, and other options of the joint fit."""
     settings = {"camera": camera, "random_state": 0, **parameters}
-    return AffineNRSfM(n_components, **settings).fit(X)
+    return limited(Limits(joint=joint))(n_components, **settings).fit(X)
 
 
 def errors_in_camera(truth, found, scale=False):
@@ -356,27 +352,6 @@ def title_of(name, camera, n_components):
     return f"{name} K={n_components}, {camera}"
 
 
-@contextmanager
-def prior_of(basis_std, least_noise):
-    """Fit with other constants of the prior, also where they are defaults."""
-    old = joint_problem.LEAST_NOISE
-    constants = {"BASIS_STD": basis_std, "LEAST_NOISE": least_noise}
-    with ExitStack() as stack:
-        for module in PRIOR_MODULES:
-            for name, known in list(vars(module).items()):
-                if name in constants:
-                    change = mock.patch.object(module, name, constants[name])
-                    stack.enter_context(change)
-                elif old in (getattr(known, "__defaults__", None) or ()):
-                    defaults = tuple(
-                        least_noise if default == old else default
-                        for default in known.__defaults__
-                    )
-                    change = mock.patch.object(known, "__defaults__", defaults)
-                    stack.enter_context(change)
-        yield
-
-
 def prior(options):
     """Errors by the prior of basis shapes and the least noise.
 
@@ -387,8 +362,8 @@ def prior(options):
     print("   std   noise" + headings_of(cases))
     for basis_std in BASIS_STDS:
         for least_noise in LEAST_NOISES:
-            with prior_of(basis_std, least_noise):
-                errors = [chosen_error(*case) for case in cases]
+            joint = JOINT_OPTIONS._replace(basis_std=basis_std, least_noise=least_noise)
+            errors = [chosen_error(*case, joint) for case in cases]
             row = "".join(f"{error:10.4f}" for error in errors)
             print(f"{basis_std:6g}{least_noise:8g}{row}", flush=True)
 
@@ -396,7 +371,8 @@ def prior(options):
 def noise(options):
     """Noise without floor and prior, to that of the spectrum; errors by the cut-off.
 
-    Models are right up to a ratio of `RIGHT`; the errors are those of `prior`.
+    Models are right up to a ratio of `JudgementOptions.right`. The errors are those of
+    `prior`.
     """
     for kind in ("weak_perspective", "affine"):
         for K, fitted in ((2, 2), (2, 4), (4, 4), (4, 6), (4, 3), (4, 2)):
@@ -427,8 +403,9 @@ def noise(options):
     )
     print("cut-off" + headings_of(cases))
     for cut_off in CUT_OFFS:
-        with mock.patch.object(joint_fit, "CUT_OFF", cut_off):
-            row = "".join(f"{chosen_error(*case):10.4f}" for case in cases)
+        judgement = JOINT_OPTIONS.judgement._replace(cut_off=cut_off)
+        joint = JOINT_OPTIONS._replace(judgement=judgement)
+        row = "".join(f"{chosen_error(*case, joint):10.4f}" for case in cases)
         print(f"{cut_off:7g}{row}", flush=True)
 
 
@@ -439,7 +416,7 @@ def noise_ratio(X, camera, n_components):
     def recorded(problem, result, start, cameras, spectrum):
         n_seen, energy = problem.totals
         free = joint_fit.unregularised(problem, result.state, cameras)
-        known = max(spectrum.noise, joint_fit.EXACT)
+        known = max(spectrum.noise, problem.options.judgement.exact)
         ratios.append(free.state.noise * n_seen / energy / known)
         return original(problem, result, start, cameras, spectrum)
 
@@ -453,10 +430,10 @@ def headings_of(cases):
     return "".join(f"{f'{name} {K}':>10}" for name, _, K in cases)
 
 
-def chosen_error(name, camera, n_components):
+def chosen_error(name, camera, n_components, joint=JOINT_OPTIONS):
     """Return the error of a fit of a set that suits its camera, as of `prior`."""
     table = load(name)
-    found = found_by_ours(fit_set(table.X, camera, n_components), table.X)
+    found = found_by_ours(fit_set(table.X, camera, n_components, joint), table.X)
     if name == "ict_68":
         return affine_shape_error(table.shapes, found.affine)
     sequence, frame = errors_in_camera(shapes_in_camera(name), found)

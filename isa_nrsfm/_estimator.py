@@ -13,7 +13,7 @@ from sklearn.utils import check_random_state, estimator_html_repr
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, fit_table
+from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, Limits, fit_table
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     full_rotations,
@@ -281,6 +281,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     n_features_in_: int
     feature_names_in_: NDArray
 
+    _limits: ClassVar[Limits] = Limits()  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
@@ -438,6 +439,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             self.max_iter,
             self.tol,
             names,
+            self._limits,
         )
         self._set(fit_table(source, self.n_components, options, progress), source)
         progress.end()
@@ -536,6 +538,25 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             setattr(self, f"{name}_", value)
         self._unit, self._n_features_out = fit.unit, len(fit.model.basis)
         self._model = fit.model
+
+
+def limited(limits: Limits) -> type[AffineNRSfM]:
+    """
+    Return the estimator with other limits.
+
+    Tests and benchmarks show with it what the limits do.
+
+    Parameters
+    ----------
+    limits : Limits
+        What steers the stages of its fits.
+
+    Returns
+    -------
+    type
+        A subclass of `AffineNRSfM`.
+    """
+    return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
 
 
 def check_class(estimator: object, where: str) -> None:

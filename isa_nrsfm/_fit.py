@@ -40,14 +40,17 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
+from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.options import PaperOptions, SampleOptions, SvdOptions
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import Triplets, block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.options import CompletionOptions, OutlierOptions
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -76,6 +79,34 @@ STAGES = (
 )
 
 
+class Limits(NamedTuple):
+    """
+    What steers the decisions of the stages, a tuple for each.
+
+    Attributes
+    ----------
+    outliers : OutlierOptions
+        Of the search for gross outliers.
+    completion : CompletionOptions
+        Of missing points.
+    svd : SvdOptions
+        Of the factorisation.
+    sample : SampleOptions
+        Of the sample.
+    paper : PaperOptions
+        Of the paper's pipeline.
+    joint : JointOptions
+        Of the joint refinement.
+    """
+
+    outliers: OutlierOptions = OutlierOptions()
+    completion: CompletionOptions = CompletionOptions()
+    svd: SvdOptions = SvdOptions()
+    sample: SampleOptions = SampleOptions()
+    paper: PaperOptions = PaperOptions()
+    joint: JointOptions = JointOptions()
+
+
 class FitOptions(NamedTuple):
     """
     How a table is fitted: parameters of `AffineNRSfM`, checked.
@@ -92,6 +123,8 @@ class FitOptions(NamedTuple):
         Whether each frame gets size one. Orthographic cameras never scale frames.
     names : ndarray of shape (2 * n_points,) or None
         Names of the columns.
+    limits : Limits
+        What steers the stages.
     """
 
     isa: Any
@@ -106,6 +139,7 @@ class FitOptions(NamedTuple):
     max_iter: int
     tol: float | None
     names: NDArray | None
+    limits: Limits
 
     @property
     def joint(self) -> bool:
@@ -227,10 +261,12 @@ def fit_table(
     # 1. Table
     table = _scaled(source, n_components, options)
     unit = 1.0 if options.scale_frames else float(table.sizes[0])
-    outliers, used = _completed(table, n_components, options.loss)
+    outliers, used = _completed(table, n_components, options)
     progress("table")
     # 2. Factorisation
-    triplets, sample, factors = _factors(table, used, n_components, options.joint)
+    triplets, sample, factors = _factors(
+        table, used, n_components, options.joint, options.limits
+    )
     progress("factorisation")
     # 3. and 4. The paper's pipeline
     isa, paper = _paper_result(factors, n_components, options, progress)
@@ -287,8 +323,8 @@ def _count_components(source: Table, options: FitOptions) -> int:
         table = _scaled(source, 1, options)
     most = largest_n_components(table.n_points)
     most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
-    outliers, used = _completed(table, most, options.loss)
-    _, sample, factors = _factors(table, used, most, joint=True)
+    outliers, used = _completed(table, most, options)
+    _, sample, factors = _factors(table, used, most, True, options.limits)
     _, paper = _paper_result(factors, most, options, lambda stage: None)
     found = count_components(
         table.rows,
@@ -301,6 +337,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
         loss=options.loss,
         max_iter=options.max_iter,
         tol=options.joint_tol,
+        options=options.limits.joint,
     )
     if found == most:
         warn_caller(
@@ -323,7 +360,7 @@ def _scaled(source: Table, n_components: int, options: FitOptions) -> ScaledTabl
 
 
 def _completed(
-    table: ScaledTable, n_components: int, loss: str
+    table: ScaledTable, n_components: int, options: FitOptions
 ) -> tuple[NDArray | None, FrameBlocks]:
     """
     Return gross outliers (n_frames, n_points) or None, and completed frames.
@@ -331,23 +368,30 @@ def _completed(
     Outliers are looked for with a robust loss only. They count as missing points.
     """
     outliers, used, complete = None, table.rows, table.complete
-    if loss != "linear":
-        outliers = gross_outliers(table.rows.whole().transpose(0, 2, 1))
+    limits = options.limits
+    if options.loss != "linear":
+        tracks = table.rows.whole().transpose(0, 2, 1)
+        outliers = gross_outliers(tracks, limits.outliers)
         used = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
     if not complete:
-        used = complete_rows(used, table.n_points, n_components)
+        used = complete_rows(used, table.n_points, n_components, limits.completion)
     return outliers, used
 
 
 def _factors(
-    table: ScaledTable, used: FrameBlocks, n_components: int, joint: bool
+    table: ScaledTable,
+    used: FrameBlocks,
+    n_components: int,
+    joint: bool,
+    limits: Limits,
 ) -> tuple[Triplets, Sample, Factorisation]:
     """Return the singular triplets of completed frames, a sample, and its factors."""
     shape = 2 * len(table.sizes), table.n_points
-    triplets = block_triplets(used, shape, 3 * n_components + 3)
+    triplets = block_triplets(used, shape, 3 * n_components + 3, limits.svd)
     if joint:
-        sample = sample_frames(used, table.n_points, triplets.vectors[:3])
+        rigid_shape = triplets.vectors[:3]
+        sample = sample_frames(used, table.n_points, rigid_shape, limits.sample)
     else:
         sample = Sample(used.whole().reshape(shape), [])
     factors = factorise(sample.W, n_components, table.precision, triplets)
@@ -377,6 +421,7 @@ def _paper_result(
             max_iter=START_STEPS if joint else options.max_iter,
             tol=START_TOL if joint else tol,
             report=report,
+            options=options.limits.paper,
         )
     return isa, result
 
@@ -447,6 +492,7 @@ def _refined_jointly(
         max_iter=options.max_iter,
         tol=options.joint_tol,
         on_step=progress.step,
+        options=options.limits.joint,
     )
     progress(JOINT_STAGE)
     # Posterior of every frame

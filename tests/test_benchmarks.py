@@ -28,7 +28,6 @@ from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._paper import svd as _factorisation
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -393,27 +392,12 @@ def test_far_perspective_cameras_are_orthographic(tracks):
     np.testing.assert_allclose(shapes[..., :2], centred, atol=1e-10)
 
 
-def test_constants_of_the_prior_are_put_back():
-    before = _joint_constants()
-    least_noise = accuracy.joint_problem.LEAST_NOISE
-    with accuracy.prior_of(0.5, 0.25):
-        changed = _joint_constants()
-    assert {0.5, 0.25} <= set(changed)
-    assert least_noise not in changed
-    assert _joint_constants() == before
-    assert changed.count(0.25) == before.count(least_noise)
-
-
-def _joint_constants():
-    """Return the constants of the prior in the joint fit, also where they are given."""
-    constants = []
-    for module in accuracy.PRIOR_MODULES:
-        for name, known in vars(module).items():
-            if name in ("BASIS_STD", "LEAST_NOISE"):
-                constants.append(known)
-            elif getattr(known, "__module__", None) == module.__name__:
-                constants += getattr(known, "__defaults__", None) or ()
-    return constants
+def test_the_prior_can_be_varied():
+    X = make_nonrigid_tracks(60, 20, 2, noise=0.05, random_state=0).data
+    usual = accuracy.fit_set(X, "affine", 2).noise_variance_
+    other = accuracy.JOINT_OPTIONS._replace(basis_std=0.5, least_noise=0.25)
+    assert accuracy.fit_set(X, "affine", 2, other).noise_variance_ != usual
+    assert accuracy.fit_set(X, "affine", 2).noise_variance_ == usual
 
 
 def test_as_many_points_are_hidden_as_is_said():
@@ -428,14 +412,12 @@ def test_as_many_points_are_hidden_as_is_said():
 
 
 @pytest.mark.parametrize("scale_frames", [True, False])
-def test_rank_floor_is_that_of_a_fit(monkeypatch, scale_frames):
+def test_rank_floor_is_that_of_a_fit(scale_frames):
     tracks = make_nonrigid_tracks(60, 40, 2, noise=0.01, random_state=0)
     model = AffineNRSfM(2, scale_frames=scale_frames, random_state=0).fit(tracks.data)
-    for dense in (1000, 10):
-        monkeypatch.setattr(_factorisation, "DENSE", dense)
-        floor = TruncatedTable(9, scale_frames).fit(tracks.data)
-        error = inverse_snr(tracks.data, floor.X_, scale_frames=scale_frames)
-        np.testing.assert_allclose(error, model.rank_floor_, rtol=1e-8)
+    floor = TruncatedTable(9, scale_frames).fit(tracks.data)
+    error = inverse_snr(tracks.data, floor.X_, scale_frames=scale_frames)
+    np.testing.assert_allclose(error, model.rank_floor_, rtol=1e-8)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -12,7 +12,6 @@ from scenes import (
 )
 
 from isa_nrsfm._paper.block_structure import (
-    LIFT_RIDGE,
     leading_blocks,
     lifted_blocks,
     lifted_moments,
@@ -24,6 +23,7 @@ from isa_nrsfm._paper.block_structure import (
     unpack,
 )
 from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.options import PAPER_OPTIONS
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
@@ -319,7 +319,7 @@ class TestLiftedMotion:
         M_0 = rigid.reshape(-1, 2, 3)
         L = []
         for A, M in zip(M_0, motion.reshape(len(M_0), 2, -1), strict=True):
-            ridge = LIFT_RIDGE * np.trace(A.T @ A)
+            ridge = PAPER_OPTIONS.lift_ridge * np.trace(A.T @ A)
             L.append(np.linalg.solve(A.T @ A + ridge * np.eye(3), A.T @ M))
         return np.array(L)
 

@@ -9,7 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
-import isa_nrsfm._prepare.completion as completion
 from isa_nrsfm._prepare.completion import (
     CompletionModel,
     _by_pattern,
@@ -18,6 +17,7 @@ from isa_nrsfm._prepare.completion import (
     complete_tracks,
     rigid_noise,
 )
+from isa_nrsfm._prepare.options import COMPLETION_OPTIONS
 from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
@@ -50,7 +50,8 @@ def completed(tracks, n_components, **params):
     """Return tracks in place of those with missing points."""
     centred, translation = centred_tracks(tracks)
     sizes = weighting_sizes(centred, scale_frames=True)
-    result = complete_tracks(centred, sizes, n_components, **params)
+    options = COMPLETION_OPTIONS._replace(**params)
+    result = complete_tracks(centred, sizes, n_components, options)
     assert_allclose(result.centred.mean(axis=1), 0, atol=1e-12 * sizes.max())
     return result.centred + (result.shift + translation)[:, None]
 
@@ -125,7 +126,7 @@ def test_missing_points_are_conditional_expectations(small):
     centred, seen, sizes = small
     frames, _ = _by_pattern(centred, seen, sizes)
     filled = completed(centred, 1)  # rank 6 of 9 points
-    model = _fit(frames, 6, completion.TOL, 200)
+    model = _fit(frames, 6, COMPLETION_OPTIONS)
     far = 1e7  # variance of the translation, which may be anything
     covariance = model.B.T @ model.B + model.noise * np.eye(9) + far
     for frame, mask, result in zip(centred, seen, filled, strict=True):
@@ -138,7 +139,8 @@ def test_missing_points_are_conditional_expectations(small):
 def test_the_fit_is_a_stationary_point_of_the_likelihood(small):
     centred, seen, sizes = small
     frames, _ = _by_pattern(centred, seen, sizes)
-    model = _fit(frames, 3, 1e-13, 5000)
+    far = COMPLETION_OPTIONS._replace(tol=1e-13, max_iter=5000)
+    model = _fit(frames, 3, far)
     best = log_likelihood(*model, *small)
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -161,7 +163,7 @@ def test_a_step_with_fixed_noise_raises_the_likelihood(small):
     B = np.random.default_rng(0).normal(size=(4, 9))
     for _ in range(20):
         before = log_likelihood(B, 0.01, *small)
-        B = _em_step(CompletionModel(B, 0.01), frames)[0].B
+        B = _em_step(CompletionModel(B, 0.01), frames, COMPLETION_OPTIONS)[0].B
         assert log_likelihood(B, 0.01, *small) > before
 
 
@@ -169,7 +171,9 @@ def test_the_residual_of_a_step_is_that_of_least_squares_with_a_ridge(small):
     centred, seen, sizes = small
     frames, order = _by_pattern(centred, seen, sizes)
     B = np.random.default_rng(0).normal(size=(3, 9))
-    _, residual, mean_square = _em_step(CompletionModel(B, 0.1), frames)
+    _, residual, mean_square = _em_step(
+        CompletionModel(B, 0.1), frames, COMPLETION_OPTIONS
+    )
     n_numbers = 2 * seen.sum()
     assert_allclose(mean_square, np.sum(residual**2) / n_numbers)
     for i, rows in zip(order, residual, strict=True):
@@ -323,10 +327,10 @@ def test_memory_order(faces):
 
 
 @pytest.mark.parametrize("numbers", [1, 12345])
-def test_split_of_the_frames_into_blocks(faces, monkeypatch, numbers):
+def test_split_of_the_frames_into_blocks(faces, numbers):
     expected = completed(faces, 3)
-    monkeypatch.setattr(completion, "BLOCK_NUMBERS", numbers)
-    assert_allclose(completed(faces, 3), expected, atol=1e-6)
+    got = completed(faces, 3, block_numbers=numbers)
+    assert_allclose(got, expected, atol=1e-6)
 
 
 # --- degenerate tables --------------------------------------------------------------

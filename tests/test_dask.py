@@ -10,6 +10,8 @@ from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._fit import Limits
 from isa_nrsfm._tables.dask_blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -107,18 +109,18 @@ class TestThreads:
             AffineNRSfM(K).fit(chunked(X))
 
 
+# The first steps are taken on few frames, as of large tables.
+SampledNRSfM = limited(
+    Limits()._replace(sample=Limits().sample._replace(small_table=1000, first=40))
+)
+
+
 @pytest.mark.cluster
 class TestCluster:
-    @pytest.fixture(autouse=True)
-    def sampled(self, monkeypatch):
-        """Take the first steps on few frames, as of large tables."""
-        monkeypatch.setattr("isa_nrsfm._paper.sample.SMALL_TABLE", 1000)
-        monkeypatch.setattr("isa_nrsfm._paper.sample.SAMPLE_FRAMES", 40)
-
     def test_fit_is_that_in_memory(self, cluster):
         X = table(0.1)
-        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
-        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+        model = SampledNRSfM(K, random_state=0).fit(chunked(X))
+        assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
     def test_a_worker_that_is_killed_does_not_change_the_result(
         self, cluster, monkeypatch
@@ -134,9 +136,9 @@ class TestCluster:
             return compute(self, *args)
 
         monkeypatch.setattr(DaskBlocks, "map", map_and_kill)
-        model = AffineNRSfM(K, random_state=0).fit(chunked(X))
+        model = SampledNRSfM(K, random_state=0).fit(chunked(X))
         assert len(maps) > 20
-        assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+        assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
     def test_nothing_as_large_as_the_table_comes_back(self, cluster, monkeypatch):
         compute, largest = DaskBlocks.map, []
@@ -149,7 +151,7 @@ class TestCluster:
         monkeypatch.setattr(DaskBlocks, "map", measured)
         X = np.tile(table(), (4, 1))
         blocks = array.from_array(X, chunks=(400, 40))
-        AffineNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
+        SampledNRSfM(K, random_state=0, max_iter=5, tol=1e3).fit(blocks)
         # Cameras, their gradients and curvatures, coefficients: 24 numbers a frame.
         assert max(largest) < 0.7 * X.size
 
@@ -167,7 +169,7 @@ class TestJoblib:
         X = table()
         isa = FastISA(n_init=4, n_jobs=2)
         search = GridSearchCV(
-            AffineNRSfM(isa=isa, refinement="alternating", random_state=0),
+            SampledNRSfM(isa=isa, refinement="alternating", random_state=0),
             {"n_components": [1, 2]},
             cv=2,
             n_jobs=2,

@@ -5,9 +5,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements, permute_frames, rotate_frames
 
-import isa_nrsfm._paper.svd as module
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.options import SVD_OPTIONS
 from isa_nrsfm._paper.svd import block_triplets, leading_triplets
 from isa_nrsfm._tables.blocks import MemoryBlocks
 
@@ -213,20 +213,22 @@ class TestOrientations:
         assert_array_equal(orientations(np.zeros((2, 5))), 1)
 
 
-class TestLargeBothWays:
-    @pytest.fixture
-    def krylov(self, monkeypatch):
-        monkeypatch.setattr(module, "DENSE", 30)
+KRYLOV = SVD_OPTIONS._replace(dense=30)
 
+
+def by_krylov(W, n_components):
+    """Return the factors of a matrix that counts as large."""
+    triplets = leading_triplets(W, 3 * n_components + 3, KRYLOV)
+    return factorise(W, n_components, triplets=triplets)
+
+
+class TestLargeBothWays:
     @pytest.mark.parametrize("size", [(60, 70), (25, 90)])
     @pytest.mark.parametrize("noise", [1e-2, 1e-6])
-    def test_the_leading_triplets_are_those_of_the_whole(
-        self, size, noise, monkeypatch
-    ):
+    def test_the_leading_triplets_are_those_of_the_whole(self, size, noise):
         W = low_rank(0, 8, *size) + noise * centred_matrix(1, *size)
         whole = factorise(W, 2)
-        monkeypatch.setattr(module, "DENSE", 30)
-        leading = factorise(W, 2)
+        leading = by_krylov(W, 2)
         # Energies converge as the squares of the directions.
         kept = np.sum(whole.singular_values**2)
         got = np.sum(leading.singular_values**2)
@@ -237,26 +239,25 @@ class TestLargeBothWays:
 
     @pytest.mark.parametrize("block_frames", [1, 7, 60])
     @pytest.mark.parametrize("size", [(60, 70), (40, 25), (60, 8)])
-    def test_blocks_make_no_difference(self, size, block_frames, monkeypatch):
-        monkeypatch.setattr(module, "DENSE", 30)
+    def test_blocks_make_no_difference(self, size, block_frames):
         W = low_rank(0, 8, *size) + 1e-2 * centred_matrix(1, *size)
         frames = W.reshape(len(W) // 2, 2, -1)
-        expected = leading_triplets(W, 5)
+        expected = leading_triplets(W, 5, KRYLOV)
         found = block_triplets(
-            MemoryBlocks.from_array(frames, block_frames), W.shape, 5
+            MemoryBlocks.from_array(frames, block_frames), W.shape, 5, KRYLOV
         )
         assert_allclose(found.values, expected.values, rtol=1e-7)
         assert_allclose(found.rest, expected.rest, rtol=1e-6)
         signs = np.sign(np.vecdot(found.vectors, expected.vectors))
         assert_allclose(found.vectors * signs[:, None], expected.vectors, atol=1e-3)
 
-    def test_null_directions_are_left_out(self, krylov):
-        f = factorise(low_rank(0, 5, 60, 70), 2)
+    def test_null_directions_are_left_out(self):
+        f = by_krylov(low_rank(0, 5, 60, 70), 2)
         assert (f.singular_values[5:] < 1e-12 * f.singular_values[0]).all()
         assert_allclose(f.signals @ f.signals.T / 70, np.eye(3), atol=1e-12)
 
-    def test_frames_in_another_order(self, krylov):
+    def test_frames_in_another_order(self):
         W = low_rank(0, 8, 60, 70) + 1e-2 * centred_matrix(1, 60, 70)
         permuted, _ = permute_frames(W, 3)
-        f, g = factorise(W, 2), factorise(permuted, 2)
+        f, g = by_krylov(W, 2), by_krylov(permuted, 2)
         assert_allclose(g.signals, f.signals, atol=1e-10)

@@ -23,6 +23,7 @@ from isa_nrsfm._joint.noise_free import (
     motion_rows,
     normal_equations,
 )
+from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
@@ -205,8 +206,8 @@ class TestMinimise:
         assert square(rows, end) < square(rows, start)
         assert_of_model(end.motion, camera)
 
-    def test_steps_go_along_with_the_basis(self, monkeypatch):
-        monkeypatch.setattr(module, "MAX_STEPS", 3)
+    def test_steps_go_along_with_the_basis(self):
+        few = JOINT_OPTIONS.noise_free._replace(max_steps=3)
         rows, start = in_row_space(random_scene(noise=0.01), size=0.1)
         rng = np.random.default_rng(5)
         space = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
@@ -222,9 +223,11 @@ class TestMinimise:
             (start.alpha + shift) @ np.linalg.inv(mixing),
         )
         assert_allclose(images(turned), images(start), atol=1e-12)
-        expected = images(minimise(rows, start, AFFINE))
+        expected = images(minimise(rows, start, AFFINE, few))
         assert np.abs(expected - images(start)).max() > 0.1
-        assert_allclose(images(minimise(rows, turned, AFFINE)), expected, atol=1e-8)
+        assert_allclose(
+            images(minimise(rows, turned, AFFINE, few)), expected, atol=1e-8
+        )
 
 
 class TestRowSpace:
@@ -318,13 +321,14 @@ class TestWholeTable:
             alpha = np.linalg.lstsq(seen[1:].T, rest, rcond=None)[0]
             assert_allclose(alpha @ seen[1:], rest, atol=1e-7)
 
-    def test_a_step_that_would_take_too_long_is_not_made(self, monkeypatch):
+    def test_a_step_that_would_take_too_long_is_not_made(self):
         scene = random_scene()
-        monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 8)
+        cost = 9**4 * 8  # of a frame, with nine rows of shapes
         blocks = in_blocks([frame_tracks(scene.tracks)])
-        assert fit_without_noise(blocks, *scene[1:], 0.0, AFFINE) is None
-        monkeypatch.setattr(module, "STEP_COST", 9**4 * 8 * 9)
-        assert fit_without_noise(blocks, *scene[1:], 0.0, AFFINE) is not None
+        for n_frames, enough in ((8, False), (9, True)):
+            limits = JOINT_OPTIONS.noise_free._replace(step_cost=cost * n_frames)
+            found = fit_without_noise(blocks, *scene[1:], 0.0, AFFINE, limits)
+            assert (found is not None) == enough
 
     def test_nor_where_no_frame_tells_its_missing_points(self):
         scene = random_scene()

@@ -19,6 +19,7 @@ from isa_nrsfm._joint.fit import (
     count_components,
     fit_jointly,
 )
+from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import leading_triplets
@@ -537,9 +538,10 @@ class TestRobustLoss:
         monkeypatch.setattr(reweighting, "robust_weights", recorded)
         moved, where = spoilt(random_table()[0])
         fitted(moved, loss=loss, outliers=where)
-        assert 1 < len(seen) < reweighting.ROUNDS
-        assert np.abs(seen[-1] - seen[-2]).max() < reweighting.SETTLED_WEIGHTS
-        assert np.abs(seen[0] - seen[-1]).max() > reweighting.SETTLED_WEIGHTS
+        limits = JOINT_OPTIONS.reweighting
+        assert 1 < len(seen) < limits.rounds
+        assert np.abs(seen[-1] - seen[-2]).max() < limits.settled
+        assert np.abs(seen[0] - seen[-1]).max() > limits.settled
 
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
     def test_clean_tables_are_fitted_nearly_as_well(self, loss):

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
 from isa_nrsfm._joint import quasi_newton as module
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
+from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+
+SEARCH = JOINT_OPTIONS.search
 
 DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]
@@ -54,10 +57,14 @@ def disturbed(state, seed=1, size=0.1):
     return JointState(shapes, motion, 5 * state.noise)
 
 
-def refined(scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3):
+def refined(
+    scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3, options=JOINT_OPTIONS
+):
     start = disturbed(scene.truth) if start is None else start
     likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-    return refine_joint(likelihood, start, AFFINE, max_iter=max_iter, tol=tol)
+    return refine_joint(
+        likelihood, start, AFFINE, max_iter=max_iter, tol=tol, options=options
+    )
 
 
 @cache
@@ -201,11 +208,11 @@ class TestOptimum:
         assert got.state.noise == pytest.approx(expected.state.noise, rel=1e-3)
         assert_allclose(images(scene, got), images(scene, expected), atol=1e-3)
 
-    def test_memory_saves_steps(self, monkeypatch):
+    def test_memory_saves_steps(self):
         scene, best = optimum()
         with_memory = refined(scene, max_iter=300, tol=0.0).history[-1]
-        monkeypatch.setattr(module, "MEMORY", 0)
-        without = refined(scene, max_iter=300, tol=0.0).history[-1]
+        none = JOINT_OPTIONS._replace(search=SEARCH._replace(memory=0, least_memory=0))
+        without = refined(scene, max_iter=300, tol=0.0, options=none).history[-1]
         assert with_memory - best.history[-1] < 0.3 * (without - best.history[-1])
 
     def test_penalty_makes_the_basis_shapes_move_less(self):
@@ -244,7 +251,7 @@ class TestFirstStep:
             assert_allclose(state.motion[..., i], start.motion[..., i] - step)
         # To first order the mean of the expected residual.
         slope = passed.noise_gradient / likelihood.n_seen
-        assert abs(slope) < module.LARGEST_NOISE_STEP
+        assert abs(slope) < SEARCH.largest_noise_step
         assert state.noise == pytest.approx(start.noise * np.exp(-slope))
 
 
@@ -479,7 +486,7 @@ class TestCalibratedCameras:
         result = refine_joint(likelihood, start, cameras, max_iter=1000, tol=1e-3)
         assert result.converged
         assert (np.diff(result.history) <= 0).all()
-        floor = module.NOISE_FLOOR * likelihood.square / likelihood.n_seen
+        floor = SEARCH.noise_floor * likelihood.square / likelihood.n_seen
         assert result.state.noise == pytest.approx(floor, rel=1e-6)
         assert result.residual * likelihood.n_seen < 1e-12 * likelihood.square
 
@@ -539,7 +546,7 @@ class TestLeastNoise:
             refine_joint(
                 likelihood, start, AFFINE, least_noise=least, max_iter=100, tol=1e-3
             )
-            for least in (1e-6, module.NOISE_FLOOR)
+            for least in (1e-6, SEARCH.noise_floor)
         )
         assert_array_equal(got.history, expected.history)
 
@@ -557,7 +564,7 @@ class TestWithoutNoise:
         scene = random_scene(noise=0.0, kind=kind)
         result = refined(scene)
         likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
-        floor = module.NOISE_FLOOR * likelihood.square / likelihood.n_seen
+        floor = SEARCH.noise_floor * likelihood.square / likelihood.n_seen
         assert result.converged
         assert result.state.noise == pytest.approx(floor, rel=1e-6)
         assert likelihood(*result.state).residual < 1e-9 * likelihood.square
@@ -600,7 +607,7 @@ class TestWithoutNoise:
         likelihood = likelihood_of(random_scene(noise=0.0).tracks, None, 0.0)
         noises = []
 
-        def fail(blocks, shapes, motion, alpha, penalty, cameras):
+        def fail(blocks, shapes, motion, *others):
             passed = likelihood(shapes, motion, 1e-12)
             noises.append(passed.residual / likelihood.n_seen)
 
@@ -615,7 +622,7 @@ class TestWithoutNoise:
         start = disturbed(scene.truth)._replace(noise=0.0)
         state = refined(scene, start, max_iter=0).state
         mean_square = np.mean(scene.tracks**2)
-        assert state.noise == pytest.approx(module.NOISE_FLOOR * mean_square)
+        assert state.noise == pytest.approx(SEARCH.noise_floor * mean_square)
 
     def test_gradient_norm_is_small_at_the_optimum(self):
         assert refined(random_scene(noise=0.0), tol=1e-8).gradient_norm < 1e-2

@@ -10,10 +10,10 @@ from scenes import permute_frames, rotate_frames
 
 from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem, Steps
+from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._joint.problem import JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.starts import (
-    HELD_STEPS,
     affine_start,
     best_starts,
     frames_last,
@@ -245,10 +245,10 @@ class TestLiftedShapes:
         assert np.isfinite(lifted_shapes(scene.rows, scene.motion, 2)).all()
 
 
-def problem_of(scene, thorough=True):
+def problem_of(scene, effort=JOINT_OPTIONS.small):
     rows = MemoryBlocks.from_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
-    return JointProblem(frames, Steps(1000, 0.01, thorough=thorough), 0.0)
+    return JointProblem(frames, Steps(1000, 0.01, effort=effort), 0.0)
 
 
 def paper_shapes(factors):
@@ -282,13 +282,15 @@ class TestBestStarts:
         mixed = mixed_cameras(scene.rows, scales if scaled else None, np.arange(60))
         candidates += list(mixed)[:2]
         n_seen, energy = problem.totals
+        least_noise = problem.options.least_noise
+        held_steps = problem.options.starts.held_steps
         for motion in candidates:
             shapes = lifted_shapes(scene.rows, motion, 2)
             noise_variance = 0.1 * np.mean((scene.rows - motion @ shapes[0]) ** 2)
-            noise_variance = max(noise_variance, LEAST_NOISE * energy / n_seen)
+            noise_variance = max(noise_variance, least_noise * energy / n_seen)
             start = JointState(shapes, frames_last(motion), noise_variance)
             held = problem.refined(
-                start, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS
+                start, HeldCameras(), least_noise, max_iter=held_steps
             )
             assert value < held.history[-1]
 
@@ -300,13 +302,13 @@ class TestBestStarts:
         motion = started(scene, "orthographic")[0].motion.transpose(2, 0, 1)
         assert camera_error(motion, scene.motion) < 0.05
 
-    @pytest.mark.parametrize("thorough", [False, True])
-    def test_of_many_frames_has_cameras_of_all(self, thorough):
+    @pytest.mark.parametrize("effort", [JOINT_OPTIONS.large, JOINT_OPTIONS.small])
+    def test_of_many_frames_has_cameras_of_all(self, effort):
         # The comparison is of some of them.
         scene = random_scene(n_frames=450, noise=0.01)
-        problem = problem_of(scene, thorough)
+        problem = problem_of(scene, effort)
         states = started(scene, "orthographic", problem)
-        assert len(states) == (3 if thorough else 1)
+        assert len(states) == effort.n_finalists
         for state in states:
             assert state.motion.shape == (2, 3, 450)
             motion = state.motion.transpose(2, 0, 1)

@@ -15,7 +15,8 @@ from sklearn.base import BaseEstimator
 from isa_nrsfm import FastISA, PooledFastICA
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._paper.factors import factorise
-from isa_nrsfm._paper.pipeline import SIGNAL_DECIMALS, run_paper_pipeline
+from isa_nrsfm._paper.options import PAPER_OPTIONS
+from isa_nrsfm._paper.pipeline import run_paper_pipeline
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
@@ -279,7 +280,7 @@ class TestStrategies:
         f = factorise(faces, 3)
         # Rounded and sorted, so that neither rounding errors nor the order of points
         # can lead the strategy elsewhere.
-        rounded = np.round(f.signals.T, SIGNAL_DECIMALS)
+        rounded = np.round(f.signals.T, PAPER_OPTIONS.signal_decimals)
         assert_array_equal(isa.signals_, rounded[np.lexsort(rounded.T)])
         assert_allclose(isa.covariance_, f.motion.T @ f.motion * 40 / 120)
 

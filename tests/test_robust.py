@@ -7,9 +7,8 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._prepare.options import OUTLIER_OPTIONS
 from isa_nrsfm._prepare.robust import (
-    DISTANT,
-    LARGEST_SHARE,
     TUNING,
     distant_points,
     gross_outliers,
@@ -173,8 +172,8 @@ class TestDistantPoints:
         rng = np.random.default_rng(0)
         tracks = rng.normal(size=(10, 15, 2))
         tracks[3, :4] = np.nan
-        tracks[5, 2] += 8 * DISTANT
-        tracks[6, 3, 1] -= 8 * DISTANT
+        tracks[5, 2] += 8 * OUTLIER_OPTIONS.distant
+        tracks[6, 3, 1] -= 8 * OUTLIER_OPTIONS.distant
         expected = np.zeros(tracks.shape[:2], dtype=bool)
         expected[5, 2] = expected[6, 3] = True
         assert_array_equal(distant_points(tracks), expected)
@@ -186,7 +185,7 @@ class TestDistantPoints:
             points[100] = [0.6 * distance, 0.8 * distance]
             size = robust_sizes(points[None])[0]
             from_median = np.linalg.norm(points[100] - spatial_median(points[None])[0])
-            expected = from_median > DISTANT * size
+            expected = from_median > OUTLIER_OPTIONS.distant * size
             assert distant_points(points[None])[0, 100] == expected
 
 
@@ -240,7 +239,7 @@ class TestGrossOutliers:
 
     def test_a_point_that_is_off_in_some_frames_does_not(self):
         tracks = rigid_tracks()
-        some = int(LARGEST_SHARE * len(tracks) / 2)
+        some = int(OUTLIER_OPTIONS.largest_share * len(tracks) / 2)
         tracks[:some, 7] += np.random.default_rng(1).choice([-1, 1], size=(some, 2))
         found = gross_outliers(tracks)
         assert found[:some, 7].mean() > 0.8
@@ -264,7 +263,7 @@ class TestGrossOutliers:
 
     def test_frames_with_not_so_many_do_not(self):
         tracks = rigid_tracks()
-        some = int(LARGEST_SHARE * tracks.shape[1] / 2)
+        some = int(OUTLIER_OPTIONS.largest_share * tracks.shape[1] / 2)
         tracks[9, :some] += np.random.default_rng(1).normal(size=(some, 2))
         found = gross_outliers(tracks)[9]
         assert found[:some].mean() > 0.8

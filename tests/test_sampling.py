@@ -1,22 +1,17 @@
 """Which frames of a large table the first stages work on."""
 
 import numpy as np
-import pytest
 from numpy.testing import assert_array_equal
 from scenes import measurements, permute_frames
 
-from isa_nrsfm._paper import sample as module
 from isa_nrsfm._paper.factors import factorise
+from isa_nrsfm._paper.options import SAMPLE_OPTIONS
 from isa_nrsfm._paper.sample import rigid_energy, sample_frames
 from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
-
-@pytest.fixture
-def small_limits(monkeypatch):
-    monkeypatch.setattr(module, "SMALL_TABLE", 1000)
-    monkeypatch.setattr(module, "SAMPLE_FRAMES", 40)
+FEW = SAMPLE_OPTIONS._replace(small_table=1000, first=40)
 
 
 def matrix(n_frames, n_points=20):
@@ -24,21 +19,21 @@ def matrix(n_frames, n_points=20):
     return measurements(tracks.data.reshape(n_frames, n_points, 2))
 
 
-def sample(W, block_frames=64):
+def sample(W, block_frames=64, options=FEW):
     rows = MemoryBlocks.from_array(W.reshape(len(W) // 2, 2, -1), block_frames)
-    return sample_frames(rows, W.shape[1], factorise(W, 2).rigid_shape)
+    return sample_frames(rows, W.shape[1], factorise(W, 2).rigid_shape, options)
 
 
-def test_parts_grow_to_half_of_the_frames(small_limits, monkeypatch):
+def test_parts_grow_to_half_of_the_frames():
     for n_frames, sizes in ((40, []), (41, [40]), (321, [40, 160]), (700, [40, 160])):
         found = sample(matrix(n_frames))
         assert [len(part) for part in found.parts] == sizes
         assert all((np.diff(part) > 0).all() for part in found.parts)
-    monkeypatch.setattr(module, "MOST_SAMPLED", 160)
-    assert [len(part) for part in sample(matrix(700)).parts] == [40]
+    most = FEW._replace(most=160)
+    assert [len(part) for part in sample(matrix(700), options=most).parts] == [40]
 
 
-def test_measurement_matrix_is_that_of_the_first_part(small_limits):
+def test_measurement_matrix_is_that_of_the_first_part():
     W = matrix(100)
     found = sample(W)
     rows = W.reshape(100, 2, -1)[found.parts[0]]
@@ -48,12 +43,12 @@ def test_measurement_matrix_is_that_of_the_first_part(small_limits):
 
 def test_small_tables_are_taken_whole():
     W = matrix(700)
-    found = sample(W)
+    found = sample(W, options=SAMPLE_OPTIONS)
     assert found.parts == []
     assert_array_equal(found.W, W)
 
 
-def test_frames_are_spread_from_the_most_to_the_least_rigid_one(small_limits):
+def test_frames_are_spread_from_the_most_to_the_least_rigid_one():
     W = matrix(100)
     factors = factorise(W, 2)
     rest = W - factors.rigid_motion @ factors.rigid_shape
@@ -69,7 +64,7 @@ def test_frames_are_spread_from_the_most_to_the_least_rigid_one(small_limits):
     assert_array_equal(sample(W).parts[0], np.sort(spread(np.argsort(energy), 40)))
 
 
-def test_the_same_frames_in_any_order_and_blocks(small_limits):
+def test_the_same_frames_in_any_order_and_blocks():
     W = matrix(100)
     permuted, order = permute_frames(W, 1)
     expected = sample(W).parts[0]

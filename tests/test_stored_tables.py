@@ -5,9 +5,8 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 
-import isa_nrsfm._paper.sample as sampling
-import isa_nrsfm._prepare.completion as completion
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._estimator import limited
+from isa_nrsfm._fit import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -35,17 +34,17 @@ def table(missing=0.0, n_points=20, n_frames=150):
     return X
 
 
-def estimator(**params):
-    return AffineNRSfM(K, random_state=0, **params)
+# Small tables are worked on as large ones are.
+SAMPLED = Limits()._replace(
+    sample=Limits().sample._replace(small_table=1000, first=50),
+    completion=Limits().completion._replace(model_frames=100, fewest_shown=20),
+)
+KRYLOV = Limits()._replace(svd=Limits().svd._replace(dense=300))
 
 
-@pytest.fixture
-def sampled(monkeypatch):
-    """Small tables are worked on as large ones are."""
-    monkeypatch.setattr(sampling, "SMALL_TABLE", 1000)
-    monkeypatch.setattr(sampling, "SAMPLE_FRAMES", 50)
-    monkeypatch.setattr(completion, "MODEL_FRAMES", 100)
-    monkeypatch.setattr(completion, "FEWEST_SHOWN", 20)
+def estimator(limits=None, **params):
+    limits = Limits() if limits is None else limits
+    return limited(limits)(K, random_state=0, **params)
 
 
 def memmap(X, path):
@@ -79,14 +78,16 @@ def assert_same_model(got, expected):
 
 
 class TestFit:
-    def test_rows_that_show_nothing_are_left_out(self, sampled, tmp_path):
+    def test_rows_that_show_nothing_are_left_out(self, tmp_path):
         X = table(0.1)
         empty = np.arange(len(X)) % 7 == 3
         empty[40:100] = True
-        expected = estimator(working_memory=0.02, keep_frames=tmp_path / "expected")
+        expected = estimator(
+            SAMPLED, working_memory=0.02, keep_frames=tmp_path / "expected"
+        )
         expected.fit(memmap(X[~empty], tmp_path))
         X[empty] = np.nan
-        model = estimator(working_memory=0.02, keep_frames=tmp_path / "found")
+        model = estimator(SAMPLED, working_memory=0.02, keep_frames=tmp_path / "found")
         with pytest.warns(UserWarning, match=rf"{empty.sum()} of 150 row\(s\)"):
             model.fit(memmap(X, tmp_path))
         for name in OF_SHAPES:
@@ -98,23 +99,22 @@ class TestFit:
             assert_array_equal(found[~empty], getattr(expected, name))
 
     @pytest.mark.parametrize("missing", slow_after(1, [0.1, 0.0]))
-    def test_block_size_makes_no_difference(self, sampled, tmp_path, missing):
+    def test_block_size_makes_no_difference(self, tmp_path, missing):
         X = table(missing)
-        expected = estimator().fit(X)
+        expected = estimator(SAMPLED).fit(X)
         for megabytes in MEMORIES:
-            got = estimator(working_memory=megabytes).fit(memmap(X, tmp_path))
+            got = estimator(SAMPLED, working_memory=megabytes).fit(memmap(X, tmp_path))
             assert_same_model(got, expected)
             assert got.score(memmap(X, tmp_path)) == pytest.approx(
                 expected.score(X), rel=1e-8
             )
 
     @pytest.mark.parametrize("n_points", slow_after(1, [100, 400]))
-    def test_of_many_points(self, monkeypatch, tmp_path, n_points):
+    def test_of_many_points(self, tmp_path, n_points):
         # Shapes along directions, and with the more points a Krylov method, too.
-        monkeypatch.setattr("isa_nrsfm._paper.svd.DENSE", 300)
         X = table(n_points=n_points, n_frames=160)
-        expected = estimator().fit(X)
-        got = estimator(working_memory=1).fit(memmap(X, tmp_path))
+        expected = estimator(KRYLOV).fit(X)
+        got = estimator(KRYLOV, working_memory=1).fit(memmap(X, tmp_path))
         assert_same_model(got, expected)
 
     @pytest.mark.parametrize("kind", slow_after(1, ["npy", "parquet"]))
@@ -128,9 +128,9 @@ class TestFit:
             assert_array_equal(got.feature_names_in_[:2], ["x0", "y0"])
         assert_allclose(got.transform(stored), got.alpha_, atol=1e-12)
 
-    def test_threads_make_no_difference(self, sampled):
+    def test_threads_make_no_difference(self):
         X = np.tile(table(), (5, 1))
-        one, two = (estimator(n_jobs=n).fit(X) for n in (1, 2))
+        one, two = (estimator(SAMPLED, n_jobs=n).fit(X) for n in (1, 2))
         for name in OF_SHAPES + OF_FRAMES:
             assert_array_equal(getattr(one, name), getattr(two, name))
 

@@ -15,7 +15,8 @@ from isa_nrsfm._prepare.checks import (
     largest_n_components,
     smallest_n_frames,
 )
-from isa_nrsfm._prepare.layout_check import LAYOUT_SAMPLE, warn_if_other_layout
+from isa_nrsfm._prepare.layout_check import warn_if_other_layout
+from isa_nrsfm._prepare.options import LAYOUT_OPTIONS
 from isa_nrsfm._tables.layout import LAYOUTS, tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
@@ -249,7 +250,7 @@ class TestOtherLayout:
             warn_if_other_layout(X, "planar", True)
 
     def test_long_tables_are_sampled_evenly(self, faces):
-        X = tracks_to_table(np.tile(faces, (LAYOUT_SAMPLE // 10, 1, 1)))
+        X = tracks_to_table(np.tile(faces, (LAYOUT_OPTIONS.frames // 10, 1, 1)))
         warn_if_other_layout(X, "interleaved", True)
         with pytest.warns(UserWarning, match="layout='interleaved' explains"):
             warn_if_other_layout(X, "planar", True)

@@ -27,8 +27,9 @@ from isa_nrsfm._joint.many_points import (
     in_all_points,
     leading_directions,
 )
-from isa_nrsfm._joint.problem import BASIS_STD, LEAST_NOISE, JointProblem, Steps
-from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointResult, JointState
+from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions
+from isa_nrsfm._joint.problem import JointProblem, Steps
+from isa_nrsfm._joint.quasi_newton import JointResult, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
 from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
@@ -37,41 +38,6 @@ from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
-
-# Convergence tolerance on a sample, if it is larger than the user's. Each number that
-# is fitted lowers the objective by about one by chance. Steps on a sample end when they
-# gain less than this share of that, for all numbers of the shapes together.
-BY_CHANCE = 0.03
-# Tables of at most FEW_FRAMES frames are refined to POLISH times the tolerance, and to
-# POLISH^2 times where the model is right: more steps cost little there.
-POLISH = 0.1
-FEW_FRAMES = 2000
-# A model is right if its noise variance is at most RIGHT times that of the spectrum.
-# The ratio is 0.8 to 1.0 for artificial tables with the true K or more, and 1.3 to 1.8
-# with fewer basis shapes. It is 1.9 and more for motion capture and cloth, where K cuts
-# a full spectrum off (``python -m benchmarks.accuracy noise``). A model is also right
-# if its noise variance is below the share EXACT of the mean square, as in tables
-# without noise: the spectrum tells no noise if it has only 3K + 3 singular values.
-RIGHT = 1.4
-EXACT = 1e-10
-# A noise variance is at the floor if it exceeds it by less than this share.
-SLACK = 1e-3
-# Without floor and prior the fit makes RELEASED_STEPS steps at a time, as long as they
-# lower the noise variance to less than FALLING times its value.
-RELEASED_STEPS = 60
-FALLING = 0.95
-# Floor of the noise variance for a model with too few basis shapes and calibrated
-# cameras: CUT_OFF times the share of the energy beyond K + 3 singular values
-# (``python -m benchmarks.accuracy noise``), but at most MOST_NOISE. Without that bound
-# the floor would be too high for large motion, which adds to the spectrum, too.
-CUT_OFF = 3.0
-MOST_NOISE = 5e-4
-# Largest number of rounds in which frames that are reversed in depth are turned back.
-REVERSALS = 5
-# Largest number of steps of an affine fit that is only compared with the calibrated
-# one, and of the two affine fits of a sample of which the better one goes on.
-COMPARED_STEPS = 60
-RACE_STEPS = 5
 
 
 class Spectrum(NamedTuple):
@@ -187,6 +153,7 @@ def fit_jointly(
     max_iter: int,
     tol: float,
     on_step: Callable[[], None] | None = None,
+    options: JointOptions = JOINT_OPTIONS,
 ) -> JointFit:
     """
     Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
@@ -217,6 +184,8 @@ def fit_jointly(
         Largest number of steps.
     tol, on_step
         As in `refine_joint`.
+    options : JointOptions
+        The limits of all stages.
 
     Returns
     -------
@@ -225,7 +194,8 @@ def fit_jointly(
     """
     n_shapes, _, n_points = paper_shapes.shape
     steps = Steps(max_iter, tol, on_step)
-    ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
+    table = rows, n_seen, sample, factors, paper_shapes
+    ready = _ready(*table, outliers, loss, steps, options)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
@@ -237,7 +207,7 @@ def fit_jointly(
         problem = problems[-1]
     # For a right model it is safe to go on to a smaller tolerance.
     if right and not sample.parts:
-        tol = POLISH**2 * problem.steps.tol
+        tol = options.judgement.polish * problem.steps.tol
         result = refined(problem, result.state, tol=tol)
     # Fits of larger samples, and of all frames
     for larger in problems[1:]:
@@ -282,6 +252,7 @@ def count_components(
     loss: str,
     max_iter: int,
     tol: float,
+    options: JointOptions = JOINT_OPTIONS,
 ) -> int:
     """
     Return the number of basis shapes that a table supports.
@@ -290,7 +261,7 @@ def count_components(
     ----------
     rows, n_seen, sample, factors, paper_shapes
         As of `fit_jointly`, with more basis shapes than are expected.
-    camera, outliers, loss, max_iter, tol
+    camera, outliers, loss, max_iter, tol, options
         As of `fit_jointly`.
 
     Returns
@@ -300,7 +271,8 @@ def count_components(
         relevant.
     """
     steps = Steps(max_iter, tol)
-    ready = _ready(rows, n_seen, sample, factors, paper_shapes, outliers, loss, steps)
+    table = rows, n_seen, sample, factors, paper_shapes
+    ready = _ready(*table, outliers, loss, steps, options)
     first = ready.problems[0]
     result, *_ = _first_fit(first, sample, factors, paper_shapes, camera)
     return max(relevant_components(first, result.state, CAMERAS[camera]), 1)
@@ -323,12 +295,14 @@ def _ready(
     outliers: NDArray | None,
     loss: str,
     steps: Steps,
+    options: JointOptions,
 ) -> _Ready:
     """Return a table ready for the joint fit."""
     n_shapes, _, n_points = paper_shapes.shape
     n_frames = len(n_seen)
     complete = bool((n_seen == n_points).all())
-    wide = complete and loss == "linear" and has_many_points(n_points, n_shapes)
+    wide = has_many_points(n_points, n_shapes, options.many_points)
+    wide = wide and complete and loss == "linear"
     used = None
     if wide:
         frames = JointFrames.from_directions(rows, leading_directions(factors))
@@ -340,15 +314,19 @@ def _ready(
             used &= ~outliers
         weights = None if used.all() else used * 1.0
         frames = JointFrames.from_points(rows, complete, weights)
-    steps = steps._replace(thorough=n_frames <= FEW_FRAMES)
-    problem = JointProblem(frames, steps, 0.0)
-    # Penalty of sum_i ||M_i B_k||^2 for the prior BASIS_STD of frames of mean square
-    # energy / n_numbers. The prior counts once, not for each frame.
+    small = n_frames <= options.few_frames
+    steps = steps._replace(effort=options.small if small else options.large)
+    problem = JointProblem(frames, steps, 0.0, options)
+    # Penalty of sum_i ||M_i B_k||^2 for the prior of basis shapes in frames of mean
+    # square energy / n_numbers. The prior counts once, not for each frame.
     n_numbers, energy = problem.totals
-    problem = problem.with_penalty(n_numbers / (BASIS_STD**2 * energy * n_frames))
-    by_chance = BY_CHANCE * frames.coordinates(paper_shapes).size
+    variance = options.basis_std**2 * energy
+    problem = problem.with_penalty(n_numbers / (variance * n_frames))
+    by_chance = options.by_chance * frames.coordinates(paper_shapes).size
     problems = [
-        problem.part(part, tol=max(steps.tol, by_chance / len(part)), thorough=False)
+        problem.part(
+            part, tol=max(steps.tol, by_chance / len(part)), effort=options.large
+        )
         for part in sample.parts
     ]
     return _Ready([*problems, problem], wide, used)
@@ -379,9 +357,10 @@ def _first_fit(
     refined = partial(_refined, problem, cameras=CAMERAS["affine"])
     max_iter = problem.steps.max_iter
     if camera != "affine":
-        max_iter = min(max_iter, COMPARED_STEPS)
-    if not problem.steps.thorough:  # only the better one goes on
-        first = _least(refined(s, max_iter=min(max_iter, RACE_STEPS)) for s in states)
+        max_iter = min(max_iter, problem.options.compared_steps)
+    race_steps = problem.steps.effort.race_steps
+    if race_steps is not None:  # only the better one goes on
+        first = _least(refined(s, max_iter=min(max_iter, race_steps)) for s in states)
         states = [first.state]
     affine = _least(refined(state, max_iter=max_iter) for state in states)
     ratio = result.left / min(affine.left, result.left)
@@ -399,12 +378,11 @@ def _calibrated_fit(
     problem: JointProblem,
     state: JointState,
     cameras: CameraModel,
-    least_noise: float = LEAST_NOISE,
+    least_noise: float | None = None,
 ) -> JointResult:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
     result = _refined(problem, state, cameras, least_noise)
-    # Only for small tables: the fit of a sample is no more than a start.
-    for _ in range(REVERSALS if problem.steps.thorough else 0):
+    for _ in range(problem.steps.effort.reversals):
         state, n_reversed = problem.reversed_back(result.state, cameras)
         if not n_reversed:
             break
@@ -416,12 +394,11 @@ def _refined(
     problem: JointProblem,
     state: JointState,
     cameras: CameraModel,
-    least_noise: float = LEAST_NOISE,
+    least_noise: float | None = None,
     **steps: Any,
 ) -> JointResult:
     """Return the refinement of a state, with a smaller tolerance for small tables."""
-    if problem.steps.thorough:
-        steps = {"tol": problem.steps.tol * POLISH, **steps}
+    steps = {"tol": problem.steps.tol * problem.steps.effort.polish, **steps}
     return problem.refined(state, cameras, least_noise, **steps)
 
 
@@ -444,20 +421,21 @@ def judged(
     the same, cameras or depths explain the deformation that is missing. With calibrated
     cameras it is fitted again, with a floor as high as that deformation.
     """
+    options, least_noise = problem.options.judgement, problem.options.least_noise
     n_seen, energy = problem.totals
     mean_square = energy / n_seen
-    right_noise = max(RIGHT * spectrum.noise, EXACT) * mean_square
-    at_floor = result.state.noise < (1 + SLACK) * LEAST_NOISE * mean_square
+    right_noise = max(options.right * spectrum.noise, options.exact) * mean_square
+    at_floor = result.state.noise < (1 + options.slack) * least_noise * mean_square
     # Right: without floor and prior
     if at_floor or result.state.noise < right_noise:
         for state in (result.state, start):
             released = unregularised(problem, state, cameras)
             if released.state.noise < right_noise:
-                return released, NOISE_FLOOR, True
+                return released, problem.options.search.noise_floor, True
     # Not right: with a floor as high as the missing deformation
-    least_noise = LEAST_NOISE
     if at_floor and cameras.calibrated and spectrum.noise > 0:
-        least_noise = np.clip(CUT_OFF * spectrum.missing, LEAST_NOISE, MOST_NOISE)
+        missing = options.cut_off * spectrum.missing
+        least_noise = np.clip(missing, least_noise, options.most_noise)
         result = _calibrated_fit(problem, result.state, cameras, least_noise)
     return result, least_noise, False
 
@@ -468,12 +446,13 @@ def unregularised(
     """Return the fit without prior and floor. It ends when the noise hardly falls."""
     problem = problem.with_penalty(0.0)
     state = with_prior(problem, state)
-    steps = min(RELEASED_STEPS, problem.steps.max_iter)
+    options, floor = problem.options.judgement, problem.options.search.noise_floor
+    steps = min(options.released_steps, problem.steps.max_iter)
     for _ in range(problem.steps.max_iter // steps):
         before = state.noise
-        result = _refined(problem, state, cameras, NOISE_FLOOR, max_iter=steps)
+        result = _refined(problem, state, cameras, floor, max_iter=steps)
         state = result.state
-        if state.noise > FALLING * before:
+        if state.noise > options.falling * before:
             break
         if cameras.calibrated:
             state, _ = problem.reversed_back(state, cameras)

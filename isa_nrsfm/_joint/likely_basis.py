@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-# Ridge of the covariance of coefficients, relative to its trace.
-RIDGE = 1e-14
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 
 
 def likely_basis(
@@ -47,7 +46,8 @@ def likely_basis(
     # Coefficients of covariance one
     rest = alpha - mean[:, None]
     covariance = rest @ rest.T / n_frames
-    covariance += (RIDGE * np.trace(covariance) or 1.0) * np.eye(len(mean))
+    # A ridge, as the covariance can be singular
+    covariance += (OF_PRODUCTS * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
     # Diagonal H / n, and the scales a_k
     cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames

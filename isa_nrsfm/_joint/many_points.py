@@ -14,24 +14,21 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.options import JOINT_OPTIONS, ManyPointOptions
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointResult, regular
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Frames are given by directions if they have more than LEAST_POINTS points, and more
-# than WIDE times the number of rows of all shapes.
-LEAST_POINTS = 200
-WIDE = 8
-# Largest number of times that directions are added.
-WIDENINGS = 20
-# Singular values of shapes below this share of the largest count as zero.
-FLAT = 1e-12
 
-
-def has_many_points(n_points: int, n_shapes: int) -> bool:
+def has_many_points(
+    n_points: int,
+    n_shapes: int,
+    options: ManyPointOptions = JOINT_OPTIONS.many_points,
+) -> bool:
     """Return whether complete frames are to be given by directions."""
-    return n_points > max(WIDE * 3 * n_shapes, LEAST_POINTS)
+    return n_points > max(options.wide * 3 * n_shapes, options.least_points)
 
 
 def leading_directions(factors: Factorisation) -> NDArray:
@@ -72,7 +69,7 @@ def in_all_points(
     problem : JointProblem
         The problem along these directions.
     """
-    for _ in range(WIDENINGS):
+    for _ in range(problem.options.many_points.widenings):
         state = result.state
         before = problem.frames.points(state.shapes)
         # Expectation maximisation in all points: solve curvature B = sum_i X_i^T W_i.
@@ -90,7 +87,8 @@ def in_all_points(
         # Directions that span the shapes before and after that step
         both = np.concatenate([after, before.reshape(after.shape)])
         _, size, directions = np.linalg.svd(both, full_matrices=False)
-        frames = JointFrames.from_directions(rows, directions[size > FLAT * size[0]])
+        directions = directions[size > OF_DIFFERENCES * size[0]]
+        frames = JointFrames.from_directions(rows, directions)
         problem = problem.with_frames(frames)
         # Further refinement, with the steps that are left
         shapes = frames.coordinates(after.reshape(before.shape))

@@ -33,8 +33,9 @@ least squares over frames whose seen points determine the others. Without noise 
 the frames tell as much as all: their number is limited by the cost of a step.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,34 +46,9 @@ from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.likely_basis import likely_basis
-from isa_nrsfm._linalg.rounding import OF_SUMS
+from isa_nrsfm._joint.options import JOINT_OPTIONS, NoiseFreeOptions
+from isa_nrsfm._linalg.rounding import OF_DISTANCES, OF_PRODUCTS, OF_SUMS
 from isa_nrsfm._tables.blocks import FrameBlocks
-
-# Largest number of multiplications of one step, less than a second. It limits how many
-# frames are used.
-STEP_COST = 2e9
-MAX_STEPS = 50
-# Levenberg-Marquardt damping: at the start, its bounds, and its factors after a step
-# that lowers the residual (EASED) and after one that does not (RAISED).
-FIRST_DAMPING = 1e-3
-SMALLEST_DAMPING = 1e-14
-LARGEST_DAMPING = 1e2
-EASED, RAISED = 0.05, 8.0
-# Convergence tolerance: the iteration ends after two consecutive steps that lower the
-# sum of squares by less than this share of it.
-LITTLE = 1e-2
-# A tangent whose part orthogonal to those before it is below this share of its norm
-# counts as linearly dependent, and is left out.
-DEPENDENT = 1e-9
-# Points with at least this weight count as seen, with weight one; others as missing.
-COUNTED = 0.5
-# The seen points of a frame determine the others if the Gram matrix of the basis of the
-# row space over these points has no eigenvalue below this. Over all points it is the
-# identity.
-DETERMINED = 1e-3
-COMPLETION_STEPS = 60
-# Ridge, relative to the trace, for matrices that can be singular.
-RIDGE = 1e-14
 
 
 class FramesAndShapes(NamedTuple):
@@ -101,6 +77,7 @@ def fit_without_noise(
     alpha: NDArray,
     penalty: NDArray | float,
     cameras: CameraModel,
+    options: NoiseFreeOptions = JOINT_OPTIONS.noise_free,
 ) -> tuple[NDArray, NDArray] | None:
     """
     Return shapes and cameras that leave as little as possible of tracks.
@@ -120,6 +97,8 @@ def fit_without_noise(
         As in `MarginalLikelihood`.
     cameras : CameraModel
         The cameras that are allowed.
+    options : NoiseFreeOptions
+        How steps are made.
 
     Returns
     -------
@@ -136,10 +115,10 @@ def fit_without_noise(
     n_shapes, _, n_points = shapes.shape
     b = shapes.reshape(3 * n_shapes, n_points)
     # Frames to fit: as many as the cost of a step allows
-    n_frames = int(STEP_COST / (len(b) ** 4 * (5 + n_shapes)))
+    n_frames = int(options.step_cost / (len(b) ** 4 * (5 + n_shapes)))
     if n_frames < len(b):
         return None
-    W, frames = complete_frames(blocks, b, n_frames)
+    W, frames = complete_frames(blocks, b, n_frames, options)
     if len(frames) < min(len(b), alpha.shape[1]):
         return None
     # Gauss-Newton steps in a basis V of the row space
@@ -147,17 +126,23 @@ def fit_without_noise(
     start = FramesAndShapes(
         b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
     )
-    found = minimise(rows, start, cameras)
+    found = minimise(rows, start, cameras, options)
     shapes = (found.shapes @ V.T).reshape(shapes.shape)
     # Cameras and coefficients of all frames for these shapes
     alpha = alpha.copy()
     alpha[:, frames] = found.alpha.T
-    motion, alpha = _all_frames(blocks, shapes, motion, alpha, cameras.name)
+    fitted = partial(
+        _fitted, shapes=shapes, camera=cameras.name, counted=options.counted
+    )
+    motion, alpha = _all_frames(blocks, fitted, motion, alpha)
     return likely_basis(shapes, motion, alpha, penalty), motion
 
 
 def complete_frames(
-    blocks: FrameBlocks, shapes: NDArray, n_frames: int
+    blocks: FrameBlocks,
+    shapes: NDArray,
+    n_frames: int,
+    options: NoiseFreeOptions = JOINT_OPTIONS.noise_free,
 ) -> tuple[NDArray, NDArray]:
     """
     Return some frames with their missing points filled in, and which ones they are.
@@ -171,6 +156,8 @@ def complete_frames(
     n_frames : int
         About how many frames to take, spread over all that determine their missing
         points.
+    options : NoiseFreeOptions
+        Which points count, and how missing ones are filled in.
 
     Returns
     -------
@@ -180,7 +167,8 @@ def complete_frames(
         The numbers of these frames.
     """
     V = np.linalg.qr(shapes.T)[0]
-    chosen = partial(_chosen, V=V, share=n_frames / blocks.n_frames)
+    share = n_frames / blocks.n_frames
+    chosen = partial(_chosen, V=V, share=share, options=options)
     tracks, masks, frames = [], [], []
     for part, found in zip(blocks.slices, blocks.map(chosen), strict=True):
         W, seen, places = found
@@ -191,48 +179,48 @@ def complete_frames(
     if masks[0] is not None:
         seen = np.concatenate(masks)
         if len(W) and not seen.all():
-            W = _completed(W, seen, V)
+            W = _completed(W, seen, V, options)
         W = W - W.mean(axis=2, keepdims=True)
     return W, np.concatenate(frames)
 
 
 def _chosen(
-    block: FrameTracks, V: NDArray, share: float
+    block: FrameTracks, V: NDArray, share: float, options: NoiseFreeOptions
 ) -> tuple[NDArray, NDArray | None, NDArray]:
     """Return tracks, seen points and numbers of evenly spread frames of a block."""
-    W, seen = _tracks_of(block)
+    W, seen = _tracks_of(block, options.counted)
     usable = np.arange(len(W))
     if seen is not None and not seen.all():
-        usable = _determined(seen, V)
+        usable = _determined(seen, V, options.determined)
     n = min(len(usable), int(np.ceil(share * len(W))))
     frames = usable[np.linspace(0, len(usable) - 1, n).round().astype(int)]
     return W[frames], None if seen is None else seen[frames], frames
 
 
-def _tracks_of(block: FrameTracks) -> tuple[NDArray, NDArray | None]:
+def _tracks_of(block: FrameTracks, counted: float) -> tuple[NDArray, NDArray | None]:
     """
     Return tracks (n_frames, 2, n_points) and which points are seen.
 
     Missing points are zero. The second array (n_frames, n_points) is 1.0 for seen
     points and 0.0 for others. It is None for frames without weights, which may be given
-    by directions instead of points.
+    by directions instead of points. Points with at least the weight counted are seen.
     """
     weighted = block.weighted.transpose(2, 1, 0)
     if block.weights is None:
         return weighted, None
     weights = block.weights.T
-    seen = weights >= COUNTED
+    seen = weights >= counted
     factor = np.where(seen, 1.0 / np.where(seen, weights, 1.0), 0.0)
     return factor[:, None] * weighted, 1.0 * seen
 
 
-def _determined(seen: NDArray, V: NDArray) -> NDArray:
+def _determined(seen: NDArray, V: NDArray, least_eigenvalue: float) -> NDArray:
     """Return the frames whose seen points determine their position and factors of V."""
     n_points = len(V)
     rows = np.hstack([V, np.full((n_points, 1), n_points**-0.5)])
     gram = (seen @ _squares(rows)).reshape(len(seen), rows.shape[1], -1)
     least = np.linalg.eigvalsh(gram)[:, 0]
-    return np.flatnonzero(least > DETERMINED)
+    return np.flatnonzero(least > least_eigenvalue)
 
 
 def _squares(rows: NDArray) -> NDArray:
@@ -240,7 +228,9 @@ def _squares(rows: NDArray) -> NDArray:
     return (rows[:, :, None] * rows[:, None]).reshape(len(rows), -1)
 
 
-def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
+def _completed(
+    W: NDArray, seen: NDArray, V: NDArray, options: NoiseFreeOptions
+) -> NDArray:
     """
     Return tracks with missing points from a low rank fit, by alternating least squares.
 
@@ -250,21 +240,21 @@ def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
     """
     n_points, rank = V.shape
     n_seen = max(2.0 * seen.sum(), 1.0)
-    square, filled = np.inf, W
-    for _ in range(COMPLETION_STEPS):
+    square, filled, little = np.inf, W, options.little
+    for _ in range(options.completion_steps):
         # Coefficients z_i and positions of the frames for given V
         rows = np.hstack([V, np.ones((n_points, 1))])
         gram = (seen @ _squares(rows)).reshape(-1, rank + 1, rank + 1)
         # A ridge: if the rank of W is lower, a column of V is arbitrary.
         size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-        gram += RIDGE * size * np.eye(rank + 1)
+        gram += OF_PRODUCTS * size * np.eye(rank + 1)
         factors = np.linalg.solve(gram, (W @ rows).swapaxes(1, 2)).swapaxes(1, 2)
         # Residual of the seen points, and convergence test
         model = factors @ rows.T
         previous = square
         filled = np.where(seen[:, None] > 0, W, model)
         square = np.sum((filled - model) ** 2) / n_seen
-        if not LITTLE * previous > 0 or square > (1 - LITTLE) * previous:
+        if not little * previous > 0 or square > (1 - little) * previous:
             break
         # V for given coefficients z_i and positions
         z, place = factors[..., :rank], factors[..., rank:]
@@ -272,7 +262,8 @@ def _completed(W: NDArray, seen: NDArray, V: NDArray) -> NDArray:
         moments = (seen.T @ moments).reshape(n_points, rank, rank)
         moved = (W - place) * seen[:, None]
         right = np.einsum("irj,irk->jk", moved, z)
-        ridge = RIDGE * np.trace(moments, axis1=1, axis2=2).mean() * np.eye(rank)
+        size = np.trace(moments, axis1=1, axis2=2).mean()
+        ridge = OF_PRODUCTS * size * np.eye(rank)
         V = np.linalg.solve(moments + ridge, right[..., None])[..., 0]
         V = np.linalg.qr(V - V.mean(axis=0))[0]
     return filled
@@ -357,7 +348,7 @@ class _Frames(NamedTuple):
         Q, R = np.linalg.qr(tangents)
         # Dependent tangents: their columns of Q are zero, their steps are zero, too.
         diagonal = np.arange(R.shape[-1])
-        kept = np.abs(R[:, diagonal, diagonal]) > DEPENDENT * size
+        kept = np.abs(R[:, diagonal, diagonal]) > OF_DISTANCES * size
         Q *= kept[:, None]
         R *= kept[..., None]
         R[:, diagonal, diagonal] += ~kept
@@ -379,7 +370,10 @@ class _Frames(NamedTuple):
 
 
 def minimise(
-    rows: NDArray, start: FramesAndShapes, cameras: CameraModel
+    rows: NDArray,
+    start: FramesAndShapes,
+    cameras: CameraModel,
+    options: NoiseFreeOptions = JOINT_OPTIONS.noise_free,
 ) -> FramesAndShapes:
     """
     Minimise the residual by Levenberg-Marquardt steps.
@@ -392,6 +386,8 @@ def minimise(
         The first iterate.
     cameras : CameraModel
         The cameras that are allowed.
+    options : NoiseFreeOptions
+        Steps and damping.
 
     Returns
     -------
@@ -402,12 +398,12 @@ def minimise(
     energy = float(np.vdot(rows, rows))
     frames = _Frames.at(rows, state, cameras)
     square = float(np.vdot(frames.rest, frames.rest))
-    damping, small_steps, system = FIRST_DAMPING, 0, None
-    for _ in range(MAX_STEPS):
+    damping, small_steps, system = options.first_damping, 0, None
+    for _ in range(options.max_steps):
         # Convergence tests
         if square <= OF_SUMS**2 * energy or small_steps == 2:
             break
-        if damping > LARGEST_DAMPING:
+        if damping > options.largest_damping:
             break
         if system is None:
             system = normal_equations(frames, state)
@@ -416,10 +412,11 @@ def minimise(
         after = _Frames.at(rows, trial, cameras)
         reached = float(np.vdot(after.rest, after.rest))
         if not reached < square:
-            damping *= RAISED
+            damping *= options.raised
             continue
-        small_steps = small_steps + 1 if reached > (1 - LITTLE) * square else 0
-        damping = max(EASED * damping, SMALLEST_DAMPING)
+        small = reached > (1 - options.little) * square
+        small_steps = small_steps + 1 if small else 0
+        damping = max(options.eased * damping, options.smallest_damping)
         state, frames, square, system = trial, after, reached, None
     return state
 
@@ -438,7 +435,7 @@ def normal_equations(frames: _Frames, state: FramesAndShapes) -> _System:
     n_frames, _, size = X.shape
     n_directions = state.shapes.shape[1]
     E = np.tensordot(X, X, axes=([0, 1], [0, 1]))
-    E += RIDGE * np.trace(E) * np.eye(size)
+    E += OF_PRODUCTS * np.trace(E) * np.eye(size)
     root = np.linalg.cholesky(E).T
     # X_i E^-1/2
     X = solve_triangular(root, X.reshape(-1, size).T, trans="T").T.reshape(X.shape)
@@ -492,15 +489,14 @@ def _better(
 
 
 def _all_frames(
-    blocks: FrameBlocks,
-    shapes: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    camera: str,
+    blocks: FrameBlocks, fitted: Callable[..., Any], motion: NDArray, alpha: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Return motion (2, 3, n_frames) and alpha (K, n_frames) of all frames."""
+    """
+    Return motion (2, 3, n_frames) and alpha (K, n_frames) of all frames.
+
+    The function fitted returns cameras and coefficients of a block.
+    """
     motion, alpha = motion.copy(), alpha.copy()
-    fitted = partial(_fitted, shapes=shapes, camera=camera)
     fits = blocks.map(fitted, alpha.T.copy())
     for part, (cameras, coefficients) in zip(blocks.slices, fits, strict=True):
         known = np.isfinite(coefficients).all(axis=1)
@@ -511,10 +507,14 @@ def _all_frames(
 
 
 def _fitted(
-    block: FrameTracks, initial: NDArray, shapes: NDArray, camera: str
+    block: FrameTracks,
+    initial: NDArray,
+    shapes: NDArray,
+    camera: str,
+    counted: float,
 ) -> tuple[NDArray, NDArray]:
     """Return cameras (n, 2, 3) and coefficients of a block; initial (n, K)."""
-    W, seen = _tracks_of(block)
+    W, seen = _tracks_of(block, counted)
     if seen is None:
         fit = fit_prepared(block, shapes, 0.0, camera=camera, initial=initial)
     else:

@@ -13,17 +13,8 @@ from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
+from isa_nrsfm._joint.options import JOINT_OPTIONS, Effort, JointOptions
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState, refine_joint
-
-# Prior of the basis shapes: standard deviation of the coordinates of the image of a
-# basis shape whose coefficient is one, as a share of the size of the frame.
-# (``python -m benchmarks.accuracy prior``)
-BASIS_STD = 0.008
-# Floor of the noise variance while the model may be wrong, as a share of the mean
-# square of the tracks. Deformation that K basis shapes do not span is not noise: with
-# less noise the fit would explain it by wrong depths.
-# (``python -m benchmarks.accuracy prior``)
-LEAST_NOISE = 5e-5
 
 
 class Steps(NamedTuple):
@@ -38,15 +29,14 @@ class Steps(NamedTuple):
         Convergence tolerance, as of `refine_joint`.
     on_step : callable or None
         As of `refine_joint`.
-    thorough : bool
-        Whether to compare more starts and to take a smaller tolerance. It is true only
-        for small tables, where more steps cost little.
+    effort : Effort
+        How much the fit compares.
     """
 
     max_iter: int
     tol: float
     on_step: Callable[[], None] | None = None
-    thorough: bool = False
+    effort: Effort = JOINT_OPTIONS.large
 
 
 class JointProblem:
@@ -61,6 +51,8 @@ class JointProblem:
         When its iteration ends.
     penalty : float or ndarray of shape (n_components,)
         As of `MarginalLikelihood`.
+    options : JointOptions
+        The limits of all stages.
     """
 
     def __init__(
@@ -68,21 +60,23 @@ class JointProblem:
         frames: JointFrames,
         steps: Steps,
         penalty: NDArray | float,
+        options: JointOptions = JOINT_OPTIONS,
     ):
         self.frames, self.steps, self.penalty = frames, steps, penalty
+        self.options = options
 
     def part(self, chosen: NDArray, **changed: Any) -> Self:
         """Return the problem of some of the frames, with some fields of `Steps` set."""
         steps = self.steps._replace(**changed)
-        return type(self)(self.frames.take(chosen), steps, self.penalty)
+        return type(self)(self.frames.take(chosen), steps, self.penalty, self.options)
 
     def with_frames(self, frames: JointFrames) -> Self:
         """Return the problem of the same frames in other coordinates or weights."""
-        return type(self)(frames, self.steps, self.penalty)
+        return type(self)(frames, self.steps, self.penalty, self.options)
 
     def with_penalty(self, penalty: NDArray | float) -> Self:
         """Return the problem with another penalty, or one for each basis shape."""
-        problem = type(self)(self.frames, self.steps, penalty)
+        problem = type(self)(self.frames, self.steps, penalty, self.options)
         problem.totals = self.totals  # saves a pass over all frames
         return problem
 
@@ -157,7 +151,7 @@ class JointProblem:
         self,
         state: JointState,
         cameras: CameraModel,
-        least_noise: float,
+        least_noise: float | None = None,
         **changed: Any,
     ) -> JointResult:
         """
@@ -169,8 +163,9 @@ class JointProblem:
             The first iterate.
         cameras : CameraModel
             The cameras that are allowed.
-        least_noise : float
-            Lower bound of the noise variance, as a share of the mean square.
+        least_noise : float, optional
+            Lower bound of the noise variance, as a share of the mean square. By default
+            that of a model that may be wrong.
         **changed : object
             Settings of `Steps` that are different.
 
@@ -184,10 +179,13 @@ class JointProblem:
             self.likelihood,
             state,
             cameras,
-            least_noise=least_noise,
+            least_noise=(
+                self.options.least_noise if least_noise is None else least_noise
+            ),
             max_iter=steps.max_iter,
             tol=steps.tol,
             on_step=steps.on_step,
+            options=self.options,
         )
 
 

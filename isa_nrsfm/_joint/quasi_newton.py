@@ -20,33 +20,8 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.noise_free import fit_without_noise
-from isa_nrsfm._linalg.rounding import OF_SUMS
-
-# L-BFGS memory: the number of pairs (step, change of the gradient) that are kept. Fewer
-# are kept if all pairs would exceed MEMORY_NUMBERS numbers, but never fewer than
-# LEAST_MEMORY.
-MEMORY = 20
-MEMORY_NUMBERS = 2**25
-LEAST_MEMORY = 3
-# Lower bound of the noise variance, as a share of the mean square of the tracks. It
-# keeps the objective finite for tables without noise.
-NOISE_FLOOR = 1e-11
-# Gauss-Newton steps are tried once the noise variance is below the share EXACT of the
-# mean square of the tracks. Where they lead nowhere, they are tried again when it has
-# fallen to the share CLOSER of its value at the last trial.
-EXACT = 1e-7
-CLOSER = 0.1
-# The logarithm of the noise variance changes by at most so much in a step.
-LARGEST_NOISE_STEP = 1.5
-# Armijo condition: a step has to gain this share of the decrease that the slope
-# predicts.
-SUFFICIENT_DECREASE = 1e-4
-# Least step length of the line search, as a share of the whole step. A shorter step
-# changes the objective by rounding errors only.
-SHORTEST_STEP = 1e-8
-# Ridge of the curvature by the shapes, relative to its mean diagonal. The curvature is
-# singular where the table does not determine the shapes.
-RIDGE = 1e-12
+from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions, SearchOptions
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 
 
 class JointState(NamedTuple):
@@ -104,10 +79,11 @@ def refine_joint(
     start: JointState,
     cameras: CameraModel,
     *,
-    least_noise: float = NOISE_FLOOR,
+    least_noise: float | None = None,
     max_iter: int,
     tol: float,
     on_step: Callable[[], None] | None = None,
+    options: JointOptions = JOINT_OPTIONS,
 ) -> JointResult:
     """
     Minimise the objective of `MarginalLikelihood`.
@@ -120,8 +96,9 @@ def refine_joint(
         The first iterate.
     cameras : CameraModel
         The cameras that are allowed, and how a step changes them.
-    least_noise : float
+    least_noise : float, optional
         Lower bound of the noise variance, as a share of the mean square of the tracks.
+        By default the `noise_floor` of the options.
     max_iter : int
         Largest number of steps.
     tol : float
@@ -129,21 +106,25 @@ def refine_joint(
         the objective by less than tol times the number of frames.
     on_step : callable, optional
         Called before each step.
+    options : JointOptions
+        How steps are made; `search` and `noise_free` are looked at.
 
     Returns
     -------
     JointResult
         The result.
     """
-    floor = least_noise * likelihood.square / likelihood.n_seen
+    search = options.search
+    floor = search.noise_floor if least_noise is None else least_noise
+    floor = floor * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
     iterate = _Iterate(likelihood, cameras, start, floor)
-    remembered = min(MEMORY_NUMBERS // (2 * iterate.gradient.size), MEMORY)
+    most = search.memory_numbers // (2 * iterate.gradient.size)
     memory: deque[tuple[NDArray, NDArray, float]] = deque(
-        maxlen=max(remembered, LEAST_MEMORY)
+        maxlen=max(min(most, search.memory), search.least_memory)
     )
     history = [iterate.value]
-    small_steps, exact = 0, EXACT * likelihood.square / likelihood.n_seen
+    small_steps, exact = 0, search.exact_noise * likelihood.square / likelihood.n_seen
     if not cameras.n_parameters:
         exact = 0.0
     while len(history) <= max_iter and small_steps < 2:
@@ -151,9 +132,9 @@ def refine_joint(
             on_step()
         # Gauss-Newton steps where hardly any noise is left
         if iterate.left < exact:
-            reached = _without_noise(likelihood, iterate, floor)
+            reached = _without_noise(likelihood, iterate, floor, options)
             # One success is enough. After a failure they are tried again with less.
-            exact = 0.0 if reached else CLOSER * iterate.left
+            exact = 0.0 if reached else search.closer * iterate.left
             if reached:
                 memory.clear()
                 iterate = reached
@@ -165,14 +146,15 @@ def refine_joint(
             memory.clear()
             direction = -iterate.precondition(iterate.gradient)
         # Armijo line search
-        reached, step = _line_search(likelihood, iterate, direction, floor)
+        reached, step = _line_search(likelihood, iterate, direction, floor, search)
         if reached is None:
             if not memory:  # the gradient itself fails: rounding errors are left
                 small_steps = 2
             memory.clear()
             continue
         # Update of the memory
-        _remember(memory, step, reached.gradient - iterate.gradient)
+        change = reached.gradient - iterate.gradient
+        _remember(memory, step, change, search.least_curvature)
         # Convergence test
         gain = iterate.value - reached.value
         rounding = OF_SUMS * likelihood.square / reached.state.noise
@@ -193,21 +175,28 @@ def refine_joint(
 
 
 def _remember(
-    memory: deque[tuple[NDArray, NDArray, float]], step: NDArray, change: NDArray
+    memory: deque[tuple[NDArray, NDArray, float]],
+    step: NDArray,
+    change: NDArray,
+    least_curvature: float,
 ) -> None:
     """
     Add a pair to the L-BFGS memory, if the curvature along the step is positive.
 
     Both are vectors of all unknowns: the step ``s`` and the change ``y`` of the
-    gradient. The curvature is ``s^T y``.
+    gradient. The curvature is ``s^T y``; its least value is relative to ``|s| |y|``.
     """
     curvature = float(step @ change)
-    if curvature > 1e-10 * np.linalg.norm(step) * np.linalg.norm(change):
+    size = least_curvature * np.linalg.norm(step) * np.linalg.norm(change)
+    if curvature > size:
         memory.append((step, change, curvature))
 
 
 def _without_noise(
-    likelihood: MarginalLikelihood, iterate: "_Iterate", floor: float
+    likelihood: MarginalLikelihood,
+    iterate: "_Iterate",
+    floor: float,
+    options: JointOptions,
 ) -> "_Iterate | None":
     """Return the iterate after Gauss-Newton steps, None if it is no better."""
     shapes, motion, _ = iterate.state
@@ -215,7 +204,13 @@ def _without_noise(
         return None
     alpha = likelihood.coefficients(*iterate.state).T
     found = fit_without_noise(
-        likelihood.frames, shapes, motion, alpha, likelihood.penalty, iterate.cameras
+        likelihood.frames,
+        shapes,
+        motion,
+        alpha,
+        likelihood.penalty,
+        iterate.cameras,
+        options.noise_free,
     )
     if found is None:
         return None
@@ -305,10 +300,14 @@ class _Iterate:
 
 
 def regular(curvature: NDArray) -> NDArray:
-    """Return curvatures (n, m, m) by the shapes with a small ridge added."""
+    """
+    Return curvatures (n, m, m) by the shapes with a small ridge added.
+
+    They are singular where the table does not determine the shapes.
+    """
     size = curvature.shape[-1]
     # Points that no frame shows have no curvature, and no gradient either.
-    ridge = RIDGE * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
+    ridge = OF_DIFFERENCES * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
     return curvature + ridge * np.eye(size)
 
 
@@ -336,7 +335,11 @@ def _inverse_hessian_product(
 
 
 def _line_search(
-    likelihood: MarginalLikelihood, iterate: _Iterate, direction: NDArray, floor: float
+    likelihood: MarginalLikelihood,
+    iterate: _Iterate,
+    direction: NDArray,
+    floor: float,
+    options: SearchOptions,
 ) -> tuple[_Iterate | None, NDArray]:
     """
     Return the first iterate along a direction that meets the Armijo condition.
@@ -347,18 +350,20 @@ def _line_search(
     # Largest step length that the parametrisation of noise and cameras allows
     length = min(
         1.0,
-        LARGEST_NOISE_STEP / max(abs(direction[-1]), 1e-300),
+        options.largest_noise_step / max(abs(direction[-1]), 1e-300),
         iterate.cameras.largest_length(iterate.split(direction)[1]),
     )
-    while length > SHORTEST_STEP:
+    while length > options.shortest_step:
         step = length * direction
         state = iterate.moved(step, floor)
         reached = _Iterate(likelihood, iterate.cameras, state, floor)
-        if reached.value <= iterate.value + SUFFICIENT_DECREASE * length * slope:
+        enough = options.sufficient_decrease * length * slope
+        if reached.value <= iterate.value + enough:
             # The lower bound may have shortened the change of the noise.
             step[-1] = np.log(reached.state.noise / iterate.state.noise)
             return reached, step
         # Backtracking by quadratic interpolation of both values and the slope
         excess = reached.value - iterate.value - length * slope
-        length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
+        best = -length * slope / (2 * excess)
+        length *= min(max(best, options.strongest_cut), options.weakest_cut)
     return None, direction

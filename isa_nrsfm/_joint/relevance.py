@@ -16,18 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
+from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState, regular
-
-# Rounds, and the steps of each.
-ROUNDS = 3
-STEPS = 30
-# Least share of the numbers of a basis shape that the table has to determine. On
-# artificial tables with 2 % noise true shapes have 0.998 and more, others 0.83 and less
-# (``python -m benchmarks.recovery components``).
-LEAST_DETERMINED = 0.95
-# Lower bound of the shares g_k, and of the variances v_k relative to the largest.
-SMALLEST = 1e-9
 
 
 def relevant_components(
@@ -53,19 +43,20 @@ def relevant_components(
     n_numbers = state.shapes[0].size  # 3J
     penalty = np.full(len(state.shapes) - 1, problem.penalty)
     determined = np.ones(len(penalty))
-    for _ in range(ROUNDS):
+    options = problem.options.relevance
+    for _ in range(options.rounds):
         part = problem.with_penalty(penalty)
         start = _orthogonal(state)
-        state = part.refined(start, cameras, LEAST_NOISE, max_iter=STEPS).state
+        state = part.refined(start, cameras, max_iter=options.steps).state
         # g_k and v_k, with penalty = 1 / (v_k n_frames)
         energy, uncertain = _image_energies(part, state)
         determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
-        determined = np.clip(determined, SMALLEST, 1.0)
+        determined = np.clip(determined, options.smallest, 1.0)
         variance = np.maximum(
-            energy / (n_numbers * determined), SMALLEST * energy.max()
+            energy / (n_numbers * determined), options.smallest * energy.max()
         )
         penalty = 1.0 / (variance * problem.n_frames)
-    return int(np.sum(determined > LEAST_DETERMINED))
+    return int(np.sum(determined > options.determined))
 
 
 def _camera_moments(state: JointState) -> NDArray:

@@ -14,10 +14,6 @@ from isa_nrsfm._prepare.robust import median_noise, robust_weights
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
-# Largest number of rounds of reweighting, and convergence tolerance of the weights.
-ROUNDS = 20
-SETTLED_WEIGHTS = 1e-2
-
 
 def reweighted(
     problem: JointProblem,
@@ -55,7 +51,8 @@ def reweighted(
     tracks = rows.whole().transpose(0, 2, 1)
     seen = seen_points(tracks)
     counted, weights = used * 1.0, np.zeros(seen.shape)
-    for _ in range(ROUNDS):
+    options = problem.options.reweighting
+    for _ in range(options.rounds):
         # Residuals of the seen points
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
@@ -74,7 +71,7 @@ def reweighted(
         deviation = max(median_noise(distance[seen]), OF_DISTANCES)
         previous, weights = weights, np.zeros(seen.shape)
         weights[seen] = robust_weights(loss, distance[seen] / deviation)
-        if np.abs(weights - previous).max() < SETTLED_WEIGHTS:
+        if np.abs(weights - previous).max() < options.settled:
             break
         # Refinement with the new weights
         problem = problem.with_frames(JointFrames.from_points(rows, False, weights))

@@ -19,7 +19,8 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
 )
 from isa_nrsfm._joint.likely_basis import likely_basis
-from isa_nrsfm._joint.problem import LEAST_NOISE, JointProblem
+from isa_nrsfm._joint.options import JOINT_OPTIONS, StartOptions
+from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormal_mixture,
@@ -29,41 +30,6 @@ from isa_nrsfm._metric_upgrade.rigid import best_metric
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._paper.sample import rigid_energy
 from isa_nrsfm._tables.ordering import spread
-
-# Columns of the mixtures: three for the rigid object and as many for each basis shape.
-WIDTHS = (6, 9, 12, 18, 24, 36)
-# Largest number of Levenberg-Marquardt steps of each mixture.
-MIXING_STEPS = 20
-# Largest number of steps of every start with its cameras held, and then of the best
-# ones with their cameras freed.
-HELD_STEPS = 6
-FREED_STEPS = 30
-# Convergence tolerance of these steps, for each frame. It may be large: the objectives
-# of starts that lead to different minima differ by tens for each frame.
-COMPARED_TOL = 0.5
-# Share of what the mean shape leaves that counts as noise at the start.
-FIRST_NOISE = 0.1
-
-
-class Comparison(NamedTuple):
-    """
-    How starts are compared.
-
-    Attributes
-    ----------
-    n_frames : int
-        The frames that are looked at.
-    n_finalists : int
-        How many starts go on with cameras that move.
-    """
-
-    n_frames: int
-    n_finalists: int
-
-
-# Small tables, such as motion capture, have several minima, and comparing them costs
-# little. Large tables show many people or things: all starts find the same minimum.
-SMALL, LARGE = Comparison(400, 3), Comparison(200, 1)
 
 
 def rigid_start(
@@ -98,7 +64,10 @@ def rigid_start(
 
 
 def mixed_cameras(
-    rows: NDArray, scales: NDArray | None, chosen: NDArray
+    rows: NDArray,
+    scales: NDArray | None,
+    chosen: NDArray,
+    options: StartOptions = JOINT_OPTIONS.starts,
 ) -> Iterator[NDArray]:
     """
     Yield calibrated cameras that are mixtures of more and more columns.
@@ -112,6 +81,8 @@ def mixed_cameras(
         mixture. None for cameras of scale one.
     chosen : ndarray of int, shape (n_chosen,)
         Frames from which the mixtures are found.
+    options : StartOptions
+        Widths and steps of the mixtures.
 
     Yields
     ------
@@ -123,11 +94,12 @@ def mixed_cameras(
     if P.shape[2] < 3:
         return
     few = P[chosen].reshape(2 * len(chosen), -1)
-    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=MIXING_STEPS)
+    max_iter = options.mixing_steps
+    mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=max_iter)
     # Each width starts from the mixture of the one before.
     rank = P.shape[2]
-    for n in sorted({min(n, rank) for n in WIDTHS if n < rank + 3}):
-        mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=MIXING_STEPS)
+    for n in sorted({min(n, rank) for n in options.widths if n < rank + 3}):
+        mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=max_iter)
         found, sizes = nearest_calibrated(P[..., :n] @ mixing)
         yield found if scales is None else (scales * sizes)[:, None, None] * found
 
@@ -230,7 +202,8 @@ def settled(
         The last iterate, in the basis of greatest posterior density.
     """
     unpenalised = problem.with_penalty(0.0)
-    result = unpenalised.refined(state, cameras, LEAST_NOISE, max_iter=HELD_STEPS)
+    held_steps = problem.options.starts.held_steps
+    result = unpenalised.refined(state, cameras, max_iter=held_steps)
     return with_prior(problem, result.state)
 
 
@@ -267,10 +240,10 @@ def best_starts(
     order = np.argsort(
         rigid_energy(rows, problem.frames.coordinates(factors.rigid_shape))
     )
-    comparison = SMALL if problem.steps.thorough else LARGE
-    few = np.sort(spread(order, min(comparison.n_frames, len(order))))
+    options, effort = problem.options.starts, problem.steps.effort
+    few = np.sort(spread(order, min(effort.n_compared, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
-    part = problem.part(few, tol=COMPARED_TOL).with_penalty(0.0)
+    part = problem.part(few, tol=options.compared_tol).with_penalty(0.0)
     # Rigid cameras, with the paper's and with lifted basis shapes
     motion, shapes = rigid_start(
         factors, problem.frames.coordinates(paper_shapes), cameras.scaled
@@ -283,14 +256,15 @@ def best_starts(
     ]
     # Mixtures of more and more columns, until the objective rises
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
-    for mixed in mixed_cameras(rows, scales if cameras.scaled else None, few):
+    frame_scales = scales if cameras.scaled else None
+    for mixed in mixed_cameras(rows, frame_scales, few, options):
         given = lifted_shapes(rows[few], mixed[few], n_components)
         trials.append(_trial(part, rows, mixed, few, given))
         if len(trials) > 3 and trials[-1].value > trials[-2].value:
             break
     # The best ones, with their cameras freed
     trials.sort(key=lambda trial: trial.value)
-    finalists = trials[: comparison.n_finalists]
+    finalists = trials[: effort.n_finalists]
     starts = [_freed(part, trial, few, cameras) for trial in finalists]
     return [with_prior(problem, state) for state in starts]
 
@@ -312,7 +286,8 @@ def _trial(
     The arrays rows (n_frames, 2, n_points) and motion (n_frames, 2, 3) have all frames.
     """
     state = _first_state(part, rows[few], motion[few], shapes)
-    result = part.refined(state, HeldCameras(), LEAST_NOISE, max_iter=HELD_STEPS)
+    held_steps = part.options.starts.held_steps
+    result = part.refined(state, HeldCameras(), max_iter=held_steps)
     return _Trial(result.history[-1], result.state, motion)
 
 
@@ -320,7 +295,8 @@ def _freed(
     part: JointProblem, trial: _Trial, few: NDArray, cameras: CameraModel
 ) -> JointState:
     """Return a start after some steps of shapes and cameras of the compared frames."""
-    result = part.refined(trial.state, cameras, LEAST_NOISE, max_iter=FREED_STEPS)
+    freed_steps = part.options.starts.freed_steps
+    result = part.refined(trial.state, cameras, max_iter=freed_steps)
     motion = frames_last(trial.motion)
     motion[:, :, few] = result.state.motion
     return result.state._replace(motion=motion)
@@ -337,8 +313,10 @@ def _first_state(
     """
     rest = rows - motion @ shapes[0]
     n_seen, energy = problem.totals
-    noise = max(FIRST_NOISE * np.mean(rest**2), LEAST_NOISE * energy / n_seen)
-    return JointState(shapes, frames_last(motion), noise)
+    options = problem.options
+    noise = options.starts.first_noise * np.mean(rest**2)
+    least_noise = options.least_noise * energy / n_seen
+    return JointState(shapes, frames_last(motion), max(noise, least_noise))
 
 
 def with_prior(problem: JointProblem, state: JointState) -> JointState:

@@ -13,5 +13,8 @@ OF_PRODUCTS = 1e-14
 OF_STEPS = 1e-13
 # What is left where large numbers cancel.
 OF_DIFFERENCES = 1e-12
+# Singular values, and eigenvalues, of directions that a matrix does not have, relative
+# to the largest.
+OF_RANKS = 1e-10
 # Square roots of what is left, as distances are.
 OF_DISTANCES = 1e-9

@@ -21,11 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._paper.block_structure import MotionProducts, packed_inner, unpack
-
-# Alternations from each start. Only the best one is then iterated to convergence.
-N_TRIAL_STEPS = 6
-# Along any direction a Newton step is at most this many times the alternation step.
-LARGEST_GAIN = 1e4
+from isa_nrsfm._paper.options import PAPER_OPTIONS, PaperOptions
 
 
 class Refinement(NamedTuple):
@@ -63,7 +59,12 @@ class _State(NamedTuple):
 
 
 def refine_alternating(
-    products: MotionProducts, starts: NDArray, *, max_iter: int, tol: float
+    products: MotionProducts,
+    starts: NDArray,
+    *,
+    max_iter: int,
+    tol: float,
+    options: PaperOptions = PAPER_OPTIONS,
 ) -> Refinement:
     """
     Return the blocks that explain most of the motion, each from several starts.
@@ -79,6 +80,8 @@ def refine_alternating(
     tol : float
         Convergence tolerance: a block has converged when a Newton step promises to
         raise its energy by less than this share.
+    options : PaperOptions
+        How many trial steps there are, and how long a Newton step may be.
 
     Returns
     -------
@@ -91,15 +94,17 @@ def refine_alternating(
     n_iter = np.ones(n_blocks, dtype=int)
     converged = np.ones(n_blocks, dtype=bool)
     for k, P in enumerate(products.blocks()):
-        best = _best_start(P, products.rigid, starts[k])
+        best = _best_start(P, products.rigid, starts[k], options.n_trial_steps)
         if best is not None:
             E[k], energy[k], n_iter[k], converged[k] = _maximise(
-                P, products.rigid, best, max_iter, tol
+                P, products.rigid, best, max_iter, tol, options.largest_gain
             )
     return Refinement(E, energy, int(n_iter.max()), bool(converged.all()))
 
 
-def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
+def _best_start(
+    P: NDArray, rigid: NDArray, starts: NDArray, n_steps: int
+) -> NDArray | None:
     """
     Return the iterate (3, 3) of largest energy after some alternations from each start.
 
@@ -110,7 +115,7 @@ def _best_start(P: NDArray, rigid: NDArray, starts: NDArray) -> NDArray | None:
     E = (starts / np.where(norms > 0, norms, 1.0))[norms.ravel() > 0]
     if not len(E) or not P.any():
         return None
-    for _ in range(N_TRIAL_STEPS):
+    for _ in range(n_steps):
         _, _, alpha = _coefficients(P, rigid, E)
         A, R = unpack((alpha**2).T @ rigid), (alpha.T @ P).reshape(-1, 3, 3)
         E = np.linalg.pinv(A, hermitian=True) @ R
@@ -134,12 +139,17 @@ def _coefficients(
 
 
 def _maximise(
-    P: NDArray, rigid: NDArray, E: NDArray, max_iter: int, tol: float
+    P: NDArray,
+    rigid: NDArray,
+    E: NDArray,
+    max_iter: int,
+    tol: float,
+    largest_gain: float,
 ) -> tuple[NDArray, float, int, bool]:
     """Return a local maximum of f from the start E: E, f, n_iter and converged."""
     state = _state(P, rigid, E)
     for n_iter in range(1, max_iter + 1):
-        plain, newton, gain = _steps(P, rigid, state)
+        plain, newton, gain = _steps(P, rigid, state, largest_gain)
         converged = gain <= tol * state.energy
         tried = _state(P, rigid, state.E + newton)
         if not tried.energy > state.energy:
@@ -160,7 +170,9 @@ def _state(P: NDArray, rigid: NDArray, E: NDArray) -> _State:
     return _State(E, float(alpha @ a), alpha, q, A, R)
 
 
-def _steps(P: NDArray, rigid: NDArray, state: _State) -> tuple[NDArray, NDArray, float]:
+def _steps(
+    P: NDArray, rigid: NDArray, state: _State, largest_gain: float
+) -> tuple[NDArray, NDArray, float]:
     """
     Return the alternation step, the Newton step and its predicted gain of energy.
 
@@ -192,7 +204,7 @@ def _steps(P: NDArray, rigid: NDArray, state: _State) -> tuple[NDArray, NDArray,
     coordinates = on_vec @ projection
     curvature, modes = np.linalg.eigh(coordinates.T @ (w.T @ weighted) @ coordinates)
     # The Newton step along each eigenvector.
-    factors = 1.0 / np.maximum(np.abs(1.0 - curvature), 1.0 / LARGEST_GAIN)
+    factors = 1.0 / np.maximum(np.abs(1.0 - curvature), 1.0 / largest_gain)
     slopes = modes.T @ gradient.ravel()
     newton = (modes @ (factors * slopes)).reshape(3, 3)
     return whitening @ gradient, whitening @ newton, float(factors @ slopes**2)

@@ -12,11 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-# Directions of a subspace with less than this share of its largest variance are left
-# out. The subspace does not move along them.
-EMPTY_DIRECTION = 1e-9
-# Ridge in `lifted_moments`, relative to the energy of the camera.
-LIFT_RIDGE = 0.1
+from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._paper.options import PAPER_OPTIONS
+
 _PACKED = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 _UNPACKED = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
@@ -149,7 +147,7 @@ def _generalized_eigen(m: NDArray, energy: NDArray, gram: NDArray) -> NDArray:
     ||M_ik D||^2``. Directions in which the subspace does not move are left out.
     """
     variance, axes = eigh(gram)
-    moving = variance > EMPTY_DIRECTION * variance[-1]
+    moving = variance > OF_RANKS * variance[-1]
     whitening = np.kron(axes[:, moving] / np.sqrt(variance[moving]), np.eye(3))
     share = whitening.T @ _explained(m, energy) @ whitening
     return whitening @ eigh(share)[1][:, -1]
@@ -193,7 +191,9 @@ _METHODS: dict[str, Callable[[NDArray, NDArray, NDArray], NDArray]] = {
 }
 
 
-def lifted_moments(products: MotionProducts) -> NDArray:
+def lifted_moments(
+    products: MotionProducts, lift_ridge: float = PAPER_OPTIONS.lift_ridge
+) -> NDArray:
     """
     Return the second moments of the lifted motions.
 
@@ -207,6 +207,8 @@ def lifted_moments(products: MotionProducts) -> NDArray:
     ----------
     products : MotionProducts
         Products of the frames.
+    lift_ridge : float
+        The ridge, relative to the energy of the camera.
 
     Returns
     -------
@@ -215,7 +217,7 @@ def lifted_moments(products: MotionProducts) -> NDArray:
     """
     n_frames, _, n_signals = products.cross.shape
     energy = products.rigid[:, :3].sum(axis=1)
-    ridge = LIFT_RIDGE * np.where(energy > 0, energy, 1.0)
+    ridge = lift_ridge * np.where(energy > 0, energy, 1.0)
     regular = unpack(products.rigid) + ridge[:, None, None] * np.eye(3)
     L = np.linalg.solve(regular, products.cross).reshape(n_frames, -1)
     return (L.T @ L).reshape(3, n_signals, 3, n_signals).transpose(0, 2, 1, 3)

@@ -10,12 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
 
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._paper.svd import Triplets, leading_triplets
-
-# Singular values below this share of the first count as zero, however precise the table
-# is. They have less than 1e-20 of the energy.
-NULL_DIRECTION = 1e-10
 
 
 class Factorisation(NamedTuple):
@@ -83,7 +80,7 @@ def factorise(
         triplets = leading_triplets(W, 3 * n_components + 3)
     S, Vt, rest = triplets
     # Rows of Vt above rounding errors, centred, their signs fixed.
-    null = max(NULL_DIRECTION, precision) * S[0]
+    null = max(OF_RANKS, precision) * S[0]
     rank = int(np.sum(S > null))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils.validation import has_fit_parameter
 
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._paper.alternating import refine_alternating
 from isa_nrsfm._paper.block_structure import (
     MotionProducts,
@@ -23,14 +24,7 @@ from isa_nrsfm._paper.block_structure import (
     structure_energies,
 )
 from isa_nrsfm._paper.factors import Factorisation
-
-# The signals are rounded to this many decimals, and their samples sorted, before the
-# analysis. Fixed-point iterations from random starts magnify rounding errors, so that
-# another order of frames or points could lead to another optimum. Signals have unit
-# variance: this is far coarser than rounding errors, and far finer than their errors.
-SIGNAL_DECIMALS = 5
-# Number of eigenvectors of `leading_blocks` that the refinement starts from.
-N_LIFTED_STARTS = 2
+from isa_nrsfm._paper.options import PAPER_OPTIONS, PaperOptions
 
 
 class PaperResult(NamedTuple):
@@ -68,6 +62,7 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
+    options: PaperOptions = PAPER_OPTIONS,
 ) -> PaperResult:
     """
     Run the stages of the paper after the factorisation.
@@ -90,6 +85,8 @@ def run_paper_pipeline(
         Tolerance of the refinement.
     report : callable
         Called with the name of each stage that has ended.
+    options : PaperOptions
+        What steers the stages.
 
     Returns
     -------
@@ -98,23 +95,27 @@ def run_paper_pipeline(
     """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
-    moments = lifted_moments(products)
+    moments = lifted_moments(products, options.lift_ridge)
     components = _independent_subspaces(
-        isa, factors.signals, products, moments, n_points / n_rows
+        isa,
+        np.round(factors.signals, options.signal_decimals),
+        products,
+        moments,
+        n_points / n_rows,
     )
     report("independent subspaces")
 
     # Block structure. E_k is the inverse of D_k.
     products = products.rotated(components)
-    E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=1e-9)
+    E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=OF_RANKS)
     n_iter, converged = 1, True
     if refinement == "alternating":
         subspaces = components.reshape(len(E), 3, -1)
-        lifted = leading_blocks(moments, subspaces, N_LIFTED_STARTS)
+        lifted = leading_blocks(moments, subspaces, options.n_lifted_starts)
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)
         E, _, n_iter, converged = refine_alternating(
-            products, starts, max_iter=max_iter, tol=tol
+            products, starts, max_iter=max_iter, tol=tol, options=options
         )
     report("block structure and refinement")
 
@@ -157,7 +158,7 @@ def _independent_subspaces(
         fit_params["covariance"] = products.gram * scale
     if has_fit_parameter(isa, "criterion"):
         fit_params["criterion"] = partial(structure_energies, moments)
-    samples = np.round(signals.T, SIGNAL_DECIMALS)
+    samples = signals.T
     isa.fit(samples[np.lexsort(samples.T)], **fit_params)
     n_signals = len(signals)
     if isa.components_.shape != (n_signals, n_signals):

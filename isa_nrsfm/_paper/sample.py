@@ -11,18 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._paper.options import SAMPLE_OPTIONS, SampleOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import spread
-
-# Frames of the first sample. Each further sample is GROWTH times larger, up to about
-# MOST_SAMPLED frames. The last steps take all frames.
-SAMPLE_FRAMES = 600
-GROWTH = 4
-MOST_SAMPLED = 40_000
-# Tables with fewer coordinates than this are taken whole.
-SMALL_TABLE = 150_000
-# A direction whose singular value is below this share of the largest counts as flat.
-FLAT = 1e-10
 
 
 class Sample(NamedTuple):
@@ -43,7 +35,12 @@ class Sample(NamedTuple):
     parts: list[NDArray]
 
 
-def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sample:
+def sample_frames(
+    rows: FrameBlocks,
+    n_points: int,
+    rigid_shape: NDArray,
+    options: SampleOptions = SAMPLE_OPTIONS,
+) -> Sample:
     """
     Return frames for the first stages.
 
@@ -55,6 +52,8 @@ def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sam
         Number of points.
     rigid_shape : ndarray of shape (3, n_points)
         Shape of the rigid factorisation.
+    options : SampleOptions
+        When and how many frames are taken.
 
     Returns
     -------
@@ -63,13 +62,14 @@ def sample_frames(rows: FrameBlocks, n_points: int, rigid_shape: NDArray) -> Sam
     """
     n_frames = rows.n_frames
     parts: list[NDArray] = []
-    if 2 * n_frames * n_points >= SMALL_TABLE and n_frames > SAMPLE_FRAMES:
+    large = 2 * n_frames * n_points >= options.small_table
+    if large and n_frames > options.first:
         energy = partial(rigid_energy, shape=rigid_shape)
         order = np.argsort(rows.joined(energy), kind="stable")
-        n = SAMPLE_FRAMES
-        while not parts or n < min(n_frames / 2, MOST_SAMPLED):
+        n = options.first
+        while not parts or n < min(n_frames / 2, options.most):
             parts.append(np.sort(spread(order, n)))
-            n *= GROWTH
+            n *= options.growth
     W = rows.take(parts[0]) if parts else rows.whole()
     W = W.reshape(-1, n_points).astype(np.float64, copy=False)
     return Sample(W, parts)
@@ -92,7 +92,7 @@ def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
         ``min_M ||W_i - M shape||_F^2``, with the rounding errors of ``||W_i||_F^2``.
     """
     axes, size, _ = np.linalg.svd(shape.T, full_matrices=False)
-    axes = axes[:, size > FLAT * size[0]]
+    axes = axes[:, size > OF_RANKS * size[0]]
     flat = rows.reshape(len(rows), -1)
     seen = (rows.reshape(-1, rows.shape[-1]) @ axes).reshape(len(rows), -1)
     return np.maximum(np.vecdot(flat, flat) - np.vecdot(seen, seen), 0.0)

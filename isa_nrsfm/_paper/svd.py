@@ -8,20 +8,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import energies
+from isa_nrsfm._paper.options import SVD_OPTIONS, SvdOptions
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
-
-# A matrix with more rows and more columns than this is not factorised as a whole. Its
-# leading subspace is found by a block Krylov method.
-DENSE = 1500
-# Block Krylov method: columns of a block beyond the k that are wanted, the most passes
-# over the matrix, and the convergence tolerance. It ends when the next pass would raise
-# the energy found by less than this share of the energy that is left.
-OVERSAMPLING = 10
-MOST_PASSES = 12
-CONVERGED = 1e-6
-# Triangular factors are stacked up to this many times their width, then factorised.
-STACKED = 6
 
 
 class Triplets(NamedTuple):
@@ -48,7 +37,7 @@ class Triplets(NamedTuple):
         return float(self.rest / (np.sum(self.values**2) + self.rest))
 
 
-def leading_triplets(W: NDArray, k: int) -> Triplets:
+def leading_triplets(W: NDArray, k: int, options: SvdOptions = SVD_OPTIONS) -> Triplets:
     """
     Return the largest singular values of a matrix, and their right vectors.
 
@@ -58,16 +47,23 @@ def leading_triplets(W: NDArray, k: int) -> Triplets:
         The matrix.
     k : int
         How many are wanted.
+    options : SvdOptions
+        How they are found.
 
     Returns
     -------
     Triplets
         As of `block_triplets`.
     """
-    return block_triplets(MemoryBlocks([W], [len(W)]), (len(W), W.shape[1]), k)
+    return block_triplets(MemoryBlocks([W], [len(W)]), (len(W), W.shape[1]), k, options)
 
 
-def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Triplets:
+def block_triplets(
+    blocks: FrameBlocks,
+    shape: tuple[int, int],
+    k: int,
+    options: SvdOptions = SVD_OPTIONS,
+) -> Triplets:
     """
     Return the largest singular values of a matrix in blocks, and their right vectors.
 
@@ -79,6 +75,8 @@ def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Tripl
         Numbers of its rows and columns.
     k : int
         How many are wanted.
+    options : SvdOptions
+        How they are found.
 
     Returns
     -------
@@ -97,14 +95,15 @@ def block_triplets(blocks: FrameBlocks, shape: tuple[int, int], k: int) -> Tripl
     do not come from ``W^T W``, so small singular values keep their precision.
     """
     n_rows, n_columns = shape
-    if min(shape) > max(DENSE, 4 * k):
-        V = _leading_subspace(blocks, n_columns, k)
+    if min(shape) > max(options.dense, 4 * k):
+        V = _leading_subspace(blocks, n_columns, k, options)
         energy = sum(blocks.map(_energy))
-        _, S, rotation = np.linalg.svd(_triangle(blocks, k, V), full_matrices=False)
+        projected = _triangle(blocks, k, options.stacked, V)
+        _, S, rotation = np.linalg.svd(projected, full_matrices=False)
         rest = max(float(energy - S @ S), 0.0)
         return Triplets(S, rotation @ V.T, rest)
     if n_rows > n_columns:
-        matrix = _triangle(blocks, n_columns)
+        matrix = _triangle(blocks, n_columns, options.stacked)
     else:
         matrix = blocks.whole().reshape(-1, n_columns)
     _, S, Vt = np.linalg.svd(matrix, full_matrices=False)
@@ -121,7 +120,9 @@ def _energy(block: NDArray) -> float:
     return float(energies(block).sum())
 
 
-def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:
+def _triangle(
+    blocks: FrameBlocks, width: int, stacked: int, V: NDArray | None = None
+) -> NDArray:
     """Return the triangular factor of a tall matrix W, or of W V with V given.
 
     `width` is the number of columns of W or W V, and V is (n_columns, width).
@@ -129,7 +130,7 @@ def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDAr
     pending: list[NDArray] = []
     for part in blocks.map(partial(_block_triangle, V=V)):
         pending.append(part)
-        if sum(map(len, pending)) > STACKED * width:
+        if sum(map(len, pending)) > stacked * width:
             pending = [_qr_factor(np.concatenate(pending))]
     return _qr_factor(np.concatenate(pending))
 
@@ -148,7 +149,9 @@ def _block_triangle(block: NDArray, V: NDArray | None) -> NDArray:
     return _qr_factor(matrix) if len(matrix) > matrix.shape[1] else matrix
 
 
-def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
+def _leading_subspace(
+    blocks: FrameBlocks, n_columns: int, k: int, options: SvdOptions
+) -> NDArray:
     """
     Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
 
@@ -160,7 +163,7 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     ends when the predicted gain is below 1e-6 of the energy that is left.
     """
     # First block: the leading subspace of a sample of frames.
-    width = k + OVERSAMPLING
+    width = k + options.oversampling
     n_frames = blocks.n_frames
     some = spread(order_by_halves(blocks), min(n_frames, 4 * width))
     sample = _matrix(blocks.take(np.sort(some))).astype(np.float64)
@@ -168,14 +171,14 @@ def _leading_subspace(blocks: FrameBlocks, n_columns: int, k: int) -> NDArray:
     basis, products = last, np.zeros((n_columns, 0))
     energy = sum(blocks.map(_energy))
     found, gains = 0.0, []
-    for _ in range(MOST_PASSES):
+    for _ in range(options.most_passes):
         # One pass over the matrix. Ritz values and vectors of W^T W in the basis.
         products = np.hstack([products, sum(blocks.map(partial(_squared, V=last)))])
         gram = basis.T @ products
         values, axes = np.linalg.eigh(0.5 * (gram + gram.T))
         # Predict the gain of the next pass.
         before, found = found, float(values[-k:].sum())
-        least_gain = CONVERGED * max(energy - found, OF_PRODUCTS * energy)
+        least_gain = options.converged * max(energy - found, OF_PRODUCTS * energy)
         gains.append(max(found - before, least_gain))
         next_gain = gains[-1]
         if len(gains) > 2:  # the first gain is the whole energy found

@@ -20,36 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
+from isa_nrsfm._prepare.options import COMPLETION_OPTIONS, CompletionOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
 from isa_nrsfm._tables.visibility import seen_points
 
 RIGID_RANK = 3
-# Convergence tolerance: EM ends when a step lowers the noise variance by less than this
-# share. Further steps fit the noise more than they improve the missing points.
-TOL = 0.05
-# EM steps at each rank below the final one. They only make a start for the next rank.
-STEPS_WHILE_GROWING = 10
-# Least variance along a new direction of B, relative to the largest. EM cannot move a
-# direction of zero variance.
-LEAST_WEIGHT = 1e-3
-# Least noise variance where a matrix is inverted, relative to the mean square
-# coordinate of a frame. Frames with fewer points than coefficients have singular
-# matrices.
-LEAST_NOISE = 1e-13
-# Ridge of the least squares for the B of one point, relative to the mean square
-# coefficient, which is 1.
-LEAST_RIDGE = 1e-12
-# Below this mean square residual the table has no noise: the fit is exact.
-EXACT = 1e-20
-# Least number of degrees of freedom left to the noise, relative to the numbers seen.
-LEAST_FREEDOM = 0.02
-# Numbers in the largest array of a block of frames.
-BLOCK_NUMBERS = 2**20
-# With more frames than MODEL_FRAMES the model is found from that many of them. Frames
-# are added for each point that fewer than FEWEST_SHOWN of these show.
-MODEL_FRAMES = 10_000
-FEWEST_SHOWN = 200
 
 
 class Completion(NamedTuple):
@@ -115,16 +92,14 @@ class CompletionModel(NamedTuple):
     @property
     def ridge(self) -> float:
         """The noise variance, bounded below so that matrices can be inverted."""
-        return max(self.noise, LEAST_NOISE)
+        return max(self.noise, OF_STEPS)
 
 
 def complete_tracks(
     centred: NDArray,
     sizes: NDArray,
     n_components: int,
-    *,
-    tol: float = TOL,
-    max_iter: int = 200,
+    options: CompletionOptions = COMPLETION_OPTIONS,
 ) -> Completion:
     """
     Return tracks with their missing points filled in, as a start for the factorisation.
@@ -143,11 +118,8 @@ def complete_tracks(
         What each frame is divided by before frames are compared.
     n_components : int
         K, the number of basis shapes.
-    tol : float, default=0.05
-        Convergence tolerance: EM at one rank ends when a step lowers the noise variance
-        by less than this share.
-    max_iter : int, default=200
-        The most steps at the final rank.
+    options : CompletionOptions
+        Steps and limits of EM.
 
     Returns
     -------
@@ -157,11 +129,16 @@ def complete_tracks(
     seen = seen_points(centred)
     if seen.all():
         return Completion(centred, np.zeros((len(centred), 2)))
-    model = completion_model(centred, sizes, n_components, tol=tol, max_iter=max_iter)
-    return filled_in(centred, sizes, model)
+    model = completion_model(centred, sizes, n_components, options)
+    return filled_in(centred, sizes, model, options)
 
 
-def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameBlocks:
+def complete_rows(
+    rows: FrameBlocks,
+    n_points: int,
+    n_components: int,
+    options: CompletionOptions = COMPLETION_OPTIONS,
+) -> FrameBlocks:
     """
     Return the frames of a table with their missing points filled in.
 
@@ -174,6 +151,8 @@ def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameB
         Number of points.
     n_components : int
         K, the number of basis shapes.
+    options : CompletionOptions
+        Steps and limits of EM.
 
     Returns
     -------
@@ -183,14 +162,16 @@ def complete_rows(rows: FrameBlocks, n_points: int, n_components: int) -> FrameB
     """
     n_frames = rows.n_frames
     frames = np.arange(n_frames)
-    if n_frames > MODEL_FRAMES:
-        frames = _model_frames(rows, n_points)
+    if n_frames > options.model_frames:
+        frames = _model_frames(rows, n_points, options)
     tracks = rows.take(frames).transpose(0, 2, 1)
-    model = completion_model(tracks, np.ones(len(tracks)), n_components)
-    return rows.derive(partial(_filled_rows, model=model))
+    model = completion_model(tracks, np.ones(len(tracks)), n_components, options)
+    return rows.derive(partial(_filled_rows, model=model, options=options))
 
 
-def _model_frames(rows: FrameBlocks, n_points: int) -> NDArray:
+def _model_frames(
+    rows: FrameBlocks, n_points: int, options: CompletionOptions
+) -> NDArray:
     """
     Return the frames (n_chosen,) from which the model of a large table is found.
 
@@ -200,14 +181,15 @@ def _model_frames(rows: FrameBlocks, n_points: int) -> NDArray:
     """
     order = order_by_halves(rows)
     chosen = np.zeros(len(order), dtype=bool)
-    chosen[spread(order, MODEL_FRAMES)] = True
+    chosen[spread(order, options.model_frames)] = True
     shown = np.zeros(n_points)
     for block in rows.map(_seen_rows, chosen):
         shown += block.sum(axis=0)
-    for point in map(int, np.flatnonzero(shown < FEWEST_SHOWN)):
+    fewest = options.fewest_shown
+    for point in map(int, np.flatnonzero(shown < fewest)):
         seen = rows.joined(partial(_sees, point=point))
         showing = order[seen[order]]
-        chosen[spread(showing, min(FEWEST_SHOWN, len(showing)))] = True
+        chosen[spread(showing, min(fewest, len(showing)))] = True
     return np.flatnonzero(chosen)
 
 
@@ -221,10 +203,12 @@ def _sees(rows: NDArray, point: int) -> NDArray:
     return ~np.isnan(rows[:, 0, point])
 
 
-def _filled_rows(rows: NDArray, model: CompletionModel) -> NDArray:
+def _filled_rows(
+    rows: NDArray, model: CompletionModel, options: CompletionOptions
+) -> NDArray:
     """Return frames (n_frames, 2, n_points) with their missing points filled in."""
     tracks = rows.transpose(0, 2, 1)
-    centred = filled_in(tracks, np.ones(len(tracks)), model).centred
+    centred = filled_in(tracks, np.ones(len(tracks)), model, options).centred
     return np.ascontiguousarray(centred.transpose(0, 2, 1))
 
 
@@ -232,16 +216,14 @@ def completion_model(
     centred: NDArray,
     sizes: NDArray,
     n_components: int,
-    *,
-    tol: float = TOL,
-    max_iter: int = 200,
+    options: CompletionOptions = COMPLETION_OPTIONS,
 ) -> CompletionModel:
     """
     Return the low-rank model that `complete_tracks` fills missing points in with.
 
     Parameters
     ----------
-    centred, sizes, n_components, tol, max_iter
+    centred, sizes, n_components, options
         As there.
 
     Returns
@@ -251,10 +233,15 @@ def completion_model(
     """
     rank = _possible_rank(3 * n_components + 3, centred.shape[1])
     frames, _ = _by_pattern(centred, seen_points(centred), sizes)
-    return _fit(frames, rank, tol, max_iter)
+    return _fit(frames, rank, options)
 
 
-def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Completion:
+def filled_in(
+    centred: NDArray,
+    sizes: NDArray,
+    model: CompletionModel,
+    options: CompletionOptions = COMPLETION_OPTIONS,
+) -> Completion:
     """
     Return tracks with the posterior means of a low-rank model as missing points.
 
@@ -266,6 +253,8 @@ def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Compl
         What each frame is divided by.
     model : CompletionModel
         The model of frames of size one.
+    options : CompletionOptions
+        The size of blocks.
 
     Returns
     -------
@@ -275,7 +264,7 @@ def filled_in(centred: NDArray, sizes: NDArray, model: CompletionModel) -> Compl
     seen = seen_points(centred)
     frames, order = _by_pattern(centred, seen, sizes)
     fitted = np.empty_like(frames.rows)
-    for block, posterior, _ in _posteriors(frames, model):
+    for block, posterior, _ in _posteriors(frames, model, options.block_numbers):
         fitted[block] = posterior.z @ model.B + posterior.t
     expected = np.empty(centred.shape)
     expected[order] = fitted.transpose(0, 2, 1)
@@ -304,7 +293,8 @@ def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
     """
     seen = seen_points(centred)
     frames, _ = _by_pattern(centred, seen, sizes)
-    return _fit(frames, _possible_rank(RIGID_RANK, seen.shape[1]), TOL, 50).noise
+    rank = _possible_rank(RIGID_RANK, seen.shape[1])
+    return _fit(frames, rank, COMPLETION_OPTIONS).noise
 
 
 def _possible_rank(rank: int, n_points: int) -> int:
@@ -332,7 +322,7 @@ def _by_pattern(
     return _Frames(rows, pattern[order], seen[first].astype(np.float64)), order
 
 
-def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionModel:
+def _fit(frames: _Frames, rank: int, options: CompletionOptions) -> CompletionModel:
     """Return the model of frames by EM, the rank raised from that of a rigid object."""
     # The rank at most doubles from one to the next.
     ranks = [rank]
@@ -341,18 +331,23 @@ def _fit(frames: _Frames, rank: int, tol: float, max_iter: int) -> CompletionMod
     rows = frames.rows
     model = CompletionModel(np.zeros((0, rows.shape[2])), np.inf)
     for wanted in ranks:
-        model = _grown(model, wanted, rows, frames)
-        for step in range(max_iter if wanted == rank else STEPS_WHILE_GROWING):
+        model = _grown(model, wanted, rows, frames, options.least_weight)
+        last = wanted == rank
+        for step in range(options.max_iter if last else options.steps_while_growing):
             before = model.noise
-            model, rows, mean_square = _em_step(model, frames)
-            stands_still = step > 0 and model.noise > (1.0 - tol) * before
-            if stands_still or mean_square < EXACT:
+            model, rows, mean_square = _em_step(model, frames, options)
+            stands_still = step > 0 and model.noise > (1.0 - options.tol) * before
+            if stands_still or mean_square < options.exact:
                 break
     return model
 
 
 def _grown(
-    model: CompletionModel, rank: int, residual: NDArray, frames: _Frames
+    model: CompletionModel,
+    rank: int,
+    residual: NDArray,
+    frames: _Frames,
+    least_weight: float,
 ) -> CompletionModel:
     """Return the model with further rows of B, the principal axes of its residual.
 
@@ -363,11 +358,11 @@ def _grown(
     n_points = len(moment)
     n_new = rank - len(model.B)
     values, axes = eigh(moment, subset_by_index=[n_points - n_new, n_points - 1])
-    weights = np.maximum(values, LEAST_WEIGHT * max(values[-1], LEAST_NOISE))
+    weights = np.maximum(values, least_weight * max(values[-1], OF_STEPS))
     noise = model.noise
     if is_first:
         rest = (np.trace(moment) - values.sum()) / n_points
-        noise = max(rest, LEAST_WEIGHT**2 * values[-1], LEAST_NOISE)
+        noise = max(rest, least_weight**2 * values[-1], OF_STEPS)
     return CompletionModel(np.vstack([model.B, (axes * np.sqrt(weights)).T]), noise)
 
 
@@ -401,7 +396,7 @@ def _second_moment(rows: NDArray, frames: _Frames, is_object: bool) -> NDArray:
 
 
 def _posteriors(
-    frames: _Frames, model: CompletionModel
+    frames: _Frames, model: CompletionModel, block_numbers: int
 ) -> Iterator[tuple[slice, _Posterior, NDArray]]:
     """
     Yield blocks of frames, their posteriors, and their seen points (n, n_points).
@@ -415,7 +410,7 @@ def _posteriors(
     upper = np.triu_indices(rank)
     products = (B[upper[0]] * B[upper[1]]).T
     n_frames = len(frames.rows)
-    length = max(1, BLOCK_NUMBERS // max(rank**2, 2 * B.shape[1]))
+    length = max(1, block_numbers // max(rank**2, 2 * B.shape[1]))
     for start in range(0, n_frames, length):
         block = slice(start, min(start + length, n_frames))
         pattern = frames.pattern[block]
@@ -436,7 +431,7 @@ def _posteriors(
 
 
 def _em_step(
-    model: CompletionModel, frames: _Frames
+    model: CompletionModel, frames: _Frames, options: CompletionOptions
 ) -> tuple[CompletionModel, NDArray, float]:
     """
     Return the model after one step of EM, and the residual before it.
@@ -454,7 +449,8 @@ def _em_step(
     # E step: sufficient statistics. `squares` are sums of E[z z^T] over the rows of a
     # pattern, packed; `moments` their sums over the patterns that show each point;
     # `products` sums of E[(w - t) z] for each point.
-    for block, (z, t, covariance, cross), seen in _posteriors(frames, model):
+    blocks = _posteriors(frames, model, options.block_numbers)
+    for block, (z, t, covariance, cross), seen in blocks:
         moved = (rows[block] - t) * seen[:, None]
         residual[block] = moved - (z @ model.B) * seen[:, None]
         energy += float(np.vdot(residual[block], residual[block]))
@@ -481,7 +477,7 @@ def _em_step(
     # rows than the rank needs the ridge.
     mean_moment = _symmetric(moment[None], rank, upper)[0] / (2 * len(rows))
     per_point = _symmetric(moments, rank, upper)
-    per_point[:, range(rank), range(rank)] += LEAST_RIDGE * len(rows)
+    per_point[:, range(rank), range(rank)] += OF_DIFFERENCES * len(rows)
     B = np.linalg.solve(per_point, products[..., None])[..., 0].T
     B -= B.mean(axis=1, keepdims=True)  # the translation takes what is common
     # Rescale so that the mean of E[z z^T] is I, as in the prior: parameter expansion,
@@ -489,7 +485,7 @@ def _em_step(
     B = np.linalg.cholesky(mean_moment).T @ B
     # Noise variance: residual energy over degrees of freedom. This is the fixed point
     # of EM's own step for the variance (MacKay 1992).
-    freedom = max(n_numbers - n_fitted, LEAST_FREEDOM * n_numbers)
+    freedom = max(n_numbers - n_fitted, options.least_freedom * n_numbers)
     return CompletionModel(B, energy / freedom), residual, energy / n_numbers
 
 

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import rigid_noise
+from isa_nrsfm._prepare.options import LAYOUT_OPTIONS, LayoutOptions
 from isa_nrsfm._tables.layout import (
     LAYOUTS,
     Layout,
@@ -15,25 +16,22 @@ from isa_nrsfm._tables.layout import (
 )
 from isa_nrsfm._tables.visibility import FEWEST_POINTS, seen_points
 
-# Warn if the energy that the other layout leaves unexplained is less than this share of
-# what the given one leaves. On real tables the right layout leaves 0.04 to 0.5.
-CLEARLY_BETTER = 0.6
-# The layouts are compared on evenly spread frames: LAYOUT_SAMPLE of them, or fewer of
-# many points, LAYOUT_NUMBERS over the number of columns, but at least FEWEST_SAMPLE.
-LAYOUT_SAMPLE = 1000
-LAYOUT_NUMBERS = 2_000_000
-FEWEST_SAMPLE = 100
-# With fewer frames or points than this the layouts are not compared.
-FEWEST_TO_TELL = 10
 
-
-def layout_sample(n_frames: int, n_columns: int) -> slice:
+def layout_sample(
+    n_frames: int, n_columns: int, options: LayoutOptions = LAYOUT_OPTIONS
+) -> slice:
     """Return evenly spread frames on which the layouts are compared."""
-    enough = max(min(LAYOUT_SAMPLE, LAYOUT_NUMBERS // n_columns), FEWEST_SAMPLE)
+    enough = min(options.frames, options.numbers // n_columns)
+    enough = max(enough, options.fewest_frames)
     return slice(None, None, max(-(-n_frames // enough), 1))
 
 
-def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None:
+def warn_if_other_layout(
+    X: NDArray,
+    layout: Layout,
+    scale_frames: bool,
+    options: LayoutOptions = LAYOUT_OPTIONS,
+) -> None:
     """
     Warn where a rigid object fits the other layout much better.
 
@@ -49,26 +47,30 @@ def warn_if_other_layout(X: NDArray, layout: Layout, scale_frames: bool) -> None
         What is said to be the order of its columns.
     scale_frames : bool
         Whether each frame is divided by its own size, or all by a common one.
+    options : LayoutOptions
+        When the layout looks wrong.
 
     Warns
     -----
     UserWarning
         If the other layout explains much more.
     """
-    if min(len(X), X.shape[1] // 2) < FEWEST_TO_TELL:
+    if min(len(X), X.shape[1] // 2) < options.fewest_to_tell:
         return
     other = next(name for name in LAYOUTS if name != layout)
-    sample = np.ascontiguousarray(X[layout_sample(*X.shape)], dtype=np.float64)
+    sample = np.ascontiguousarray(
+        X[layout_sample(len(X), X.shape[1], options)], dtype=np.float64
+    )
     both = [table_to_tracks(sample, name) for name in (layout, other)]
     both = _without_rarely_seen(both)
-    if min(min(tracks.shape[:2]) for tracks in both) < FEWEST_TO_TELL:
+    if min(min(tracks.shape[:2]) for tracks in both) < options.fewest_to_tell:
         return
     centred = [tracks - np.nanmean(tracks, axis=1, keepdims=True) for tracks in both]
     # The size of a frame is the smaller of the two, that of the right layout.
     sizes = np.min([weighting_sizes(c, scale_frames) for c in centred], axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)
     given, swapped = (_rigid_residual(c, sizes) for c in centred)
-    if given > OF_DIFFERENCES and swapped < CLEARLY_BETTER * given:
+    if given > OF_DIFFERENCES and swapped < options.clearly_better * given:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
             f"what is not rigid has {swapped / given:.2g} times the energy",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._prepare.options import OUTLIER_OPTIONS, OutlierOptions
 from isa_nrsfm._tables.visibility import seen_points
 
 # Tuning constant c of a loss, in standard deviations of a coordinate. With these, the
@@ -18,18 +19,6 @@ from isa_nrsfm._tables.visibility import seen_points
 TUNING = {"huber": 1.5011, "cauchy": 2.5486}
 # Median distance of normal noise in the plane, in standard deviations of a coordinate.
 MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
-# A point farther from the spatial median of its frame than this many sizes of the frame
-# does not belong to it.
-DISTANT = 6.0
-# A gross outlier is farther than this many typical distances from the rigid object.
-GROSS = 4.5
-# The most rounds of the search for gross outliers, and its convergence tolerance: the
-# largest change of a filled-in coordinate over the typical distance.
-GROSS_ROUNDS = 100
-SETTLED = 1e-2
-# If a larger share of a frame's points are gross outliers, the frame is unusual, and
-# none of its points is marked.
-LARGEST_SHARE = 0.4
 # Steps to the point with the least sum of distances.
 MEDIAN_STEPS = 20
 
@@ -63,7 +52,9 @@ def median_noise(distance: NDArray) -> float:
     return float(np.median(distance) / MEDIAN_DISTANCE)
 
 
-def distant_points(tracks: NDArray) -> NDArray:
+def distant_points(
+    tracks: NDArray, distant: float = OUTLIER_OPTIONS.distant
+) -> NDArray:
     """
     Tell which points are far from all others of their frame.
 
@@ -71,15 +62,17 @@ def distant_points(tracks: NDArray) -> NDArray:
     ----------
     tracks : ndarray of shape (n_frames, n_points, 2)
         Tracks, NaN where a point is not seen.
+    distant : float
+        As of `OutlierOptions`.
 
     Returns
     -------
     ndarray of bool, shape (n_frames, n_points)
-        Points whose distance from the median of their frame is more than six times the
-        frame's size (`robust_sizes`).
+        Points whose distance from the median of their frame is more than so many times
+        the frame's size (`robust_sizes`).
     """
     square = _squares(tracks)
-    return np.sqrt(square) > DISTANT * _sizes(square)[:, None]
+    return np.sqrt(square) > distant * _sizes(square)[:, None]
 
 
 def _squares(tracks: NDArray) -> NDArray:
@@ -141,7 +134,9 @@ def robust_sizes(centred: NDArray) -> NDArray:
     return _sizes(_squares(centred))
 
 
-def gross_outliers(tracks: NDArray) -> NDArray:
+def gross_outliers(
+    tracks: NDArray, options: OutlierOptions = OUTLIER_OPTIONS
+) -> NDArray:
     """
     Tell which points are far from any rigid object.
 
@@ -149,19 +144,21 @@ def gross_outliers(tracks: NDArray) -> NDArray:
     ----------
     tracks : ndarray of shape (n_frames, n_points, 2)
         Tracks, each frame divided by its size; NaN where a point is not seen.
+    options : OutlierOptions
+        Which points are gross outliers.
 
     Returns
     -------
     ndarray of bool, shape (n_frames, n_points)
-        Points whose distance from a rigid factorisation of the others is more than 4.5
-        times the typical distance, the larger one of the table and of this point. None
+        Points whose distance from a rigid factorisation of the others is many times the
+        typical distance, the larger one of the table and of this point. None
         in frames with many such points.
     """
     seen = seen_points(tracks)
-    hidden = ~seen | distant_points(tracks)
+    hidden = ~seen | distant_points(tracks, options.distant)
     target = tracks - spatial_median(tracks)[:, None]
     filled = np.where(hidden[..., None], 0.0, target)
-    for _ in range(GROSS_ROUNDS):
+    for _ in range(options.rounds):
         # Rigid factorisation, rank 3, of the filled tracks.
         translation = filled.mean(axis=1, keepdims=True)
         rows = (filled - translation).transpose(0, 2, 1).reshape(-1, tracks.shape[1])
@@ -172,12 +169,12 @@ def gross_outliers(tracks: NDArray) -> NDArray:
         distance = np.linalg.norm(target - rigid, axis=2)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
-        limit = GROSS * np.maximum(typical, of_point)
+        limit = options.gross * np.maximum(typical, of_point)
         previous, hidden = hidden, ~(distance <= limit)
         moved = np.abs(np.where(hidden[..., None], rigid, target) - filled).max()
         filled = np.where(hidden[..., None], rigid, target)
-        if (hidden == previous).all() and moved <= SETTLED * typical:
+        if (hidden == previous).all() and moved <= options.settled * typical:
             break
     gross = hidden & seen
-    few = gross.sum(axis=1) <= LARGEST_SHARE * seen.sum(axis=1)
+    few = gross.sum(axis=1) <= options.largest_share * seen.sum(axis=1)
     return gross & few[:, None]

@@ -14,12 +14,12 @@ from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
     conformal_equations,
     symmetric_matrix,
 )
-from isa_nrsfm._paper.factors import NULL_DIRECTION
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
@@ -81,7 +81,7 @@ def metric_correction(blocks: NDArray) -> NDArray:
     """
     equations = conformal_equations(blocks)
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
-    n_determined = min(int(np.sum(values > NULL_DIRECTION * values[0])), 5)
+    n_determined = min(int(np.sum(values > OF_RANKS * values[0])), 5)
     solutions = vectors[n_determined:]
     traces = solutions[:, :3].sum(axis=1)
     eigenvalues, axes = np.linalg.eigh(symmetric_matrix(traces @ solutions))
@@ -388,5 +388,5 @@ def _row_space(W: NDArray) -> tuple[NDArray, NDArray]:
     """
     triangle = np.linalg.qr(W, mode="r") if len(W) > W.shape[1] else W
     _, values, basis = np.linalg.svd(triangle, full_matrices=False)
-    rank = max(3, int(np.sum(values > NULL_DIRECTION * values[0])))
+    rank = max(3, int(np.sum(values > OF_RANKS * values[0])))
     return (W @ basis[:rank].T).reshape(len(W) // 2, 2, -1), basis[:rank]

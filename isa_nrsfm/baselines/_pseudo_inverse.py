@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormal_cameras,
 )
-from isa_nrsfm._paper.factors import NULL_DIRECTION
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
@@ -38,7 +38,7 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
         If W has less than rank three.
     """
     S, Vt, rest = leading_triplets(W, 3 * rank)
-    n_columns = int(np.sum(S > NULL_DIRECTION * S[0]))
+    n_columns = int(np.sum(S > OF_RANKS * S[0]))
     if n_columns < 3:
         raise ValueError(
             "orthographic cameras need a table of rank three or more, once frames are "

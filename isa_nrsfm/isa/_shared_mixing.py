@@ -14,13 +14,10 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
 
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
-from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
-
-# Singular values below this share of the first count as zero.
-NULL_DIRECTION = 1e-10
 
 # The densities among which each signal chooses, by their *tail*: degrees of freedom of
 # Student's t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).
@@ -187,7 +184,7 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     # The triangular factor keeps the precision that rows @ rows.T would lose.
     R = np.linalg.qr(rows.T, mode="r") / np.sqrt(rows.shape[1])
     U, S, _ = np.linalg.svd(R.T)
-    rank = int(np.sum(S > NULL_DIRECTION * S[0]))
+    rank = int(np.sum(S > OF_RANKS * S[0]))
     if rank == 0:
         return np.empty((0, len(rows))), np.eye(len(rows))
     return (U[:, :rank] / S[:rank]).T, U[:, rank:].T / S[0]
