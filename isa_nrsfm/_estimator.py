@@ -1,6 +1,5 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
-import os
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
@@ -28,6 +27,7 @@ from isa_nrsfm._parameters.choices import (
 )
 from isa_nrsfm._prepare.checks import check_names
 from isa_nrsfm._summary import summary_html
+from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm._tables.sources import (
     StoredTable,
@@ -116,9 +116,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
     keep_frames : bool, str or path-like, default=True
-        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept. A path is
-        that of a folder for files of these names, ``alpha.npy`` and so on, of which
-        they are memory maps.
+        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept. With the
+        path of a folder they are memory maps of files of these names, ``alpha.npy`` and
+        so on, in a new folder within that one, which each fit makes for itself;
+        ``alpha_.filename`` says where. A fit that fails leaves none. Fits never remove
+        the files of earlier ones, which other models may use.
     working_memory : float or None, default=None
         Megabytes that a block of a table takes that is not in memory (a memory map or a
         table of `isa_nrsfm.io.open_table`); None is scikit-learn's setting
@@ -368,7 +370,10 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             one to three points or some on one line only, a point that is seen in too
             few frames, or column names that contradict `layout`; or if `loss` is not
             linear without the joint refinement, or either is not the default for a
-            `StoredTable` or a dask array.
+            `StoredTable` or a dask array; or if `keep_frames` is an empty text.
+        OSError
+            If the folder of `keep_frames` cannot be made or written to, before the fit;
+            if the disk is full, after it.
 
         Warns
         -----
@@ -379,7 +384,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         """
         self._forget()
         try:
-            self._fit(X, y)
+            with kept_arrays(self.keep_frames) as keep:
+                self._fit(X, y, keep)
         except BaseException:
             self._forget()
             raise
@@ -416,7 +422,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
-    def _fit(self, X: Any, y: Any) -> None:
+    def _fit(self, X: Any, y: Any, keep: Keep) -> None:
         """Check a table and its options, fit it, and set what was found."""
         joint = self.refinement == "joint"
         stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
@@ -441,7 +447,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             names,
             self._limits,
         )
-        self._set(fit_table(source, self.n_components, options, progress), source)
+        fit = fit_table(source, self.n_components, options, progress)
+        self._set(fit, source, keep)
         progress.end()
 
     @property
@@ -504,7 +511,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         """Return whether a fit has ended."""
         return hasattr(self, "_model")
 
-    def _set(self, fit: Fit, source: Table) -> None:
+    def _set(self, fit: Fit, source: Table, keep: Keep) -> None:
         """Set all that a fit has found."""
         found: dict[str, Any] = {
             "mean_shape": fit.model.mean_shape,
@@ -524,9 +531,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         if fit.numbers is not None:
             found |= fit.numbers._asdict()
         if self.keep_frames:
-            kept = fit.frames
-            if isinstance(self.keep_frames, str | os.PathLike):
-                kept = kept.in_files(self.keep_frames)
+            kept = FrameFit(**keep(fit.frames._asdict()))
             kept = FrameFit(*map(source.blocks.spread, kept))
             found |= kept._asdict()
             if fit.numbers is None:

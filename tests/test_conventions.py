@@ -32,6 +32,7 @@ LINT_IMPORTS = "from importlinter.cli import lint_imports_command as run; run()"
 # Where everybody finds names; each has __all__.
 PUBLIC_MODULES = [
     "isa_nrsfm",
+    "isa_nrsfm.analysis",
     "isa_nrsfm.baselines",
     "isa_nrsfm.calibration",
     "isa_nrsfm.cli",

@@ -8,8 +8,7 @@ joint refinement, takes the most probable camera and coefficients together.
 
 from collections.abc import Iterable
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +22,6 @@ from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._prepare.robust import distant_points, robust_weights
 from isa_nrsfm._tables.layout import measurement_matrix
 from isa_nrsfm._tables.visibility import seen_points
-
-if TYPE_CHECKING:
-    import os
 
 # A camera does not see a basis shape if its image has less than this share of the
 # energy ``||M||^2 ||B_k||^2``: such an image is rounding errors.
@@ -69,16 +65,6 @@ class FrameFit(NamedTuple):
         if len(parts) == 1:
             return parts[0]
         return cls(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def in_files(self, folder: "str | os.PathLike[str]") -> "FrameFit":
-        """Return the fit as memory maps of files in a folder, named like the parts."""
-        path = Path(folder)
-        path.mkdir(parents=True, exist_ok=True)
-        for name, part in self._asdict().items():
-            np.save(path / f"{name}.npy", part)
-        return type(self)(
-            *(np.load(path / f"{name}.npy", mmap_mode="r") for name in self._fields)
-        )
 
     @classmethod
     def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":

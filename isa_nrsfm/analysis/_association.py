@@ -55,7 +55,19 @@ class Association(NamedTuple):
     n_frames: int
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a pandas table with a row for each coefficient, counted from 1."""
+        """
+        Return the results as a table.
+
+        Returns
+        -------
+        DataFrame
+            A row for each coefficient, counted from 1, with its statistic and p_value.
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed.
+        """
         pd = import_optional("pandas", extra="io")
         name = "eta_squared" if self.kind == "classes" else "spearman"
         index = pd.RangeIndex(1, len(self.statistic) + 1, name="component")
@@ -161,8 +173,12 @@ def predictability(
     ----------
     features : array-like of shape (n_frames, n_features)
         Coefficients, or other features to compare with. Frames with NaN are left out.
-    y, groups, kind
-        As of `association`. Frames of a group are in one fold.
+    y : array-like of shape (n_frames,)
+        A label for each frame.
+    groups : array-like of shape (n_frames,), default=None
+        People, videos or other groups. Frames of a group are in one fold.
+    kind : {"auto", "classes", "number"}, default="auto"
+        As of `association`.
     n_folds : int, default=5
         Number of folds; fewer where a class has fewer frames, or if there are fewer
         groups.

@@ -131,7 +131,35 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     def fit_transform(
         self, X: Any, y: Any = None, *, groups: Any = None, neutral: Any = None
     ) -> NDArray:
-        """Fit to groups and return the differences, as `fit` and `transform`."""
+        """
+        Learn the means of groups, and return coefficients minus them.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, n_features)
+            Coefficients; NaN where a frame has none.
+        y : None
+            Ignored.
+        groups : array-like of shape (n_frames,), default=None
+            Group of each frame; None for one group.
+        neutral : array-like of bool, shape (n_frames,), default=None
+            Frames whose mean is taken; None for all.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_features)
+            The differences.
+
+        Raises
+        ------
+        ValueError
+            As `fit`.
+
+        Warns
+        -----
+        UserWarning
+            If a group has one frame only, whose differences are zero.
+        """
         fitted = self.fit(X, y, groups=groups, neutral=neutral)
         if neutral is None and groups is not None:
             _warn_of_single_frames(np.asarray(groups))

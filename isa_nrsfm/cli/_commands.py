@@ -13,22 +13,32 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.whole_files import files_together, folder_for_writing
+from isa_nrsfm._tables.landmark_columns import find_landmark_columns
 from isa_nrsfm.cli._choice import choose_n_components
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import (
-    prepare_folder,
+    ARRAYS,
+    FIGURES,
+    MODEL,
+    PAGE,
+    TABLES,
+    check_outputs,
+    old_figures,
     write_figures,
     write_report,
     write_results,
 )
 from isa_nrsfm.cli._parser import AUTO
-from isa_nrsfm.cli._reading import read_frames
+from isa_nrsfm.cli._reading import read_frames, taken_frames
 from isa_nrsfm.cli._report import (
     fit_text,
     model_report,
     table_report,
     versions,
 )
+from isa_nrsfm.cli._runs import REPORT
+from isa_nrsfm.io import write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +52,8 @@ def run_fit(args: Namespace, warned: list[str]) -> str:
 def fit_table(
     args: Namespace,
     warned: list[str],
+    *,
+    table: "pd.DataFrame | None" = None,
     **extra: "Callable[[AffineNRSfM, pd.DataFrame], Any]",
 ) -> dict[str, Any]:
     """Fit a table and write everything; return the report.
@@ -52,6 +64,9 @@ def fit_table(
         The options of the command fit.
     warned : list of str
         The messages of the warnings shown so far. It grows while the fit runs.
+    table : DataFrame, optional
+        A table to fit instead of that of the options, which then says how the file is
+        called that it is written to, with the results.
     **extra : callable
         Further entries of the report, computed from the model and its table.
     """
@@ -71,13 +86,52 @@ def fit_table(
         )
     folder = Path(args.output)
     clock = {"": time.perf_counter()}
-    frames = read_frames(args)
+    if table is None:
+        frames = read_frames(args)
+    else:
+        args.format = "table"
+        frames = taken_frames(args, table, find_landmark_columns(table.columns))
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
-    files = prepare_folder(folder, [args.table], figures=not args.no_figures)
-    clock["read"] = time.perf_counter()
+    files = MODEL | TABLES | ARRAYS | PAGE | ({} if args.no_figures else FIGURES)
+    inputs = [args.table]
+    if table is not None:
+        files, inputs = files | {Path(args.table).name: "the table"}, []
+    with folder_for_writing(folder):
+        check_outputs((folder / name for name in (*files, REPORT)), inputs)
+        removed = old_figures(folder) if args.no_figures else []
+        clock["read"] = time.perf_counter()
+        estimator, choice = _fitted(args, X, clock)
+        with files_together(folder, removed=removed) as new:
+            if table is not None:
+                write_table(table, new / Path(args.table).name)
+            write_results(new, estimator, frames, std=args.std)
+            if not args.no_figures:
+                write_figures(new, estimator, X, args.random_state)
+            model = model_report(estimator, X, frames)
+            clock["write"] = time.perf_counter()
+            seconds = np.diff([*clock.values()]).round(3)
+            report = {
+                "command": "fit",
+                "finished": datetime.now(UTC).isoformat(timespec="seconds"),
+                "table": table_report(args.table, args.format, frames),
+                **({} if choice is None else {"choice": choice}),
+                "model": model,
+                **{name: compute(estimator, X) for name, compute in extra.items()},
+                "seconds": dict(zip([*clock][1:], seconds, strict=True)),
+                "warnings": warned,
+                "versions": versions(),
+                "files": files,
+            }
+            write_report(new, report)
+    return report
 
+
+def _fitted(
+    args: Namespace, X: "pd.DataFrame", clock: dict[str, float]
+) -> tuple[AffineNRSfM, dict[str, Any] | None]:
+    """Return the model that the options ask for, and how K was chosen."""
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=_strategy(args),
@@ -99,28 +153,7 @@ def fit_table(
     if estimator.refinement == "joint":
         estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
-
-    write_results(folder, estimator, frames, std=args.std)
-    if not args.no_figures:
-        write_figures(folder, estimator, X, args.random_state)
-    model = model_report(estimator, X, frames)
-    clock["write"] = time.perf_counter()
-    report = {
-        "command": "fit",
-        "finished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "table": table_report(args.table, args.format, frames),
-        **({} if choice is None else {"choice": choice}),
-        "model": model,
-        **{name: compute(estimator, X) for name, compute in extra.items()},
-        "seconds": dict(
-            zip([*clock][1:], np.diff([*clock.values()]).round(3), strict=True)
-        ),
-        "warnings": warned,
-        "versions": versions(),
-        "files": files,
-    }
-    write_report(folder, report)
-    return report
+    return estimator, choice
 
 
 def _strategy(args: Namespace) -> Any:

@@ -13,7 +13,6 @@ from isa_nrsfm.cli._outputs import component_names
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
 from isa_nrsfm.cli._report import fit_text, lay_out
 from isa_nrsfm.datasets import make_face_tracks
-from isa_nrsfm.io import write_table
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 if TYPE_CHECKING:
@@ -36,12 +35,8 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
     table.insert(0, "frame", [f"face{i:03d}" for i in range(_N_FRAMES)])
     folder = Path(args.output)
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "tracks.csv"
-    write_table(table, path)
-
     options = [
-        *("fit", str(path)),
+        *("fit", str(folder / "tracks.csv")),
         *("--n-components", _TRIED),
         *("--camera", _CAMERA),
         *("--output", str(folder)),
@@ -50,6 +45,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
     report = fit_table(
         build_parser().parse_args(options),
         warned,
+        table=table,
         truth=lambda estimator, X: _compare(faces, estimator, X),
     )
     truth = report["truth"]

@@ -11,6 +11,7 @@ from isa_nrsfm.cli._export_options import SUFFIXES
 from isa_nrsfm.cli._outputs import refuse_overwriting
 from isa_nrsfm.cli._reading import as_fitted, read_frames
 from isa_nrsfm.cli._report import lay_out, table_lines, table_report
+from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.export import (
     point_distribution_model,
     write_glb,
@@ -46,6 +47,7 @@ def run_export(args: Namespace) -> str:
     content = _content(output, args.content)
     options = _options(args, content)
     estimator = load_model(args.model)
+    warn_of_mixed_runs(args.model)
     for source in filter(None, (args.model, args.table, options.get("edges"))):
         if source != "none":
             refuse_overwriting(source, [output])

@@ -1,7 +1,7 @@
 """Write the results of a fit to a folder."""
 
+import io
 import json
-import tempfile
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +12,9 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.whole_files import refuse_replacing, write_whole
 from isa_nrsfm.cli._frames import Frames
+from isa_nrsfm.cli._runs import DIGESTS, REPORT, digests_of, files_of_report
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
@@ -20,7 +22,6 @@ from isa_nrsfm.metrics._reprojection import frame_energies
 if TYPE_CHECKING:
     import pandas as pd
 
-REPORT = "report.json"
 FIGURES = {
     "basis_shapes.png": "mean shape and basis shapes",
     "mode_covariance.png": "covariance of the deformations over the images, 3x3 blocks",
@@ -46,23 +47,26 @@ def component_names(n_components: int) -> list[str]:
     return names_of_components(None, n_components)
 
 
-def prepare_folder(
-    folder: Path, inputs: Iterable[str], *, figures: bool
-) -> dict[str, str]:
-    """Create the output folder, check that it can be written, and list its files."""
-    files = MODEL | TABLES | ARRAYS | PAGE | (FIGURES if figures else {})
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        pass
-    for path in inputs:
-        refuse_overwriting(path, [folder / name for name in (*files, REPORT)])
-    if not figures:
-        stale = [name for name in FIGURES if (folder / name).exists()]
-        if stale:
-            warn_caller(
-                f"{folder} has figures of an earlier run: {', '.join(stale)}",
-            )
-    return files
+def old_figures(folder: Path) -> list[str]:
+    """Return the names of the figures that the report of an earlier run lists.
+
+    Of figures that no report lists, it is said that they are old.
+    """
+    old = [name for name in FIGURES if (folder / name).exists()]
+    listed = files_of_report(folder)
+    others = [name for name in old if name not in listed]
+    if others:
+        warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
+    return [name for name in old if name in listed]
+
+
+def check_outputs(targets: Iterable[Path], inputs: Iterable[str]) -> None:
+    """Raise if files cannot be replaced by results, or are inputs."""
+    targets = list(targets)
+    for source in inputs:
+        refuse_overwriting(source, targets)
+    for target in targets:
+        refuse_replacing(target)
 
 
 def refuse_overwriting(source: str, targets: Iterable[Path]) -> None:
@@ -184,14 +188,20 @@ def write_figures(
         ).figure_,
     )
     for name, figure in zip(FIGURES, figures, strict=True):
-        figure.savefig(folder / name, dpi=150)
+        image = io.BytesIO()
+        figure.savefig(image, format="png", dpi=150)
         plt.close(figure)
+        write_whole(folder / name, image.getvalue())
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
-    """Write the report as JSON, in which NaN and infinities become null."""
+    """Write the report as JSON, in which NaN and infinities become null.
+
+    It gets the digests of the files that it lists, which are in the folder.
+    """
+    report = report | {DIGESTS: digests_of(folder, report["files"])}
     text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+    write_whole(folder / REPORT, f"{text}\n".encode())
 
 
 def _plain(value: Any) -> Any:

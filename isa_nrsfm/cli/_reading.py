@@ -32,6 +32,16 @@ def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
+    return taken_frames(args, table, columns, failed)
+
+
+def taken_frames(
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    failed: NDArray[np.bool_] | None = None,
+) -> Frames:
+    """Take the frames out of a table, as the options ask for."""
     frames = choose_frames(
         table,
         columns,

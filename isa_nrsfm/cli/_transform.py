@@ -19,6 +19,7 @@ from isa_nrsfm.cli._report import (
     table_lines,
     table_report,
 )
+from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import table_suffix
 
@@ -28,6 +29,7 @@ def run_transform(args: Namespace) -> str:
     output = Path(args.output)
     table_suffix(output)
     estimator = load_model(args.model)
+    warn_of_mixed_runs(args.model)
     if args.std and not hasattr(estimator, "alpha_std_"):
         raise ValueError(
             f"--std: {args.model} was fitted with refinement="

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import __version__
+from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.export._drawing import (
     Links,
     choose_links,
@@ -171,7 +172,7 @@ def write_glb(
         "materials": MATERIALS[: 1 + max(p["material"] for p in primitives)],
         "animations": [animation],
     }
-    Path(path).write_bytes(file.with_document(document))
+    write_whole(path, file.with_document(document))
 
 
 class Binary:

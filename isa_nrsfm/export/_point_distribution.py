@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
+from isa_nrsfm._compat.whole_files import whole_file, write_whole
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._edges import Origin
@@ -207,18 +208,20 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
             f"{eigenvalues.shape}"
         )
     if suffix == ".npz":
-        np.savez(path, mean=mean, modes=modes, eigenvalues=eigenvalues)
+        with whole_file(path) as file:
+            np.savez(file, mean=mean, modes=modes, eigenvalues=eigenvalues)
         return
     M = mean.T.reshape(-1, 1)
     V = modes.transpose(2, 1, 0).reshape(-1, n_modes)
     if suffix == ".mat":
-        savemat(path, {"M": M, "V": V, "E": eigenvalues[:, None]})
+        with whole_file(path) as file:
+            savemat(file, {"M": M, "V": V, "E": eigenvalues[:, None]})
         return
     lines = []
     for comment, matrix in zip(COMMENTS, (M, V, eigenvalues[None]), strict=True):
         lines += [f"# {comment}", *map(str, (*matrix.shape, OPENCV_DOUBLES))]
         lines += [" ".join(format(x, ".17g") for x in row) for row in matrix]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+    write_whole(path, ("\n".join(lines) + "\n").encode("ascii"))
 
 
 def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm.export._names import names_of_components, names_of_points
 
@@ -136,9 +137,11 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
         )
     arrays = shape_arrays(model)._asdict()
     if suffix == ".npz":
-        np.savez(path, **arrays)
+        with whole_file(path) as file:
+            np.savez(file, **arrays)
         return
     for name, array in arrays.items():
         if array.dtype.kind == "U":
             arrays[name] = array.astype(object)
-    savemat(path, arrays, oned_as="column")
+    with whole_file(path) as file:
+        savemat(file, arrays, oned_as="column")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
+from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.export._drawing import Links, choose_links, edges_of
 from isa_nrsfm.export._names import names_of_components, names_of_points
 from isa_nrsfm.export._upright import (
@@ -152,7 +153,7 @@ def write_viewer(
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
     }
-    Path(path).write_text(_page(content), encoding="utf-8", newline="\n")
+    write_whole(path, _page(content).encode("utf-8"))
 
 
 def _page(content: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns, parse_coordinate
 
 if TYPE_CHECKING:
@@ -114,9 +115,11 @@ def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
     suffix = table_suffix(path)
     if suffix == ".parquet":
         import_optional("pyarrow", extra="parquet")
-        frame.to_parquet(path, index=False)
+        with whole_file(path) as file:
+            frame.to_parquet(file, index=False)
     else:
-        frame.to_csv(path, sep=_SEPARATORS[suffix], index=False)
+        with whole_file(path) as file:
+            frame.to_csv(file, sep=_SEPARATORS[suffix], index=False)
 
 
 def landmark_table(

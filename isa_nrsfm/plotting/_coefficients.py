@@ -135,8 +135,16 @@ class CoefficientsDisplay:
             A fitted estimator.
         X : array-like of shape (n_frames, 2 * n_points), default=None
             A table with the points of the fitted one. By default the fitted table.
-        y, time, groups, label, component_names
-            As of `CoefficientsDisplay`.
+        y : array-like of shape (n_frames,), default=None
+            A label for each frame: classes, or a number.
+        time : array-like of shape (n_frames,), default=None
+            Times of the frames. By default their numbers.
+        groups : array-like of shape (n_frames,), default=None
+            Videos or people: a curve does not go from one to another.
+        label : str, default=None
+            What `y` is, for the axis. By default "label".
+        component_names : list of str of length n_components, default=None
+            Names of the basis shapes. By default their numbers, from 1.
         ax : array of n_components matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
         **kw : dict
