@@ -88,10 +88,10 @@ def kind_of(y: NDArray, kind: str) -> Kind:
     n_values = len(np.unique(y))
     if n_values == 1:
         raise ValueError(
-            f"all {len(y)} labels are {y[0]!r}: there is nothing to compare"
+            f"all {len(y)} labels are {y[0]}: there is nothing to compare"
         )
     if kind == "number" and y.dtype.kind not in "biuf":
-        raise ValueError(f"labels that are numbers are expected; got {y[0]!r}")
+        raise ValueError(f"labels that are numbers are expected; got {str(y[0])!r}")
     found: Kind = "classes"
     if kind == "number" or (kind == "auto" and type_of_target(y) == "continuous"):
         found = "number"

@@ -15,6 +15,12 @@ from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import files_together, folder_for_writing
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns
+from isa_nrsfm.cli._answers import (
+    answer_figures,
+    answered,
+    asked_for,
+    draw_answers,
+)
 from isa_nrsfm.cli._choice import choose_n_components
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import (
@@ -94,7 +100,9 @@ def fit_table(
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
-    files = MODEL | TABLES | ARRAYS | PAGE | ({} if args.no_figures else FIGURES)
+    asked = asked_for(args, frames)
+    figures = {} if args.no_figures else FIGURES | answer_figures(asked)
+    files = MODEL | TABLES | ARRAYS | PAGE | figures
     inputs = [args.table]
     if table is not None:
         files, inputs = files | {Path(args.table).name: "the table"}, []
@@ -103,12 +111,14 @@ def fit_table(
         removed = old_figures(folder) if args.no_figures else []
         clock["read"] = time.perf_counter()
         estimator, choice = _fitted(args, X, clock)
+        answers = answered(asked, estimator, X, args.random_state)
         with files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            write_results(new, estimator, frames, std=args.std)
+            write_results(new, estimator, frames, answers.alpha, std=args.std)
             if not args.no_figures:
                 write_figures(new, estimator, X, args.random_state)
+                draw_answers(new, asked, answers, estimator)
             model = model_report(estimator, X, frames)
             clock["write"] = time.perf_counter()
             seconds = np.diff([*clock.values()]).round(3)
@@ -118,6 +128,7 @@ def fit_table(
                 "table": table_report(args.table, args.format, frames),
                 **({} if choice is None else {"choice": choice}),
                 "model": model,
+                **answers.report,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "seconds": dict(zip([*clock][1:], seconds, strict=True)),
                 "warnings": warned,

@@ -136,15 +136,7 @@ def _reasons(
 
 def _matching_rows(table: "pd.DataFrame", rule: RowRule) -> NDArray[np.bool_]:
     """Tell which rows a rule leaves out."""
-    by_name = {str(name).strip(): name for name in table.columns}
-    if rule.column not in by_name:
-        names = [name for name in by_name if name]
-        raise ValueError(
-            f"--skip-rows: the table has no column {rule.column!r}; its columns are "
-            + ", ".join(names[:8])
-            + (", ..." if len(names) > 8 else "")
-        )
-    cells = table[by_name[rule.column]]
+    cells = column_named(table, rule.column, "--skip-rows")
     search = rule.expression.search
     return np.array(
         [
@@ -153,6 +145,19 @@ def _matching_rows(table: "pd.DataFrame", rule: RowRule) -> NDArray[np.bool_]:
         ],
         dtype=bool,
     )
+
+
+def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
+    """Return a column of a table, whatever blanks are around its name."""
+    by_name = {str(each).strip(): each for each in table.columns}
+    if name.strip() not in by_name:
+        names = [each for each in by_name if each]
+        raise ValueError(
+            f"{option}: the table has no column {name!r}; its columns are "
+            + ", ".join(names[:8])
+            + (", ..." if len(names) > 8 else "")
+        )
+    return table[by_name[name.strip()]]
 
 
 def _warn_of_zeros(tracks: NDArray[np.float64]) -> None:

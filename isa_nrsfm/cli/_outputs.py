@@ -52,8 +52,9 @@ def old_figures(folder: Path) -> list[str]:
 
     Of figures that no report lists, it is said that they are old.
     """
-    old = [name for name in FIGURES if (folder / name).exists()]
     listed = files_of_report(folder)
+    figures = {*FIGURES, *(name for name in listed if name.endswith(".png"))}
+    old = sorted(name for name in figures if (folder / name).exists())
     others = [name for name in old if name not in listed]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
@@ -105,16 +106,17 @@ def write_results(
     folder: Path,
     estimator: AffineNRSfM,
     frames: Frames,
+    further: "pd.DataFrame",
     *,
     std: bool,
 ) -> None:
-    """Write model, coefficients, cameras, shapes and the viewer.
+    """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
     The tables have a row for each frame, empty for those that could not be fitted.
     """
     pd = import_optional("pandas", extra="io")
     fit = fitted_frames(estimator)
-    alpha = alpha_table(fit, frames, std=std)
+    alpha = alpha_table(fit, frames, std=std).join(further)
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
@@ -173,7 +175,6 @@ def write_figures(
 ) -> None:
     """Draw the figures without a screen."""
     import_optional("matplotlib", extra="plot").use("Agg")
-    plt = import_optional("matplotlib.pyplot", extra="plot")
     from isa_nrsfm.plotting import (
         BasisShapeDisplay,
         ModeCovarianceDisplay,
@@ -188,10 +189,15 @@ def write_figures(
         ).figure_,
     )
     for name, figure in zip(FIGURES, figures, strict=True):
-        image = io.BytesIO()
-        figure.savefig(image, format="png", dpi=150)
-        plt.close(figure)
-        write_whole(folder / name, image.getvalue())
+        write_figure(folder / name, figure)
+
+
+def write_figure(path: Path, figure: Any) -> None:
+    """Write a figure, and close it."""
+    image = io.BytesIO()
+    figure.savefig(image, format="png", dpi=150)
+    import_optional("matplotlib.pyplot", extra="plot").close(figure)
+    write_whole(path, image.getvalue())
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:

@@ -98,6 +98,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     _add_table_options(fit)
     _add_std_option(_add_folder_options(fit, required=True))
+    _add_question_options(fit)
     _add_method_options(fit)
 
     transform = commands.add_parser(
@@ -211,6 +212,52 @@ def _add_table_options(
         help="size of the images in pixels, such as 1920x1080, for the coordinates of "
         "MediaPipe, which are shares of it",
     )
+
+
+def _add_question_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that name other columns of the table to ask about."""
+    group = parser.add_argument_group("what other columns say")
+    group.add_argument(
+        "--label",
+        metavar="COLUMN",
+        action="append",
+        default=[],
+        help="a class or a number for each frame, such as an expression or an age: how "
+        "each coefficient goes with it, and how well all tell it; may be repeated. "
+        "Whole numbers are classes; COLUMN:number says otherwise",
+    )
+    group.add_argument(
+        "--group",
+        metavar="COLUMN",
+        help="people, videos or files: how much coefficients differ between and within "
+        "them; held-out frames are of others, and time does not go from one to another",
+    )
+    time = group.add_mutually_exclusive_group()
+    time.add_argument(
+        "--time",
+        metavar="COLUMN",
+        help="times of the frames, numbers or dates that rise within each group: "
+        "coefficients are smoothed, too",
+    )
+    time.add_argument(
+        "--fps",
+        metavar="NUMBER",
+        type=_frequency,
+        help="rows are the frames of a video, so many a second, instead of --time",
+    )
+
+
+def _frequency(text: str) -> float:
+    """Read a number above zero."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0 < number < float("inf"):
+        raise argparse.ArgumentTypeError(
+            f"expected frames a second, a number above zero; got {text!r}"
+        )
+    return number
 
 
 def _add_method_options(parser: argparse.ArgumentParser) -> None:

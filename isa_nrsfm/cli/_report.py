@@ -12,6 +12,7 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM, Decomposition, __version__
 from isa_nrsfm._diagnostics import camera_meaning
+from isa_nrsfm.cli._answer_text import answer_lines
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
 from isa_nrsfm.cli._parser import AUTO
@@ -179,6 +180,7 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
         "Fit": fit,
         "Cameras": _camera_lines(model),
         "Alpha": alpha,
+        **answer_lines(report),
         "Files": files,
     }
     return f"{title}\n\n{lay_out(sections)}"
