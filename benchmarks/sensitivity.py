@@ -23,7 +23,7 @@ from isa_nrsfm._fit import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
-SEEDS = range(3)
+SEEDS = range(2)
 
 
 @cache
@@ -69,7 +69,7 @@ def of_instances(
     K=3,
     **parameters,
 ):
-    """Return the median error in 3D of artificial tables."""
+    """Return the mean error in 3D of artificial tables."""
     errors = []
     for seed in SEEDS:
         tracks = artificial(seed, n_frames, n_points, K, noise, camera)
@@ -83,7 +83,7 @@ def of_instances(
             X = np.where(np.repeat(hidden, 2, axis=1), np.nan, X)
         model = estimator(K, camera=camera, random_state=0, **parameters).fit(X)
         errors.append(affine_shape_error(tracks.shapes, model.reconstruct(X)))
-    return 100 * np.median(errors)
+    return 100 * np.mean(errors)
 
 
 def of_missing(name, step, n_components, estimator):
@@ -114,12 +114,12 @@ def counted(estimator, noise=0.02, K=3):
 CAPTURED = {
     "yoga 3D": partial(of_set, "yoga", 3, 4, "orthographic"),
     "drink 3D": partial(of_set, "drink", 8, 3, "orthographic"),
-    "faces 3D": partial(of_set, "ict_68", 4, 9, "affine"),
+    "faces 3D": partial(of_set, "ict_68", 8, 9, "affine"),
 }
 USUAL = {
     **CAPTURED,
     "noisy 3D": of_instances,
-    "large 3D": partial(of_instances, n_frames=6000, n_points=30),
+    "large 3D": partial(of_instances, n_frames=2600, n_points=30),
 }
 EXACT = {
     "exact 3D": partial(of_instances, noise=0.0),
@@ -135,14 +135,14 @@ ROBUST = {
 MISSING = {
     "yoga": partial(of_missing, "yoga", 3, 4),
     "drink": partial(of_missing, "drink", 8, 3),
-    "faces": partial(of_missing, "ict_68", 4, 9),
+    "faces": partial(of_missing, "ict_68", 8, 9),
     "noisy 3D": partial(of_instances, missing=0.2),
     "exact 3D": partial(of_instances, noise=0.0, missing=0.2),
 }
 BY_PAPER = {
     "yoga 3D": partial(of_set, "yoga", 3, 4, "affine", refinement="alternating"),
     "drink 3D": partial(of_set, "drink", 8, 3, "affine", refinement="alternating"),
-    "faces 3D": partial(of_set, "ict_68", 4, 9, "affine", refinement="alternating"),
+    "faces 3D": partial(of_set, "ict_68", 8, 9, "affine", refinement="alternating"),
     "noisy 3D": partial(of_instances, refinement="alternating"),
 }
 LARGE = {

@@ -524,7 +524,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             kept = fit.frames
             if isinstance(self.keep_frames, str | os.PathLike):
                 kept = kept.in_files(self.keep_frames)
-            kept = FrameFit(*map(source.blocks.spread, kept))
+            kept = FrameFit(*map(source.blocks.as_collected, kept))
             found |= kept._asdict()
             if fit.numbers is None:
                 del found["alpha_std"]

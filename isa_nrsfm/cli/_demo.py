@@ -27,8 +27,12 @@ _CAMERA: Final = "weak_perspective"
 _SEED = 0
 
 
-def run_demo(args: Namespace, warned: list[str]) -> str:
-    """Fit a table of artificial faces, and return the report with the truth."""
+def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
+    """
+    Fit a table of artificial faces, and return the report with the truth.
+
+    The numbers of basis shapes that are tried are as of ``--n-components``.
+    """
     pd = import_optional("pandas", extra="io")
     faces = make_face_tracks(
         _N_FRAMES, n_components=_N_COMPONENTS, camera=_CAMERA, random_state=_SEED
@@ -42,7 +46,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
 
     options = [
         *("fit", str(path)),
-        *("--n-components", _TRIED),
+        *("--n-components", tried),
         *("--camera", _CAMERA),
         *("--output", str(folder)),
         *(["--no-figures"] if args.no_figures else []),

@@ -227,7 +227,7 @@ def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
     return np.concatenate([axes[None], orthogonalise(turned)])
 
 
-def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
+def _fixed_point(W: NDArray, Z: NDArray, n_steps: int = FIXED_POINT_STEPS) -> NDArray:
     """
     Return the iterates after some steps of symmetric FastICA for vectors.
 
@@ -237,7 +237,7 @@ def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
     """
     n_signals, n_samples, size = Z.shape
     flat = Z.reshape(n_signals, -1)
-    for _ in range(FIXED_POINT_STEPS):
+    for _ in range(n_steps):
         Y = (W @ flat).reshape(*W.shape[:2], n_samples, size)
         u = np.einsum("skjc,skjc->skj", Y, Y)
         g, dg = _slopes(u, np.array(FIRST_TAIL), size)
