@@ -556,6 +556,11 @@ def limited(limits: Limits) -> type[AffineNRSfM]:
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
 
 
+def frames_of(estimator: AffineNRSfM) -> Any:
+    """Return the fitted model of a frame: shapes, noise, starts, and its fit."""
+    return estimator._model.frames
+
+
 def check_class(estimator: object, where: str) -> None:
     """Raise if an object is not the estimator of this package."""
     if not isinstance(estimator, AffineNRSfM):

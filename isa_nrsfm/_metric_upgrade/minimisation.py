@@ -41,7 +41,7 @@ LONGEST_STEP = 2.0
 LEAST_ALONG = 1e-8
 
 
-def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
+def safe_start(motion: NDArray, G: NDArray, camera: CameraModel) -> NDArray:
     """
     Return a metric to start from, near to a given one.
 
@@ -49,8 +49,8 @@ def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
     ----------
     motion : ndarray of shape (n_frames, 2, 3)
         Cameras, finite, which together see three directions of space.
-    Q : ndarray of shape (3, 3)
-        A symmetric matrix, positive definite or not: the linear solution for G.
+    G : ndarray of shape (3, 3)
+        A symmetric matrix, positive definite or not: the linear solution.
     camera : {"orthographic", "weak_perspective"}
         Only orthographic cameras determine the scale of G.
 
@@ -63,7 +63,7 @@ def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
     """
     counted = motion if camera == "orthographic" else unit_cameras(motion)
     root = symmetric_power(mean_gram(counted), 0.5)
-    values, axes = np.linalg.eigh(root @ Q @ root)
+    values, axes = np.linalg.eigh(root @ G @ root)
     values = np.maximum(values, values[-1] / STRETCH_OF_START**2)
     # Scale: the mean of tr(M_i G M_i^T) is 2, that of two rows of unit length.
     values *= 2 / values.sum()
