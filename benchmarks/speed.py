@@ -21,6 +21,7 @@ import pandas as pd
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._tables.layout import (
@@ -167,7 +168,7 @@ def found_by_search(model, tracks, seed):
 
     Both are in units of the noise variance: minus twice the log posterior.
     """
-    frames = model._model.frames
+    frames = frames_of(model)
     fit = frames.posterior(tracks).objective
     found = np.full(len(tracks), np.inf)
     rng = np.random.default_rng(seed)

@@ -532,7 +532,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             found |= fit.numbers._asdict()
         if self.keep_frames:
             kept = FrameFit(**keep(fit.frames._asdict()))
-            kept = FrameFit(*map(source.blocks.spread, kept))
+            kept = FrameFit(*map(source.blocks.as_collected, kept))
             found |= kept._asdict()
             if fit.numbers is None:
                 del found["alpha_std"]
@@ -562,6 +562,11 @@ def limited(limits: Limits) -> type[AffineNRSfM]:
         A subclass of `AffineNRSfM`.
     """
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
+
+
+def frames_of(estimator: AffineNRSfM) -> Any:
+    """Return the fitted model of a frame: shapes, noise, starts, and its fit."""
+    return estimator._model.frames
 
 
 def check_class(estimator: object, where: str) -> None:

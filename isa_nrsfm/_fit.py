@@ -38,7 +38,7 @@ from isa_nrsfm._gauge.canonical import (
     mode_covariance,
     reorder_blocks,
 )
-from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._gauge.independent import GaugeOptions, independent_gauge
 from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
 from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
@@ -61,12 +61,6 @@ from isa_nrsfm._tables.sources import Table
 # refinement for each frame. PAPER_TOL: gain of the paper's refinement, as a share of
 # the energy that it explains.
 JOINT_TOL, PAPER_TOL = 0.025, 1e-10
-# Largest number of steps, and tolerance, of the paper's refinement before a joint one.
-START_STEPS, START_TOL = 200, 1e-5
-# Largest number of basis shapes that n_components="auto" tries.
-MOST_COMPONENTS = 12
-# Number of starts of the fit of a frame besides zero: coefficients of other frames.
-N_STARTS = 8
 # Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
 STAGES = (
@@ -97,6 +91,16 @@ class Limits(NamedTuple):
         Of the paper's pipeline.
     joint : JointOptions
         Of the joint refinement.
+    gauge : GaugeOptions
+        Of the gauge after it.
+    start_steps, start_tol : int and float
+        Largest number of steps, and tolerance, of the paper's refinement before a joint
+        one.
+    most_components : int
+        Largest number of basis shapes that ``n_components="auto"`` tries.
+    n_starts : int
+        Number of starts of the fit of a frame besides zero: coefficients of other
+        frames.
     """
 
     outliers: OutlierOptions = OutlierOptions()
@@ -105,6 +109,11 @@ class Limits(NamedTuple):
     sample: SampleOptions = SampleOptions()
     paper: PaperOptions = PaperOptions()
     joint: JointOptions = JointOptions()
+    gauge: GaugeOptions = GaugeOptions()
+    start_steps: int = 200
+    start_tol: float = 1e-5
+    most_components: int = 12
+    n_starts: int = 8
 
 
 class FitOptions(NamedTuple):
@@ -322,7 +331,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
         warnings.simplefilter("ignore")  # the fit itself warns again
         table = _scaled(source, 1, options)
     most = largest_n_components(table.n_points)
-    most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
+    most = min(options.limits.most_components, most, most_for_frames(len(table.sizes)))
     outliers, used = _completed(table, most, options)
     _, sample, factors = _factors(table, used, most, True, options.limits)
     _, paper = _paper_result(factors, most, options, lambda stage: None)
@@ -406,7 +415,7 @@ def _paper_result(
 ) -> tuple[Any, PaperResult]:
     """Return the fitted strategy and what the paper's pipeline finds with it."""
     # A clone: the options stay as they are, also where K is looked for first.
-    isa, joint = clone(options.isa), options.joint
+    isa, joint, limits = clone(options.isa), options.joint, options.limits
     tol = PAPER_TOL if options.tol is None else options.tol
     with warnings.catch_warnings():
         if joint and options.default_isa:
@@ -418,10 +427,10 @@ def _paper_result(
             isa,
             block_recovery=options.block_recovery,
             refinement="alternating" if joint else options.refinement,
-            max_iter=START_STEPS if joint else options.max_iter,
-            tol=START_TOL if joint else tol,
+            max_iter=limits.start_steps if joint else options.max_iter,
+            tol=limits.start_tol if joint else tol,
             report=report,
-            options=options.limits.paper,
+            options=limits.paper,
         )
     return isa, result
 
@@ -499,7 +508,7 @@ def _refined_jointly(
     frames = PosteriorFrames(
         fitted.shapes,
         fitted.noise_variance,
-        spread_starts(fitted.alpha, N_STARTS),
+        spread_starts(fitted.alpha, options.limits.n_starts),
         options.loss,
         FrameMap.identity(len(paper.basis)),
         options.camera,
@@ -514,6 +523,7 @@ def _refined_jointly(
         options.independence,
         options.camera,
         float(table.sizes[0]) if options.camera == "orthographic" else None,
+        options.limits.gauge,
     )
     frames = frames._replace(gauge=gauge.frames)
     shown = FrameFit.from_blocks(posteriors.map(frames.shown, table.sizes))

@@ -59,7 +59,7 @@ class TableModel(NamedTuple):
         K = len(self.basis)
         shapes = ((2, 3), (2,), (K,), (K,))
         fit = partial(_fit, model=self, dtype=table.dtype)
-        return FrameFit(*table.blocks.gather(fit, shapes, table.dtype))
+        return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
 
     def coefficient_posterior(self, table: Table) -> tuple[NDArray, NDArray]:
         """
@@ -95,12 +95,12 @@ class TableModel(NamedTuple):
         shape = partial(
             _shapes, model=self, metric=metric, scaled=scaled, dtype=table.dtype
         )
-        return table.blocks.gather(shape, (self.mean_shape.shape,), table.dtype)[0]
+        return table.blocks.collect(shape, (self.mean_shape.shape,), table.dtype)[0]
 
     def reproject(self, table: Table) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
         image = partial(_images, model=self, dtype=table.dtype)
-        return table.blocks.gather(image, ((table.n_columns,),), table.dtype)[0]
+        return table.blocks.collect(image, ((table.n_columns,),), table.dtype)[0]
 
     def held_out_error(self, table: Table) -> float:
         """Return the inverse SNR of points held out of the fit of their frame."""

@@ -1,5 +1,8 @@
 """The parts of fits of frames, by their names."""
 
+# What a fitted model has of each frame.
+ATTRIBUTES_OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
+
 
 def camera_and_alpha(fits):
     """Return motion, translation and coefficients."""

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import _cost
 from benchmarks.asv_suite import _measured, fits, stages
 
 pytestmark = [
@@ -48,7 +47,7 @@ def run_each(kind, *parameters):
 @pytest.fixture(autouse=True)
 def small_tables(monkeypatch):
     small = {"n_frames": 40, "n_points": 20, "n_components": 2}
-    monkeypatch.setattr(_cost, "SWEEP", _cost.SWEEP._replace(base=small))
+    monkeypatch.setattr(fits._Swept, "base", small)
 
 
 @pytest.fixture(scope="module")

@@ -99,14 +99,13 @@ def test_quadratic_model():
     assert (scale > 0).all()
 
 
-def test_frames_do_not_depend_on_each_other(monkeypatch):
+def test_frames_do_not_depend_on_each_other():
     given = model(0.01)
     tracks = frames(given, 0.1)[0]
     whole = given.fit(tracks)
     single = [given.fit(tracks[i : i + 1]) for i in range(N_FRAMES)]
-    monkeypatch.setattr(_orthographic_frames, "BATCH", 4)
     for part, together, in_batches in zip(
-        zip(*single, strict=True), whole, given.fit(tracks), strict=True
+        zip(*single, strict=True), whole, given.fit(tracks, batch=4), strict=True
     ):
         assert_allclose(np.concatenate(part), together, atol=1e-7)
         assert_allclose(in_batches, together, atol=1e-7)

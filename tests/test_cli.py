@@ -19,6 +19,7 @@ from sklearn.model_selection import cross_val_score
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm.cli import main
+from isa_nrsfm.cli._demo import run_demo
 from isa_nrsfm.cli._parser import build_parser
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import load_model, save_model
@@ -746,9 +747,9 @@ def test_warnings_are_shown_once_and_in_one_line(run, table, tmp_path, monkeypat
 def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # All numbers that the demo tries would take long.
-    monkeypatch.setattr("isa_nrsfm.cli._demo._TRIED", "3-4")
-    code, out, err = run("demo", "--no-figures")
-    assert (code, err) == (0, "")
+    args, warned = build_parser().parse_args(["demo", "--no-figures"]), []
+    out = run_demo(args, warned, tried="3-4")
+    assert warned == []
     folder = tmp_path / "isa-nrsfm-demo"
     assert {path.name for path in folder.iterdir()} == FIT_FILES | {"tracks.csv"}
     report = json.loads((folder / "report.json").read_text())

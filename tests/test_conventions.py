@@ -5,6 +5,7 @@ import importlib
 import inspect
 import os
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import isa_nrsfm
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
+TESTS = ROOT / "tests"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]
 OPTIONAL = [
     "h5py",
@@ -259,9 +261,9 @@ def test_an_import_that_goes_up_is_found(tmp_path, file, line):
     assert "BROKEN" in output
 
 
-# Methods of named tuples have such names, and a benchmark looks into a stage.
+# Methods of named tuples have such names, and a parser of options is private there.
 NAMED_TUPLES = {"_asdict", "_replace", "_fields", "_make"}
-LOOKED_INTO = {"argparse._ActionsContainer", "model._model"}
+LOOKED_INTO = {"argparse._ActionsContainer"}
 
 
 @pytest.mark.parametrize(
@@ -308,3 +310,50 @@ def test_version():
     version = Version(isa_nrsfm.__version__)
     assert str(version) == isa_nrsfm.__version__
     assert not version.is_devrelease
+
+
+def patched_constants(code):
+    """Return the constants, names in capitals, that a test puts others in place of."""
+    found = []
+    for node in ast.walk(ast.parse(code)):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        called = ast.unparse(node.func)
+        if not re.search(
+            r"(\.setattr|\bpatch|\bpatch\.(object|dict|multiple))$", called
+        ):
+            continue
+        texts = [a.value for a in node.args[:2] if isinstance(a, ast.Constant)]
+        names = [text.split(".")[-1] for text in texts if isinstance(text, str)]
+        names += [keyword.arg or "" for keyword in node.keywords]
+        found += [name for name in names if re.fullmatch(r"_?[A-Z][A-Z0-9_]*", name)]
+    return found
+
+
+@pytest.mark.parametrize("file", sorted(path.name for path in TESTS.glob("*.py")))
+def test_limits_are_arguments(file):
+    code = (TESTS / file).read_text(encoding="utf-8")
+    assert patched_constants(code) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'monkeypatch.setattr(module, "MAX_STEPS", 3)',
+        'monkeypatch.setattr("isa_nrsfm._paper.svd.DENSE", 300)',
+        'patch.setattr(module, "_TRIED", "1")',
+        'with mock.patch.object(module, "CUT_OFF", 1.0): pass',
+        'mock.patch("isa_nrsfm._fit.JOINT_TOL", 1.0)',
+    ],
+)
+def test_a_constant_that_is_patched_is_found(line):
+    assert patched_constants(line)
+    assert not patched_constants(line.lower())
+
+
+@pytest.mark.parametrize("file", sorted(path.name for path in TESTS.glob("*.py")))
+def test_no_test_imports_another_test_module(file):
+    for node in ast.walk(ast.parse((TESTS / file).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [a.name for a in node.names] + [getattr(node, "module", None) or ""]
+            assert not [n for n in names if re.match(r"(tests\.)?test_", n)], names

@@ -5,6 +5,7 @@ import hashlib
 import io
 import re
 import sys
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from types import SimpleNamespace
@@ -82,6 +83,12 @@ def without_pooch(monkeypatch):
     monkeypatch.setitem(sys.modules, "pooch", None)
 
 
+def replace_file(monkeypatch, module, remote):
+    """Fetch another file than the one a module describes."""
+    fetch = partial(fetch_file, remote)
+    monkeypatch.setattr(module, "fetch_file", lambda known, *args: fetch(*args))
+
+
 @pytest.fixture
 def shark_file(monkeypatch):
     """Put a file of 4 frames and 5 points in the place of the shark's."""
@@ -90,7 +97,7 @@ def shark_file(monkeypatch):
     savemat(file, {"P3_gt": coordinates})
     content = file.getvalue()
     remote = described(content, "http://127.0.0.1/data/jaws.mat", "jaws.mat")
-    monkeypatch.setattr(_shark, "JAWS", remote)
+    replace_file(monkeypatch, _shark, remote)
     return SimpleNamespace(remote=remote, content=content, coordinates=coordinates)
 
 
@@ -109,7 +116,7 @@ def muct_file(monkeypatch):
     content = "\n".join([",".join(header), *lines, ""]).encode()
     name = "muct76-opencv.csv"
     remote = described(content, f"http://127.0.0.1/{name}", name)
-    monkeypatch.setattr(_muct, "MUCT", remote)
+    replace_file(monkeypatch, _muct, remote)
     return SimpleNamespace(remote=remote, content=content, values=values)
 
 
@@ -282,7 +289,7 @@ class TestShark:
     def test_is_downloaded(self, tmp_path, server, shark_file, monkeypatch):
         server.answers["/jaws.mat"] = shark_file.content
         remote = shark_file.remote._replace(url=f"{server.url}/jaws.mat")
-        monkeypatch.setattr(_shark, "JAWS", remote)
+        replace_file(monkeypatch, _shark, remote)
         first, second = (fetch_shark(data_home=tmp_path) for _ in range(2))
         assert server.requests == ["/jaws.mat"]
         assert_array_equal(first.data, second.data)
@@ -341,7 +348,7 @@ class TestMuct:
     def test_is_downloaded(self, tmp_path, server, muct_file, monkeypatch):
         server.answers["/faces.csv"] = muct_file.content
         remote = muct_file.remote._replace(url=f"{server.url}/faces.csv")
-        monkeypatch.setattr(_muct, "MUCT", remote)
+        replace_file(monkeypatch, _muct, remote)
         first, second = (fetch_muct(data_home=tmp_path) for _ in range(2))
         assert server.requests == ["/faces.csv"]
         assert_array_equal(first.data, second.data)

@@ -57,7 +57,7 @@ class TestBlocks:
         self, kind, array, length
     ):
         frames = np.isin(np.arange(N_FRAMES), [0, 1, 6, 7, 8, 18, 19, 22])
-        kept = blocks_of(kind, array, length).kept(frames)
+        kept = blocks_of(kind, array, length).subset(frames)
         alone = blocks_of(kind, array[frames], length)
         assert kept.lengths == alone.lengths
         assert_array_equal(kept.whole(), array[frames])
@@ -67,7 +67,7 @@ class TestBlocks:
 
     def test_gather_concatenates_each_of_several_results(self, kind, array, length):
         blocks = blocks_of(kind, array, length)
-        first, second = blocks.gather(lambda b: (b, b[:, 0]), ((4,), ()), float)
+        first, second = blocks.collect(lambda b: (b, b[:, 0]), ((4,), ()), float)
         assert_array_equal(first, array)
         assert_array_equal(second, array[:, 0])
 
@@ -99,7 +99,7 @@ def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
 
     stored = StoredBlocks.from_table(array, 4).derive(recorded)
     frames = np.isin(np.arange(N_FRAMES), [0, 22])
-    assert_array_equal(stored.kept(frames).whole(), array[frames])
+    assert_array_equal(stored.subset(frames).whole(), array[frames])
     assert max(calls) == 4
 
 
@@ -121,6 +121,6 @@ def test_an_error_in_a_thread_is_raised(array):
 
 def test_no_frames():
     blocks = MemoryBlocks.from_array(np.empty((0, 4)), 5)
-    (got,) = blocks.gather(lambda b: (b,), ((4,),), np.float32)
+    (got,) = blocks.collect(lambda b: (b,), ((4,),), np.float32)
     assert got.shape == (0, 4)
     assert got.dtype == np.float32

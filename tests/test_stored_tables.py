@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from frame_parts import ATTRIBUTES_OF_FRAMES
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -11,7 +12,6 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
 # What is known of each frame.
-OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 
 pa = pytest.importorskip("pyarrow")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -68,7 +68,7 @@ def folder(X, path, kind, n_files=3):
 
 
 def assert_same_model(got, expected):
-    for name in OF_SHAPES + OF_FRAMES:
+    for name in OF_SHAPES + ATTRIBUTES_OF_FRAMES:
         value = getattr(expected, name)
         atol = 1e-8 * np.abs(value).max()
         assert_allclose(getattr(got, name), value, rtol=0, atol=atol, err_msg=name)
@@ -92,7 +92,7 @@ class TestFit:
             model.fit(memmap(X, tmp_path))
         for name in OF_SHAPES:
             assert_array_equal(getattr(model, name), getattr(expected, name))
-        for name in OF_FRAMES:
+        for name in ATTRIBUTES_OF_FRAMES:
             found = getattr(model, name)
             assert isinstance(found, np.memmap)
             assert np.isnan(found[empty]).all()
@@ -131,7 +131,7 @@ class TestFit:
     def test_threads_make_no_difference(self):
         X = np.tile(table(), (5, 1))
         one, two = (estimator(SAMPLED, n_jobs=n).fit(X) for n in (1, 2))
-        for name in OF_SHAPES + OF_FRAMES:
+        for name in OF_SHAPES + ATTRIBUTES_OF_FRAMES:
             assert_array_equal(getattr(one, name), getattr(two, name))
 
     @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ class TestKeepFrames:
         X = table()
         plain = estimator().fit(X)
         model = estimator(keep_frames=tmp_path / "found").fit(X)
-        for name in OF_FRAMES:
+        for name in ATTRIBUTES_OF_FRAMES:
             array = getattr(model, name)
             assert isinstance(array, np.memmap)
             assert_array_equal(array, getattr(plain, name))
@@ -209,7 +209,7 @@ class TestKeepFrames:
         X = table()
         model, plain = estimator(keep_frames=False), estimator().fit(X)
         assert_array_equal(model.fit_transform(X), plain.alpha_)
-        for name in OF_FRAMES:
+        for name in ATTRIBUTES_OF_FRAMES:
             assert not hasattr(model, name)
         assert_array_equal(model.basis_, plain.basis_)
         assert_array_equal(model.reproject(X), plain.reproject(X))

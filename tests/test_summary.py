@@ -1,6 +1,7 @@
 """What a notebook shows of a model."""
 
 import re
+from copy import copy
 
 import numpy as np
 import pytest
@@ -70,8 +71,9 @@ def test_rows_without_points_are_told():
     assert shown["Noise"].endswith("in the units of the table")
 
 
-def test_warnings_of_the_diagnostics_are_shown(model, monkeypatch):
-    monkeypatch.setattr("isa_nrsfm._diagnostics.LEAST_RELIABILITY", 1.1)
+def test_warnings_of_the_diagnostics_are_shown(model):
+    model = copy(model)
+    model.reliability_ = np.array([0.1, 0.3])
     with pytest.warns(UserWarning, match="does not support"):
         model.diagnostics()
     assert "take at most n_components=0" in summary(model)["Diagnostics"]

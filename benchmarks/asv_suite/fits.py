@@ -47,8 +47,10 @@ class OfTables(Fit):
 class _Swept(Fit):
     """Fits of the tables of the section cost, one setting being varied."""
 
+    base = _cost.SWEEP.base
+
     def table(self, value):
-        setting = _cost.SWEEP.base | {self.param_names[0]: value}
+        setting = self.base | {self.param_names[0]: value}
         return Table.of(_cost.tracks(**setting))
 
 

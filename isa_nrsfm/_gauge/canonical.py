@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera import mean_view
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import orientations
 
 # Frames that are taken together where much is computed of each.
@@ -102,11 +103,6 @@ def euclidean_space(
     return size * canonical_rotation(mean_shape, motion)
 
 
-# A basis shape holds only rounding errors if its energy in the images is below this
-# share of that of the mean shape.
-NO_MOTION = 1e-20
-
-
 class Gauge(NamedTuple):
     """
     Canonical shapes.
@@ -164,7 +160,8 @@ def canonical_gauge(
     energy = image_energies(motion, basis, alpha)
     order = np.argsort(-energy, kind="stable")
     rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
-    moving = energy > NO_MOTION * rigid
+    # Others hold only rounding errors.
+    moving = energy > OF_RANKS**2 * rigid
     deviation = alpha.std(axis=0)
     constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
     size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)

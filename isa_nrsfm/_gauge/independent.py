@@ -18,13 +18,34 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
-from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
+from isa_nrsfm.isa._shared_mixing import (
+    MixingOptions,
+    independent_coefficients,
+    shared_mixing,
+)
 
-# Alternation of the shifts u and v: its convergence tolerance, and the most rounds.
-SHIFTED = 1e-12
-MAX_SHIFTS = 200
-# If the scale of a frame gets below this share of the mean, v stays zero.
-SMALLEST_SCALE = 0.1
+
+class GaugeOptions(NamedTuple):
+    """
+    What steers the choice of the independent basis.
+
+    Attributes
+    ----------
+    max_shifts : int
+        Largest number of alternations of the shifts u and v.
+    smallest_scale : float
+        If the scale of a frame gets below this share of the mean, v stays zero.
+    mixing : MixingOptions
+        Of `shared_mixing`.
+    """
+
+    max_shifts: int = 200
+    smallest_scale: float = 0.1
+    mixing: MixingOptions = MixingOptions()
+
+
+GAUGE_OPTIONS = GaugeOptions()
 
 
 class IndependentGauge(NamedTuple):
@@ -53,6 +74,7 @@ def independent_gauge(
     independence: str | None,
     camera: str = "affine",
     unit: float | None = None,
+    options: GaugeOptions = GAUGE_OPTIONS,
 ) -> IndependentGauge:
     """
     Return the independent basis of a fit.
@@ -74,6 +96,8 @@ def independent_gauge(
     unit : float, optional
         What a unit of the shapes becomes with calibrated cameras, as of
         `euclidean_space`.
+    options : GaugeOptions
+        What steers the choice.
 
     Returns
     -------
@@ -81,7 +105,7 @@ def independent_gauge(
         The basis, and the map of the frames to it.
     """
     # The shifts u and v, then the affinity of space.
-    shift, motion, alpha = _centred(shapes, motion, alpha, camera)
+    shift, motion, alpha = _centred(shapes, motion, alpha, camera, options)
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
     white = shapes[1:].transpose(0, 2, 1) @ space.T
@@ -90,9 +114,10 @@ def independent_gauge(
     # The mixing of the basis shapes, then their order, scale and signs.
     mixing: NDArray
     if independence == "shapes":
-        mixing = shared_mixing(white)
+        mixing = shared_mixing(white, options=options.mixing)
     elif independence == "coefficients":
-        mixing = np.linalg.inv(independent_coefficients(alpha)).T
+        unmixing = independent_coefficients(alpha, options=options.mixing)
+        mixing = np.linalg.inv(unmixing).T
     else:
         mixing = _principal_axes(white, alpha)
     basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
@@ -109,7 +134,11 @@ def independent_gauge(
 
 
 def _centred(
-    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    camera: str,
+    options: GaugeOptions,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
@@ -126,14 +155,14 @@ def _centred(
 
     Shapes are (n, 3, n_points), cameras (n_frames, 2, 3), alpha (n_frames, n - 1).
     """
-    rank = max(np.linalg.matrix_rank(shapes[0], rtol=1e-9), 1)
+    rank = max(np.linalg.matrix_rank(shapes[0], rtol=OF_RANKS), 1)
     first = total = _mean_shift(alpha)
     moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
-    for _ in range(0 if camera == "orthographic" else MAX_SHIFTS):
+    for _ in range(0 if camera == "orthographic" else options.max_shifts):
         # v, from the current shapes: <B_k, dual> is the part of B_k along B_0.
         current = np.tensordot(total, shapes, 1)
         if camera == "affine":
-            dual = np.linalg.pinv(current[0], rcond=1e-9).T / rank
+            dual = np.linalg.pinv(current[0], rcond=OF_RANKS).T / rank
         else:
             dual = current[0] / (np.vdot(current[0], current[0]) or 1.0)
         along = np.eye(len(shapes))
@@ -149,8 +178,10 @@ def _centred(
         moved = moved - mean[0, 1:]
         total = mean @ along @ total
         change = np.abs(mean[0, 1:]) + np.abs(along[1:, 0])
-        if np.max(change, initial=0.0) <= SHIFTED * max(1.0, np.abs(moved).max()):
-            if scale.min() < SMALLEST_SCALE * scale.mean():
+        if np.max(change, initial=0.0) <= OF_DIFFERENCES * max(
+            1.0, np.abs(moved).max()
+        ):
+            if scale.min() < options.smallest_scale * scale.mean():
                 break
             return total, motion * scale[:, None, None], moved
     return first, motion, alpha - first[0, 1:]
@@ -169,7 +200,9 @@ def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
     The basis is (K, n_points, 3) in the white space, alpha is (n_frames, K).
     """
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
-    variance = np.where(variance > 1e-20 * max(variance[-1], 1e-300), variance, 1.0)
+    variance = np.where(
+        variance > OF_RANKS**2 * max(variance[-1], 1e-300), variance, 1.0
+    )
     root = (axes * np.sqrt(variance)) @ axes.T
     flat = root @ basis.reshape(len(basis), -1)
     _, directions = np.linalg.eigh(flat @ flat.T)

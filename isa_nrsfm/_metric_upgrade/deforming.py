@@ -22,18 +22,35 @@ from isa_nrsfm._metric_upgrade.rigid import (
     warn_if_degenerate,
 )
 
-# Prior standard deviation of an entry of E_k: its first value, and its upper bound.
-# Larger strains are taken for errors of the affine cameras.
-STRAIN_DEVIATION = 0.3
 # Bound on the eigenvalues of the strain of a frame. Unusual coefficients then stretch
 # no direction by more than exp(1 / 2).
 LARGEST_STRAIN = 1.0
-# Rounds of estimating the two variances, and their convergence tolerance: the largest
-# change of a logarithm.
-MAX_ROUNDS = 15
-SETTLED = 0.05
-# Convergence tolerance of the metric in these rounds, as `shortest_step`.
-ROUGH_STEP = 1e-4
+
+
+class StrainOptions(NamedTuple):
+    """
+    How the strains of `deformation_metric` are fitted.
+
+    Attributes
+    ----------
+    deviation : float
+        Prior standard deviation of an entry of E_k: its first value, and its upper
+        bound. Larger strains are taken for errors of the affine cameras.
+    max_rounds : int
+        Rounds of estimating the two variances.
+    settled : float
+        Their convergence tolerance: the largest change of a logarithm.
+    rough_step : float
+        Convergence tolerance of the metric in these rounds, as `shortest_step`.
+    """
+
+    deviation: float = 0.3
+    max_rounds: int = 15
+    settled: float = 0.05
+    rough_step: float = 1e-4
+
+
+STRAIN_OPTIONS = StrainOptions()
 
 
 class DeformationMetric(NamedTuple):
@@ -138,7 +155,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
         )
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
-    fit = _fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
+    fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
     # The symmetric Q is fit.Q times a rotation, which turns the strains, too.
     Q = symmetric_power(fit.Q @ fit.Q.T, 0.5)
     turn = np.linalg.solve(Q, fit.Q)
@@ -261,23 +278,41 @@ def euclidean_frames(
     return frames
 
 
-def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
+def fit_strain(
+    cameras: NDArray,
+    alpha: NDArray,
+    rigid: MetricFit,
+    options: StrainOptions = STRAIN_OPTIONS,
+) -> MetricFit:
     """
     Return the metric with strains, with the ridge of maximal evidence.
 
-    Cameras are (n_frames, 2, 3), alpha is (n_frames, n_components), `rigid` is the fit
-    without strains.
+    Parameters
+    ----------
+    cameras : ndarray of shape (n_frames, 2, 3)
+        Usable cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Their coefficients.
+    rigid : MetricFit
+        The fit without strains.
+    options : StrainOptions
+        How the strains are fitted.
+
+    Returns
+    -------
+    MetricFit
+        The fit with strains.
     """
     size = len(strain_basis("weak_perspective"))
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
-    variance = STRAIN_DEVIATION**2
+    variance = options.deviation**2
     blocks = frame_blocks(cameras, alpha)
     none = np.zeros((alpha.shape[1], 3, 3))
     fit = fit_at(blocks, rigid.Q, none, "weak_perspective")
-    for _ in range(MAX_ROUNDS):
+    for _ in range(options.max_rounds):
         ridge = noise / variance
-        fit = refine_fit(blocks, fit, "weak_perspective", ridge, ROUGH_STEP)
+        fit = refine_fit(blocks, fit, "weak_perspective", ridge, options.rough_step)
         # Curvature in the strains, with the common metric eliminated (a Schur
         # complement), and the effective number of strain parameters from it.
         mixed = fit.curvature[:size, size:]
@@ -291,8 +326,8 @@ def _fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit
         previous = noise, variance
         noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
         variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
-        variance = np.clip(variance, OF_DIFFERENCES, STRAIN_DEVIATION**2)
-        if np.abs(np.log([noise, variance]) - np.log(previous)).max() < SETTLED:
+        variance = np.clip(variance, OF_DIFFERENCES, options.deviation**2)
+        if np.abs(np.log([noise, variance]) - np.log(previous)).max() < options.settled:
             break
     return refine_fit(blocks, fit, "weak_perspective", ridge)
 

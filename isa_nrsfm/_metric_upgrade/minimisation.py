@@ -41,7 +41,7 @@ LONGEST_STEP = 2.0
 LEAST_ALONG = 1e-8
 
 
-def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
+def safe_start(motion: NDArray, G: NDArray, camera: CameraModel) -> NDArray:
     """
     Return a metric to start from, near to a given one.
 
@@ -49,8 +49,8 @@ def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
     ----------
     motion : ndarray of shape (n_frames, 2, 3)
         Cameras, finite, which together see three directions of space.
-    Q : ndarray of shape (3, 3)
-        A symmetric matrix, positive definite or not: the linear solution for G.
+    G : ndarray of shape (3, 3)
+        A symmetric matrix, positive definite or not: the linear solution.
     camera : {"orthographic", "weak_perspective"}
         Only orthographic cameras determine the scale of G.
 
@@ -63,7 +63,7 @@ def safe_start(motion: NDArray, Q: NDArray, camera: CameraModel) -> NDArray:
     """
     counted = motion if camera == "orthographic" else unit_cameras(motion)
     root = symmetric_power(mean_gram(counted), 0.5)
-    values, axes = np.linalg.eigh(root @ Q @ root)
+    values, axes = np.linalg.eigh(root @ G @ root)
     values = np.maximum(values, values[-1] / STRETCH_OF_START**2)
     # Scale: the mean of tr(M_i G M_i^T) is 2, that of two rows of unit length.
     values *= 2 / values.sum()
@@ -76,6 +76,7 @@ def refine_metric(
     camera: CameraModel,
     alpha: NDArray | None = None,
     ridge: float = 0.0,
+    max_steps: int = MAX_STEPS,
 ) -> MetricFit:
     """
     Minimise the squared residuals of `orthonormality`, from a start without strains.
@@ -92,6 +93,8 @@ def refine_metric(
         Coefficients of the strains; by default there are none.
     ridge : float, default=0.0
         Ridge: the regularisation weight of the squared norm of the strains.
+    max_steps : int, default=200
+        Largest number of steps.
 
     Returns
     -------
@@ -102,7 +105,7 @@ def refine_metric(
         alpha = np.zeros((len(motion), 0))
     blocks = frame_blocks(motion, alpha)
     start = fit_at(blocks, Q, np.zeros((alpha.shape[1], 3, 3)), camera)
-    return refine_fit(blocks, start, camera, ridge)
+    return refine_fit(blocks, start, camera, ridge, max_steps=max_steps)
 
 
 def refine_fit(
@@ -111,6 +114,7 @@ def refine_fit(
     camera: CameraModel,
     ridge: float,
     shortest_step: float = SHORTEST_STEP,
+    max_steps: int = MAX_STEPS,
 ) -> MetricFit:
     """
     Minimise the squared residuals of `orthonormality`, from any fit.
@@ -125,6 +129,8 @@ def refine_fit(
         As of `refine_metric`.
     shortest_step : float
         Convergence tolerance: the largest entry of a step.
+    max_steps : int, default=200
+        Largest number of steps.
 
     Returns
     -------
@@ -143,7 +149,7 @@ def refine_fit(
     value = fit.cost + ridge * float(np.sum(numbers**2))
     damping = FIRST_DAMPING
     second_order = np.zeros_like(fit.curvature)
-    for _ in range(MAX_STEPS):
+    for _ in range(max_steps):
         # Damped step, shortened to LONGEST_STEP.
         curvature = fit.curvature + second_order + np.diag(ridges)
         gradient = fit.gradient + ridges * np.append(np.zeros(size), numbers)

@@ -8,15 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
-from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
 
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3
-# A column is linearly dependent on those before it if less than this share of its norm
-# is orthogonal to them.
-DEPENDENT = 1e-10
-# Squared singular values below this share of the largest are rounding errors.
-NO_ENERGY = 1e-13
 # Steps from each start before the starts are compared. The best of the about twenty
 # starts then leads to the least cost, or close to it.
 ROUGH_STEPS = 8
@@ -283,7 +278,7 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     lengths = np.linalg.norm(motion, axis=0)
     kept = np.flatnonzero(lengths > 0)
     scaled = np.linalg.qr(motion[:, kept] / lengths[kept], mode="r")
-    kept = kept[np.abs(np.diagonal(scaled)) > DEPENDENT]
+    kept = kept[np.abs(np.diagonal(scaled)) > OF_RANKS]
     if len(kept) < 3:
         raise ValueError(
             "motion must have at least three linearly independent columns; "
@@ -311,5 +306,5 @@ def principal_columns(W: NDArray) -> NDArray:
         as columns of cameras are on average.
     """
     square, V = np.linalg.eigh(W.T @ W)
-    kept = np.flatnonzero(square > NO_ENERGY * square[-1])[::-1]
+    kept = np.flatnonzero(square > OF_STEPS * square[-1])[::-1]
     return W @ (V[:, kept] * np.sqrt(len(W) / 3 / square[kept]))

@@ -5,19 +5,21 @@ space. If the cameras are scaled orthographic (weak perspective) ones in some me
 space, as those of small objects and square pixels are, they tell which (Tomasi, Kanade
 1992; Poelman, Kanade, "A paraperspective factorization method for shape and motion
 recovery", 1997).
+
+The metric is the symmetric matrix G: a root of it, ``G = Q Q^T``, takes cameras M to M
+Q, which are nearly scaled rotations. Q is known up to a rotation.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-# A symmetric matrix counts as positive definite if its smallest eigenvalue is above
-# this share of the largest.
-SMALLEST_EIGENVALUE = 1e-10
+from isa_nrsfm._linalg.rounding import OF_RANKS
+
 # Linear equations determine their unknowns if the smallest singular value is above this
 # share of the largest.
 SMALLEST_SINGULAR_VALUE = 1e-6
-# Bound on the ratio of stretches of space by Q. It is exceeded where the cameras hardly
-# show the depth, which noise then stretches without limit.
+# Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
+# where the cameras hardly show the depth, which noise then stretches without limit.
 LARGEST_STRETCH = 20.0
 
 # The six unknowns of a symmetric 3x3 matrix are its diagonal, and sqrt(2) times the
@@ -61,8 +63,8 @@ def conformal_equations(cameras: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (2 * n_frames, 6)
-        Coefficients of ``m1 Q m1^T - m2 Q m2^T`` and of ``2 m1 Q m2^T`` in the six
-        unknowns of Q, see `symmetric_matrix`. Turning a frame in its image plane turns
+        Coefficients of ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the six
+        unknowns of G, see `symmetric_matrix`. Turning a frame in its image plane turns
         the two into each other.
     """
     m1, m2 = np.moveaxis(cameras, 1, 0)
@@ -75,7 +77,7 @@ def conformal_equations(cameras: NDArray) -> NDArray:
 
 
 def _quadratic_terms(a: NDArray, b: NDArray) -> NDArray:
-    """Return the coefficients of a Q b^T in the six unknowns of Q, one row a pair."""
+    """Return the coefficients of a G b^T in the six unknowns of G, one row a pair."""
     mixed = a[:, _ROWS] * b[:, _COLUMNS] + a[:, _COLUMNS] * b[:, _ROWS]
     return np.hstack([a * b, mixed / np.sqrt(2)])
 
@@ -89,13 +91,13 @@ def symmetric_matrix(unknowns: NDArray) -> NDArray:
 
 def metric_quadric(motion: NDArray) -> NDArray | None:
     """
-    Find the symmetric Q under which the cameras are weak-perspective ones.
+    Find the symmetric G under which the cameras are weak-perspective ones.
 
     The rows m1 and m2 of each camera, divided by its norm, should satisfy
-    ``m1 Q m1^T = m2 Q m2^T`` and ``m1 Q m2^T = 0``: homogeneous linear equations in
+    ``m1 G m1^T = m2 G m2^T`` and ``m1 G m2^T = 0``: homogeneous linear equations in
     six unknowns, solved by least squares. Their weights are such that turning a frame
-    in its image plane changes nothing. To exclude Q = 0 the mean of ``m1 Q m1^T + m2 Q
-    m2^T`` is fixed. With a fixed norm of Q instead, a Q along a direction that the
+    in its image plane changes nothing. To exclude G = 0 the mean of ``m1 G m1^T + m2 G
+    m2^T`` is fixed. With a fixed norm of G instead, a G along a direction that the
     cameras hardly see would nearly solve the equations.
 
     Parameters
@@ -106,29 +108,29 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     Returns
     -------
     ndarray of shape (3, 3) or None
-        Q, positive definite, the mean of ``m1 Q m1^T + m2 Q m2^T`` being one. None if
+        G, positive definite, the mean of ``m1 G m1^T + m2 G m2^T`` being one. None if
         the equations do not determine it, or if it is not safely positive definite.
     """
-    Q = _least_squares_quadric(motion)
-    if Q is None:
+    G = _least_squares_quadric(motion)
+    if G is None:
         return None
-    eigenvalues = np.linalg.eigvalsh(Q)
-    # Eigenvalues of Q are squares of the stretches of space.
-    return Q if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
+    eigenvalues = np.linalg.eigvalsh(G)
+    # Eigenvalues of G are squares of the stretches of space.
+    return G if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
 
 
 def _least_squares_quadric(motion: NDArray) -> NDArray | None:
-    """Return Q (3, 3) of `metric_quadric`, positive definite or not.
+    """Return G (3, 3) of `metric_quadric`, positive definite or not.
 
-    Cameras are (n_frames, 2, 3). None if the equations do not determine Q.
+    Cameras are (n_frames, 2, 3). None if the equations do not determine G.
     """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)
     eigenvalues = np.linalg.eigvalsh(gram)
-    if eigenvalues[0] <= SMALLEST_EIGENVALUE * eigenvalues[-1]:
+    if eigenvalues[0] <= OF_RANKS * eigenvalues[-1]:
         return None
     # In coordinates where the mean of M_i^T M_i is the identity, the mean that is fixed
-    # is the trace of Q. So Q is I / 3 plus a matrix without trace, of five unknowns.
+    # is the trace of G. So G is I / 3 plus a matrix without trace, of five unknowns.
     whitening = symmetric_power(gram, -0.5)
     equations = conformal_equations(cameras @ whitening)
     trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
@@ -166,11 +168,11 @@ def anisotropy(motion: NDArray) -> float:
         return 0.0
     # In the space in which the cameras see all directions alike.
     motion = motion @ np.linalg.pinv(symmetric_power(mean_gram(motion), 0.5))
-    Q = _least_squares_quadric(motion)
-    if Q is None:
+    G = _least_squares_quadric(motion)
+    if G is None:
         return 0.0
-    stretch, axes = np.linalg.eigh(Q)
-    Q = (axes * np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)) @ axes.T
-    gram = motion @ Q @ motion.transpose(0, 2, 1)
+    stretch, axes = np.linalg.eigh(G)
+    G = (axes * np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)) @ axes.T
+    gram = motion @ G @ motion.transpose(0, 2, 1)
     xx, xy, yy = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
     return float(np.sqrt(np.mean(((xx - yy) ** 2 + 4 * xy**2) / (xx + yy) ** 2)))

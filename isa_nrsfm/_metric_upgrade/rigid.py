@@ -7,9 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
-    SMALLEST_EIGENVALUE,
     mean_gram,
     metric_quadric,
     symmetric_power,
@@ -236,7 +236,7 @@ def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
     if len(cameras):
         gram = mean_gram(unit_cameras(cameras))
         eigenvalues = np.linalg.eigvalsh(gram)
-    seen = eigenvalues > SMALLEST_EIGENVALUE * eigenvalues[-1]
+    seen = eigenvalues > OF_RANKS * eigenvalues[-1]
     if not seen.all():
         raise ValueError(
             "a metric upgrade needs cameras that together see three directions of "

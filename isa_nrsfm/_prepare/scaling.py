@@ -144,7 +144,7 @@ def scaled_table(
     if not shown.all():
         _warn_of_empty(shown)
         check_size(int(shown.sum()), n_points, n_components)
-        blocks, report = blocks.kept(shown), report.of_frames(shown)
+        blocks, report = blocks.subset(shown), report.of_frames(shown)
     check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
     check_places(report, n_points)
     n_frames = blocks.n_frames

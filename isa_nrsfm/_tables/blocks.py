@@ -70,7 +70,7 @@ class FrameBlocks(ABC):
         """
 
     @abstractmethod
-    def kept(self, frames: NDArray) -> Self:
+    def subset(self, frames: NDArray) -> Self:
         """
         Return blocks of only some of the frames. These blocks must be arrays.
 
@@ -105,13 +105,13 @@ class FrameBlocks(ABC):
         """
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        found = self.joined(kept_rows, chosen)
+        found = self.joined(chosen_rows, chosen)
         # Here the frames increase. The order that was asked for is that of their ranks.
         order = np.empty(len(frames), dtype=int)
         order[np.argsort(frames)] = np.arange(len(frames))
         return found[order]
 
-    def gather(
+    def collect(
         self,
         function: Callable[..., Any],
         shapes: tuple[tuple[int, ...], ...],
@@ -142,8 +142,8 @@ class FrameBlocks(ABC):
             return tuple(np.empty((0, *shape), dtype=dtype) for shape in shapes)
         return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
-    def spread(self, values: NDArray) -> Any:
-        """Return an array (n_frames, ...) as an array of the kind that `gather` has."""
+    def as_collected(self, values: NDArray) -> Any:
+        """Return an array (n_frames, ...) as one of the kind that `collect` returns."""
         return values
 
     def whole(self) -> NDArray:
@@ -173,7 +173,7 @@ class FrameBlocks(ABC):
         return tuple(array[self.slices[block]] for array in arrays)
 
 
-def kept_rows(block: NDArray, kept: NDArray) -> NDArray:
+def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:
     """Return the frames of a block that are kept."""
     return block[kept]
 
@@ -239,9 +239,9 @@ class MemoryBlocks(FrameBlocks):
         blocks = list(self.map(function, *by_frame))
         return type(self)(blocks, self.lengths, self.n_threads)
 
-    def kept(self, frames: NDArray) -> Self:
+    def subset(self, frames: NDArray) -> Self:
         """Return blocks of only some of the frames. These blocks must be arrays."""
-        array = self.joined(kept_rows, frames)
+        array = self.joined(chosen_rows, frames)
         return self.from_array(array, max(self.lengths), self.n_threads)
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
@@ -294,7 +294,7 @@ class StoredBlocks(FrameBlocks):
 
         return type(self)(read, self.lengths)
 
-    def kept(self, frames: NDArray) -> Self:
+    def subset(self, frames: NDArray) -> Self:
         """Return blocks of only some of the frames. These blocks must be arrays."""
         numbers, length = np.flatnonzero(frames), max(self.lengths)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.blocks import FrameBlocks, kept_rows
+from isa_nrsfm._tables.blocks import FrameBlocks, chosen_rows
 
 
 class DaskBlocks(FrameBlocks):
@@ -55,12 +55,12 @@ class DaskBlocks(FrameBlocks):
         blocks = _run_quietly(dask.persist, self._tasks(function, by_frame))
         return type(self)(blocks, self.lengths)
 
-    def kept(self, frames: NDArray) -> Self:
+    def subset(self, frames: NDArray) -> Self:
         """Return blocks of only some of the frames. These blocks must be arrays."""
         lengths = [int(frames[rows].sum()) for rows in self.slices]
-        return self._filled(self.derive(kept_rows, frames).blocks, lengths)
+        return self._filled(self.derive(chosen_rows, frames).blocks, lengths)
 
-    def gather(
+    def collect(
         self,
         function: Callable[..., Any],
         shapes: tuple[tuple[int, ...], ...],
@@ -79,7 +79,7 @@ class DaskBlocks(FrameBlocks):
             for part, shape in enumerate(shapes)
         )
 
-    def spread(self, values: NDArray) -> Any:
+    def as_collected(self, values: NDArray) -> Any:
         """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
         array = import_optional("dask.array", extra="dask")
         chunks = (tuple(self.lengths), *values.shape[1:])

@@ -87,9 +87,7 @@ def kind_of(y: NDArray, kind: str) -> Kind:
         raise ValueError(f"kind must be 'auto', 'classes' or 'number'; got {kind!r}")
     n_values = len(np.unique(y))
     if n_values == 1:
-        raise ValueError(
-            f"all {len(y)} labels are {y[0]}: there is nothing to compare"
-        )
+        raise ValueError(f"all {len(y)} labels are {y[0]}: there is nothing to compare")
     if kind == "number" and y.dtype.kind not in "biuf":
         raise ValueError(f"labels that are numbers are expected; got {str(y[0])!r}")
     found: Kind = "classes"

@@ -23,8 +23,6 @@ MAX_RELAXED_STEPS = 1000
 # kept in the end are reweighted so many times.
 KEPT = 0.7
 LAST_REWEIGHTINGS = 12
-# Frames that are coded at a time, so that their equations need little memory.
-BATCH = 1000
 # Frames that an atom and its metric need.
 FEWEST_FRAMES = 3
 
@@ -89,7 +87,11 @@ def shrink_blocks(blocks: NDArray, threshold: float) -> NDArray:
 
 
 def group_sparse_factors(
-    frames: NDArray, n_atoms: int, penalty: float, random_state: np.random.RandomState
+    frames: NDArray,
+    n_atoms: int,
+    penalty: float,
+    random_state: np.random.RandomState,
+    most_frames: int = 1000,
 ) -> tuple[NDArray, NDArray]:
     """
     Solve the relaxed problem, in which the norms of the blocks are penalised.
@@ -104,6 +106,8 @@ def group_sparse_factors(
         Price gamma of the norm of a block.
     random_state : RandomState
         Draws the atoms to start from.
+    most_frames : int, default=1000
+        Of more frames so many are drawn, and the problem is solved for these.
 
     Returns
     -------
@@ -114,6 +118,8 @@ def group_sparse_factors(
         ``sum_i (||W_i - sum_l P_il D_l||_F^2 / 2 + gamma sum_l ||P_il||_F)``, by the
         alternating direction method of multipliers with copies of blocks and atoms.
     """
+    if len(frames) > most_frames:
+        frames = frames[random_state.permutation(len(frames))[:most_frames]]
     n_points = frames.shape[2]
     W = frames.reshape(-1, n_points)
     D = random_state.standard_normal((3 * n_atoms, n_points))
@@ -157,7 +163,7 @@ def _within_unit_norm(rows: NDArray, n_atoms: int) -> NDArray:
 
 
 def code_frames(
-    frames: NDArray, atoms: NDArray, sparsity: int, ridge: float
+    frames: NDArray, atoms: NDArray, sparsity: int, ridge: float, batch: int = 1000
 ) -> BlockCode:
     """
     Find a few blocks for each frame by reweighted ridge regression.
@@ -172,6 +178,8 @@ def code_frames(
         The most blocks of a frame.
     ridge : float
         Price of a block, as a share of the frame's energy.
+    batch : int, default=1000
+        Frames that are coded at a time, so that their equations need little memory.
 
     Returns
     -------
@@ -191,8 +199,8 @@ def code_frames(
     code = BlockCode(
         np.zeros((n_frames, n_atoms, 2, 3)), np.zeros((n_frames, n_atoms), dtype=bool)
     )
-    for first in range(0, n_frames, BATCH):
-        part = slice(first, first + BATCH)
+    for first in range(0, n_frames, batch):
+        part = slice(first, first + batch)
         norms = np.linalg.norm(frames[part], axis=(1, 2))[:, None, None]
         right = (frames[part] / norms) @ rows.T
         right = right.reshape(-1, 2, n_atoms, 3).transpose(0, 2, 3, 1)

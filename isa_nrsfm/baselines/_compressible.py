@@ -30,8 +30,6 @@ from isa_nrsfm.baselines._block_dictionary import (
 )
 from isa_nrsfm.baselines._shape_sequence import ShapeSequence
 
-# The relaxed problem, whose atoms are a start, is solved for at most so many frames.
-RELAXED_FRAMES = 1000
 # An atom is aligned by the cameras of frames that it shares with the atoms before it,
 # if there are so many. Where few share, their second blocks are small, and the result
 # is often mirrored or wrong.
@@ -366,10 +364,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
                 f"atoms, n_atoms={n_atoms}"
             )
         random_state = check_random_state(self.random_state)
-        drawn = frames
-        if n_frames > RELAXED_FRAMES:
-            drawn = frames[random_state.permutation(n_frames)[:RELAXED_FRAMES]]
-        _, atoms = group_sparse_factors(drawn, n_atoms, self.penalty, random_state)
+        _, atoms = group_sparse_factors(frames, n_atoms, self.penalty, random_state)
         return block_ksvd(
             frames,
             atoms,

@@ -15,8 +15,6 @@ from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_SUMS
 from isa_nrsfm._tables.layout import measurement_matrix
 
-# Frames that are fitted at a time: their equations need little memory.
-BATCH = 2000
 MAX_STEPS = 200
 # Damping of the first step, relative to the curvature, and the most of it.
 FIRST_DAMPING, LARGEST_DAMPING = 1e-3, 1e9
@@ -50,7 +48,7 @@ class OrthographicFrames(NamedTuple):
     basis: NDArray
     noise_variance: float
 
-    def fit(self, centred: NDArray) -> tuple[NDArray, NDArray]:
+    def fit(self, centred: NDArray, batch: int = 2000) -> tuple[NDArray, NDArray]:
         """
         Return camera and coefficients of frames.
 
@@ -58,6 +56,9 @@ class OrthographicFrames(NamedTuple):
         ----------
         centred : ndarray of shape (n_frames, n_points, 2)
             Centred tracks W_i^T, in the unit of the shapes.
+        batch : int, default=2000
+            Frames that are fitted at a time, so that their equations need little
+            memory.
 
         Returns
         -------
@@ -75,8 +76,8 @@ class OrthographicFrames(NamedTuple):
         shapes = np.ascontiguousarray(R.T).reshape(n_shapes, 3, -1)
         cameras = np.empty((len(centred), 2, 3))
         alpha = np.empty((len(centred), n_shapes - 1))
-        for first in range(0, len(centred), BATCH):
-            part = slice(first, first + BATCH)
+        for first in range(0, len(centred), batch):
+            part = slice(first, first + batch)
             W = measurement_matrix(centred[part])
             images = (W @ Q).reshape(len(W) // 2, 2, -1)
             first_fit, second_fit = (

@@ -26,8 +26,12 @@ _CAMERA: Final = "weak_perspective"
 _SEED = 0
 
 
-def run_demo(args: Namespace, warned: list[str]) -> str:
-    """Fit a table of artificial faces, and return the report with the truth."""
+def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
+    """
+    Fit a table of artificial faces, and return the report with the truth.
+
+    The numbers of basis shapes that are tried are as of ``--n-components``.
+    """
     pd = import_optional("pandas", extra="io")
     faces = make_face_tracks(
         _N_FRAMES, n_components=_N_COMPONENTS, camera=_CAMERA, random_state=_SEED
@@ -37,7 +41,7 @@ def run_demo(args: Namespace, warned: list[str]) -> str:
     folder = Path(args.output)
     options = [
         *("fit", str(folder / "tracks.csv")),
-        *("--n-components", _TRIED),
+        *("--n-components", tried),
         *("--camera", _CAMERA),
         *("--output", str(folder)),
         *(["--no-figures"] if args.no_figures else []),

@@ -34,8 +34,6 @@ Camera = Literal["weak_perspective"] | None
 MIRROR = np.diag([1.0, 1.0, -1.0])
 # Half a turn about x takes shapes whose y points up to those whose y points down.
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
-# So many numbers of shapes are computed at a time.
-BLOCK_SIZE = 2**23
 
 
 class UprightSpace(NamedTuple):
@@ -168,7 +166,9 @@ def upright_frames(
     return EuclideanFrames(shapes @ space.transform.T, rotations, scales)
 
 
-def upright_basis(space: UprightSpace, model: Any) -> tuple[NDArray, NDArray]:
+def upright_basis(
+    space: UprightSpace, model: Any, block_numbers: int = 2**23
+) -> tuple[NDArray, NDArray]:
     """
     Return the mean shape and the basis shapes in the upright space.
 
@@ -182,6 +182,8 @@ def upright_basis(space: UprightSpace, model: Any) -> tuple[NDArray, NDArray]:
         Of the model.
     model : AffineNRSfM
         The fitted model.
+    block_numbers : int
+        So many numbers of shapes are computed at a time.
 
     Returns
     -------
@@ -196,7 +198,7 @@ def upright_basis(space: UprightSpace, model: Any) -> tuple[NDArray, NDArray]:
     size = model.mean_shape_.size
     gram = np.zeros((1 + n_components, 1 + n_components))
     product = np.zeros((1 + n_components, size))
-    for block in gen_batches(n_frames, max(1, BLOCK_SIZE // size)):
+    for block in gen_batches(n_frames, max(1, block_numbers // size)):
         motion, alpha = model.motion_[block], model.alpha_[block]
         shapes = upright_frames(space, model, motion, alpha).shapes
         known = np.isfinite(shapes).all(axis=(1, 2))

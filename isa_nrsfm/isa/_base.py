@@ -14,11 +14,7 @@ from sklearn.base import (
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
-
-# Signals are linearly dependent if the smallest eigenvalue of their correlation matrix
-# is below this share of the largest. A signal is constant if its standard deviation is
-# below this share of its largest magnitude.
-DEPENDENT = 1e-14
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 
 
 class BaseSubspaceAnalysis(
@@ -116,11 +112,11 @@ def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     """
     n_samples, n_signals = centred.shape
     scale = centred.std(axis=0)
-    varies = scale > DEPENDENT * np.abs(centred).max(axis=0)
+    varies = scale > OF_PRODUCTS * np.abs(centred).max(axis=0)
     scale = np.where(varies, scale, 1.0)
     standard = centred / scale
     variance, axes = np.linalg.eigh(standard.T @ standard / n_samples)
-    rank = int(np.sum(variance > DEPENDENT * variance[-1]))
+    rank = int(np.sum(variance > OF_PRODUCTS * variance[-1]))
     if rank < n_signals:
         raise ValueError(
             f"{n_signals} linearly independent signals are needed; got rank {rank} "

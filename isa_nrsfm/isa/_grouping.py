@@ -5,10 +5,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.isa._density import SubspaceDensity
-
-# A swap must raise the objective by more than this share of its size: rounding errors.
-LEAST_GAIN = 1e-12
 
 
 def swap_until_best(
@@ -24,7 +22,7 @@ def swap_until_best(
     gains : callable
         Takes an assignment. Returns how much the swap of any two signals raises the
         objective, a symmetric matrix (n_signals, n_signals), and the size of the
-        objective, to which `LEAST_GAIN` is relative.
+        objective, to which rounding errors are relative.
 
     Returns
     -------
@@ -36,7 +34,7 @@ def swap_until_best(
         gain, size = gains(assignment)
         gain = np.where(assignment[:, None] == assignment, 0.0, gain)
         a, b = np.unravel_index(np.argmax(gain), gain.shape)
-        if not gain[a, b] > LEAST_GAIN * size:
+        if not gain[a, b] > OF_DIFFERENCES * size:
             return assignment
         assignment[[a, b]] = assignment[[b, a]]
 

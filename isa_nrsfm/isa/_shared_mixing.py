@@ -27,37 +27,73 @@ TAILS = (LIGHT, 16.0, 8.0, 4.0, 2.0)
 # likelihood has no bound where a signal vanishes at a large share of the samples.
 TEMPER = 1e-3
 
-# FastICA makes the starts: its density, with mild tails, has few local optima. A few
-# steps lead to a basin of attraction. More would go astray where signals are Gaussian,
-# and magnify rounding errors.
+# FastICA makes the starts: its density, with mild tails, has few local optima.
 FIRST_TAIL = 8.0
-FIXED_POINT_STEPS = 8
-# Two orthogonal matrices are in one basin if each row of one has a row of the other
-# with at least this cosine, up to sign.
-SAME_BASIN = 0.97
-# Number of basins, the likeliest ones, from which the likelihood is maximised.
-N_FINALISTS = 2
-# With more than MANY_SAMPLES samples the likelihood is first maximised on
-# FIRST_SAMPLES.
-MANY_SAMPLES, FIRST_SAMPLES = 3000, 1500
-TURNS = 10  # alternations of mixing and densities
-SCALE_STEPS = 5  # Newton steps for the scale of a density
-NEWTON_STEPS = 100  # for the mixing
-# Convergence tolerance: the largest entry of the relative gradient, divided by `size`.
-GRADIENT_TOL = 1e-11
-# Largest entry of a step E. A longer one would turn past the next maximum.
-LONGEST_STEP = 1.0
-# Levenberg-Marquardt shift of the Hessian, relative to `size`: bounds, and the factor
-# by which it rises when a Newton step fails and falls when one succeeds.
-SMALLEST_SHIFT, LARGEST_SHIFT, SHIFT_FACTOR = 1e-3, 1e8, 4.0
-# A step is accepted if it gains this share of what the gradient predicts (Armijo).
-LEAST_GAIN = 1e-3
+
+
+class MixingOptions(NamedTuple):
+    """
+    How the likeliest mixing is searched for.
+
+    Attributes
+    ----------
+    fixed_point_steps : int
+        Steps of FastICA from each start. A few lead to a basin of attraction. More
+        would go astray where signals are Gaussian, and magnify rounding errors.
+    same_basin : float
+        Two orthogonal matrices are in one basin if each row of one has a row of the
+        other with at least this cosine, up to sign.
+    n_finalists : int
+        Number of basins, the likeliest ones, from which the likelihood is maximised.
+    many_samples, first_samples : int
+        With more than the first number of samples the likelihood is first maximised on
+        the second.
+    turns : int
+        Alternations of mixing and densities.
+    scale_steps : int
+        Newton steps for the scale of a density.
+    newton_steps : int
+        Newton steps for the mixing.
+    gradient_tol : float
+        Convergence tolerance: the largest entry of the relative gradient, divided by
+        `size`.
+    longest_step : float
+        Largest entry of a step E. A longer one would turn past the next maximum.
+    smallest_shift, largest_shift, shift_factor : float
+        Levenberg-Marquardt shift of the Hessian, relative to `size`: bounds, and the
+        factor by which it rises when a Newton step fails and falls when one succeeds.
+    least_gain : float
+        A step is accepted if it gains this share of what the gradient predicts
+        (Armijo).
+    """
+
+    fixed_point_steps: int = 8
+    same_basin: float = 0.97
+    n_finalists: int = 2
+    many_samples: int = 3000
+    first_samples: int = 1500
+    turns: int = 10
+    scale_steps: int = 5
+    newton_steps: int = 100
+    gradient_tol: float = 1e-11
+    longest_step: float = 1.0
+    smallest_shift: float = 1e-3
+    largest_shift: float = 1e8
+    shift_factor: float = 4.0
+    least_gain: float = 1e-3
+
+
+MIXING_OPTIONS = MixingOptions()
 
 
 # Threads cost more than they give on matrices of this size.
 @one_blas_thread
 def shared_mixing(
-    signals: NDArray, *, n_starts: int = 8, random_state: int = 0
+    signals: NDArray,
+    *,
+    n_starts: int = 8,
+    random_state: int = 0,
+    options: MixingOptions = MIXING_OPTIONS,
 ) -> NDArray[np.float64]:
     """
     Return the mixing, the same for all coordinates, that makes signals independent.
@@ -78,6 +114,8 @@ def shared_mixing(
         Number of orthogonal starts: a canonical one, and rotations of it.
     random_state : int, default=0
         Draws the rotations.
+    options : MixingOptions
+        How the mixing is searched for.
 
     Returns
     -------
@@ -114,15 +152,17 @@ def shared_mixing(
     Z = np.tensordot(whitening, signals, 1)
 
     # Basins of attraction, and the likelihood's maximum in the likeliest of them.
-    some = _some_samples(Z)
-    basins = _distinct(_fixed_point(_starts(some, n_starts, random_state), some))
-    if len(basins) > N_FINALISTS:
-        likeliest = np.argsort([-_fit_densities(W, some).total for W in basins])
-        basins = [basins[b] for b in likeliest[:N_FINALISTS]]
-    optima = [_maximise(W, some) for W in basins]
+    some = _some_samples(Z, options)
+    starts = _starts(some, n_starts, random_state)
+    ends = _fixed_point(starts, some, options.fixed_point_steps)
+    basins = _distinct(ends, options.same_basin)
+    if len(basins) > options.n_finalists:
+        likely = [-_fit_densities(W, some, options).total for W in basins]
+        basins = [basins[b] for b in np.argsort(likely)[: options.n_finalists]]
+    optima = [_maximise(W, some, options) for W in basins]
     W, fit = max(optima, key=lambda optimum: optimum[1].total)
     if some is not Z:
-        W, fit = _maximise(W, Z)
+        W, fit = _maximise(W, Z, options)
 
     # Scale, sign and order. Of all signals of unit mean square, Gaussian ones are the
     # least likely.
@@ -134,7 +174,11 @@ def shared_mixing(
 
 
 def independent_coefficients(
-    alpha: NDArray, *, n_starts: int = 8, random_state: int = 0
+    alpha: NDArray,
+    *,
+    n_starts: int = 8,
+    random_state: int = 0,
+    options: MixingOptions = MIXING_OPTIONS,
 ) -> NDArray[np.float64]:
     """
     Return the mixing that makes coefficients independent over the frames.
@@ -143,9 +187,7 @@ def independent_coefficients(
     ----------
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients; their means do not matter.
-    n_starts : int, default=8
-        As for `shared_mixing`.
-    random_state : int, default=0
+    n_starts, random_state, options
         As for `shared_mixing`.
 
     Returns
@@ -162,7 +204,9 @@ def independent_coefficients(
     """
     centred = alpha - alpha.mean(axis=0)
     signals = centred.T[:, :, None]
-    return shared_mixing(signals, n_starts=n_starts, random_state=random_state)
+    return shared_mixing(
+        signals, n_starts=n_starts, random_state=random_state, options=options
+    )
 
 
 def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
@@ -190,17 +234,17 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     return (U[:, :rank] / S[:rank]).T, U[:, rank:].T / S[0]
 
 
-def _some_samples(Z: NDArray) -> NDArray:
+def _some_samples(Z: NDArray, options: MixingOptions) -> NDArray:
     """
     Return some of many samples, spread evenly from the smallest to the largest.
 
     Z is (n_signals, n_samples, size). Neither the order of the samples nor an
     orthogonal mixing of the signals changes which samples are taken.
     """
-    if Z.shape[1] <= MANY_SAMPLES:
+    if Z.shape[1] <= options.many_samples:
         return Z
     order = np.argsort(np.einsum("kjc,kjc->j", Z, Z), kind="stable")
-    return np.ascontiguousarray(Z[:, spread(order, FIRST_SAMPLES)])
+    return np.ascontiguousarray(Z[:, spread(order, options.first_samples)])
 
 
 def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
@@ -227,7 +271,7 @@ def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
     return np.concatenate([axes[None], orthogonalise(turned)])
 
 
-def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
+def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
     """
     Return the iterates after some steps of symmetric FastICA for vectors.
 
@@ -237,7 +281,7 @@ def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
     """
     n_signals, n_samples, size = Z.shape
     flat = Z.reshape(n_signals, -1)
-    for _ in range(FIXED_POINT_STEPS):
+    for _ in range(n_steps):
         Y = (W @ flat).reshape(*W.shape[:2], n_samples, size)
         u = np.einsum("skjc,skjc->skj", Y, Y)
         g, dg = _slopes(u, np.array(FIRST_TAIL), size)
@@ -247,12 +291,12 @@ def _fixed_point(W: NDArray, Z: NDArray) -> NDArray:
     return W
 
 
-def _distinct(W: NDArray) -> list[NDArray]:
+def _distinct(W: NDArray, same_basin: float) -> list[NDArray]:
     """Return one orthogonal matrix of each basin, from W (n_starts, n, n)."""
     kept: list[NDArray] = []
     for candidate in W:
         cosines = [np.abs(candidate @ other.T).max(axis=1).min() for other in kept]
-        if max(cosines, default=0.0) < SAME_BASIN:
+        if max(cosines, default=0.0) < same_basin:
             kept.append(candidate)
     return kept
 
@@ -313,7 +357,9 @@ class DensityFit(NamedTuple):
     total: float
 
 
-def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
+def _fit_densities(
+    W: NDArray, Z: NDArray, options: MixingOptions = MIXING_OPTIONS
+) -> DensityFit:
     """Return the likeliest density and scale of each signal ``W z``.
 
     W is (n_signals, n_signals), Z is (n_signals, n_samples, size).
@@ -324,7 +370,7 @@ def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
     log_variance = np.log(u.mean(axis=1) / size)
     variances, values = [], []
     for tail in TAILS:
-        for _ in range(SCALE_STEPS):
+        for _ in range(options.scale_steps):
             v = u * np.exp(-log_variance)[:, None]
             g, dg = _slopes(v, np.array(tail), size)
             # Newton step for the scale. The likelihood is largest where
@@ -344,21 +390,25 @@ def _fit_densities(W: NDArray, Z: NDArray) -> DensityFit:
     )
 
 
-def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, DensityFit]:
+def _maximise(
+    W: NDArray, Z: NDArray, options: MixingOptions
+) -> tuple[NDArray, DensityFit]:
     """Return a local maximum of the likelihood near W, by alternating maximisation.
 
     The mixing and the densities take turns, until the densities stay the same.
     """
-    fit = _fit_densities(W, Z)
-    for _ in range(TURNS):
-        W = _newton(W / np.sqrt(fit.variance)[:, None], Z, fit.tails)
-        before, fit = fit, _fit_densities(W, Z)
+    fit = _fit_densities(W, Z, options)
+    for _ in range(options.turns):
+        W = _newton(W / np.sqrt(fit.variance)[:, None], Z, fit.tails, options)
+        before, fit = fit, _fit_densities(W, Z, options)
         if np.array_equal(fit.tails, before.tails):
             break
     return W, fit
 
 
-def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
+def _newton(
+    W: NDArray, Z: NDArray, tails: NDArray, options: MixingOptions = MIXING_OPTIONS
+) -> NDArray:
     """
     Maximise the likelihood over all mixings W for fixed densities `tails` (n_signals,).
 
@@ -378,24 +428,26 @@ def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
 
     value, Y, u = likelihood(W)
     shift = 0.0
-    for _ in range(NEWTON_STEPS):
+    for _ in range(options.newton_steps):
         gradient, hessian = _relative_derivatives(Y, *_slopes(u, tail, size))
-        if np.abs(gradient).max() < GRADIENT_TOL * size:
+        if np.abs(gradient).max() < options.gradient_tol * size:
             break
         # Raise the shift until a step succeeds.
-        while shift < LARGEST_SHIFT:
+        while shift < options.largest_shift:
             E = _ascent(gradient, hessian, shift * size)
-            if E is not None:
+            if E is not None and np.abs(E).max() < options.longest_step:
                 trial = expm(E) @ W
                 raised, Y, u = likelihood(trial)
-                least = LEAST_GAIN * np.vdot(gradient, E) - OF_STEPS * abs(value)
+                least = options.least_gain * np.vdot(gradient, E)
+                least -= OF_STEPS * abs(value)
                 if raised - value > least:
                     break
-            shift = max(SHIFT_FACTOR * shift, SMALLEST_SHIFT)
+            shift = max(options.shift_factor * shift, options.smallest_shift)
         else:
             break
         W, value = trial, raised
-        shift = shift / SHIFT_FACTOR if shift > SMALLEST_SHIFT else 0.0
+        eased = shift > options.smallest_shift
+        shift = shift / options.shift_factor if eased else 0.0
     return W
 
 
@@ -435,12 +487,11 @@ def _relative_derivatives(
 def _ascent(gradient: NDArray, hessian: NDArray, shift: float) -> NDArray | None:
     """Return the step ``E = (shift I - H)^-1 G`` (n_signals, n_signals).
 
-    None if the matrix is not positive definite, or the step too long.
+    None if the matrix is not positive definite.
     """
     matrix = shift * np.eye(gradient.size) - hessian.reshape(gradient.size, -1)
     try:
         factor = cho_factor(matrix)
     except np.linalg.LinAlgError:
         return None
-    E = cho_solve(factor, gradient.ravel()).reshape(gradient.shape)
-    return E if np.abs(E).max() < LONGEST_STEP else None
+    return cho_solve(factor, gradient.ravel()).reshape(gradient.shape)

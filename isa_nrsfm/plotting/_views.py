@@ -122,11 +122,11 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
         the viewing frame. If the cameras are weak-perspective ones of some shape, that
         is this shape up to scale, a rotation and its mirror image.
     """
-    Q = metric_quadric(motion)
-    if Q is None:
+    G = metric_quadric(motion)
+    if G is None:
         metric = symmetric_power(mean_gram(unit_cameras(motion)), 0.5)
     else:
-        metric = symmetric_power(Q, -0.5)
+        metric = symmetric_power(G, -0.5)
     from_metric = np.linalg.pinv(metric)
     axes = front_axes(
         unit_cameras(motion @ from_metric),
