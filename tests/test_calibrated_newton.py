@@ -18,6 +18,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
 from isa_nrsfm._linalg.packed_symmetric import unpacked
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 NOISE = 0.02
 BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
@@ -116,8 +117,7 @@ def problem_of(scene, camera, noise):
     products = frame_sums(frame_tracks(scene.tracks, weights), search.shapes)
     problem = module._problem(products, np.full(len(scene.tracks), noise), cameras)
     axes = search.cameras(np.eye(3)[None])[0].T
-    motion = np.ascontiguousarray((scene.motion @ axes).transpose(1, 2, 0))
-    return problem, motion
+    return problem, frames_last(scene.motion @ axes)
 
 
 def assert_calibrated(motion, camera):
@@ -265,19 +265,19 @@ class TestDerivatives:
     H = 1e-5
 
     @staticmethod
-    def disturbed(motion, cameras, size=0.1):
+    def disturbed(M, cameras, size=0.1):
         rng = np.random.default_rng(1)
-        step = size * rng.normal(size=(cameras.n_parameters, motion.shape[2]))
-        return cameras.moved(motion, step)
+        step = size * rng.normal(size=(cameras.n_parameters, M.shape[2]))
+        return cameras.moved(M, step)
 
-    def states(self, problem, motion):
+    def states(self, problem, M):
         """Yield the states above and below along each tangent."""
         n = problem.cameras.n_parameters
         for c in range(n):
-            step = np.zeros((n, motion.shape[2]))
+            step = np.zeros((n, M.shape[2]))
             step[c] = self.H
             yield tuple(
-                module._evaluate(problem, problem.cameras.moved(motion, sign * step))
+                module._evaluate(problem, problem.cameras.moved(M, sign * step))
                 for sign in (1, -1)
             )
 
@@ -286,9 +286,9 @@ class TestDerivatives:
     def test_value_by_dense_algebra(self, camera, gaps):
         scene = random_scene(camera)
         scene = scene.hidden() if gaps else scene
-        problem, motion = problem_of(scene, camera, NOISE**2)
-        got = module._evaluate(problem, motion).value
-        expected = [value(scene, i, M) for i, M in enumerate(scene.motion)]
+        problem, M = problem_of(scene, camera, NOISE**2)
+        got = module._evaluate(problem, M).value
+        expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
         assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
 
     @BOTH
@@ -297,18 +297,18 @@ class TestDerivatives:
     def test_slope_by_differences(self, camera, gaps, noise):
         scene = random_scene(camera)
         scene = scene.hidden() if gaps else scene
-        problem, motion = problem_of(scene, camera, noise)
-        motion = self.disturbed(motion, CAMERAS[camera])
-        slope = module._evaluate(problem, motion).slope
-        for c, (above, below) in enumerate(self.states(problem, motion)):
+        problem, M = problem_of(scene, camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        slope = module._evaluate(problem, M).slope
+        for c, (above, below) in enumerate(self.states(problem, M)):
             expected = -(above.value - below.value) / (4 * self.H)
             assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-6)
 
-    def numerical_hessian(self, problem, motion):
+    def numerical_hessian(self, problem, M):
         """Return half the Hessian of s2 F (p, p, n), by differences of the slope."""
         rows = [
             (below.slope - above.slope) / (2 * self.H)
-            for above, below in self.states(problem, motion)
+            for above, below in self.states(problem, M)
         ]
         # Differences of the slope along tangents that turn along: what is not
         # symmetric is the commutator of two rotations.
@@ -323,10 +323,10 @@ class TestDerivatives:
         scene = scene.hidden() if gaps else scene
         errors = []
         for noise in (1e-2, 1e-3, 1e-4):
-            problem, motion = problem_of(scene, camera, noise)
-            motion = self.disturbed(motion, CAMERAS[camera], 0.03)
-            got = unpacked(module._evaluate(problem, motion).hessian)
-            expected = self.numerical_hessian(problem, motion)
+            problem, M = problem_of(scene, camera, noise)
+            M = self.disturbed(M, CAMERAS[camera], 0.03)
+            got = unpacked(module._evaluate(problem, M).hessian)
+            expected = self.numerical_hessian(problem, M)
             size = np.abs(expected).max(axis=(0, 1))
             errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
         assert errors[0] < 0.1
@@ -337,11 +337,11 @@ class TestDerivatives:
     @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
     def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
         scene = random_scene(camera)
-        problem, motion = problem_of(scene, camera, noise)
-        motion = self.disturbed(motion, CAMERAS[camera])
-        got = unpacked(module._evaluate(problem, motion).hessian)
-        excess = got - self.numerical_hessian(problem, motion)
-        least = np.linalg.eigvalsh(excess.transpose(2, 0, 1))[:, 0]
+        problem, M = problem_of(scene, camera, noise)
+        M = self.disturbed(M, CAMERAS[camera])
+        got = unpacked(module._evaluate(problem, M).hessian)
+        excess = got - self.numerical_hessian(problem, M)
+        least = np.linalg.eigvalsh(frames_first(excess))[:, 0]
         assert (least > -1e-5).all()
         assert np.abs(excess).max() > 1e-5
 
@@ -349,10 +349,10 @@ class TestDerivatives:
     def test_of_rigid_shapes_it_is_exact(self, camera):
         scene = random_scene(camera)
         rigid = scene._replace(shapes=scene.shapes[:1])
-        problem, motion = problem_of(rigid, camera, 0.1)
-        motion = self.disturbed(motion, CAMERAS[camera])
-        got = unpacked(module._evaluate(problem, motion).hessian)
-        expected = self.numerical_hessian(problem, motion)
+        problem, M = problem_of(rigid, camera, 0.1)
+        M = self.disturbed(M, CAMERAS[camera])
+        got = unpacked(module._evaluate(problem, M).hessian)
+        expected = self.numerical_hessian(problem, M)
         assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
 
 

@@ -16,6 +16,7 @@ from isa_nrsfm._frames.camera_models import (
     tangent_curvature,
 )
 from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, unpack3
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 N = 7
 CALIBRATED = pytest.mark.parametrize("name", ["weak_perspective", "orthographic"])
@@ -30,7 +31,7 @@ def random_cameras(seed=0, name="weak_perspective", n=N):
     rows = Rotation.random(n, rng=rng).as_matrix()[:, :2]
     if name == "weak_perspective":
         rows = rng.uniform(0.3, 3.0, n)[:, None, None] * rows
-    return rows.transpose(1, 2, 0)
+    return frames_last(rows)
 
 
 def random_curvatures(seed=1, n=N):
@@ -40,13 +41,13 @@ def random_curvatures(seed=1, n=N):
     return full, full[:, ROWS, COLUMNS].T
 
 
-def tangents(cameras, motion, h=1e-5):
+def tangents(cameras, M, h=1e-5):
     """Return the derivatives D_c (p, 2, 3, n) of cameras by their parameters."""
     found = []
     for c in range(cameras.n_parameters):
-        step = np.zeros((cameras.n_parameters, motion.shape[2]))
+        step = np.zeros((cameras.n_parameters, M.shape[2]))
         step[c] = h
-        change = cameras.moved(motion, step) - cameras.moved(motion, -step)
+        change = cameras.moved(M, step) - cameras.moved(M, -step)
         found.append(change / (2 * h))
     return np.array(found)
 
@@ -61,144 +62,144 @@ def curvature_along(D, A):
 class TestMoved:
     @EACH
     def test_no_step_stays(self, name):
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
+        M, cameras = random_cameras(name=name), CAMERAS[name]
         step = np.zeros((cameras.n_parameters, N))
-        assert_allclose(cameras.moved(motion, step), motion, rtol=1e-15, atol=1e-15)
+        assert_allclose(cameras.moved(M, step), M, rtol=1e-15, atol=1e-15)
 
     @EACH
     def test_cameras_stay_of_their_model(self, name):
         rng = np.random.default_rng(2)
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
-        moved = cameras.moved(motion, rng.normal(size=(cameras.n_parameters, N)))
-        assert np.abs(moved - motion).max() > 0.1
+        M, cameras = random_cameras(name=name), CAMERAS[name]
+        moved = cameras.moved(M, rng.normal(size=(cameras.n_parameters, N)))
+        assert np.abs(moved - M).max() > 0.1
         if name == "affine":
             return
-        for before, after in zip(motion.T, moved.T, strict=True):
+        for before, after in zip(M.T, moved.T, strict=True):
             gram, size = after.T @ after, np.sum(before**2) / 2
             assert_allclose(gram, gram[0, 0] * np.eye(2), atol=1e-13 * gram[0, 0])
             if name == "orthographic":
                 assert gram[0, 0] == pytest.approx(size, rel=1e-13)
 
     def test_log_scales_multiply(self):
-        motion, cameras = random_cameras(), CAMERAS["weak_perspective"]
+        M, cameras = random_cameras(), CAMERAS["weak_perspective"]
         step = np.zeros((4, N))
         step[3] = np.log(np.arange(1, N + 1))
-        expected = motion * np.arange(1, N + 1)
-        assert_allclose(cameras.moved(motion, step), expected, rtol=1e-14)
+        expected = M * np.arange(1, N + 1)
+        assert_allclose(cameras.moved(M, step), expected, rtol=1e-14)
 
     def test_affine_cameras_are_their_entries(self):
-        motion, step = random_cameras(name="affine"), np.arange(6.0 * N).reshape(6, N)
-        moved = CAMERAS["affine"].moved(motion, step)
+        M, step = random_cameras(name="affine"), np.arange(6.0 * N).reshape(6, N)
+        moved = CAMERAS["affine"].moved(M, step)
         for i in range(N):
-            assert_allclose(moved[..., i], motion[..., i] + step[:, i].reshape(2, 3))
+            assert_allclose(moved[..., i], M[..., i] + step[:, i].reshape(2, 3))
 
     def test_input_is_not_changed(self):
         for name, cameras in CAMERAS.items():
-            motion = random_cameras(name=name)
+            M = random_cameras(name=name)
             step = np.ones((cameras.n_parameters, N))
-            copies = motion.copy(), step.copy()
-            cameras.moved(motion, step)
-            assert_array_equal(motion, copies[0])
+            copies = M.copy(), step.copy()
+            cameras.moved(M, step)
+            assert_array_equal(M, copies[0])
             assert_array_equal(step, copies[1])
 
 
 class TestRotated:
     @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-4, 1.0, np.pi, 10.0])
     def test_is_the_exponential(self, size):
-        motion = random_cameras(name="affine")
+        M = random_cameras(name="affine")
         turns = size * np.random.default_rng(3).normal(size=(3, N))
-        moved = rotated(motion, turns)
+        moved = rotated(M, turns)
         for i in range(N):
             R = Rotation.from_rotvec(turns[:, i]).as_matrix()
-            assert_allclose(moved[..., i], motion[..., i] @ R, atol=1e-14)
+            assert_allclose(moved[..., i], M[..., i] @ R, atol=1e-14)
 
     def test_back_again(self):
-        motion = random_cameras()
+        M = random_cameras()
         turns = np.random.default_rng(3).normal(size=(3, N))
-        assert_allclose(rotated(rotated(motion, turns), -turns), motion, atol=1e-14)
+        assert_allclose(rotated(rotated(M, turns), -turns), M, atol=1e-14)
 
 
 class TestDerivatives:
     @EACH
     def test_tangents(self, name):
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
-        expected = tangents(cameras, motion)
-        assert_allclose(cameras.tangents(motion), expected, atol=1e-8)
+        M, cameras = random_cameras(name=name), CAMERAS[name]
+        expected = tangents(cameras, M)
+        assert_allclose(cameras.tangents(M), expected, atol=1e-8)
 
     @EACH
     def test_gradient_is_that_along_the_tangents(self, name):
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
-        slope = np.random.default_rng(2).normal(size=(2, 3, N))
-        expected = np.einsum("crai,rai->ci", tangents(cameras, motion), slope)
-        assert_allclose(cameras.gradient(motion, slope), expected, atol=1e-8)
+        M, cameras = random_cameras(name=name), CAMERAS[name]
+        G = np.random.default_rng(2).normal(size=(2, 3, N))
+        expected = np.einsum("crai,rai->ci", tangents(cameras, M), G)
+        assert_allclose(cameras.gradient(M, G), expected, atol=1e-8)
 
     @CALIBRATED
     def test_gradient_of_a_function_by_differences(self, name):
         # <C, M> + ||M - T||^4 of each camera.
         rng = np.random.default_rng(2)
         C, T = rng.normal(size=(2, 2, 3, N))
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
+        M, cameras = random_cameras(name=name), CAMERAS[name]
 
         def value(M):
             rest = np.einsum("rai,rai->i", M - T, M - T)
             return np.einsum("rai,rai->i", C, M) + rest**2
 
-        rest = np.einsum("rai,rai->i", motion - T, motion - T)
-        got = cameras.gradient(motion, C + 4 * rest * (motion - T))
+        rest = np.einsum("rai,rai->i", M - T, M - T)
+        got = cameras.gradient(M, C + 4 * rest * (M - T))
         h = 1e-5
         for c in range(cameras.n_parameters):
             step = np.zeros((cameras.n_parameters, N))
             step[c] = h
-            change = value(cameras.moved(motion, step))
-            change = change - value(cameras.moved(motion, -step))
+            change = value(cameras.moved(M, step))
+            change = change - value(cameras.moved(M, -step))
             assert_allclose(got[c], change / (2 * h), rtol=1e-7, atol=1e-7)
 
     @pytest.mark.parametrize("name", ["affine", "weak_perspective"])
     def test_tangent_curvature(self, name):
         # The cameras need not be scaled rotations for it.
-        motion, (A, packed) = random_cameras(name=name), random_curvatures()
-        turns, across, scale = tangent_curvature(motion, packed)
-        D = tangents(CAMERAS["weak_perspective"], motion)
+        M, (A, packed) = random_cameras(name=name), random_curvatures()
+        turns, across, scale = tangent_curvature(M, packed)
+        D = tangents(CAMERAS["weak_perspective"], M)
         expected = curvature_along(D, A)
         assert_allclose(unpack3(turns).T, expected[:, :3, :3], atol=1e-8)
         assert_allclose(across.T, expected[:, 3, :3], atol=1e-8)
         assert_allclose(scale, expected[:, 3, 3], rtol=1e-8)
 
     def test_tangent_curvature_leaves_its_input(self):
-        motion, (_, packed) = random_cameras(), random_curvatures()
-        copies = motion.copy(), packed.copy()
-        tangent_curvature(motion, packed)
-        assert_array_equal(motion, copies[0])
+        M, (_, packed) = random_cameras(), random_curvatures()
+        copies = M.copy(), packed.copy()
+        tangent_curvature(M, packed)
+        assert_array_equal(M, copies[0])
         assert_array_equal(packed, copies[1])
 
 
 class TestInverseCurvature:
     @CALIBRATED
     def test_is_that_along_the_tangents(self, name):
-        motion, (A, packed) = random_cameras(name=name), random_curvatures()
+        M, (A, packed) = random_cameras(name=name), random_curvatures()
         cameras = CAMERAS[name]
-        expected = curvature_along(tangents(cameras, motion), A)
-        inverse = cameras.inverse_curvature(motion, packed)
+        expected = curvature_along(tangents(cameras, M), A)
+        inverse = cameras.inverse_curvature(M, packed)
         for i in range(N):
             found = inverse[..., i]
             assert_allclose(found, found.T, rtol=1e-12)
             assert_allclose(found, np.linalg.inv(expected[i]), rtol=1e-5, atol=1e-8)
 
     def test_of_affine_cameras_is_that_of_each_row(self):
-        motion, (A, packed) = random_cameras(name="affine"), random_curvatures()
+        M, (A, packed) = random_cameras(name="affine"), random_curvatures()
         cameras = CAMERAS["affine"]
-        expected = curvature_along(tangents(cameras, motion), A)
+        expected = curvature_along(tangents(cameras, M), A)
         vector = np.random.default_rng(2).normal(size=(6, N))
-        got = cameras.product(cameras.inverse_curvature(motion, packed), vector)
+        got = cameras.product(cameras.inverse_curvature(M, packed), vector)
         for i in range(N):
             solved = np.linalg.solve(expected[i], vector[:, i])
             assert_allclose(got[:, i], solved, rtol=1e-8)
 
     @CALIBRATED
     def test_product_by_loops(self, name):
-        motion, (_, packed) = random_cameras(name=name), random_curvatures()
+        M, (_, packed) = random_cameras(name=name), random_curvatures()
         cameras = CAMERAS[name]
-        inverse = cameras.inverse_curvature(motion, packed)
+        inverse = cameras.inverse_curvature(M, packed)
         vector = np.random.default_rng(2).normal(size=(cameras.n_parameters, N))
         got = cameras.product(inverse, vector)
         for i in range(N):
@@ -210,8 +211,8 @@ class TestInverseCurvature:
         factors = np.random.default_rng(1).normal(size=(N, 3, rank))
         A = factors @ factors.swapaxes(1, 2)
         packed = A[:, ROWS, COLUMNS].T
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
-        inverse = cameras.inverse_curvature(motion, packed)
+        M, cameras = random_cameras(name=name), CAMERAS[name]
+        inverse = cameras.inverse_curvature(M, packed)
         assert np.isfinite(inverse).all()
         # A step along it never goes uphill.
         for found in inverse.T:
@@ -221,16 +222,16 @@ class TestInverseCurvature:
     @CALIBRATED
     @pytest.mark.parametrize("unit", [1e-12, 1e12])
     def test_unit_of_the_curvature(self, name, unit):
-        motion, (_, packed) = random_cameras(name=name), random_curvatures()
+        M, (_, packed) = random_cameras(name=name), random_curvatures()
         cameras = CAMERAS[name]
-        expected = cameras.inverse_curvature(motion, packed) / unit
-        found = cameras.inverse_curvature(motion, unit * packed)
+        expected = cameras.inverse_curvature(M, packed) / unit
+        found = cameras.inverse_curvature(M, unit * packed)
         assert_allclose(found, expected, rtol=1e-9)
 
     @CALIBRATED
     def test_cameras_of_zero(self, name):
-        motion, cameras = np.zeros((2, 3, N)), CAMERAS[name]
-        inverse = cameras.inverse_curvature(motion, random_curvatures()[1])
+        M, cameras = np.zeros((2, 3, N)), CAMERAS[name]
+        inverse = cameras.inverse_curvature(M, random_curvatures()[1])
         assert np.isfinite(inverse).all()
 
 
@@ -268,16 +269,16 @@ class TestLargestLength:
 
 class TestHeldCameras:
     def test_stay(self):
-        motion, cameras = random_cameras(), HeldCameras()
+        M, cameras = random_cameras(), HeldCameras()
         assert cameras.n_parameters == 0
         assert not cameras.calibrated
-        nothing = cameras.gradient(motion, np.ones_like(motion))
+        nothing = cameras.gradient(M, np.ones_like(M))
         assert nothing.shape == (0, N)
-        assert cameras.tangents(motion).shape == (0, 2, 3, N)
-        inverse = cameras.inverse_curvature(motion, random_curvatures()[1])
+        assert cameras.tangents(M).shape == (0, 2, 3, N)
+        inverse = cameras.inverse_curvature(M, random_curvatures()[1])
         assert inverse.shape == (0, 0, N)
         assert cameras.product(inverse, nothing).shape == (0, N)
-        assert_array_equal(cameras.moved(motion, nothing), motion)
+        assert_array_equal(cameras.moved(M, nothing), M)
 
 
 class TestModels:
@@ -293,15 +294,15 @@ class TestModels:
 
     @EACH
     def test_tangents_are_independent(self, name):
-        motion, cameras = random_cameras(name=name), CAMERAS[name]
-        D = cameras.tangents(motion).reshape(cameras.n_parameters, 6, N)
+        M, cameras = random_cameras(name=name), CAMERAS[name]
+        D = cameras.tangents(M).reshape(cameras.n_parameters, 6, N)
         for i in range(N):
             assert np.linalg.matrix_rank(D[..., i]) == cameras.n_parameters
 
 
 class TestNearestCalibrated:
     def test_scaled_rotations_are_their_own(self):
-        motion = random_cameras().transpose(2, 0, 1)
+        motion = frames_first(random_cameras())
         rows, scales = nearest_calibrated(motion)
         assert_allclose(scales[:, None, None] * rows, motion, atol=1e-14)
 
@@ -315,8 +316,8 @@ class TestNearestCalibrated:
         scaled = np.sum((motion - scales[:, None, None] * rows) ** 2, axis=(1, 2))
         for size in (1e-3, 0.1, 3.0):
             for _ in range(10):
-                other = rotated(rows.transpose(1, 2, 0), size * rng.normal(size=(3, N)))
-                other = other.transpose(2, 0, 1)
+                turns = size * rng.normal(size=(3, N))
+                other = frames_first(rotated(frames_last(rows), turns))
                 rest = motion - other
                 assert (np.sum(rest**2, axis=(1, 2)) > least).all()
                 factor = scales * np.exp(size * rng.normal(size=N))
@@ -331,7 +332,7 @@ class TestNearestCalibrated:
 
 class TestFullRotations:
     def test_are_rotations_with_the_rows_of_the_cameras(self):
-        motion = random_cameras().transpose(2, 0, 1)
+        motion = frames_first(random_cameras())
         rotations, scales = full_rotations(motion)
         assert_allclose(scales[:, None, None] * rotations[:, :2], motion, atol=1e-14)
         identity = np.broadcast_to(np.eye(3), (N, 3, 3))
@@ -342,7 +343,7 @@ class TestFullRotations:
         assert (scales > 0).all()
 
     def test_frames_without_camera_are_nan(self):
-        motion = random_cameras().transpose(2, 0, 1).copy()
+        motion = frames_first(random_cameras()).copy()
         motion[2] = np.nan
         rotations, scales = full_rotations(motion)
         missing = np.arange(N) == 2

@@ -8,9 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
+from isa_nrsfm._frames.camera_models import camera_gram
+from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
+from isa_nrsfm._linalg.vectors import frames_first
 
 NOISE = 0.05
 
@@ -18,12 +20,12 @@ NOISE = 0.05
 class Scene(NamedTuple):
     tracks: NDArray  # (n_frames, n_points, 2)
     shapes: NDArray  # (n_components + 1, 3, n_points)
-    motion: NDArray  # (2, 3, n_frames)
+    M: NDArray  # (2, 3, n_frames)
     weights: NDArray | None
 
     def posterior(self, noise=NOISE, **options):
         products = frame_sums(frame_tracks(self.tracks, self.weights), self.shapes)
-        return coefficient_posterior(products, self.motion, noise, **options)
+        return coefficient_posterior(products, self.M, noise, **options)
 
 
 def random_scene(kind="complete", seed=0, n_frames=6, n_points=11, n_components=3):
@@ -60,7 +62,7 @@ def frames_of(scene):
         points, shapes, w = points[seen], scene.shapes[..., seen], w[seen]
         points = points - w @ points / w.sum()
         shapes = shapes - (shapes @ w / w.sum())[..., None]
-        images = np.sqrt(w) * (scene.motion[..., i] @ shapes)
+        images = np.sqrt(w) * (scene.M[..., i] @ shapes)
         columns = images.reshape(len(shapes), -1)
         yield Frame((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
 
@@ -176,10 +178,10 @@ class TestPosterior:
         scene = random_scene(n_frames=n, n_components=2)
         alpha = rng.normal(size=(n, 2))
         frames = scene.shapes[0] + np.tensordot(alpha, scene.shapes[1:], 1)
-        tracks = (scene.motion.transpose(2, 0, 1) @ frames).swapaxes(1, 2)
+        tracks = (frames_first(scene.M) @ frames).swapaxes(1, 2)
         tracks += np.sqrt(noise) * rng.normal(size=tracks.shape)
         got = scene._replace(tracks=tracks).posterior(noise)
-        covariance = -noise * unpacked(got.inverse)[1:, 1:].transpose(2, 0, 1)
+        covariance = -noise * frames_first(unpacked(got.inverse)[1:, 1:])
         error = alpha - got.alpha.T
         square = np.vecdot(error, np.linalg.solve(covariance, error[..., None])[..., 0])
         assert np.mean(square) == pytest.approx(2.0, rel=0.06)  # chi-squared
@@ -207,7 +209,7 @@ class TestNoise:
     def test_large_noise_leaves_the_prior(self):
         got = random_scene().posterior(1e12)
         assert_allclose(got.alpha, 0.0, atol=1e-9)
-        covariance = -1e12 * unpacked(got.inverse)[1:, 1:].transpose(2, 0, 1)
+        covariance = -1e12 * frames_first(unpacked(got.inverse)[1:, 1:])
         assert_allclose(covariance, np.broadcast_to(np.eye(3), (6, 3, 3)), atol=1e-9)
         assert_allclose(got.log_determinant, 0.0, atol=1e-9)
 
@@ -227,7 +229,7 @@ class TestNoise:
         shapes[2] = shapes[1] + 1e-4 * shapes[2]
         alpha = np.random.default_rng(1).normal(size=(6, 3))
         frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-        tracks = (scene.motion.transpose(2, 0, 1) @ frames).swapaxes(1, 2)
+        tracks = (frames_first(scene.M) @ frames).swapaxes(1, 2)
         scene = scene._replace(tracks=tracks, shapes=shapes)
         noise = 1e-14
 
@@ -265,7 +267,7 @@ class TestWeights:
         weights = np.tile(1.0 * kept, (6, 1))
         fewer = scene.shapes[..., kept]
         fewer = fewer - fewer.mean(axis=2, keepdims=True)
-        expected = Scene(scene.tracks[:, kept], fewer, scene.motion, None).posterior()
+        expected = Scene(scene.tracks[:, kept], fewer, scene.M, None).posterior()
         hidden = np.where(weights[..., None] > 0, scene.tracks, np.nan)
         got = scene._replace(tracks=hidden, weights=weights).posterior()
         for one, other in zip(got, expected, strict=True):
@@ -276,8 +278,8 @@ class TestInvariances:
     def test_affinity_of_space(self):
         scene = random_scene()
         A = np.random.default_rng(1).normal(size=(3, 3))
-        motion = np.einsum("rai,ab->rbi", scene.motion, np.linalg.inv(A))
-        got = scene._replace(shapes=A @ scene.shapes, motion=motion).posterior()
+        M = np.einsum("rai,ab->rbi", scene.M, np.linalg.inv(A))
+        got = scene._replace(shapes=A @ scene.shapes, M=M).posterior()
         for one, other in zip(got, scene.posterior(), strict=True):
             assert_allclose(one, other, rtol=1e-8, atol=1e-10)
 
@@ -296,8 +298,8 @@ class TestInvariances:
     def test_rotation_of_images(self):
         scene = random_scene()
         R = random_rotation(1, 2)
-        motion = np.einsum("sr,rai->sai", R, scene.motion)
-        got = scene._replace(tracks=scene.tracks @ R.T, motion=motion).posterior()
+        M = np.einsum("sr,rai->sai", R, scene.M)
+        got = scene._replace(tracks=scene.tracks @ R.T, M=M).posterior()
         for one, other in zip(got, scene.posterior(), strict=True):
             assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
@@ -322,21 +324,21 @@ class TestDegenerate:
 
     def test_cameras_of_zero_leave_the_prior(self):
         scene = random_scene()
-        got = scene._replace(motion=np.zeros((2, 3, 6))).posterior()
+        got = scene._replace(M=np.zeros((2, 3, 6))).posterior()
         assert_array_equal(got.alpha, 0.0)
         energy = [np.sum(frame.y**2) for frame in frames_of(scene)]
         assert_allclose(got.objective, energy)
 
     def test_exact_frames_have_no_negative_objective(self):
         scene = random_scene()
-        images = (scene.motion.transpose(2, 0, 1) @ scene.shapes[0]).swapaxes(1, 2)
+        images = (frames_first(scene.M) @ scene.shapes[0]).swapaxes(1, 2)
         got = scene._replace(tracks=images).posterior(1e-20, refined=True)
         assert (got.objective >= 0).all()
         assert_allclose(got.objective, 0.0, atol=1e-12)
 
 
 def test_camera_gram():
-    motion = random_scene().motion
-    gram = unpack3(camera_gram(motion))
-    for i, M in enumerate(motion.transpose(2, 0, 1)):
-        assert_allclose(gram[..., i], M.T @ M, rtol=1e-13)
+    M = random_scene().M
+    gram = unpack3(camera_gram(M))
+    for i, camera in enumerate(frames_first(M)):
+        assert_allclose(gram[..., i], camera.T @ camera, rtol=1e-13)

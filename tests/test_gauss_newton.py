@@ -24,6 +24,7 @@ from isa_nrsfm._joint.noise_free import (
     normal_equations,
 )
 from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.blocks import MemoryBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
@@ -41,13 +42,13 @@ def in_blocks(parts):
 class Scene(NamedTuple):
     tracks: NDArray  # (n_frames, n_points, 2), centred
     shapes: NDArray  # (n_shapes, 3, n_points)
-    motion: NDArray  # (2, 3, n_frames)
-    alpha: NDArray  # (n_components, n_frames)
+    motion: NDArray  # (n_frames, 2, 3)
+    alpha: NDArray  # (n_frames, n_components)
 
     def frame_shapes(self, shapes, alpha):
         """Return the shapes of all frames (n_frames, n_points, 3)."""
-        c = np.vstack([np.ones(alpha.shape[1]), alpha])
-        return np.einsum("kaj,ki->ija", shapes, c)
+        frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+        return frames.swapaxes(1, 2)
 
 
 def random_scene(
@@ -58,17 +59,21 @@ def random_scene(
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
     shapes[1:] *= 0.3
     shapes -= shapes.mean(axis=2, keepdims=True)
-    motion = rng.normal(size=(2, 3, n_frames))
+    motion = rng.normal(size=(n_frames, 2, 3))
     if camera != "affine":
-        rows, scales = nearest_calibrated(motion.transpose(2, 0, 1))
-        motion = rows.transpose(1, 2, 0)
+        motion, scales = nearest_calibrated(motion)
         if camera == "weak_perspective":
-            motion = scales * motion
-    alpha = rng.normal(size=(n_components, n_frames))
-    c = np.vstack([np.ones(n_frames), alpha])
-    tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
+            motion = scales[:, None, None] * motion
+    alpha = rng.normal(size=(n_frames, n_components))
+    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    tracks = (motion @ frames).swapaxes(1, 2)
     tracks += noise * rng.normal(size=tracks.shape)
     return Scene(tracks - tracks.mean(axis=1, keepdims=True), shapes, motion, alpha)
+
+
+def moved(cameras, motion, step):
+    """Return cameras (n_frames, 2, 3) after steps (n_parameters, n_frames)."""
+    return frames_first(cameras.moved(frames_last(motion), step))
 
 
 def in_row_space(scene, size=0.0, seed=1, camera="affine"):
@@ -76,7 +81,7 @@ def in_row_space(scene, size=0.0, seed=1, camera="affine"):
     rng = np.random.default_rng(seed)
     b = scene.shapes.reshape(-1, scene.shapes.shape[2])
     rows, V = compressed(scene.tracks.swapaxes(1, 2), b)
-    exact = b @ V, scene.motion.transpose(2, 0, 1), scene.alpha.T
+    exact = b @ V, scene.motion, scene.alpha
     shapes, motion, alpha = (
         part + size * rng.normal(size=part.shape) for part in exact
     )
@@ -84,7 +89,7 @@ def in_row_space(scene, size=0.0, seed=1, camera="affine"):
         cameras = CAMERAS[camera]
         step = size * rng.normal(size=(cameras.n_parameters, len(motion)))
         step[3:] /= max(size, 1.0)  # of the logarithms of the scales
-        motion = cameras.moved(scene.motion, step).transpose(2, 0, 1)
+        motion = moved(cameras, scene.motion, step)
     return rows, FramesAndShapes(shapes, motion, alpha)
 
 
@@ -129,9 +134,9 @@ class TestEquations:
                     step[column] = sign * h
                 else:
                     alpha[:, column - n] += sign * h
-                motion = cameras.moved(state.motion.transpose(1, 2, 0), step)
-                moved = FramesAndShapes(state.shapes, motion.transpose(2, 0, 1), alpha)
-                change = change + sign * images(moved).reshape(len(alpha), -1)
+                motion = moved(cameras, state.motion, step)
+                other = FramesAndShapes(state.shapes, motion, alpha)
+                change = change + sign * images(other).reshape(len(alpha), -1)
             assert_allclose(change / (2 * h), tangents[:, :, column], atol=1e-8)
 
     @EACH
@@ -308,14 +313,14 @@ class TestWholeTable:
         near[0] -= near[0].mean(axis=2, keepdims=True)
         if camera != "affine":
             step = 0.01 * rng.normal(size=(CAMERAS[camera].n_parameters, 40))
-            near[1] = CAMERAS[camera].moved(scene.motion, step)
+            near[1] = moved(CAMERAS[camera], scene.motion, step)
         copies = [part.copy() for part in near]
         shapes, motion = fit_without_noise(blocks, *near, 0.0, CAMERAS[camera])
-        assert_of_model(motion.transpose(2, 0, 1), camera)
+        assert_of_model(motion, camera)
         for part, copy in zip(near, copies, strict=True):
             assert_array_equal(part, copy)
         # What the cameras leave open are the coefficients.
-        for camera, frame in zip(motion.transpose(2, 0, 1), scene.tracks, strict=True):
+        for camera, frame in zip(motion, scene.tracks, strict=True):
             seen = (camera @ shapes).reshape(n_components + 1, -1)
             rest = frame.T.ravel() - seen[0]
             alpha = np.linalg.lstsq(seen[1:].T, rest, rcond=None)[0]
@@ -348,8 +353,8 @@ class TestWholeTable:
             mean = shapes[0] + np.tensordot(shift, shapes[1:], 1)
             frames = scene.frame_shapes(scene.shapes, scene.alpha).swapaxes(1, 2)
             alpha = (frames - mean).reshape(40, -1) @ np.linalg.pinv(basis)
-            moved = np.einsum("rai,kaj->ikrj", scene.motion, basis.reshape(2, 3, -1))
-            gram = np.einsum("ikrj,ilrj->ikl", moved, moved)
+            seen = np.einsum("ira,kaj->ikrj", scene.motion, basis.reshape(2, 3, -1))
+            gram = np.einsum("ikrj,ilrj->ikl", seen, seen)
             value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
             return value + penalty * np.trace(gram, axis1=1, axis2=2).sum()
 

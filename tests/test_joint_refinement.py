@@ -14,6 +14,7 @@ from isa_nrsfm._joint import quasi_newton as module
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 SEARCH = JOINT_OPTIONS.search
 
@@ -35,9 +36,9 @@ def random_scene(
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
     shapes[1:] *= 0.25
     shapes -= shapes.mean(axis=2, keepdims=True)
-    motion = rng.normal(size=(2, 3, n_frames))
+    motion = frames_first(rng.normal(size=(2, 3, n_frames)))
     c = np.vstack([np.ones(n_frames), rng.normal(size=(n_components, n_frames))])
-    tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
+    tracks = np.einsum("ira,kaj,ki->ijr", motion, shapes, c)
     tracks += noise * rng.normal(size=tracks.shape)
     weights = None
     if kind != "complete":
@@ -80,7 +81,7 @@ def images(scene, result):
     likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
     alpha = likelihood.coefficients(*result.state)
     frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-    points = motion.transpose(2, 0, 1) @ frames
+    points = motion @ frames
     return points - points.mean(axis=2, keepdims=True)
 
 
@@ -118,7 +119,7 @@ class TestHistory:
         assert result.history[0] == likelihood(*start).value
         passed = likelihood(*result.state)
         assert result.history[-1] == passed.value
-        assert_array_equal(likelihood.coefficients(*result.state), passed.alpha.T)
+        assert_array_equal(likelihood.coefficients(*result.state), passed.alpha)
 
     def test_start_is_not_changed(self):
         scene = random_scene()
@@ -180,7 +181,7 @@ class TestOptimum:
         for j, g in enumerate(points):
             N = passed.shape_curvature[j if kind == "weighted" else 0]
             square += noise / 2 * g @ np.linalg.solve(N, g)
-        for i, g in enumerate(passed.motion_gradient.transpose(2, 0, 1)):
+        for i, g in enumerate(passed.motion_gradient):
             xx, yy, zz, xy, xz, yz = passed.motion_curvature[:, i]
             A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             square += noise / 2 * np.trace(g @ np.linalg.solve(A, g.T))
@@ -219,7 +220,7 @@ class TestOptimum:
         scene = random_scene()
 
         def energy(result):
-            moved = result.state.motion.transpose(2, 0, 1)[:, None]
+            moved = result.state.motion[:, None]
             return np.sum((moved @ result.state.shapes[1:]) ** 2)
 
         energies = [energy(refined(scene, penalty=s)) for s in (0.0, 1.0, 100.0)]
@@ -247,8 +248,8 @@ class TestFirstStep:
         for i, packed in enumerate(passed.motion_curvature.T):
             xx, yy, zz, xy, xz, yz = packed
             A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            step = half * passed.motion_gradient[..., i] @ np.linalg.inv(A)
-            assert_allclose(state.motion[..., i], start.motion[..., i] - step)
+            step = half * passed.motion_gradient[i] @ np.linalg.inv(A)
+            assert_allclose(state.motion[i], start.motion[i] - step)
         # To first order the mean of the expected residual.
         slope = passed.noise_gradient / likelihood.n_seen
         assert abs(slope) < SEARCH.largest_noise_step
@@ -270,7 +271,7 @@ class TestTolerance:
         scene = random_scene()
         start = disturbed(scene.truth)
         twice = scene._replace(tracks=np.repeat(scene.tracks, 2, axis=0))
-        start_twice = start._replace(motion=np.repeat(start.motion, 2, axis=2))
+        start_twice = start._replace(motion=np.repeat(start.motion, 2, axis=0))
         once, result = refined(scene, start), refined(twice, start_twice)
         assert_allclose(result.history, 2 * once.history, rtol=1e-7)
 
@@ -302,7 +303,7 @@ class TestInvariances:
         A = np.array([[2.0, 1.0, 0.0], [0.0, 1.0, -1.0], [0.5, 0.0, 0.5]])
         other = start._replace(
             shapes=np.einsum("ab,kbj->kaj", A, start.shapes),
-            motion=np.einsum("rbi,ba->rai", start.motion, np.linalg.inv(A)),
+            motion=start.motion @ np.linalg.inv(A),
         )
         got, expected = refined(scene, other), refined(scene, start)
         assert_allclose(got.history, expected.history, rtol=1e-6)
@@ -336,7 +337,7 @@ class TestInvariances:
                 scene.truth,
             ),
             start._replace(
-                shapes=start.shapes[..., points], motion=start.motion[..., frames]
+                shapes=start.shapes[..., points], motion=start.motion[frames]
             ),
         )
         expected = refined(scene, start)
@@ -348,12 +349,11 @@ def calibrated_scene(camera, seed=0, noise=DEVIATION, kind="complete"):
     """Return a table of calibrated cameras, and what made it."""
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, noise, kind)
-    rows, scales = nearest_calibrated(scene.truth.motion.transpose(2, 0, 1))
-    motion = rows.transpose(1, 2, 0)
+    motion, scales = nearest_calibrated(scene.truth.motion)
     if camera == "weak_perspective":
-        motion = scales * motion
+        motion = scales[:, None, None] * motion
     c = np.vstack([np.ones(40), rng.normal(size=(2, 40))])
-    tracks = np.einsum("rai,kaj,ki->ijr", motion, scene.truth.shapes, c)
+    tracks = np.einsum("ira,kaj,ki->ijr", motion, scene.truth.shapes, c)
     tracks += noise * rng.normal(size=tracks.shape)
     tracks[np.isnan(scene.tracks)] = np.nan
     if kind == "complete":
@@ -361,11 +361,16 @@ def calibrated_scene(camera, seed=0, noise=DEVIATION, kind="complete"):
     return Scene(tracks, scene.weights, scene.truth._replace(motion=motion))
 
 
+def moved(cameras, motion, step):
+    """Return cameras (n_frames, 2, 3) after steps (n_parameters, n_frames)."""
+    return frames_first(cameras.moved(frames_last(motion), step))
+
+
 def disturbed_by(cameras, state, seed=1, size=0.1):
     """Return a state that is some way off, with cameras of the model."""
-    moved = disturbed(state, seed, size)
+    other = disturbed(state, seed, size)
     step = size * np.random.default_rng(seed).normal(size=(cameras.n_parameters, 40))
-    return moved._replace(motion=cameras.moved(state.motion, step))
+    return other._replace(motion=moved(cameras, state.motion, step))
 
 
 @cache
@@ -390,7 +395,7 @@ class TestCalibratedCameras:
         assert (np.diff(result.history) < 0).all()
         assert result.history[0] == likelihood(*start).value
         assert result.history[-1] == likelihood(*result.state).value
-        motion = result.state.motion.transpose(2, 0, 1)
+        motion = result.state.motion
         gram = motion @ motion.swapaxes(1, 2)
         scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
         unit = np.broadcast_to(np.eye(2), gram.shape)
@@ -408,15 +413,15 @@ class TestCalibratedCameras:
         shapes, motion, noise = result.state
         for _ in range(10):
             change = rng.normal(size=shapes.shape)
-            step = rng.normal(size=(cameras.n_parameters, motion.shape[2]))
+            step = rng.normal(size=(cameras.n_parameters, len(motion)))
             rises = []
             for size in (-1e-3, 1e-3):
-                moved = likelihood(
+                after = likelihood(
                     shapes + size * change,
-                    cameras.moved(motion, size * step),
+                    moved(cameras, motion, size * step),
                     noise * np.exp(size),
                 )
-                rises.append(moved.value - result.history[-1])
+                rises.append(after.value - result.history[-1])
             assert min(rises) > 0
             assert_allclose(rises[0], rises[1], rtol=0.1)
 
@@ -431,8 +436,8 @@ class TestCalibratedCameras:
         square = passed.noise_gradient**2 / likelihood.n_seen
         for g in passed.shape_gradient.reshape(9, -1).T:
             square += noise / 2 * g @ np.linalg.solve(passed.shape_curvature[0], g)
-        D = cameras.tangents(motion)
-        slope = np.einsum("crai,rai->ci", D, passed.motion_gradient)
+        D = cameras.tangents(frames_last(motion))
+        slope = np.einsum("crai,rai->ci", D, frames_last(passed.motion_gradient))
         for i, g in enumerate(slope.T):
             xx, yy, zz, xy, xz, yz = passed.motion_curvature[:, i]
             A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -454,8 +459,8 @@ class TestCalibratedCameras:
         scene, _, _, result = calibrated_optimum(camera)
         assert result.state.noise == pytest.approx(DEVIATION**2, rel=0.3)
         # Up to a rotation and, with scales, a unit of space.
-        motion = result.state.motion.transpose(2, 0, 1).reshape(-1, 3)
-        other = scene.truth.motion.transpose(2, 0, 1).reshape(-1, 3)
+        motion = result.state.motion.reshape(-1, 3)
+        other = scene.truth.motion.reshape(-1, 3)
         U, S, Vt = np.linalg.svd(motion.T @ other)
         size = S.sum() / np.sum(motion**2) if camera == "weak_perspective" else 1.0
         assert_allclose(size * motion @ (U @ Vt), other, atol=0.1)
@@ -468,7 +473,7 @@ class TestCalibratedCameras:
         R = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
         turned = start._replace(
             shapes=R @ start.shapes,
-            motion=np.einsum("rai,ba->rbi", start.motion, R),
+            motion=start.motion @ R.T,
         )
         got, expected = (
             refine_joint(likelihood, each, cameras, max_iter=300, tol=1e-3)
@@ -578,7 +583,7 @@ class TestWithoutNoise:
         assert (np.diff(result.history) <= 0).all()
         weights = 1.0 if scene.weights is None else np.sqrt(scene.weights)[..., None]
         for i, (frame, camera) in enumerate(
-            zip(scene.tracks, result.state.motion.transpose(2, 0, 1), strict=True)
+            zip(scene.tracks, result.state.motion, strict=True)
         ):
             root = np.broadcast_to(
                 weights if kind == "complete" else weights[i], (25, 1)
@@ -681,7 +686,7 @@ class TestDegenerate:
         if part == "noise":
             start = start._replace(noise=value)
         else:
-            getattr(start, part)[..., 3] = value
+            getattr(start, part)[3 if part == "motion" else (..., 3)] = value
         likelihood = counted(scene)
         refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-3)
         assert likelihood.n_calls < 100
@@ -689,7 +694,7 @@ class TestDegenerate:
     def test_has_not_converged_where_the_objective_is_not_finite(self):
         scene = random_scene()
         start = disturbed(scene.truth)
-        start.motion[..., 3] = np.nan
+        start.motion[3] = np.nan
         assert not refined(scene, start).converged
 
     def test_point_that_no_frame_shows_stays_where_it_is(self):

@@ -16,7 +16,6 @@ from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.starts import (
     affine_start,
     best_starts,
-    frames_last,
     lifted_shapes,
     mixed_cameras,
     rigid_start,
@@ -273,7 +272,7 @@ class TestBestStarts:
         problem = problem_of(scene)
         states = started(scene, camera, problem)
         for state in states:
-            assert_calibrated(state.motion.transpose(2, 0, 1), camera)
+            assert_calibrated(state.motion, camera)
         value = min(problem.likelihood(*state).value for state in states)
         scaled = camera == "weak_perspective"
         rigid, _ = rigid_start(scene.factors, scene.shapes, scaled)
@@ -288,7 +287,7 @@ class TestBestStarts:
             shapes = lifted_shapes(scene.rows, motion, 2)
             noise_variance = 0.1 * np.mean((scene.rows - motion @ shapes[0]) ** 2)
             noise_variance = max(noise_variance, least_noise * energy / n_seen)
-            start = JointState(shapes, frames_last(motion), noise_variance)
+            start = JointState(shapes, motion, noise_variance)
             held = problem.refined(
                 start, HeldCameras(), least_noise, max_iter=held_steps
             )
@@ -299,7 +298,7 @@ class TestBestStarts:
         scene = random_scene(seed=seed, amplitude=0.6)
         rigid, _ = rigid_start(scene.factors, scene.shapes, False)
         assert camera_error(rigid, scene.motion) > 0.3
-        motion = started(scene, "orthographic")[0].motion.transpose(2, 0, 1)
+        motion = started(scene, "orthographic")[0].motion
         assert camera_error(motion, scene.motion) < 0.05
 
     @pytest.mark.parametrize("effort", [JOINT_OPTIONS.large, JOINT_OPTIONS.small])
@@ -310,17 +309,16 @@ class TestBestStarts:
         states = started(scene, "orthographic", problem)
         assert len(states) == effort.n_finalists
         for state in states:
-            assert state.motion.shape == (2, 3, 450)
-            motion = state.motion.transpose(2, 0, 1)
-            assert_calibrated(motion, "orthographic")
-            assert camera_error(motion, scene.motion) < 0.2
+            assert state.motion.shape == (450, 2, 3)
+            assert_calibrated(state.motion, "orthographic")
+            assert camera_error(state.motion, scene.motion) < 0.2
 
     @BOTH
     def test_rigid_objects(self, camera):
         scene = random_scene(camera, n_components=0)
         for state in started(scene, camera):
             assert all(np.isfinite(each).all() for each in state)
-            rest = scene.rows - state.motion.transpose(2, 0, 1) @ state.shapes[0]
+            rest = scene.rows - state.motion @ state.shapes[0]
             assert np.mean(rest**2) < 1e-4 * np.mean(scene.rows**2)
 
     def test_is_reproducible(self):
@@ -340,7 +338,7 @@ class TestAffineStart:
         left = 0.0
         for i, W in enumerate(scene.rows):
             M = W @ np.linalg.pinv(paper[0])
-            assert_allclose(state.motion[..., i], M, atol=1e-12)
+            assert_allclose(state.motion[i], M, atol=1e-12)
             left += np.sum((W - M @ paper[0]) ** 2)
         assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
 
@@ -351,9 +349,7 @@ class TestAffineStart:
         for before, after in zip(paper[1:], state.shapes[1:], strict=True):
             alpha = [
                 np.vdot(M @ before, W) / np.sum((M @ before) ** 2)
-                for M, W in zip(
-                    state.motion.transpose(2, 0, 1), scene.rows, strict=True
-                )
+                for M, W in zip(state.motion, scene.rows, strict=True)
             ]
             assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
@@ -364,11 +360,3 @@ class TestAffineStart:
         state = affine_start(problem_of(scene), scene.W, paper)
         assert_array_equal(state.shapes[2], 0.0)
         assert np.isfinite(state.shapes).all()
-
-
-def test_frames_last():
-    motion = random_scene().motion
-    last = frames_last(motion)
-    assert last.flags.c_contiguous
-    for i, M in enumerate(motion):
-        assert_array_equal(last[..., i], M)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scenes import random_rotation
 
 from isa_nrsfm._joint.likelihood import likelihood_of
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 NOISE = 0.05
 PENALTY = 7.0
@@ -18,7 +19,7 @@ class Scene(NamedTuple):
     tracks: NDArray  # (n_frames, n_points, 2)
     weights: NDArray | None  # (n_frames, n_points)
     shapes: NDArray  # (n_components + 1, 3, n_points)
-    motion: NDArray  # (2, 3, n_frames)
+    motion: NDArray  # (n_frames, 2, 3)
 
     def at(self, penalty=0.0, noise=NOISE, **options):
         """Return the objective and its derivatives."""
@@ -36,9 +37,9 @@ def random_scene(kind, seed=0, n_frames=11, n_points=9, n_components=3):
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
     shapes[1:] *= 0.3
     shapes -= shapes.mean(axis=2, keepdims=True)
-    motion = rng.normal(size=(2, 3, n_frames))
+    motion = rng.normal(size=(n_frames, 2, 3))
     c = np.vstack([np.ones(n_frames), rng.normal(size=(n_components, n_frames))])
-    tracks = np.einsum("rai,kaj,ki->ijr", motion, shapes, c)
+    tracks = np.einsum("ira,kaj,ki->ijr", motion, shapes, c)
     tracks += 0.2 * rng.normal(size=tracks.shape)
     weights = None
     if kind != "complete":
@@ -63,7 +64,7 @@ def frame_by_frame(scene):
         points = frame[seen] - np.average(frame[seen], axis=0, weights=w)
         shapes = scene.shapes[:, :, seen]
         middle = np.average(shapes, axis=2, weights=w)
-        yield points, shapes - middle[..., None], np.sqrt(w), scene.motion[..., i], seen
+        yield points, shapes - middle[..., None], np.sqrt(w), scene.motion[i], seen
 
 
 def coefficients(points, shapes, root, M, noise):
@@ -119,7 +120,7 @@ class TestValue:
         residual = 0.0
         for i, (points, shapes, root, M, _) in enumerate(frame_by_frame(scene)):
             alpha, _ = coefficients(points, shapes, root, M, NOISE)
-            assert_allclose(passed.alpha[:, i], alpha, rtol=1e-10, atol=1e-12)
+            assert_allclose(passed.alpha[i], alpha, rtol=1e-10, atol=1e-12)
             model = M @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
             residual += np.sum((root * (points.T - model)) ** 2)
         assert passed.residual == pytest.approx(residual, rel=1e-11)
@@ -129,7 +130,7 @@ class TestValue:
         scene = random_scene("complete", n_components=2)
         scene.shapes[2] = scene.shapes[1] + 1e-5 * scene.shapes[2]
         c = np.vstack([np.ones(11), np.random.default_rng(1).normal(size=(2, 11))])
-        tracks = np.einsum("rai,kaj,ki->ijr", scene.motion, scene.shapes, c)
+        tracks = np.einsum("ira,kaj,ki->ijr", scene.motion, scene.shapes, c)
         scene = scene._replace(tracks=tracks)
         noise = 1e-11
         expected = 0.0
@@ -269,7 +270,7 @@ class TestCurvature:
         weights = np.broadcast_to(weights, scene.tracks.shape[:2])
         moments = second_moments(scene, NOISE, penalty)
         for i, (E, _) in enumerate(moments):
-            M = scene.motion[..., i]
+            M = scene.motion[i]
             expected += weights[i][:, None, None] * np.kron(E, M.T @ M)
         assert got.shape[0] == (1 if kind == "complete" else n_points)
         assert_allclose(np.broadcast_to(got, expected.shape), expected, rtol=1e-10)
@@ -305,9 +306,9 @@ class TestCurvature:
             W = scene.tracks[i].T - scene.tracks[i].mean(axis=0)[:, None]
             A = np.einsum("kl,kaj,lbj->ab", E, scene.shapes, scene.shapes)
             Y = np.einsum("k,rj,kaj->ra", c, W, scene.shapes)
-            step = NOISE / 2 * passed.motion_gradient[..., i] @ np.linalg.inv(A)
-            assert_allclose(scene.motion[..., i] - step, Y @ np.linalg.inv(A))
-            M = scene.motion[..., i]
+            step = NOISE / 2 * passed.motion_gradient[i] @ np.linalg.inv(A)
+            assert_allclose(scene.motion[i] - step, Y @ np.linalg.inv(A))
+            M = scene.motion[i]
             N += np.kron(E, M.T @ M)
             R += np.kron(c[:, None], M.T) @ W
         step = np.linalg.solve(
@@ -360,9 +361,7 @@ class TestBlocks:
         other = scene._replace(
             tracks=np.asfortranarray(scene.tracks),
             shapes=np.asfortranarray(scene.shapes),
-            motion=np.ascontiguousarray(scene.motion.transpose(2, 0, 1)).transpose(
-                1, 2, 0
-            ),
+            motion=frames_first(frames_last(scene.motion)),
         )
         assert_same(other.at(PENALTY), scene.at(PENALTY))
 
@@ -421,7 +420,7 @@ class TestInvariances:
         A = np.random.default_rng(1).normal(size=(3, 3))
         other = scene._replace(
             shapes=np.einsum("ab,kbj->kaj", A, scene.shapes),
-            motion=np.einsum("rbi,ba->rai", scene.motion, np.linalg.inv(A)),
+            motion=scene.motion @ np.linalg.inv(A),
         )
         got, expected = other.at(PENALTY), scene.at(PENALTY)
         for name in ("value", "alpha", "residual", "noise_gradient"):
@@ -436,7 +435,7 @@ class TestInvariances:
         got = scene._replace(shapes=shapes).at(PENALTY)
         expected = scene.at(PENALTY)
         assert_allclose(got.value, expected.value, rtol=1e-12)
-        assert_allclose(got.alpha, Q @ expected.alpha, atol=1e-10)
+        assert_allclose(got.alpha, expected.alpha @ Q.T, atol=1e-10)
         assert_allclose(got.motion_gradient, expected.motion_gradient, atol=1e-8)
 
     def test_other_mixings_of_the_coefficients_do_matter(self):
@@ -451,15 +450,12 @@ class TestInvariances:
         scene = random_scene(kind)
         angle = np.random.default_rng(1).uniform(0, 2 * np.pi, len(scene.tracks))
         c, s = np.cos(angle), np.sin(angle)
-        R = np.array([[c, -s], [s, c]])
+        R = frames_first(np.array([[c, -s], [s, c]]))
         other = scene._replace(
-            tracks=np.einsum("rci,ijc->ijr", R, scene.tracks),
-            motion=np.einsum("rci,cai->rai", R, scene.motion),
+            tracks=scene.tracks @ R.swapaxes(1, 2), motion=R @ scene.motion
         )
         turned = scene.at(PENALTY)
-        turned = turned._replace(
-            motion_gradient=np.einsum("rci,cai->rai", R, turned.motion_gradient)
-        )
+        turned = turned._replace(motion_gradient=R @ turned.motion_gradient)
         assert_same(other.at(PENALTY), turned)
 
     @KINDS
@@ -480,16 +476,16 @@ class TestInvariances:
             scene.tracks[frames][:, points],
             None if weights is None else weights[frames][:, points],
             scene.shapes[..., points],
-            scene.motion[..., frames],
+            scene.motion[frames],
         )
         expected = scene.at(PENALTY)
         curvature = expected.shape_curvature
         expected = expected._replace(
             shape_gradient=expected.shape_gradient[..., points],
-            motion_gradient=expected.motion_gradient[..., frames],
+            motion_gradient=expected.motion_gradient[frames],
             shape_curvature=curvature if weights is None else curvature[points],
             motion_curvature=expected.motion_curvature[:, frames],
-            alpha=expected.alpha[:, frames],
+            alpha=expected.alpha[frames],
         )
         assert_same(other.at(PENALTY), expected)
 
@@ -515,7 +511,7 @@ class TestDegenerate:
         if part == "basis":
             shapes[1:] = 0.0
         elif part == "cameras":
-            motion[..., 3] = 0.0
+            motion[3] = 0.0
         elif part == "shapes":
             shapes[:, 2] = 0.0
         else:

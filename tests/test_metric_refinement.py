@@ -7,6 +7,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from isa_nrsfm._linalg.vectors import frames_last
 from isa_nrsfm._metric_upgrade.minimisation import (
     STRETCH_OF_START,
     exponential,
@@ -64,7 +65,7 @@ def bad_start(seed):
 def objective(motion, Q, camera, alpha, strain, ridge):
     turned = [Q @ expm(np.tensordot(a, strain, 1)) @ Q.T for a in alpha]
     gram = motion @ np.array(turned) @ motion.transpose(0, 2, 1)
-    rest = orthonormality(gram.transpose(1, 2, 0), camera)
+    rest = orthonormality(frames_last(gram), camera)
     return np.sum(rest**2) + ridge * np.sum(strain**2)
 
 
@@ -81,7 +82,7 @@ class TestParts:
     def test_norms_of_the_residuals(self):
         cameras = np.random.default_rng(0).standard_normal((6, 2, 3))
         gram = cameras @ cameras.transpose(0, 2, 1)
-        last = gram.transpose(1, 2, 0)
+        last = frames_last(gram)
         s1, s2 = np.linalg.svd(cameras, compute_uv=False).T
         weak = np.linalg.norm(orthonormality(last, "weak_perspective"), axis=0)
         assert_allclose(weak, (s1**2 - s2**2) / (s1**2 + s2**2))
@@ -100,7 +101,7 @@ class TestParts:
             first, rest = step[: len(basis)], step[len(basis) :].reshape(numbers.shape)
             moved = motion @ expm(np.tensordot(first, basis, 1) / 2)
             strain = np.tensordot(numbers + rest, basis, 1)
-            return _linearised(moved.transpose(1, 2, 0), strain, alpha, camera)
+            return _linearised(frames_last(moved), strain, alpha, camera)
 
         residuals, slopes, own_slopes = at(np.zeros(3 * len(basis)))
         by_strains = [own_slopes * coefficients for coefficients in alpha]
@@ -111,7 +112,7 @@ class TestParts:
 
         # The sums over frames are those of all derivatives.
         parts = _linearised(
-            motion.transpose(1, 2, 0), np.tensordot(numbers, basis, 1), alpha, camera
+            frames_last(motion), np.tensordot(numbers, basis, 1), alpha, camera
         )
         cost, curvature, gradient = _normal_equations(alpha, *parts)
         flat = slopes.reshape(len(slopes), -1)
@@ -252,7 +253,7 @@ class TestRefineMetric:
         def cost(entries):
             root = entries.reshape(3, 3)
             gram = motion @ root @ root.T @ motion.transpose(0, 2, 1)
-            return np.sum(orthonormality(gram.transpose(1, 2, 0), camera) ** 2)
+            return np.sum(orthonormality(frames_last(gram), camera) ** 2)
 
         found = [minimize(cost, rng.standard_normal(9)).fun for _ in range(20)]
         assert fit.cost <= min(found) * (1 + 1e-6)
@@ -262,7 +263,7 @@ class TestRefineMetric:
         linear = metric_quadric(motion)
         fit = refine_metric(motion, safe_start(motion, linear, "weak_perspective"),
                             "weak_perspective")  # fmt: skip
-        gram = (motion @ linear @ motion.transpose(0, 2, 1)).transpose(1, 2, 0)
+        gram = frames_last(motion @ linear @ motion.transpose(0, 2, 1))
         before = np.sum(orthonormality(gram, "weak_perspective") ** 2)
         assert fit.cost < 0.999 * before
 

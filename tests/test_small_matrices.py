@@ -13,6 +13,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     inverse3,
     inverse_factor3,
     invert_positive,
+    pack3,
     packed_gram,
     packed_rows,
     pair_indices,
@@ -21,6 +22,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpack3,
     unpacked,
 )
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 # One number of matrices for each of the two ways to solve, by LAPACK and by passes.
 NUMBERS = [3, FEW + 50]
@@ -263,3 +265,23 @@ def test_nothing_to_solve(k, n):
     assert positive.all()
     assert unpacked(inverse).shape == (k, k, n)
     assert_array_equal(log_determinant, np.zeros(n))
+
+
+class TestOrderOfTheFrames:
+    motion = np.arange(24.0).reshape(4, 2, 3)
+
+    def test_last(self):
+        M = frames_last(self.motion)
+        assert M.flags.c_contiguous
+        for i, camera in enumerate(self.motion):
+            assert_array_equal(M[..., i], camera)
+
+    def test_first_and_back_without_a_copy(self):
+        M = frames_last(self.motion)
+        assert_array_equal(frames_first(M), self.motion)
+        assert np.shares_memory(frames_last(frames_first(M)), M)
+
+
+def test_packing_of_3x3_matrices():
+    entries = np.random.default_rng(0).normal(size=(4, 6, 5))
+    assert_array_equal(pack3(unpack3(entries)), entries)

@@ -27,7 +27,13 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameGram, FrameSums, SharedGram, whitened
+from isa_nrsfm._frames.point_sums import (
+    FrameGram,
+    FrameSums,
+    SharedGram,
+    whitened,
+    with_one,
+)
 from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
@@ -41,6 +47,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpacked,
 )
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.vectors import frames_first
 
 # Ridge of ``A = S S^T``, as a share of the second moment of the shapes, and lower bound
 # of s2, as a share of the energy of the frame. They keep the result finite for
@@ -98,7 +105,7 @@ class AffineSearch:
             Noise variances.
         n_points : float
             Number of points of a frame.
-        initial : ndarray of shape (n_components, n_frames)
+        initial : ndarray of shape (n_frames, n_components)
             Coefficients to start from.
         max_steps : int
             The most steps.
@@ -109,14 +116,15 @@ class AffineSearch:
             The minima.
         """
         problem = _problem(products, variance, n_points)
-        alpha, converged = _descend(problem, initial, max_steps)
+        start = np.ascontiguousarray(initial.T)
+        alpha, converged = _descend(problem, start, max_steps)
         state = _evaluate(problem, alpha)
         prior = problem.ridge * np.einsum("ki,ki->i", alpha, alpha)
         objective = np.maximum(products.energy - state.explained, 0.0)
         return FoundFrames(
-            state.camera.transpose(1, 0, 2),
-            alpha,
-            problem.ridge * _inverse_schur(state),
+            _motion(state.camera),
+            alpha.T,
+            frames_first(unpacked(problem.ridge * _inverse_schur(state))),
             objective,
             np.maximum(objective - prior, 0.0),
             converged,
@@ -125,14 +133,18 @@ class AffineSearch:
     def rough_cameras(
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
-        """Return cameras (2, 3, n_frames) by two steps from coefficients of zero."""
+        """Return cameras (n_frames, 2, 3) by two steps from coefficients of zero."""
         problem = _problem(products, variance, n_points)
         state = _evaluate(problem, np.zeros((len(self.shapes) - 1, len(variance))))
         # A step with the camera held, then a Newton step
         alpha, _ = solve_positive(state.held, state.slope)
         step, _ = _newton_step(_evaluate(problem, alpha), np.zeros(len(variance)))
-        camera = _eliminated(problem, with_one(alpha + step))[-1]
-        return camera.transpose(1, 0, 2)
+        return _motion(_eliminated(problem, with_one(alpha + step))[-1])
+
+
+def _motion(camera: NDArray) -> NDArray:
+    """Return cameras (n, 2, 3) from ``M^T`` (3, 2, n)."""
+    return frames_first(camera.swapaxes(0, 1))
 
 
 class _Problem(NamedTuple):
@@ -185,11 +197,6 @@ class _State(NamedTuple):
         """Set the state of some of the frames."""
         for each, given in zip(self, other, strict=True):
             each[..., frames] = given
-
-
-def with_one(alpha: NDArray) -> NDArray:
-    """Return ``c = (1, alpha)`` (n_components + 1, n) of alpha (n_components, n)."""
-    return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
 
 
 def _eliminated(
@@ -299,9 +306,7 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
     and attacking the saddle point problem in high-dimensional non-convex optimization",
     2014).
     """
-    held, schur = (
-        unpacked(each).transpose(2, 0, 1) for each in (state.held, state.schur)
-    )
+    held, schur = (frames_first(unpacked(each)) for each in (state.held, state.schur))
     size, axes = np.linalg.eigh(held)
     size = np.maximum(size, SMALLEST_PIVOT * size[:, -1:])
     whitening = axes / np.sqrt(size)[:, None]

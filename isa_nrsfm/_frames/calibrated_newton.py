@@ -33,18 +33,19 @@ from isa_nrsfm._frames.coefficients import (
     CoefficientPosterior,
     coefficient_posterior,
 )
-from isa_nrsfm._frames.point_sums import FLAT, FrameSums
+from isa_nrsfm._frames.point_sums import FLAT, FrameSums, with_one
 from isa_nrsfm._frames.search import MAX_STEPS, FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
-    COLUMNS,
-    ROWS,
     inverse3,
     invert_positive,
+    pack3,
+    pair_indices,
     solve_positive,
     unpack3,
     unpacked,
 )
 from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 # The least noise variance, as a share of the energy of a frame.
 RIDGE = 1e-13
@@ -118,7 +119,7 @@ class CalibratedSearch:
             Noise variances.
         n_points : float
             Not used.
-        initial : ndarray of shape (n_components, n_frames)
+        initial : ndarray of shape (n_frames, n_components)
             Coefficients that give the first cameras. These are near the affine cameras
             of least squares for the shapes with these coefficients.
         max_steps : int
@@ -130,11 +131,11 @@ class CalibratedSearch:
             The minima.
         """
         problem = _problem(products, variance, self._models)
-        motion = _first_cameras(problem, initial)
-        motion, converged = _descend(problem, motion, max_steps)
-        motion, better, reached = _better_reversed(problem, motion, max_steps)
+        M = _first_cameras(problem, np.ascontiguousarray(initial.T))
+        M, converged = _descend(problem, M, max_steps)
+        M, better, reached = _better_reversed(problem, M, max_steps)
         converged[better] = reached[better]
-        return _found(problem, motion, converged)
+        return _found(problem, M, converged)
 
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
@@ -158,23 +159,23 @@ class CalibratedSearch:
         better : ndarray of bool, shape (n_frames,)
             Which of them are new.
         """
-        turned = np.ascontiguousarray((motion @ self._axes).transpose(1, 2, 0))
+        M = frames_last(motion @ self._axes)
         problem = _problem(products, np.full(len(motion), noise), self._models)
         # The cameras may not be at their minimum yet. Compare minima with minima.
-        turned, _ = _descend(problem, turned, REVERSED_STEPS)
-        other, better, _ = _better_reversed(problem, turned, REVERSED_STEPS)
+        M, _ = _descend(problem, M, REVERSED_STEPS)
+        M, better, _ = _better_reversed(problem, M, REVERSED_STEPS)
         motion = motion.copy()
-        motion[better] = self.cameras(other[:, :, better].transpose(2, 0, 1))
+        motion[better] = self.cameras(frames_first(M[:, :, better]))
         return motion, better
 
     def rough_cameras(
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
-        """Return cameras (2, 3, n_frames) by a few steps from coefficients of zero."""
+        """Return cameras (n_frames, 2, 3) by a few steps from coefficients of zero."""
         problem = _problem(products, variance, self._models)
         zero = np.zeros((len(self.shapes) - 1, len(variance)))
-        motion = _first_cameras(problem, zero)
-        return _descend(problem, motion, ROUGH_STEPS)[0]
+        M = _first_cameras(problem, zero)
+        return frames_first(_descend(problem, M, ROUGH_STEPS)[0])
 
 
 class _Problem(NamedTuple):
@@ -207,18 +208,17 @@ def _first_cameras(problem: _Problem, alpha: NDArray) -> NDArray:
     one with the lower objective is taken.
     """
     products = problem.products
-    c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
+    c = with_one(alpha)
     seen = np.einsum("ki,kari->rai", c, products.cross)  # W S^T
     # Affine cameras of least squares, M = W S^T (S S^T)^-1
     T = products.gram.products(c)
-    inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, _packed3(T)))
-    affine = np.einsum("rbi,bai->rai", seen, inverse).transpose(2, 0, 1)
+    inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, pack3(T)))
+    affine = frames_first(np.einsum("rbi,bai->rai", seen, inverse))
     starts = [nearest_calibrated(affine), _completed(affine)]
     if not problem.cameras.scaled:
         starts = [(rows, np.ones(len(rows))) for rows, _ in starts]
     first, other = (
-        np.ascontiguousarray((scales[:, None, None] * rows).transpose(1, 2, 0))
-        for rows, scales in starts
+        frames_last(scales[:, None, None] * rows) for rows, scales in starts
     )
     values = [_value(problem, _posterior(problem, each)) for each in (first, other)]
     return np.where(values[1] < values[0], other, first)
@@ -243,7 +243,7 @@ def _completed(affine: NDArray) -> tuple[NDArray, NDArray]:
     return np.concatenate([block, (sign[:, None] * depth)[..., None]], axis=2), scale
 
 
-def _reversed(motion: NDArray) -> NDArray:
+def _reversed(M: NDArray) -> NDArray:
     """
     Return cameras (2, 3, n) that see the mean shape reversed in depth.
 
@@ -252,34 +252,28 @@ def _reversed(motion: NDArray) -> NDArray:
     is taken perpendicular to the thinnest axis of the mean shape, the last one: the
     third column changes its sign.
     """
-    return motion * np.array([1.0, 1.0, -1.0])[:, None]
+    return M * np.array([1.0, 1.0, -1.0])[:, None]
 
 
 def _better_reversed(
-    problem: _Problem, motion: NDArray, max_steps: int
+    problem: _Problem, M: NDArray, max_steps: int
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the better cameras (2, 3, n) of those given and of minima from reversed ones.
 
     Also returned are which of them are new (n,), and which searches converged (n,).
     """
-    value = _value(problem, _posterior(problem, motion))
+    value = _value(problem, _posterior(problem, M))
     limit = value - EQUAL * (problem.products.energy + problem.noise)
-    other, converged = _descend(problem, _reversed(motion), max_steps, limit)
+    other, converged = _descend(problem, _reversed(M), max_steps, limit)
     better = _value(problem, _posterior(problem, other)) < limit
-    return np.where(better, other, motion), better, converged
-
-
-def _packed3(full: NDArray) -> NDArray:
-    """Return symmetric matrices (..., 3, 3, n) packed."""
-    pairs = zip(ROWS, COLUMNS, strict=True)
-    return np.stack([full[..., a, b, :] for a, b in pairs], axis=-2)
+    return np.where(better, other, M), better, converged
 
 
 class _State(NamedTuple):
     """The objective at some cameras of n frames, and its derivatives."""
 
-    motion: NDArray  # (2, 3, n)
+    M: NDArray  # (2, 3, n)
     value: NDArray  # s2 F (n,)
     slope: NDArray  # minus half the gradient of s2 F along the tangents (p, n)
     definite: NDArray  # tr(D_c A D_d^T), positive semidefinite, packed (n_pairs, n)
@@ -300,35 +294,35 @@ def _value(problem: _Problem, posterior: CoefficientPosterior) -> NDArray:
     return posterior.objective + problem.noise * posterior.log_determinant
 
 
-def _posterior(problem: _Problem, motion: NDArray) -> CoefficientPosterior:
+def _posterior(problem: _Problem, M: NDArray) -> CoefficientPosterior:
     """Return the posterior of the coefficients for cameras (2, 3, n)."""
-    return coefficient_posterior(problem.products, motion, problem.noise)
+    return coefficient_posterior(problem.products, M, problem.noise)
 
 
 def _coupling(
-    problem: _Problem, motion: NDArray, posterior: CoefficientPosterior
+    problem: _Problem, M: NDArray, posterior: CoefficientPosterior
 ) -> NDArray:
     """Return ``<D_c, F_k>`` (p, K, n)."""
     products = problem.products
     T = products.gram.products(posterior.c)[1:]
-    F = np.einsum("rbi,kbai->krai", motion, T)
+    F = np.einsum("rbi,kbai->krai", M, T)
     F -= products.cross[1:].swapaxes(1, 2)
-    D = problem.cameras.tangents(motion)
+    D = problem.cameras.tangents(M)
     return np.einsum("crai,krai->cki", D, F)
 
 
 def _curvature(
-    motion: NDArray, A: NDArray, G: NDArray, gradient: NDArray
+    M: NDArray, A: NDArray, G: NDArray, gradient: NDArray
 ) -> tuple[NDArray, NDArray]:
     """
     Return ``tr(D_c A D_d^T)`` and ``<G, D_cd>``, packed (n_pairs, n).
 
-    The arrays are motion and G (2, 3, n), A (6, n), packed, and the gradient
+    The arrays are M and G (2, 3, n), A (6, n), packed, and the gradient
     ``<G, D_c>`` (n_parameters, n).
     """
-    turns, across, scale = tangent_curvature(motion, A)
+    turns, across, scale = tangent_curvature(M, A)
     # D_cd = (e_c m_d + e_d m_c) / 2 - m d_cd for rotations, row by row.
-    mixed = np.einsum("rai,rbi->abi", G, motion)
+    mixed = np.einsum("rai,rbi->abi", G, M)
     trace = np.einsum("aai->i", mixed)
     bent = 0.5 * (mixed + mixed.swapaxes(0, 1)) - trace * np.eye(3)[:, :, None]
     xx, yy, zz, xy, xz, yz = turns
@@ -350,34 +344,32 @@ def _curvature(
     return first, second
 
 
-def _evaluate(problem: _Problem, motion: NDArray) -> _State:
-    """Return F and its derivatives at motion (2, 3, n), see the docstring on top."""
-    return _state(problem, motion, _posterior(problem, motion))
+def _evaluate(problem: _Problem, M: NDArray) -> _State:
+    """Return F and its derivatives at M (2, 3, n), see the docstring on top."""
+    return _state(problem, M, _posterior(problem, M))
 
 
-def _state(
-    problem: _Problem, motion: NDArray, posterior: CoefficientPosterior
-) -> _State:
-    """Return F and its derivatives at motion (2, 3, n), whose posterior is given."""
+def _state(problem: _Problem, M: NDArray, posterior: CoefficientPosterior) -> _State:
+    """Return F and its derivatives at M (2, 3, n), whose posterior is given."""
     noise, cameras = problem.noise, problem.cameras
     A = problem.products.gram.moments(posterior.second_moments(noise))
-    G = np.einsum("rbi,bai->rai", motion, unpack3(A))
+    G = np.einsum("rbi,bai->rai", M, unpack3(A))
     G -= np.einsum("ki,kari->rai", posterior.c, problem.products.cross)
-    gradient = cameras.gradient(motion, G)
-    definite, bent = _curvature(motion, A, G, gradient)
+    gradient = cameras.gradient(M, G)
+    definite, bent = _curvature(M, A, G, gradient)
     # - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
     Q = -unpacked(posterior.inverse)[1:, 1:]
-    coupling = _coupling(problem, motion, posterior)
+    coupling = _coupling(problem, M, posterior)
     through = np.einsum("kli,cli->cki", Q, coupling)
     hessian = definite + bent
-    rows, columns = np.triu_indices(cameras.n_parameters)
+    rows, columns = pair_indices(cameras.n_parameters)
     hessian -= np.einsum("pki,pki->pi", through[rows], coupling[columns])
     value = _value(problem, posterior)
-    return _State(motion, value, -gradient, definite, hessian)
+    return _State(M, value, -gradient, definite, hessian)
 
 
 def _descend(
-    problem: _Problem, motion: NDArray, max_steps: int, limit: NDArray | None = None
+    problem: _Problem, M: NDArray, max_steps: int, limit: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
     """
     Return the last iterates from cameras (2, 3, n), and whether they have converged.
@@ -385,10 +377,10 @@ def _descend(
     With a limit (n,) the search of a frame is given up where the predicted gain says
     that the objective will not fall below its limit.
     """
-    found, converged = motion.copy(), np.zeros(motion.shape[2], dtype=bool)
-    running, damping = np.arange(motion.shape[2]), np.zeros(motion.shape[2])
+    found, converged = M.copy(), np.zeros(M.shape[2], dtype=bool)
+    running, damping = np.arange(M.shape[2]), np.zeros(M.shape[2])
     limit = np.full(len(running), np.inf) if limit is None else limit
-    state = _evaluate(problem, motion)
+    state = _evaluate(problem, M)
     for _ in range(max_steps):
         # Damped Newton step, and convergence test by the decrease that it predicts
         step, damping = _newton_step(state, damping)
@@ -400,7 +392,7 @@ def _descend(
         leaving |= state.value - PROMISED * gain > limit
         # Frames that have ended leave the problem, converged ones with a last step.
         if leaving.any():
-            last = problem.cameras.moved(state.motion, np.where(small, step, 0.0))
+            last = problem.cameras.moved(state.M, np.where(small, step, 0.0))
             found[:, :, running[leaving]] = last[:, :, leaving]
             converged[running[leaving]] = small[leaving]
             left = np.flatnonzero(~leaving)
@@ -411,7 +403,7 @@ def _descend(
             problem, state = problem.take(left), state.take(left)
             energy = energy[left]
         # Trial step, refused where the objective rises, and the next damping
-        trial = _evaluate(problem, problem.cameras.moved(state.motion, step))
+        trial = _evaluate(problem, problem.cameras.moved(state.M, step))
         worse = np.flatnonzero(~(trial.value <= state.value + OF_STEPS * energy))
         eased = EASED * damping
         eased[eased < SMALLEST_DAMPING] = 0.0
@@ -419,7 +411,7 @@ def _descend(
             eased[worse] = np.maximum(RAISED * damping[worse], FIRST_DAMPING)
             trial.put(worse, state.take(worse))
         state, damping = trial, eased
-    found[:, :, running] = state.motion
+    found[:, :, running] = state.M
     return found, converged
 
 
@@ -442,27 +434,27 @@ def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
     return step, damping
 
 
-def _found(problem: _Problem, motion: NDArray, converged: NDArray) -> FoundFrames:
+def _found(problem: _Problem, M: NDArray, converged: NDArray) -> FoundFrames:
     """Return the minima of a search from their cameras (2, 3, n)."""
     noise = problem.noise
-    posterior = _posterior(problem, motion)
-    state = _state(problem, motion, posterior)
+    posterior = _posterior(problem, M)
+    state = _state(problem, M, posterior)
     # Covariance of the coefficients with the uncertainty of the camera, by the inverse
     # of the joint Hessian of both: s2 (Q + Q C^T Y^-1 C Q). C is the coupling, and Y
     # the Hessian by the camera with the coefficients eliminated.
     Q = -unpacked(posterior.inverse)[1:, 1:]
-    through = np.einsum("kli,cli->kci", Q, _coupling(problem, motion, posterior))
+    through = np.einsum("kli,cli->kci", Q, _coupling(problem, M, posterior))
     inverse, _, positive = invert_positive(state.hessian)
     bad = np.flatnonzero(~positive)
     if len(bad):
         inverse[:, bad] = invert_positive(state.definite[:, bad])[0]
     inverse = unpacked(inverse)
     covariance = Q + np.einsum("kci,cdi,ldi->kli", through, inverse, through)
-    rows, columns = np.triu_indices(len(Q))
+    covariance = unpacked(noise * covariance[pair_indices(len(Q))])  # symmetric
     return FoundFrames(
-        motion,
-        posterior.alpha,
-        noise * covariance[rows, columns],
+        frames_first(M),
+        posterior.alpha.T,
+        frames_first(covariance),
         posterior.objective,
         np.maximum(posterior.residual(noise), 0.0),
         converged,

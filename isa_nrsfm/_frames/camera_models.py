@@ -13,8 +13,8 @@ its scale ::
 
 Its tangents are the derivatives by w, ``D_c = M hat(e_c)`` for c = x, y, z, and by l,
 ``D_4 = M``. With the rows m_r of M and G_r of G the gradient is ``sum_r G_r x m_r`` by
-w and ``<M, G>`` by l. The curvature is ``tr(D_c A D_d^T)``. Cameras are (2, 3,
-n_frames) here, frames last.
+w and ``<M, G>`` by l. The curvature is ``tr(D_c A D_d^T)``. The frame is the last
+index of all arrays here: M and G are (2, 3, n_frames), steps (n_parameters, n_frames).
 """
 
 from typing import Protocol
@@ -53,16 +53,16 @@ class CameraModel(Protocol):
     calibrated: bool
     scaled: bool
 
-    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+    def moved(self, M: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (n_parameters, n)."""
 
-    def tangents(self, motion: NDArray) -> NDArray:
+    def tangents(self, M: NDArray) -> NDArray:
         """Return the derivatives (n_parameters, 2, 3, n) of cameras."""
 
-    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
-        """Return dF/dparameters (n_parameters, n) from dF/dM (2, 3, n)."""
+    def gradient(self, M: NDArray, G: NDArray) -> NDArray:
+        """Return dF/dparameters (n_parameters, n) from G = dF/dM (2, 3, n)."""
 
-    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+    def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return the inverse curvature that `product` takes, from curvatures (6, n)."""
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
@@ -83,20 +83,20 @@ class AffineCameras:
     calibrated = False
     scaled = True
 
-    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+    def moved(self, M: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (6, n)."""
-        return motion + step.reshape(motion.shape)
+        return M + step.reshape(M.shape)
 
-    def tangents(self, motion: NDArray) -> NDArray:
+    def tangents(self, M: NDArray) -> NDArray:
         """Return the unit matrices (6, 2, 3, n), each with a single entry one."""
         entries = np.eye(6).reshape(6, 2, 3, 1)
-        return np.broadcast_to(entries, (6, *motion.shape))
+        return np.broadcast_to(entries, (6, *M.shape))
 
-    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+    def gradient(self, M: NDArray, G: NDArray) -> NDArray:
         """Return the derivative by the entries (6, n)."""
-        return slope.reshape(6, -1)
+        return G.reshape(6, -1)
 
-    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+    def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return the inverse curvature (3, 3, n) by a row, the same for both rows."""
         return inverse3(curvature)
 
@@ -122,21 +122,21 @@ class HeldCameras:
     calibrated = False
     scaled = False
 
-    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+    def moved(self, M: NDArray, step: NDArray) -> NDArray:
         """Return the cameras."""
-        return motion
+        return M
 
-    def tangents(self, motion: NDArray) -> NDArray:
+    def tangents(self, M: NDArray) -> NDArray:
         """Return no derivative."""
-        return np.zeros((0, *motion.shape))
+        return np.zeros((0, *M.shape))
 
-    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+    def gradient(self, M: NDArray, G: NDArray) -> NDArray:
         """Return no derivative."""
-        return np.zeros((0, motion.shape[-1]))
+        return np.zeros((0, M.shape[-1]))
 
-    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+    def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return no curvature."""
-        return np.zeros((0, 0, motion.shape[-1]))
+        return np.zeros((0, 0, M.shape[-1]))
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
         """Return no step."""
@@ -169,30 +169,30 @@ class CalibratedCameras:
         self.name = "weak_perspective" if scaled else "orthographic"
         self.n_parameters = 4 if scaled else 3
 
-    def moved(self, motion: NDArray, step: NDArray) -> NDArray:
+    def moved(self, M: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps w (3, n), or w and l (4, n)."""
-        turned = rotated(motion, step[:3])
+        turned = rotated(M, step[:3])
         return np.exp(step[3]) * turned if self.scaled else turned
 
-    def tangents(self, motion: NDArray) -> NDArray:
+    def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""
-        zero = np.zeros_like(motion[:, 0])
-        x, y, z = motion[:, 0], motion[:, 1], motion[:, 2]
+        zero = np.zeros_like(M[:, 0])
+        x, y, z = M[:, 0], M[:, 1], M[:, 2]
         rows = [(zero, z, -y), (-z, zero, x), (y, -x, zero)]  # m x e_c
         tangents = [np.stack(row, axis=1) for row in rows]
-        return np.stack([*tangents, motion] if self.scaled else tangents)
+        return np.stack([*tangents, M] if self.scaled else tangents)
 
-    def gradient(self, motion: NDArray, slope: NDArray) -> NDArray:
+    def gradient(self, M: NDArray, G: NDArray) -> NDArray:
         """Return the derivative by the tangents (n_parameters, n)."""
-        gradient = np.empty((self.n_parameters, motion.shape[-1]))
-        gradient[:3] = _cross(slope, motion).sum(axis=0)
+        gradient = np.empty((self.n_parameters, M.shape[-1]))
+        gradient[:3] = _cross(G, M).sum(axis=0)
         if self.scaled:
-            gradient[3] = np.einsum("rai,rai->i", motion, slope)
+            gradient[3] = np.einsum("rai,rai->i", M, G)
         return gradient
 
-    def inverse_curvature(self, motion: NDArray, curvature: NDArray) -> NDArray:
+    def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return the inverses (n_parameters, n_parameters, n) of the curvatures."""
-        C, across, scale = tangent_curvature(motion, curvature)
+        C, across, scale = tangent_curvature(M, curvature)
         C[:3] += RIDGE * C[:3].mean(axis=0)
         inverse = inverse3(C)
         if not self.scaled:
@@ -203,7 +203,7 @@ class CalibratedCameras:
         rest = scale - np.einsum("an,an->n", across, turn)
         rest = np.maximum(rest, RIDGE * scale)
         rest = np.divide(1.0, rest, where=rest > 0, out=np.zeros_like(rest))
-        full = np.empty((4, 4, motion.shape[-1]))
+        full = np.empty((4, 4, M.shape[-1]))
         full[:3, :3] = inverse + rest * turn[:, None] * turn
         full[:3, 3] = full[3, :3] = -rest * turn
         full[3, 3] = rest
@@ -234,15 +234,20 @@ CAMERAS: dict[str, CameraModel] = {
 }
 
 
+def camera_gram(M: NDArray) -> NDArray:
+    """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
+    return np.einsum("rpi,rpi->pi", M[:, ROWS], M[:, COLUMNS])
+
+
 def tangent_curvature(
-    motion: NDArray, curvature: NDArray
+    M: NDArray, curvature: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the curvature ``tr(D_c A D_d^T)`` along the tangents of calibrated cameras.
 
     Parameters
     ----------
-    motion : ndarray of shape (2, 3, n_frames)
+    M : ndarray of shape (2, 3, n_frames)
         M.
     curvature : ndarray of shape (6, n_frames)
         A, packed.
@@ -257,7 +262,7 @@ def tangent_curvature(
     scale : ndarray of shape (n_frames,)
         The entry of the logarithm of the scale, ``tr(A N)``.
     """
-    N = np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])
+    N = camera_gram(M)
     full_A, full_N = unpack3(curvature), unpack3(N)
     product = np.einsum("abi,bci->aci", full_A, full_N)
     scale = np.einsum("aai->i", product)
@@ -265,17 +270,17 @@ def tangent_curvature(
     turns = product[ROWS, COLUMNS] + product[COLUMNS, ROWS]
     turns -= trace_A * N + trace_N * curvature
     turns[:3] += trace_A * trace_N - scale
-    pulled = np.einsum("abi,rbi->rai", full_A, motion)
-    return turns, _cross(pulled, motion).sum(axis=0), scale
+    pulled = np.einsum("abi,rbi->rai", full_A, M)
+    return turns, _cross(pulled, M).sum(axis=0), scale
 
 
-def rotated(motion: NDArray, turns: NDArray) -> NDArray:
+def rotated(M: NDArray, turns: NDArray) -> NDArray:
     """
     Return cameras times rotations, ``M exp(hat(w))``.
 
     Parameters
     ----------
-    motion : ndarray of shape (2, 3, n_frames)
+    M : ndarray of shape (2, 3, n_frames)
         M.
     turns : ndarray of shape (3, n_frames)
         Rotation vectors w, in radians.
@@ -286,11 +291,11 @@ def rotated(motion: NDArray, turns: NDArray) -> NDArray:
         Rows ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2``, t = |w|.
     """
     angle = np.sqrt(np.einsum("an,an->n", turns, turns))
-    along = np.einsum("ran,an->rn", motion, turns)[:, None]
+    along = np.einsum("ran,an->rn", M, turns)[:, None]
     # sin(t) / t and (1 - cos(t)) / t^2 = 2 (sin(t/2) / t)^2, also for t = 0.
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    moved = np.cos(angle) * motion + first * _cross(motion, turns[None])
+    moved = np.cos(angle) * M + first * _cross(M, turns[None])
     return moved + second * along * turns
 
 

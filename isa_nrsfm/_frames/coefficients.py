@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameSums
+from isa_nrsfm._frames.camera_models import camera_gram
+from isa_nrsfm._frames.point_sums import FrameSums, with_one
 from isa_nrsfm._linalg.packed_symmetric import (
-    COLUMNS,
-    ROWS,
     diagonal_of,
     packed_rows,
     sweep,
@@ -80,14 +79,9 @@ class CoefficientPosterior(NamedTuple):
         return moments
 
 
-def camera_gram(motion: NDArray) -> NDArray:
-    """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
-    return np.einsum("rpi,rpi->pi", motion[:, ROWS], motion[:, COLUMNS])
-
-
 def coefficient_posterior(
     products: FrameSums,
-    motion: NDArray,
+    M: NDArray,
     noise: NDArray | float,
     *,
     refined: bool = False,
@@ -99,7 +93,7 @@ def coefficient_posterior(
     ----------
     products : FrameSums
         Sums of the frames for the shapes.
-    motion : ndarray of shape (2, 3, n_frames)
+    M : ndarray of shape (2, 3, n_frames)
         Cameras.
     noise : float or ndarray of shape (n_frames,)
         s2.
@@ -112,8 +106,8 @@ def coefficient_posterior(
     CoefficientPosterior
         The posterior.
     """
-    H = products.gram.energies(camera_gram(motion))
-    seen = np.einsum("kari,rai->ki", products.cross, motion)
+    H = products.gram.energies(camera_gram(M))
+    seen = np.einsum("kari,rai->ki", products.cross, M)
     n_shapes = len(seen)
     diagonal = diagonal_of(H)[1:]
     image_energy = H[diagonal]
@@ -130,9 +124,8 @@ def coefficient_posterior(
         left = equations[1:n_shapes] - _product(equations[n_shapes:], alpha)
         alpha -= _product(H[n_shapes:], left)
         objective -= np.einsum("ki,ki->i", alpha, left)
-    c = np.concatenate([np.ones((1, alpha.shape[1])), alpha])
     return CoefficientPosterior(
-        c,
+        with_one(alpha),
         H,
         np.maximum(objective, 0.0),  # less is rounding errors
         log_determinant - len(alpha) * np.log(noise),

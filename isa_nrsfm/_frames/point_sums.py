@@ -222,6 +222,25 @@ class FrameSums(NamedTuple):
     weight: NDArray
     energy: NDArray
 
+    def positions(self, motion: NDArray, alpha: NDArray) -> NDArray:
+        """
+        Return where frames show the origin of the shapes, by least squares.
+
+        Parameters
+        ----------
+        motion : ndarray of shape (n_frames, 2, 3)
+            Cameras.
+        alpha : ndarray of shape (n_frames, n_components)
+            Coefficients.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 2)
+            ``mean_i - M_i sum_k c_ik mean_ik`` with ``c = (1, alpha)``.
+        """
+        middle = np.einsum("kai,ki->ai", self.shape_centroid, with_one(alpha.T))
+        return (self.centroid - np.einsum("ira,ai->ri", motion, middle)).T
+
     def take(self, frames: NDArray) -> Self:
         """Return the sums of some of the frames."""
         return self._replace(
@@ -232,6 +251,11 @@ class FrameSums(NamedTuple):
             weight=self.weight[frames],
             energy=self.energy[frames],
         )
+
+
+def with_one(alpha: NDArray) -> NDArray:
+    """Return ``c = (1, alpha)`` (n_components + 1, n) of alpha (n_components, n)."""
+    return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
 
 
 def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks:

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.affine_newton import AffineSearch, with_one
+from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.point_sums import (
     FrameSums,
@@ -22,7 +22,6 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
 )
 from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch
-from isa_nrsfm._linalg.packed_symmetric import unpacked
 
 # Frames in a block: enough to be worth the calls, few enough for the cache. Frames
 # with missing points have a Gram matrix each.
@@ -196,8 +195,7 @@ def approximate_cameras(
     motion = np.empty((len(frames.weight), 2, 3))
     for block, products in prepared.blocks(search.shapes):
         variance = np.full(len(block), noise_variance)
-        found = search.rough_cameras(products, variance, prepared.n_points)
-        motion[block] = found.transpose(2, 0, 1)
+        motion[block] = search.rough_cameras(products, variance, prepared.n_points)
     return search.cameras(motion)
 
 
@@ -354,17 +352,13 @@ def _fit(
             products,
             variance[block],
             frames.n_points,
-            np.ascontiguousarray(initial[block].T),
+            initial[block],
             max_steps,
         )
-        c = with_one(found.alpha)
-        origin = np.einsum("kai,ki->ai", products.shape_centroid, c)
-        fits.motion[block] = found.motion.transpose(2, 0, 1)
-        fits.translation[block] = (
-            products.centroid - np.einsum("rai,ai->ri", found.motion, origin)
-        ).T
-        fits.alpha[block] = found.alpha.T
-        fits.covariance[block] = unpacked(found.covariance).transpose(2, 0, 1)
+        fits.motion[block] = found.motion
+        fits.translation[block] = products.positions(found.motion, found.alpha)
+        fits.alpha[block] = found.alpha
+        fits.covariance[block] = found.covariance
         fits.objective[block] = found.objective
         fits.residual[block] = found.residual
         fits.converged[block] = found.converged

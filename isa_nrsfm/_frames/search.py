@@ -12,17 +12,17 @@ MAX_STEPS = 60
 
 class FoundFrames(NamedTuple):
     """
-    Minima that the search for cameras and coefficients has reached, frames last.
+    Minima that the search for cameras and coefficients has reached.
 
     Attributes
     ----------
-    motion : ndarray of shape (2, 3, n_frames)
+    motion : ndarray of shape (n_frames, 2, 3)
         Cameras.
-    alpha : ndarray of shape (n_components, n_frames)
+    alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
-    covariance : ndarray of shape (n_pairs, n_frames)
-        Posterior covariance of the coefficients, packed. It contains the uncertainty of
-        the camera.
+    covariance : ndarray of shape (n_frames, n_components, n_components)
+        Posterior covariance of the coefficients. It contains the uncertainty of the
+        camera.
     objective : ndarray of shape (n_frames,)
         ``||W - M S||^2 + s2 |a|^2``.
     residual : ndarray of shape (n_frames,)
@@ -69,11 +69,11 @@ class FrameSearch(Protocol):
         """
         Return the minima that frames reach from given coefficients.
 
-        The noise variances are (n_frames,), the coefficients initial (n_components,
-        n_frames).
+        The noise variances are (n_frames,), the coefficients initial (n_frames,
+        n_components).
         """
 
     def rough_cameras(
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
-        """Return cameras (2, 3, n_frames) that are close to those of a fit."""
+        """Return cameras (n_frames, 2, 3) that are close to those of a fit."""

@@ -224,7 +224,7 @@ def fit_jointly(
     # Coefficients of the sample, and degrees of freedom of the noise
     state = result.state._replace(shapes=first.frames.coordinates(shapes))
     if sample.parts:
-        state = state._replace(motion=state.motion[:, :, sample.parts[0]])
+        state = state._replace(motion=state.motion[sample.parts[0]])
     unknowns = (2 + cameras.n_parameters, n_fitted)
     noise *= _freedom_correction(n_seen, n_points, n_shapes, *unknowns)
     return JointFit(

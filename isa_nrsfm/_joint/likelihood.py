@@ -19,8 +19,9 @@ The gradient follows from the first two posterior moments of the coefficients, a
 expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
 1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
 
-Frames are the last index of all arrays here. All terms are sums over blocks of frames:
-how the frames are split makes no difference but for rounding.
+All terms are sums over blocks of frames: how the frames are split makes no difference
+but for rounding. The pass over a block works with the frame as the last index of all
+arrays, with cameras M and the gradient G by them (2, 3, n_frames).
 """
 
 from collections.abc import Callable
@@ -30,7 +31,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.coefficients import camera_gram, coefficient_posterior
+from isa_nrsfm._frames.camera_models import camera_gram
+from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
     SharedGram,
@@ -39,6 +41,7 @@ from isa_nrsfm._frames.point_sums import (
     shared_gram,
 )
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
@@ -58,7 +61,7 @@ class LikelihoodTerms(NamedTuple):
         The objective.
     shape_gradient : ndarray of shape (n_shapes, 3, n_points)
         Its derivative by the shapes.
-    motion_gradient : ndarray of shape (2, 3, n_frames)
+    motion_gradient : ndarray of shape (n_frames, 2, 3)
         Its derivative by the cameras.
     noise_gradient : float
         Its derivative by the logarithm of the noise variance.
@@ -69,7 +72,7 @@ class LikelihoodTerms(NamedTuple):
         where all weights are one.
     motion_curvature : ndarray of shape (6, n_frames)
         ``sum_kl E_kl B_k B_l^T``, packed: the same for each row of the cameras.
-    alpha : ndarray of shape (n_components, n_frames)
+    alpha : ndarray of shape (n_frames, n_components)
         Posterior means of the coefficients.
     residual : float
         Sum of squared residuals of the tracks at these means.
@@ -159,7 +162,7 @@ class MarginalLikelihood:
         ----------
         shapes : ndarray of shape (n_shapes, 3, n_points)
             B_0, ..., B_K.
-        motion : ndarray of shape (2, 3, n_frames)
+        motion : ndarray of shape (n_frames, 2, 3)
             M_i.
         noise : float
             s2.
@@ -171,15 +174,14 @@ class MarginalLikelihood:
         """
         n_shapes = len(shapes)
         over_block = self._over_block(shapes, noise)
-        alpha = np.empty((n_shapes - 1, self.n_frames))
-        motion_gradient = np.empty((2, 3, self.n_frames))
+        alpha = np.empty((n_shapes - 1, self.n_frames)).T
+        motion_gradient = frames_first(np.empty((2, 3, self.n_frames)))
         motion_curvature = np.empty((6, self.n_frames))
         sums: Any = (0.0,) * 5
-        cameras = motion.transpose(2, 0, 1)
-        passes = self.frames.map(over_block, cameras)
+        passes = self.frames.map(over_block, motion)
         for frames, part in zip(self.frames.slices, passes, strict=True):
-            alpha[:, frames] = part.alpha
-            motion_gradient[:, :, frames] = part.motion_gradient
+            alpha[frames] = part.alpha
+            motion_gradient[frames] = part.motion_gradient
             motion_curvature[:, frames] = part.motion_curvature
             sums = [a + b for a, b in zip(sums, _sums(part), strict=True)]
         value, shape_gradient, noise_gradient, packed, residual = sums
@@ -213,11 +215,9 @@ class MarginalLikelihood:
             The means.
         """
         alpha = np.empty((self.n_frames, len(shapes) - 1))
-        passes = self.frames.map(
-            self._over_block(shapes, noise), motion.transpose(2, 0, 1)
-        )
+        passes = self.frames.map(self._over_block(shapes, noise), motion)
         for frames, part in zip(self.frames.slices, passes, strict=True):
-            alpha[frames] = part.alpha.T
+            alpha[frames] = part.alpha
         return alpha
 
     def _over_block(
@@ -282,16 +282,10 @@ def _block_terms(
     penalty: NDArray | float,
     tiny_noise: bool,
 ) -> LikelihoodTerms:
-    """
-    Return the terms of a block, from those of pieces whose matrices fit the cache.
-
-    Here motion is (n_frames, 2, 3): the blocks of frames are cut along the first axis.
-    """
-    motion = motion.transpose(1, 2, 0)
+    """Return the terms of a block, summed over pieces whose matrices fit the cache."""
+    M = frames_last(motion)
     parts = [
-        _frame_terms(
-            piece, shapes, gram, motion[:, :, frames], noise, penalty, tiny_noise
-        )
+        _frame_terms(piece, shapes, gram, M[:, :, frames], noise, penalty, tiny_noise)
         for frames, piece in block.pieces(BLOCK_FRAMES)
     ]
     if len(parts) == 1:
@@ -301,11 +295,11 @@ def _block_terms(
     return LikelihoodTerms(
         value,
         shape_gradient,
-        np.concatenate([part.motion_gradient for part in parts], axis=-1),
+        np.concatenate([part.motion_gradient for part in parts]),
         noise_gradient,
         shape_curvature,
         np.concatenate([part.motion_curvature for part in parts], axis=-1),
-        np.concatenate([part.alpha for part in parts], axis=-1),
+        np.concatenate([part.alpha for part in parts]),
         residual,
     )
 
@@ -314,13 +308,13 @@ def _frame_terms(
     block: FrameTracks,
     shapes: NDArray,
     gram: SharedGram,
-    motion: NDArray,
+    M: NDArray,
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
 ) -> LikelihoodTerms:
     """
-    Return the terms of frames of one block, motion (2, 3, n_frames).
+    Return the terms of frames of one block, M (2, 3, n_frames).
 
     Left out is what the caller adds for all frames at once: ``N log s2``, and the term
     ``2 / s2 curvature B`` of the gradient by the shapes. The curvature by the shapes is
@@ -328,7 +322,7 @@ def _frame_terms(
     """
     n_shapes, _, n_points = shapes.shape
     products = frame_sums(block, shapes, gram)
-    posterior = coefficient_posterior(products, motion, noise, refined=tiny_noise)
+    posterior = coefficient_posterior(products, M, noise, refined=tiny_noise)
     c, alpha = posterior.c, posterior.alpha
     value = np.sum(posterior.objective / noise + posterior.log_determinant)
     value += np.sum(penalty * posterior.image_energy.sum(axis=1))
@@ -338,14 +332,14 @@ def _frame_terms(
     # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
     moments = posterior.second_moments(noise)
     moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
-    cameras = camera_gram(motion)
+    cameras = camera_gram(M)
     # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
     motion_curvature = products.gram.moments(moments)
     A = unpack3(motion_curvature)
-    motion_gradient = np.einsum("rbi,bai->rai", motion, A)
-    motion_gradient -= np.einsum("ki,kari->rai", c, products.cross)
+    G = np.einsum("rbi,bai->rai", M, A)
+    G -= np.einsum("ki,kari->rai", c, products.cross)
     # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
-    X = (c[:, None, None] * motion.transpose(1, 0, 2)).reshape(3 * n_shapes, -1)
+    X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
     shape_gradient = X @ block.weighted.reshape(n_points, -1).T
     if block.weights is None:
         shape_curvature = (moments @ cameras.T)[:, :, None]
@@ -359,11 +353,11 @@ def _frame_terms(
     return LikelihoodTerms(
         float(value),
         (-2 / noise) * shape_gradient.reshape(shapes.shape),
-        (2 / noise) * motion_gradient,
+        frames_first((2 / noise) * G),
         -(residual + spread) / noise,
         shape_curvature,
         motion_curvature,
-        alpha,
+        alpha.T,
         residual,
     )
 

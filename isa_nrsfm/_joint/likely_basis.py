@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.vectors import frames_last
 
 
 def likely_basis(
@@ -27,9 +28,9 @@ def likely_basis(
     ----------
     shapes : ndarray of shape (n_shapes, 3, n_points)
         Mean shape and basis shapes.
-    motion : ndarray of shape (2, 3, n_frames)
+    motion : ndarray of shape (n_frames, 2, 3)
         Cameras.
-    alpha : ndarray of shape (n_components, n_frames)
+    alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
     penalty : float
         As in `MarginalLikelihood`.
@@ -39,18 +40,18 @@ def likely_basis(
     ndarray of shape (n_shapes, 3, n_points)
         Mean shape and basis shapes.
     """
-    n_frames = motion.shape[2]
+    M, n_frames = frames_last(motion), len(motion)
     # Coefficients of mean zero
-    mean = alpha.mean(axis=1)
+    mean = alpha.mean(axis=0)
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
     # Coefficients of covariance one
-    rest = alpha - mean[:, None]
-    covariance = rest @ rest.T / n_frames
+    rest = alpha - mean
+    covariance = rest.T @ rest / n_frames
     # A ridge, as the covariance can be singular
     covariance += (OF_PRODUCTS * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
     # Diagonal H / n, and the scales a_k
-    cameras = np.einsum("rai,rbi->ab", motion, motion) / n_frames
+    cameras = np.einsum("rai,rbi->ab", M, M) / n_frames
     energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
     price = penalty * np.maximum(energy, 0.0)
     scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))

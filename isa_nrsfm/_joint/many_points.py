@@ -75,9 +75,8 @@ def in_all_points(
         # Expectation maximisation in all points: solve curvature B = sum_i X_i^T W_i.
         passed = problem.likelihood(*state)
         curvature = regular(passed.shape_curvature)[0]
-        right = sum(
-            rows.map(_right_side, state.motion.transpose(2, 0, 1), passed.alpha.T)
-        ).reshape(len(curvature), -1)
+        right = sum(rows.map(_right_side, state.motion, passed.alpha))
+        right = right.reshape(len(curvature), -1)
         after = np.linalg.solve(curvature, right)
         # Predicted gain of the objective
         change = after - before.reshape(after.shape)

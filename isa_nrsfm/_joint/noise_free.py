@@ -48,6 +48,7 @@ from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.options import JOINT_OPTIONS, NoiseFreeOptions
 from isa_nrsfm._linalg.rounding import OF_DISTANCES, OF_PRODUCTS, OF_SUMS
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 
@@ -89,9 +90,9 @@ def fit_without_noise(
         others alike.
     shapes : ndarray of shape (n_shapes, 3, n_points)
         B_0, ..., B_K to start from, close enough for the residual to be small.
-    motion : ndarray of shape (2, 3, n_frames)
+    motion : ndarray of shape (n_frames, 2, 3)
         Cameras to start from.
-    alpha : ndarray of shape (n_components, n_frames)
+    alpha : ndarray of shape (n_frames, n_components)
         Coefficients to start from.
     penalty : float or ndarray of shape (n_components,)
         As in `MarginalLikelihood`.
@@ -104,7 +105,7 @@ def fit_without_noise(
     -------
     shapes : ndarray of shape (n_shapes, 3, n_points)
         Shapes, in the basis of greatest marginal likelihood.
-    motion : ndarray of shape (2, 3, n_frames)
+    motion : ndarray of shape (n_frames, 2, 3)
         Cameras. Those of frames whose points do not determine one are as they came.
 
     Notes
@@ -119,18 +120,16 @@ def fit_without_noise(
     if n_frames < len(b):
         return None
     W, frames = complete_frames(blocks, b, n_frames, options)
-    if len(frames) < min(len(b), alpha.shape[1]):
+    if len(frames) < min(len(b), len(alpha)):
         return None
     # Gauss-Newton steps in a basis V of the row space
     rows, V = compressed(W, b)
-    start = FramesAndShapes(
-        b @ V, motion[..., frames].transpose(2, 0, 1), alpha[:, frames].T
-    )
+    start = FramesAndShapes(b @ V, motion[frames], alpha[frames])
     found = minimise(rows, start, cameras, options)
     shapes = (found.shapes @ V.T).reshape(shapes.shape)
     # Cameras and coefficients of all frames for these shapes
-    alpha = alpha.copy()
-    alpha[:, frames] = found.alpha.T
+    alpha = alpha.copy(order="F")  # sums over the frames are over rows of memory
+    alpha[frames] = found.alpha
     fitted = partial(
         _fitted, shapes=shapes, camera=cameras.name, counted=options.counted
     )
@@ -322,7 +321,7 @@ def frame_tangents(state: FramesAndShapes, cameras: CameraModel) -> NDArray:
     shapes = b.reshape(n_components + 1, 3, -1)
     frame_shapes = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
     n_directions = b.shape[1]
-    D = cameras.tangents(motion.transpose(1, 2, 0))
+    D = cameras.tangents(frames_last(motion))
     by_camera = np.einsum("crai,iad->irdc", D, frame_shapes)
     by_alpha = np.einsum("ira,kad->irdk", motion, shapes[1:])
     tangents = np.concatenate([by_camera, by_alpha], axis=3)
@@ -364,9 +363,9 @@ class _Frames(NamedTuple):
         step = np.linalg.solve(self.factor, along)[..., 0]
         n = self.cameras.n_parameters
         turns = self.cameras.limited(step[:, :n].T)
-        motion = self.cameras.moved(state.motion.transpose(1, 2, 0), turns)
+        M = self.cameras.moved(frames_last(state.motion), turns)
         alpha = state.alpha + step[:, n:]
-        return FramesAndShapes(state.shapes, motion.transpose(2, 0, 1), alpha)
+        return FramesAndShapes(state.shapes, frames_first(M), alpha)
 
 
 def minimise(
@@ -492,17 +491,17 @@ def _all_frames(
     blocks: FrameBlocks, fitted: Callable[..., Any], motion: NDArray, alpha: NDArray
 ) -> tuple[NDArray, NDArray]:
     """
-    Return motion (2, 3, n_frames) and alpha (K, n_frames) of all frames.
+    Return motion (n_frames, 2, 3) and alpha (n_frames, K) of all frames.
 
     The function fitted returns cameras and coefficients of a block.
     """
-    motion, alpha = motion.copy(), alpha.copy()
-    fits = blocks.map(fitted, alpha.T.copy())
+    motion, alpha = np.copy(motion), np.copy(alpha)
+    fits = blocks.map(fitted, alpha.copy())
     for part, (cameras, coefficients) in zip(blocks.slices, fits, strict=True):
         known = np.isfinite(coefficients).all(axis=1)
         frames = np.arange(part.start, part.stop)[known]
-        motion[..., frames] = cameras[known].transpose(1, 2, 0)
-        alpha[:, frames] = coefficients[known].T
+        motion[frames] = cameras[known]
+        alpha[frames] = coefficients[known]
     return motion, alpha
 
 

@@ -112,8 +112,7 @@ class JointProblem:
         aligned = partial(
             _aligned_cameras, shapes=shapes, noise=state.noise, camera=camera
         )
-        motion = self.frames.blocks.joined(aligned)
-        return JointState(shapes, motion.transpose(1, 2, 0), state.noise)
+        return JointState(shapes, self.frames.blocks.joined(aligned), state.noise)
 
     def reversed_back(
         self, state: JointState, cameras: CameraModel
@@ -142,9 +141,8 @@ class JointProblem:
             noise=state.noise,
             scaled=cameras.scaled,
         )
-        found = self.frames.blocks.map(function, state.motion.transpose(2, 0, 1))
+        found = self.frames.blocks.map(function, state.motion)
         motion, better = map(np.concatenate, zip(*found, strict=True))
-        motion = np.ascontiguousarray(motion.transpose(1, 2, 0))
         return state._replace(motion=motion), int(better.sum())
 
     def refined(
@@ -196,11 +194,7 @@ def _reversed_back(
     noise: float,
     scaled: bool,
 ) -> tuple[NDArray, NDArray]:
-    """
-    Return the better cameras (n_frames, 2, 3) of a block, and which were reversed.
-
-    The cameras that come, motion, are (n_frames, 2, 3), too.
-    """
+    """Return the better cameras (n_frames, 2, 3), and which ones were reversed."""
     search = CalibratedSearch(shapes, scaled)
     found = [
         search.reversed_cameras(frame_sums(piece, search.shapes), noise, motion[frames])

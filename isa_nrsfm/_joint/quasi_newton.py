@@ -22,6 +22,7 @@ from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.noise_free import fit_without_noise
 from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions, SearchOptions
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 
 class JointState(NamedTuple):
@@ -32,8 +33,8 @@ class JointState(NamedTuple):
     ----------
     shapes : ndarray of shape (n_shapes, 3, n_points)
         B_0, ..., B_K.
-    motion : ndarray of shape (2, 3, n_frames)
-        Cameras, frames last.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
     noise : float
         Variance of the noise of a coordinate.
     """
@@ -202,7 +203,7 @@ def _without_noise(
     shapes, motion, _ = iterate.state
     if not np.isfinite(iterate.value):
         return None
-    alpha = likelihood.coefficients(*iterate.state).T
+    alpha = likelihood.coefficients(*iterate.state)
     found = fit_without_noise(
         likelihood.frames,
         shapes,
@@ -239,6 +240,7 @@ class _Iterate:
     ):
         passed = likelihood(*state)
         self.state, self.cameras = state, cameras
+        self.M = frames_last(state.motion)
         self.n_seen = likelihood.n_seen
         self.value = passed.value
         self.residual = passed.residual / likelihood.n_seen
@@ -247,7 +249,7 @@ class _Iterate:
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             passed.shape_gradient,
-            cameras.gradient(state.motion, passed.motion_gradient),
+            cameras.gradient(self.M, frames_last(passed.motion_gradient)),
             # At its lower bound the noise variance may only rise.
             min(passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
@@ -256,8 +258,8 @@ class _Iterate:
     @cached_property
     def metric(self) -> tuple[NDArray, NDArray]:
         """Inverses of the curvatures by the shapes and by the cameras."""
-        by_shapes, by_motion = self.curvature
-        inverse = self.cameras.inverse_curvature(self.state.motion, by_motion)
+        by_shapes, by_cameras = self.curvature
+        inverse = self.cameras.inverse_curvature(self.M, by_cameras)
         return np.linalg.inv(regular(by_shapes)), inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
@@ -268,33 +270,31 @@ class _Iterate:
         number of coordinates, by ``log s2``. It has no blocks across these three.
         """
         half = self.state.noise / 2
-        shapes, motion, noise = self.split(vector)
-        by_shapes, by_motion = self.metric
+        shapes, steps, noise = self.split(vector)
+        by_shapes, by_cameras = self.metric
         stacked = shapes.reshape(-1, shapes.shape[-1])
         if len(by_shapes) == 1:
             stacked = by_shapes[0] @ stacked
         else:
             stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
-        motion = self.cameras.product(by_motion, motion)
-        return _stacked(half * stacked, half * motion, noise / self.n_seen)
+        steps = self.cameras.product(by_cameras, steps)
+        return _stacked(half * stacked, half * steps, noise / self.n_seen)
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:
         """Return shapes (n, 3, J), parameters of cameras (p, I), and log noise."""
         first = self.state.shapes.size
         return (
             vector[:first].reshape(self.state.shapes.shape),
-            vector[first:-1].reshape(
-                self.cameras.n_parameters, self.state.motion.shape[-1]
-            ),
+            vector[first:-1].reshape(self.cameras.n_parameters, len(self.state.motion)),
             vector[-1],
         )
 
     def moved(self, step: NDArray, floor: float) -> JointState:
         """Return the state after a step; the noise variance is at least floor."""
-        shapes, motion, noise = self.split(step)
+        shapes, steps, noise = self.split(step)
         return JointState(
             self.state.shapes + shapes,
-            self.cameras.moved(self.state.motion, motion),
+            frames_first(self.cameras.moved(self.M, steps)),
             max(self.state.noise * np.exp(noise), floor),
         )
 
@@ -311,9 +311,9 @@ def regular(curvature: NDArray) -> NDArray:
     return curvature + ridge * np.eye(size)
 
 
-def _stacked(shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
-    """Return the three parts of the unknowns as one vector."""
-    return np.concatenate([shapes.ravel(), motion.ravel(), [noise]])
+def _stacked(shapes: NDArray, steps: NDArray, noise: float) -> NDArray:
+    """Return the three parts of the unknowns as one vector, with steps (p, I)."""
+    return np.concatenate([shapes.ravel(), steps.ravel(), [noise]])
 
 
 def _inverse_hessian_product(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState, regular
+from isa_nrsfm._linalg.vectors import frames_last
 
 
 def relevant_components(
@@ -61,7 +62,8 @@ def relevant_components(
 
 def _camera_moments(state: JointState) -> NDArray:
     """Return ``C = mean_i M_i^T M_i`` (3, 3)."""
-    return np.einsum("rai,rbi->ab", state.motion, state.motion) / state.motion.shape[2]
+    M = frames_last(state.motion)
+    return np.einsum("rai,rbi->ab", M, M) / M.shape[2]
 
 
 def _orthogonal(state: JointState) -> JointState:

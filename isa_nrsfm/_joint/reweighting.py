@@ -57,11 +57,7 @@ def reweighted(
         shapes, motion, _ = result.state
         stacked = shapes.transpose(0, 2, 1)
         alpha = problem.coefficients(result.state)
-        model = project(
-            compose(stacked[0], stacked[1:], alpha),
-            motion.transpose(2, 0, 1),
-            np.zeros(2),
-        )
+        model = project(compose(stacked[0], stacked[1:], alpha), motion, np.zeros(2))
         rest = np.where(seen[..., None], tracks - model, 0.0)
         # less the weighted mean of each frame, its position
         position = np.einsum("ij,ijc->ic", counted, rest)

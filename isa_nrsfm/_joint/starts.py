@@ -297,8 +297,8 @@ def _freed(
     """Return a start after some steps of shapes and cameras of the compared frames."""
     freed_steps = part.options.starts.freed_steps
     result = part.refined(trial.state, cameras, max_iter=freed_steps)
-    motion = frames_last(trial.motion)
-    motion[:, :, few] = result.state.motion
+    motion = trial.motion.copy()
+    motion[few] = result.state.motion
     return result.state._replace(motion=motion)
 
 
@@ -316,7 +316,7 @@ def _first_state(
     options = problem.options
     noise = options.starts.first_noise * np.mean(rest**2)
     least_noise = options.least_noise * energy / n_seen
-    return JointState(shapes, frames_last(motion), max(noise, least_noise))
+    return JointState(shapes, motion, max(noise, least_noise))
 
 
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
@@ -336,7 +336,7 @@ def with_prior(problem: JointProblem, state: JointState) -> JointState:
         The state with its basis shapes mixed and scaled.
     """
     shapes, motion, _ = state
-    alpha = problem.coefficients(state).T
+    alpha = problem.coefficients(state)
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
     return state._replace(shapes=shapes)
 
@@ -354,8 +354,3 @@ def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
     energy = np.einsum("ikrj,ikrj->ik", images, images)
     alpha = np.divide(along, energy, where=energy > 0, out=np.zeros_like(along))
     return np.concatenate([shapes[:1], alpha.std(axis=0)[:, None, None] * shapes[1:]])
-
-
-def frames_last(motion: NDArray) -> NDArray:
-    """Return cameras (n_frames, 2, 3) as (2, 3, n_frames)."""
-    return np.ascontiguousarray(motion.transpose(1, 2, 0))

@@ -1,4 +1,4 @@
-"""Energies of rows of numbers, and a convention for their signs."""
+"""Energies and signs of rows of numbers, and the axes of one matrix for each frame."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,41 @@ def energies(rows: NDArray) -> NDArray[np.float64]:
     """Return the sums of the squares of arrays (n_frames, ...), in double precision."""
     flat = rows.reshape(len(rows), -1).astype(np.float64, copy=False)
     return np.vecdot(flat, flat)
+
+
+def frames_last(motion: NDArray) -> NDArray:
+    """
+    Return matrices with the frame as the last index.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, a, b)
+        A matrix for each frame, such as a camera.
+
+    Returns
+    -------
+    ndarray of shape (a, b, n_frames)
+        The same, with long rows over the frames in memory: `motion` itself where it
+        comes from `frames_first`, and a copy otherwise.
+    """
+    return np.ascontiguousarray(motion.transpose(1, 2, 0))
+
+
+def frames_first(M: NDArray) -> NDArray:
+    """
+    Return matrices with the frame as the first index.
+
+    Parameters
+    ----------
+    M : ndarray of shape (a, b, n_frames)
+        A matrix for each frame.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, a, b)
+        A view of them. `frames_last` takes it back without a copy.
+    """
+    return M.transpose(2, 0, 1)
 
 
 def orientations(rows: NDArray) -> NDArray:

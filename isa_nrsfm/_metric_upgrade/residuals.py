@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, eigh3
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.vectors import frames_last
 
 CameraModel = Literal["orthographic", "weak_perspective"]
 CAMERA_MODELS = ("orthographic", "weak_perspective")
@@ -149,7 +150,7 @@ def frame_blocks(motion: NDArray, alpha: NDArray) -> list[Block]:
     Returns
     -------
     list of tuple of ndarray
-        Cameras (2, 3, n) and coefficients (n_components, n) of n frames each.
+        Cameras M (2, 3, n) and coefficients (n_components, n) of n frames each.
     """
     parts = [
         slice(start, start + BLOCK_FRAMES)
@@ -157,7 +158,7 @@ def frame_blocks(motion: NDArray, alpha: NDArray) -> list[Block]:
     ]
     return [
         (
-            np.ascontiguousarray(motion[part].transpose(1, 2, 0)),
+            frames_last(motion[part]),
             np.ascontiguousarray(alpha[part].T),
         )
         for part in parts
@@ -187,8 +188,8 @@ def fit_at(
         The metric, with its cost, curvature and gradient.
     """
     parts = [
-        _normal_equations(alpha, *_linearised(Q.T @ cameras, strain, alpha, camera))
-        for cameras, alpha in blocks
+        _normal_equations(alpha, *_linearised(Q.T @ M, strain, alpha, camera))
+        for M, alpha in blocks
     ]
     costs, curvatures, gradients = zip(*parts, strict=True)
     return MetricFit(
@@ -202,15 +203,15 @@ def fit_at(
 
 
 def _linearised(
-    cameras: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
+    MQ: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return residuals of cameras and their derivatives.
 
     Parameters
     ----------
-    cameras : ndarray of shape (2, 3, n_frames)
-        ``M_i Q``, the frame last.
+    MQ : ndarray of shape (2, 3, n_frames)
+        ``M_i Q``: cameras in the axes of the metric.
     strain : ndarray of shape (n_components, 3, 3)
         E_k.
     alpha : ndarray of shape (n_components, n_frames)
@@ -231,17 +232,17 @@ def _linearised(
     numbers = strain_basis(camera)
     # M_i Q exp(E) is `grown`, and M_i G_i M_i^T the product of that with M_i Q. The
     # eigenvectors of E are `axes`, and `seen` is M_i Q in these axes.
-    grown = cameras
+    grown = MQ
     if len(strain):
         stretch, axes = eigh3(strain[:, ROWS, COLUMNS].T @ alpha)
-        seen = np.einsum("abn,pan->pbn", axes, cameras)
+        seen = np.einsum("abn,pan->pbn", axes, MQ)
         grown = np.einsum("abn,pbn->pan", axes, np.exp(stretch) * seen)
-    gram = np.einsum("pan,qan->pqn", grown, cameras)
+    gram = np.einsum("pan,qan->pqn", grown, MQ)
     residuals = orthonormality(gram, camera)
     # Residual c changes by tr(F_c d(M_i G_i M_i^T)). The weak-perspective residual is a
     # quotient: F_c is (pattern - residual * I) / (xx + yy).
     F = np.broadcast_to(
-        _patterns(camera)[..., None], (len(residuals), 2, 2, cameras.shape[-1])
+        _patterns(camera)[..., None], (len(residuals), 2, 2, MQ.shape[-1])
     )
     if camera == "weak_perspective":
         F = F - residuals[:, None, None] * np.eye(2)[:, :, None]
@@ -249,7 +250,7 @@ def _linearised(
 
     # Derivatives in E_0: exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by
     # (E_0 exp(E) + exp(E) E_0) / 2.
-    turned = np.einsum("cpqn,qan->cpan", F, cameras)
+    turned = np.einsum("cpqn,qan->cpan", F, MQ)
     by_common = np.einsum("cpan,pbn->abcn", turned, grown)
     slopes = np.tensordot(numbers, by_common, 2)
     if not len(strain):
