@@ -258,7 +258,7 @@ def test_texts_as_others_write_them_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no point distribution model; where there should be the mean"),
+        ("", "as a point distribution model: where there should be the mean"),
         ("# mean\n3 1 6 1 2\n", "where there should be the mean"),
         ("3 1 6 1 2 3 3 1 6 1 one 1 1 1 6 1", "there should be the principal comp"),
         ("3 1 6 1 2 3 3 1 6 1 1 1 1 2 6 1 1", r"should have a mean of 3n numbers"),

@@ -89,7 +89,7 @@ def test_damaged_hdf5_files_are_read_or_refused(format, tmp_path):
     for part in truncated(content, 20)[:-1]:
         assert read_or_refuse(path, part, format) is None
     path.write_bytes(content[:-100])
-    with pytest.raises(ValueError, match=r"a\.h5 is a damaged HDF5 file"):
+    with pytest.raises(ValueError, match=r"a\.h5 cannot be read as HDF5"):
         read_landmarks(path)
     for part in with_other_bytes(content, 24):
         read_or_refuse(path, part, format)

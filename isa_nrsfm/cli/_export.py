@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm.cli._export_options import SUFFIXES
 from isa_nrsfm.cli._outputs import refuse_overwriting
 from isa_nrsfm.cli._reading import as_fitted, read_frames
@@ -141,7 +142,9 @@ def _edges(path: str, estimator: AffineNRSfM) -> Any:
         return None
     numbers = {name: j for j, name in enumerate(names_of_points(estimator))}
     edges: list[list[int]] = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines()):
+    with reading(path, "a list of edges"):
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    for number, line in enumerate(lines):
         names = [name.strip() for name in line.split(",")]
         if not line.strip():
             continue

@@ -1,14 +1,18 @@
 """Point distribution models, and their files for OpenFace."""
 
 import os
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 
+from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm._compat.whole_files import whole_file, write_whole
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
@@ -195,18 +199,8 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     """
     suffix = _suffix(path)
     mean, modes, eigenvalues = map(np.asarray, pdm)
+    _check_shapes(PointDistributionModel(mean, modes, eigenvalues))
     n_modes = len(eigenvalues)
-    if (
-        mean.ndim != 2
-        or mean.shape[1] != 3
-        or modes.shape != (n_modes, *mean.shape)
-        or eigenvalues.shape != (n_modes,)
-    ):
-        raise ValueError(
-            "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
-            f"eigenvalues (n_modes,); got {mean.shape}, {modes.shape} and "
-            f"{eigenvalues.shape}"
-        )
     if suffix == ".npz":
         with whole_file(path) as file:
             np.savez(file, mean=mean, modes=modes, eigenvalues=eigenvalues)
@@ -243,38 +237,31 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     ------
     ValueError
         If the suffix is none of ``.txt``, ``.mat`` and ``.npz``, or the file does not
-        have the three matrices, of shapes that fit each other.
+        have the three matrices, of finite numbers and shapes that fit each other.
     OSError
         If the file cannot be opened.
 
     See Also
     --------
     write_pdm : Write such a file.
+
+    Notes
+    -----
+    SciPy reads ``.mat`` files. Damaged ones can end Python: of strangers, take a text.
     """
     suffix = _suffix(path)
-    if suffix == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
+    with reading(path, "a point distribution model"):
+        if suffix == ".npz":
             names = PointDistributionModel._fields
-            absent = [name for name in names if name not in arrays]
-            if absent:
-                raise ValueError(f"{os.fspath(path)} has no {', '.join(absent)}")
-            return PointDistributionModel(*(arrays[name] for name in names))
-    if suffix == ".mat":
-        variables = loadmat(path)
-        absent = [name for name in "MVE" if name not in variables]
-        if absent:
-            raise ValueError(f"{os.fspath(path)} has no {', '.join(absent)}")
-        M, V, E = (variables[name].astype(np.float64) for name in "MVE")
-    else:
-        M, V, E = _read_matrices(path)
-    n_points, n_modes = M.size // 3, E.size
-    if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
-        raise ValueError(
-            f"{os.fspath(path)} should have a mean of 3n numbers, components of shape "
-            f"(3n, m) and m variances; got {M.size}, {V.shape} and {E.size}"
-        )
-    modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
-    return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
+            pdm = PointDistributionModel(*_numbers(_unzipped(path, names), names))
+        elif suffix == ".mat":
+            pdm = _from_matrices(*_numbers(loadmat(path), "MVE"))
+        else:
+            pdm = _from_matrices(*_read_matrices(path))
+        _check_shapes(pdm)
+        if not all(np.isfinite(part).all() for part in pdm):
+            raise ValueError("its numbers should be finite; got NaN or infinity")
+        return pdm
 
 
 def _suffix(path: str | os.PathLike[str]) -> str:
@@ -286,6 +273,58 @@ def _suffix(path: str | os.PathLike[str]) -> str:
             f"{SUFFIXES[-1]}; got {os.fspath(path)}"
         )
     return suffix
+
+
+def _check_shapes(pdm: PointDistributionModel) -> None:
+    """Raise if the arrays of a model do not fit each other."""
+    mean, modes, eigenvalues = map(np.shape, pdm)
+    if (
+        len(mean) != 2
+        or mean[1] != 3
+        or len(eigenvalues) != 1
+        or modes != (*eigenvalues, *mean)
+    ):
+        raise ValueError(
+            "mean must have shape (n_points, 3), modes (n_modes, n_points, 3) and "
+            f"eigenvalues (n_modes,); got {mean}, {modes} and {eigenvalues}"
+        )
+
+
+def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel:
+    """Return the model of mean (3n x 1), components (3n x m) and m variances."""
+    M, V, E = (np.asarray(matrix, dtype=np.float64) for matrix in (M, V, E))
+    n_points, n_modes = M.size // 3, E.size
+    if M.size != 3 * n_points or V.shape != (3 * n_points, n_modes):
+        raise ValueError(
+            "it should have a mean of 3n numbers, components of shape (3n, m) and m "
+            f"variances; got {M.size}, {V.shape} and {E.size}"
+        )
+    modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
+    return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
+
+
+def _unzipped(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, NDArray]:
+    """Return those arrays of an .npz file that have one of the names."""
+    with ZipFile(path) as archive:
+        stored = set(archive.namelist())
+        return {
+            name: array_in(archive.read(f"{name}.npy"))
+            for name in names
+            if f"{name}.npy" in stored
+        }
+
+
+def _numbers(found: Mapping[str, NDArray], names: Sequence[str]) -> list[NDArray]:
+    """Return the arrays with some names, which must hold real numbers."""
+    absent = [name for name in names if name not in found]
+    if absent:
+        raise ValueError(f"it has no {', '.join(absent)}")
+    for name in names:
+        if found[name].dtype.kind not in "fiu":
+            raise ValueError(
+                f"{name} should have real numbers; got {found[name].dtype}"
+            )
+    return [found[name] for name in names]
 
 
 def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
@@ -302,8 +341,7 @@ def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
                 raise ValueError(f"{matrices[-1].shape[1]} columns for {n_columns}")
         except ValueError as error:
             raise ValueError(
-                f"{os.fspath(path)} is no point distribution model; where there should "
-                f"be {comment.partition(':')[0].lower()}: {error}"
+                f"where there should be {comment.partition(':')[0].lower()}: {error}"
             ) from error
         words = words[3 + size :]
     return matrices

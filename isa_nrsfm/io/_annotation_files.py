@@ -155,7 +155,11 @@ def _floats(fields: list[str]) -> NDArray[np.float64]:
     bad = next((field for field in fields if "_" in field), None)
     if bad is not None:
         raise ValueError(f"a coordinate should be a number; got {bad!r}")
-    return np.array(fields, dtype=np.float64)
+    numbers = np.array(fields, dtype=np.float64)
+    if np.isinf(numbers).any():
+        infinite = fields[int(np.isinf(numbers).argmax())]
+        raise ValueError(f"a coordinate should be finite; got {infinite!r}")
+    return numbers
 
 
 def _numbered(

@@ -157,7 +157,8 @@ def read_mesh_table(
         scale = (
             table[sizes].to_numpy(float) if image_size is None else np.array(image_size)
         )
-        tracks = tracks * scale.reshape(-1, 1, 2)
+        with np.errstate(over="ignore"):  # what is infinite is refused below
+            tracks = tracks * scale.reshape(-1, 1, 2)
     elif image_size is not None:
         raise ValueError(
             "image_size is for coordinates that are shares of the image's width and "

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._tables.landmark_columns import point_names
 from isa_nrsfm.io._annotation_files import is_pts, is_wflw, read_pts, read_wflw
 from isa_nrsfm.io._coco import is_coco, read_coco
@@ -21,7 +22,7 @@ from isa_nrsfm.io._face_tables import (
 from isa_nrsfm.io._format_names import TABLE
 from isa_nrsfm.io._landmarks import Landmarks, assemble, drop_unsure_points
 from isa_nrsfm.io._sleap import is_sleap, read_sleap
-from isa_nrsfm.io._tables import TABLE_SUFFIXES, landmark_table, read_table
+from isa_nrsfm.io._tables import TABLE_SUFFIXES, landmark_table, parse_table
 
 if TYPE_CHECKING:
     import os
@@ -49,7 +50,7 @@ class LandmarkFormat:
         Tells from the beginning of a file whether it is of the format.
     parse : callable
         Reads a file and returns its `Landmarks`, or raises a ValueError that says what
-        is wrong.
+        is wrong. What libraries raise for damaged content, `read` turns into one.
     options : tuple of str
         Names of the options that `read` takes.
     """
@@ -123,13 +124,8 @@ class LandmarkFormat:
                 f"{path} cannot be read as {self.name} ({self.title}): expected "
                 f"{self.expected}, in {_listed(self.suffixes)}"
             )
-        try:
+        with reading(path, f"{self.name} ({self.title})", self.expected):
             return self.parse(path, **options)
-        except ValueError as error:
-            raise ValueError(
-                f"{path} cannot be read as {self.name} ({self.title}): {error}. "
-                f"Expected {self.expected}"
-            ) from error
 
 
 def read_landmarks(
@@ -264,7 +260,7 @@ def _read_named_columns(
     path: Path, columns: str | None = None, missing: Any = None
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
-    points, other = landmark_table(read_table(path), columns=columns, missing=missing)
+    points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(points.columns[::2]),

@@ -120,10 +120,7 @@ def read_columns(
         "na_values": _NOT_NUMBERS,
         "low_memory": False,
     }
-    try:
-        frame = pd.read_csv(path, dtype=dict.fromkeys(text, "str"), **options)
-    except (UnicodeDecodeError, pd.errors.ParserError) as error:
-        raise ValueError(f"it is not a table of separated values: {error}") from error
+    frame = pd.read_csv(path, dtype=dict.fromkeys(text, "str"), **options)
     types = pd.api.types
     found = dict(frame.dtypes)
     for name in numbers:

@@ -14,6 +14,8 @@ from zipfile import ZipFile
 
 import numpy as np
 
+from isa_nrsfm._compat.stored_arrays import array_in
+
 #: Types of the numbers and texts of a model.
 PLAIN_TYPES = (bool, int, float, str)
 NUMPY_TYPES = (
@@ -115,8 +117,7 @@ def _array(node: Any, name: str, file: ZipFile) -> Any:
         if _value(node["shape"], file) != (len(items),):
             raise ValueError("it contains an array of objects with several axes")
         return items
-    stored = io.BytesIO(file.read(node["file"]))
-    array = np.lib.format.read_array(stored, allow_pickle=False)
+    array = array_in(file.read(node["file"]))
     if name == "numpy.ndarray":
         return array
     number: Any = array[()]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns
-from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
+from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
 from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,
@@ -74,21 +74,16 @@ def _read_h5(path: Path) -> Landmarks:
     """Read an h5 file."""
     pd = import_optional("pandas", extra="io")
     h5py = import_optional("h5py", extra="h5")
-    try:
-        with h5py.File(path, "r") as file:
-            absent = _NEEDED.difference(file)
-            if absent:
-                raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
-            nodes = _texts(file["node_names"])
-            names = _texts(file["track_names"])
-            stored, dims = _stored(file["tracks"], len(nodes))
-            tracks = _ordered(stored, dims, _DIMS)
-            scores = _scores(file, "point_scores", dims, tracks.shape[:3])
-            of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
-    except ValueError:
-        raise
-    except Exception as error:  # h5py has errors of many kinds for damaged files
-        raise ValueError(f"h5py cannot read it: {error}") from error
+    with h5py.File(path, "r") as file:
+        absent = _NEEDED.difference(file)
+        if absent:
+            raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
+        nodes = _texts(content_of(file, "node_names"))
+        names = _texts(content_of(file, "track_names"))
+        stored, dims = _stored(file, len(nodes))
+        tracks = _ordered(stored, dims, _DIMS)
+        scores = _scores(file, "point_scores", dims, tracks.shape[:3])
+        of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
     rows = each_individual(tracks, scores)
     frames: dict[str, Any] = {"frame": rows.frame}
     if names:
@@ -111,9 +106,9 @@ def _read_h5(path: Path) -> Landmarks:
     )
 
 
-def _stored(dataset: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
+def _stored(file: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
     """Return the points as they are stored, and the names of their axes."""
-    dims = _named_dims(dataset)
+    stored, dims = numbers_of(file, "tracks"), _named_dims(file["tracks"])
     if dims is not None and sorted(dims) != sorted(_DIMS):
         raise ValueError(
             f"the axes of tracks should be {', '.join(_DIMS)} in some order; got "
@@ -121,16 +116,16 @@ def _stored(dataset: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
         )
     orders = _ORDERS if dims is None else (dims,)
     for order in orders:
-        lengths = dict(zip(order, dataset.shape, strict=False))
+        lengths = dict(zip(order, stored.shape, strict=False))
         if (
-            len(dataset.shape) == len(_DIMS)
+            stored.ndim == len(_DIMS)
             and lengths["xy"] == 2
             and lengths["node"] == n_nodes
         ):
-            return np.asarray(dataset[()], dtype=np.float64), order
+            return stored, order
     raise ValueError(
         f"tracks should have the axes {', '.join(orders[0])}, with 2 and {n_nodes} for "
-        f"xy and node; got the shape {dataset.shape}"
+        f"xy and node; got the shape {stored.shape}"
     )
 
 
@@ -157,24 +152,22 @@ def _scores(
     """Return scores by frame, track and, of points, node; None where there are none."""
     if name not in file:
         return None
-    dataset = file[name]
+    stored = numbers_of(file, name)
     wanted = _DIMS[: len(shape)]
-    dims = _named_dims(dataset) or tuple(d for d in dims_of_tracks if d in wanted)
-    if sorted(dims) == sorted(wanted) and len(dataset.shape) == len(shape):
-        scores = _ordered(np.asarray(dataset[()], dtype=np.float64), dims, wanted)
+    dims = _named_dims(file[name]) or tuple(d for d in dims_of_tracks if d in wanted)
+    if sorted(dims) == sorted(wanted) and stored.ndim == len(shape):
+        scores = _ordered(stored, dims, wanted)
         if scores.shape == shape:
             return scores
     raise ValueError(
         f"{name} should have the axes {', '.join(dims)} of tracks; got the shape "
-        f"{dataset.shape}"
+        f"{stored.shape}"
     )
 
 
-def _texts(dataset: Any) -> list[str]:
-    """Return the texts that a dataset holds."""
-    if dataset.shape == (0,):
-        return []
-    return [
-        text.decode() if isinstance(text, bytes) else str(text)
-        for text in np.ravel(dataset[()])
-    ]
+def _texts(content: Any) -> list[str]:
+    """Return the texts that a dataset holds; an empty one may be of numbers."""
+    texts = np.ravel(content).tolist() if np.size(content) else []
+    if not all(isinstance(text, bytes | str) for text in texts):
+        raise ValueError(f"the names of nodes and tracks should be texts; got {texts}")
+    return [text.decode() if isinstance(text, bytes) else text for text in texts]

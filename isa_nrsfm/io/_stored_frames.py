@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.io._hdf5 import content_of
 
 
 class StoredFrame(NamedTuple):
@@ -43,32 +44,28 @@ def read_stored_frame(path: Path, key: str) -> StoredFrame:
     Raises
     ------
     ValueError
-        If there is no such table in the file, or it is damaged.
+        If there is no such table in the file, or it does not fit together. Damaged
+        files lead to errors of h5py and pickle, too.
     """
     h5py = import_optional("h5py", extra="h5")
-    try:
-        with h5py.File(path, "r") as file:
-            if key not in file:
-                raise ValueError(f"it has no group {key}")
-            group = file[key]
-            kind = _text(group.attrs.get("pandas_type", ""))
-            if kind == "frame_table":
-                return _of_blocks(*_table_blocks(group["table"]))
-            if kind == "frame":
-                return _of_blocks(*_fixed_blocks(group))
-            raise ValueError(f"{key} is no table of pandas")
-    except ValueError:
-        raise
-    except Exception as error:  # h5py and pickle have errors of many kinds
-        raise ValueError(f"{key} cannot be read: {error}") from error
+    with h5py.File(path, "r") as file:
+        if key not in file:
+            raise ValueError(f"it has no group {key}")
+        group = file[key]
+        kind = _text(group.attrs.get("pandas_type", ""))
+        if kind == "frame_table":
+            return _of_blocks(*_table_blocks(group))
+        if kind == "frame":
+            return _of_blocks(*_fixed_blocks(group))
+        raise ValueError(f"{key} is no table of pandas")
 
 
 _Block = tuple[NDArray, list[tuple[str, ...]]]
 
 
-def _table_blocks(table: Any) -> tuple[list[_Block], list[Any]]:
+def _table_blocks(group: Any) -> tuple[list[_Block], list[Any]]:
     """Return the blocks of format="table", one field of the rows each."""
-    rows = table[()]
+    rows, table = content_of(group, "table"), group["table"]
     blocks = []
     for name in rows.dtype.names or ():
         is_number = rows.dtype[name].base.kind in "fiu"
@@ -83,25 +80,28 @@ def _fixed_blocks(group: Any) -> tuple[list[_Block], list[Any]]:
     """Return the blocks of format="fixed", an array each."""
     blocks = []
     for i in range(int(group.attrs["nblocks"])):
-        stored = group[f"block{i}_values"]
-        if stored.dtype.kind in "fiu":
-            values = stored[()]
-            if not stored.attrs.get("transposed", False):
+        name = f"block{i}_values"
+        values = content_of(group, name)
+        if values.dtype.kind in "fiu":
+            if not group[name].attrs.get("transposed", False):
                 values = values.T
             blocks.append((values, _levels(group, f"block{i}_items")))
     if _text(group.attrs["axis1_variety"]) == "multi":
         return blocks, ["/".join(label) for label in _levels(group, "axis1")]
-    return blocks, [_label(label) for label in group["axis1"][()]]
+    return blocks, [_label(label) for label in content_of(group, "axis1")]
 
 
 def _levels(group: Any, name: str) -> list[tuple[str, ...]]:
     """Return labels of several levels."""
     if _text(group.attrs[f"{name}_variety"]) != "multi":
-        return [(_text(label),) for label in group[name][()]]
+        return [(_text(label),) for label in content_of(group, name)]
     parts = []
     for i in range(int(group.attrs[f"{name}_nlevels"])):
-        texts = [_text(text) for text in group[f"{name}_level{i}"][()]]
-        parts.append([texts[code] for code in group[f"{name}_label{i}"][()]])
+        texts = [_text(text) for text in content_of(group, f"{name}_level{i}")]
+        codes = content_of(group, f"{name}_label{i}")
+        if np.any((codes < 0) | (codes >= len(texts))):
+            raise ValueError(f"{name} has labels that are not among its texts")
+        parts.append([texts[code] for code in codes])
     return list(zip(*parts, strict=True))
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.blocks import read_rows
 from isa_nrsfm._tables.sources import StoredTable
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import os
 
 SUFFIXES = (".npy", ".parquet")
+PARQUET = "a parquet file"
 
 
 def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
@@ -39,8 +41,9 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
     FileNotFoundError
         If there is no such file, or none in the folder.
     ValueError
-        If files are of another kind, do not fit together, or do not hold a table of
-        numbers.
+        If files are of another kind, are damaged, do not fit together, or do not hold a
+        table of numbers. The file is named, also where the damage shows only when the
+        table is used.
 
     Examples
     --------
@@ -81,7 +84,8 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
 
 def _mapped(file: Path) -> NDArray:
     """Return the memory map of an array."""
-    array = np.load(file, mmap_mode="r")
+    with reading(file, "an array of numbers in NumPy's format"):
+        array = np.lib.format.open_memmap(file, mode="r")
     if array.ndim != 2 or array.dtype.kind not in "fiu":
         raise ValueError(
             f"{file} must hold a table of real numbers, (n_frames, 2 * n_points); got "
@@ -113,7 +117,7 @@ def _open_parquet(files: list[Path]) -> StoredTable:
     """Return the table that parquet files hold."""
     parquet = import_optional("pyarrow.parquet", extra="parquet")
     types = import_optional("pyarrow.types", extra="parquet")
-    opened = [parquet.ParquetFile(file) for file in files]
+    opened = [_opened_parquet(file, parquet.ParquetFile) for file in files]
     names = [table.schema_arrow.names for table in opened]
     _same_shape(files, names, "columns")
     kinds = set()
@@ -126,11 +130,22 @@ def _open_parquet(files: list[Path]) -> StoredTable:
                 )
             kinds.add(str(field.type))
     dtype = np.dtype(np.float32 if kinds == {"float"} else np.float64)
-    parts = [(table.metadata.num_rows, _row_groups(table, dtype)) for table in opened]
+    parts = [
+        (table.metadata.num_rows, _row_groups(file, table, dtype))
+        for file, table in zip(files, opened, strict=True)
+    ]
     return StoredTable(parts, len(names[0]), dtype, np.array(names[0], dtype=object))
 
 
-def _row_groups(table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
+def _opened_parquet(file: Path, open_file: Callable[[Path], Any]) -> Any:
+    """Return an open parquet file whose schema has been read."""
+    with reading(file, PARQUET):
+        table = open_file(file)
+        _ = table.schema_arrow
+        return table
+
+
+def _row_groups(file: Path, table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
     """Return what reads rows of a parquet file, only the groups that are needed."""
     sizes = [
         table.metadata.row_group(group).num_rows
@@ -141,9 +156,9 @@ def _row_groups(table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
     def read(first: int, last: int) -> NDArray:
         groups = np.flatnonzero((ends > first) & (ends - sizes < last))
         begin = ends[groups[0]] - sizes[groups[0]]
-        found = table.read_row_groups(groups.tolist()).slice(
-            first - begin, last - first
-        )
+        with reading(file, PARQUET):
+            read = table.read_row_groups(groups.tolist())
+        found = read.slice(first - begin, last - first)
         columns = [np.asarray(column, dtype=dtype) for column in found.columns]
         return np.stack(columns, axis=1)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns, parse_coordinate
@@ -85,7 +86,13 @@ def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
     0  007     1.5     2.0
     1  008     NaN     NaN
     """
-    path = Path(path)
+    table_suffix(path)
+    with reading(path, "a table"):
+        return parse_table(Path(path))
+
+
+def parse_table(path: Path) -> "pd.DataFrame":
+    """Read a table as `read_table` does; errors do not name the file."""
     suffix = table_suffix(path)
     if suffix == ".parquet":
         return _read_parquet(path)
@@ -205,21 +212,16 @@ def table_suffix(path: "str | os.PathLike[str]") -> str:
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
     pd = import_optional("pandas", extra="io")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            header = _check_lines(csv.reader(file, delimiter=separator), path)
-        frame = pd.read_csv(
-            path,
-            sep=separator,
-            dtype=str,
-            index_col=False,
-            keep_default_na=False,
-            encoding="utf-8-sig",
-        )
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not a text file in UTF-8: {error}") from error
-    except (csv.Error, pd.errors.ParserError) as error:
-        raise ValueError(f"{path} cannot be read as a table: {error}") from error
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        header = _check_lines(csv.reader(file, delimiter=separator))
+    frame = pd.read_csv(
+        path,
+        sep=separator,
+        dtype=str,
+        index_col=False,
+        keep_default_na=False,
+        encoding="utf-8-sig",
+    )
     frame.columns = pd.Index(header)
     for name in header:
         if parse_coordinate(name) is not None:
@@ -229,7 +231,7 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     return frame
 
 
-def _check_lines(lines: Any, path: Path) -> list[str]:
+def _check_lines(lines: Any) -> list[str]:
     """
     Return the header of a file, or raise if its lines do not make a table.
 
@@ -237,25 +239,25 @@ def _check_lines(lines: Any, path: Path) -> list[str]:
     """
     header = next((line for line in lines if line), None)
     if header is None:
-        raise ValueError(f"{path} is empty; a first line with column names is needed")
+        raise ValueError("it is empty; a first line with column names is needed")
     if len(header) == 1:
         for separator, word in ((";", "semicolons"), ("\t", "tabs"), (",", "commas")):
             if separator in header[0]:
                 raise ValueError(
-                    f"the columns of {path} are separated by {word}; commas are needed "
-                    "in a .csv file and tabs in a .tsv file"
+                    f"its columns are separated by {word}; commas are needed in a "
+                    ".csv file and tabs in a .tsv file"
                 )
     n_lines = 0
     for line in lines:
         if line and len(line) != len(header):
             raise ValueError(
-                f"line {lines.line_num} of {path} has {len(line)} values, but the "
-                f"header has {len(header)} names"
+                f"line {lines.line_num} has {len(line)} values, but the header has "
+                f"{len(header)} names"
             )
         n_lines += bool(line)
     if n_lines == 0:
-        raise ValueError(f"{path} has a header but no rows")
-    _refuse_same_names(header, str(path))
+        raise ValueError("it has a header but no rows")
+    _refuse_same_names(header, "it")
     return header
 
 
@@ -271,21 +273,17 @@ def _refuse_same_names(names: Sequence[str], where: str) -> None:
 def _read_parquet(path: Path) -> "pd.DataFrame":
     """Read a parquet file."""
     pd = import_optional("pandas", extra="io")
-    pyarrow = import_optional("pyarrow", extra="parquet")
+    import_optional("pyarrow", extra="parquet")
     with path.open("rb"):  # opening errors as for text files
         pass
-    try:
-        frame = pd.read_parquet(path)
-    except (pyarrow.ArrowException, ValueError) as error:
-        first_line = str(error).partition("\n")[0]
-        raise ValueError(f"{path} is not a parquet file: {first_line}") from error
+    frame = pd.read_parquet(path)
     if frame.empty:
-        raise ValueError(f"{path} has no rows")
+        raise ValueError("it has no rows")
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     if len(unnamed) == frame.index.nlevels:
         return frame.reset_index(drop=True)
     index = frame.index.droplevel(unnamed)
-    _refuse_same_names([str(name) for name in (*index.names, *frame)], str(path))
+    _refuse_same_names([str(name) for name in (*index.names, *frame)], "it")
     return frame.set_axis(index).reset_index()
 
 

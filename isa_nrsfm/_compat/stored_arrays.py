@@ -1,0 +1,45 @@
+"""Arrays in NumPy's format that are not larger than what holds them."""
+
+import io
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def array_in(content: bytes) -> NDArray:
+    """
+    Return the array of numbers that bytes in NumPy's format hold.
+
+    NumPy itself makes room for whatever shape the header names.
+
+    Parameters
+    ----------
+    content : bytes
+        The header and the numbers.
+
+    Returns
+    -------
+    ndarray
+        The array.
+
+    Raises
+    ------
+    ValueError
+        If the bytes hold objects, or more or fewer numbers than the header says. What
+        else is wrong with a header leads to errors of NumPy.
+    """
+    stored = io.BytesIO(content)
+    version = np.lib.format.read_magic(stored)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(stored)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(stored)
+    found, expected = len(content) - stored.tell(), math.prod(shape) * dtype.itemsize
+    if dtype.hasobject or found != expected:
+        raise ValueError(
+            f"an array of shape {shape} and type {dtype} should have {expected} bytes; "
+            f"got {found}"
+        )
+    stored.seek(0)
+    return np.lib.format.read_array(stored, allow_pickle=False)

@@ -1,0 +1,452 @@
+"""Files of every format, damaged in many ways: they are read, or refused in words.
+
+The damages of `damage.py` have fixed seeds. What is read has finite numbers and what
+the documentation promises; a refusal is an error of a usual kind that names the file.
+"""
+
+import contextlib
+import csv
+import functools
+import gc
+import json
+import os
+import signal
+import warnings
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import damage
+import landmark_files as files
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.exceptions import NotFittedError
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export import PointDistributionModel, read_pdm, write_pdm
+from isa_nrsfm.io import (
+    load_model,
+    open_table,
+    read_landmarks,
+    read_table,
+    save_model,
+)
+
+resource = pytest.importorskip("resource", reason="limits the memory of a process")
+for library in ("h5py", "tables", "pyarrow", "skops"):
+    pytest.importorskip(library, reason="needs the extra cli, and tables")
+
+REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
+# What the reading of a small file may take: seconds, and bytes besides what is used.
+SECONDS, MEMORY = 60, 2**31
+QUICK, ALL = 20, 500
+
+TRACKS = files.scene(n_frames=4)
+OLD_MODEL = Path(__file__).with_name("saved_models") / "0b_alternating.skops"
+FACES = make_face_tracks(20, n_components=1, random_state=0).data[:, :28]
+PDM = PointDistributionModel(
+    files.scene(7, 3)[..., 0][:, :3].copy(), np.ones((2, 7, 3)), np.array([2.0, 1.0])
+)
+
+
+class Format(NamedTuple):
+    """
+    Files of a format.
+
+    `write` writes a valid file or folder and returns its path, `damage` takes the path
+    of a file and a generator, and `read` takes the path and asserts what is promised
+    of the result.
+    """
+
+    write: Callable
+    damage: Callable
+    read: Callable
+
+
+# --- damages ------------------------------------------------------------------------
+
+
+def rewritten(damaged, *, also=damage.damaged_bytes, of_bytes=1):
+    """Return what damages a file: its bytes, or of each four `of_bytes` by `also`."""
+
+    def change(path, rng):
+        how = also if rng.integers(4) < of_bytes else damaged
+        path.write_bytes(how(path.read_bytes(), rng))
+
+    return change
+
+
+def of_text(separator=","):
+    return rewritten(
+        lambda content, rng: damage.damaged_text(content.decode(), rng, separator)
+    )
+
+
+def of_json(content, rng):
+    return damage.as_json(damage.damaged_tree(json.loads(content), rng))
+
+
+def of_hdf5(path, rng):
+    if rng.integers(3) == 0:
+        path.write_bytes(damage.damaged_bytes(path.read_bytes(), rng))
+    else:
+        damage.damage_hdf5(path, rng)
+
+
+# --- promises -----------------------------------------------------------------------
+
+
+def check_landmarks(found):
+    """Assert what is promised of all landmarks."""
+    points, n_frames = found.points, len(found.points)
+    values = points.to_numpy()
+    assert n_frames > 0
+    assert values.dtype == np.float64
+    assert not np.isinf(values).any()
+    assert points.shape[1] == 2 * len(found.point_names) > 0
+    names = [*points.columns, *found.frames.columns]
+    assert len(set(names)) == len(names)
+    assert len(found.frames) == len(found.failed) == n_frames
+    assert np.isnan(values[found.failed]).all()
+    assert not np.isnan(values[~found.failed]).all(axis=1).any()
+    if found.confidence is not None:
+        assert found.confidence.shape == (n_frames, len(found.point_names))
+
+
+def rows_of(path, separator):
+    """Return the cells of a file as Python's reader finds them, without empty lines."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        rows = csv.reader(file, delimiter=separator)
+        return [row for row in rows if "".join(row).strip() or len(row) > 1]
+
+
+def check_cells(points, failed, path, separator=","):
+    """Assert that points have the numbers that Python's reader finds in the cells."""
+    rows = rows_of(path, separator)
+    header = [name.strip() for name in rows[0]]
+    assert len(rows) - 1 == len(points)
+    written = pd.DataFrame(rows[1:], columns=header)
+    for name in points.columns:
+        for i in np.flatnonzero(~failed):
+            cell, value = written[name].iloc[i].strip(), points[name].iloc[i]
+            missing = cell.lower() in ("", "na", "nan", "n/a", "null", "none")
+            missing |= cell.lower() in ("<na>", "#n/a", "nan(ind)", "-nan(ind)")
+            assert np.isnan(value) if missing else float(cell) == value
+
+
+def read_format(format, *, cells=False, **options):
+    def read(path):
+        found = read_landmarks(path, format, **options)
+        check_landmarks(found)
+        if cells:
+            check_cells(found.points, found.failed, path)
+
+    return read
+
+
+def read_text_table(path):
+    table = read_table(path)
+    separator = {".csv": ",", ".tsv": "\t"}[path.suffix]
+    rows = rows_of(path, separator)
+    assert table.shape == (len(rows) - 1, len(rows[0]))
+    for name, cells in zip(table, zip(*rows[1:], strict=True), strict=True):
+        if table[name].dtype != np.float64:
+            assert list(table[name]) == list(cells)
+    found = read_landmarks(path, "table")
+    check_landmarks(found)
+    check_cells(found.points, found.failed, path, separator)
+
+
+def read_parquet(path):
+    read_table(path)
+    check_landmarks(read_landmarks(path, "table"))
+
+
+def read_stored(path):
+    table = open_table(path)
+    rows = np.asarray(table[0 : len(table)])
+    assert rows.shape == table.shape
+    assert rows.dtype.kind in "fiu"
+
+
+def read_model(path):
+    model = load_model(path)
+    alpha = model.transform(FACES[:2, : model.n_features_in_])
+    assert alpha.shape == (2, len(model.basis_))
+    assert np.isfinite(alpha).all()
+
+
+def read_shape_model(path):
+    mean, modes, eigenvalues = read_pdm(path)
+    assert mean.shape[1:] == (3,)
+    assert modes.shape == (len(eigenvalues), *mean.shape)
+    assert all(np.isfinite(part).all() for part in (mean, modes, eigenvalues))
+
+
+def export_edges(path):
+    """Draw the edges of a file with the command line; raise what it says."""
+    output = path.with_name("a.glb")
+    said = path.with_name("said")
+    with said.open("w") as file, contextlib.redirect_stderr(file):
+        with contextlib.redirect_stdout(None):
+            model = path.with_name("a.skops")
+            code = main(
+                ["export", str(model), "--edges", str(path), "--output", str(output)]
+            )
+    message = said.read_text()
+    said.unlink()
+    assert output.exists() == (code == 0)
+    output.unlink(missing_ok=True)
+    if code:
+        assert code == 1
+        raise ValueError(message)
+
+
+# --- formats ------------------------------------------------------------------------
+
+
+def write_points(path, separator=","):
+    frame = pd.DataFrame(
+        TRACKS.reshape(len(TRACKS), -1),
+        columns=[f"{name}_{axis}" for name in files.BODYPARTS for axis in "xy"],
+    )
+    frame.insert(0, "id", [f"00{i}" for i in range(len(frame))])
+    if path.suffix == ".parquet":
+        frame.to_parquet(path)
+    else:
+        frame.to_csv(path, sep=separator, index=False)
+    return path
+
+
+def write_parts(path, suffix):
+    path.mkdir()
+    for number, part in enumerate(np.array_split(files.scene(6), 3)):
+        rows = part.reshape(len(part), -1)
+        file = path / f"part{number}{suffix}"
+        if suffix == ".npy":
+            np.save(file, rows)
+        else:
+            pd.DataFrame(rows, columns=[f"c{i}" for i in range(16)]).to_parquet(file)
+    return path
+
+
+@functools.cache
+def model():
+    return AffineNRSfM(1, random_state=0, camera="weak_perspective").fit(FACES[:, :20])
+
+
+def write_model(path):
+    save_model(model(), path)
+    return path
+
+
+def write_old_model(path):
+    path.write_bytes(OLD_MODEL.read_bytes())
+    return path
+
+
+def write_edges(path):
+    write_model(path.with_name("a.skops"))
+    path.write_text("0,1\n1,2\n2,3\n3,4\n")
+    return path
+
+
+def write_shape_model(path):
+    write_pdm(PDM, path)
+    return path
+
+
+npz = rewritten(damage.damaged_archive)
+FORMATS = {
+    "csv": Format(lambda d: write_points(d / "a.csv"), of_text(), read_text_table),
+    "tsv": Format(
+        lambda d: write_points(d / "a.tsv", "\t"), of_text("\t"), read_text_table
+    ),
+    "parquet": Format(
+        lambda d: write_points(d / "a.parquet"),
+        rewritten(damage.damaged_parquet, of_bytes=2),
+        read_parquet,
+    ),
+    "openface": Format(
+        lambda d: files.write_openface(d / "a.csv", TRACKS),
+        of_text(),
+        read_format("openface", cells=True),
+    ),
+    "pyfeat": Format(
+        lambda d: files.write_pyfeat(d / "a.csv", TRACKS),
+        of_text(),
+        read_format("pyfeat", cells=True),
+    ),
+    "mediapipe": Format(
+        lambda d: files.write_mesh(d / "a.csv", TRACKS, sizes=True),
+        of_text(),
+        read_format("mediapipe"),
+    ),
+    "pts": Format(
+        lambda d: files.write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
+        of_text(" "),
+        read_format("pts"),
+    ),
+    "pts folder": Format(
+        lambda d: files.write_pts(d / "a", TRACKS[:2]),
+        of_text(" "),
+        read_format("pts"),
+    ),
+    "wflw": Format(
+        lambda d: files.write_wflw(d / "a.txt", files.scene(3, 98)),
+        of_text(" "),
+        read_format("wflw"),
+    ),
+    "deeplabcut csv": Format(
+        lambda d: files.write_deeplabcut(d / "a.csv", files.deeplabcut_frame(TRACKS)),
+        of_text(),
+        read_format("deeplabcut"),
+    ),
+    "deeplabcut h5": Format(
+        lambda d: files.write_deeplabcut(
+            d / "a.h5", files.deeplabcut_frame(TRACKS), how="table"
+        ),
+        of_hdf5,
+        read_format("deeplabcut"),
+    ),
+    "deeplabcut fixed h5": Format(
+        lambda d: files.write_deeplabcut(
+            d / "a.h5", files.deeplabcut_frame(TRACKS), how="fixed"
+        ),
+        of_hdf5,
+        read_format("deeplabcut"),
+    ),
+    "sleap h5": Format(
+        lambda d: files.write_sleap(d / "a.h5", TRACKS.reshape(2, 2, 8, 2)),
+        of_hdf5,
+        read_format("sleap"),
+    ),
+    "sleap csv": Format(
+        lambda d: files.write_sleap_csv(
+            d / "a.csv", TRACKS.reshape(2, 2, 8, 2), np.ones((2, 2, 8))
+        ),
+        of_text(),
+        read_format("sleap"),
+    ),
+    "coco": Format(
+        lambda d: files.write_json(d / "a.json", files.coco_annotations(TRACKS)),
+        rewritten(of_json),
+        read_format("coco"),
+    ),
+    "model": Format(lambda d: write_model(d / "a.skops"), npz, read_model),
+    "old model": Format(lambda d: write_old_model(d / "a.skops"), npz, read_model),
+    "pdm npz": Format(lambda d: write_shape_model(d / "a.npz"), npz, read_shape_model),
+    "pdm txt": Format(
+        lambda d: write_shape_model(d / "a.txt"), of_text(" "), read_shape_model
+    ),
+    "edges": Format(lambda d: write_edges(d / "a.csv"), of_text(), export_edges),
+    "npy folder": Format(
+        lambda d: write_parts(d / "a", ".npy"),
+        rewritten(damage.damaged_npy),
+        read_stored,
+    ),
+    "parquet folder": Format(
+        lambda d: write_parts(d / "a", ".parquet"),
+        rewritten(damage.damaged_parquet, of_bytes=2),
+        read_stored,
+    ),
+}
+
+
+# --- the corpus ---------------------------------------------------------------------
+
+
+class TooLong(Exception):
+    """The reading of a small file takes long."""
+
+
+@contextlib.contextmanager
+def limits():
+    """Bound what may be used within: time, and memory besides what is in use."""
+
+    def stop(signum, frame):
+        raise TooLong
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MEMORY
+    handler = signal.signal(signal.SIGALRM, stop)
+    resource.setrlimit(resource.RLIMIT_AS, (most, before[1]))
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, handler)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def contents(folder):
+    """Return the files in a folder, with what they hold."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if not path.is_dir()}
+
+
+def outcome(read, path, damaged):
+    """Return whether a damaged file is read, or refused; raise if it is neither."""
+    refusal = None
+    with warnings.catch_warnings(record=True) as warned, limits():
+        warnings.simplefilter("always")
+        try:
+            read(path)
+        except REFUSALS as error:
+            refusal = error
+    others = [w for w in warned if w.category is not UserWarning]
+    assert not others, f"warns: {others[0].message}"
+    if refusal is None:
+        return "read"
+    assert damaged.name in str(refusal), f"not named in: {refusal}"
+    return "refused"
+
+
+def tried(format, numbers, folder):
+    """Return outcomes of damages by their numbers, and what is wrong with some."""
+    write, change, read = FORMATS[format]
+    path = write(folder)
+    read(path)
+    targets = sorted(path.iterdir()) if path.is_dir() else [path]
+    targets = [target for target in targets if target.suffix != ".png"]
+    whole = {target: target.read_bytes() for target in targets}
+    outcomes, broken = {}, {}
+    for number in numbers:
+        rng = np.random.default_rng([number, zlib.crc32(format.encode())])
+        target = damage.pick(rng, targets)
+        change(target, rng)
+        before = contents(folder)
+        try:
+            outcomes[number] = outcome(read, path, target)
+        except Exception as error:
+            broken[number] = f"{type(error).__name__}: {error}"
+        if contents(folder) != before:
+            broken[number] = "files are left, or changed"
+        target.write_bytes(whole[target])
+    return outcomes, broken
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        pytest.param(range(QUICK), id="few"),
+        pytest.param(range(QUICK, ALL), id="many", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("format", FORMATS)
+def test_damaged_files_are_read_or_refused(format, numbers, tmp_path):
+    for folder in ("first", "corpus"):
+        (tmp_path / folder).mkdir()
+    tried(format, range(1), tmp_path / "first")  # what is imported stays open
+    gc.collect()
+    opened = len(os.listdir("/proc/self/fd"))
+    outcomes, broken = tried(format, numbers, tmp_path / "corpus")
+    assert broken == {}
+    assert "refused" in outcomes.values()
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) <= opened
