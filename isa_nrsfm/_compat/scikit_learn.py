@@ -16,17 +16,17 @@ try:
     from sklearn.base import _fit_context
     from sklearn.utils._param_validation import (
         HasMethods,
-        Interval,
         StrOptions,
         validate_params,
     )
+    from sklearn.utils._param_validation import Interval as _Interval
 except ImportError:
     from isa_nrsfm._compat.plain_checks import (
         HasMethods,
-        Interval,
         StrOptions,
         validate_params,
     )
+    from isa_nrsfm._compat.plain_checks import Interval as _Interval
     from isa_nrsfm._compat.plain_checks import fit_context as _fit_context
 
 try:
@@ -64,6 +64,15 @@ __all__ = [
     "one_blas_thread",
     "taken_rows",
 ]
+
+
+class Interval(_Interval):
+    """Numbers of a type between two bounds. True and False are no numbers."""
+
+    def is_satisfied_by(self, value: Any) -> bool:
+        """Return whether a value is such a number."""
+        return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

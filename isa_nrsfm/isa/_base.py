@@ -14,6 +14,7 @@ from sklearn.base import (
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
+from isa_nrsfm._tables.sources import unmasked
 
 # Signals are linearly dependent if the smallest eigenvalue of their correlation matrix
 # is below this share of the largest. A signal is constant if its standard deviation is
@@ -49,7 +50,7 @@ class BaseSubspaceAnalysis(
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(
             self,
-            signals,
+            unmasked(signals),
             dtype=np.float64,
             ensure_min_samples=2,
             ensure_min_features=self.subspace_size,
@@ -90,7 +91,7 @@ class BaseSubspaceAnalysis(
             ``(signals - mean_) @ components_.T``; consecutive columns form a subspace.
         """
         check_is_fitted(self)
-        signals = validate_data(self, signals, dtype=np.float64, reset=False)
+        signals = validate_data(self, unmasked(signals), dtype=np.float64, reset=False)
         return (signals - self.mean_) @ self.components_.T
 
 
