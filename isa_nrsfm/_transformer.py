@@ -24,9 +24,11 @@ from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,
     Table,
+    checked_range,
     column_sample,
     is_on_dask,
     is_stored,
+    unmasked,
 )
 
 
@@ -375,6 +377,7 @@ class TableTransformer(
             If the shapes do not fit the model or each other.
         """
         check_is_fitted(self)
+        alpha = unmasked(alpha)
         alpha = check_array(alpha, dtype=[np.float64, np.float32], input_name="alpha")
         if motion is None:
             motion = self.reference_motion_
@@ -467,14 +470,15 @@ class TableTransformer(
                 return Table.on_dask(X)
             return Table.stored(X, self.working_memory)
         least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-        X = validate_data(self, X, reset=reset, **CHECKS, **least)
+        X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
+        checked_range(X)
         return Table.in_memory(X, self.n_jobs)
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
     """Return values as a finite array of one of the allowed shapes, or raise."""
     array = check_array(
-        values,
+        unmasked(values),
         dtype=[np.float64, np.float32],
         input_name=name,
         ensure_2d=False,

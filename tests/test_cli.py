@@ -369,6 +369,15 @@ def test_standard_deviations_are_written_where_they_are_known(
     np.testing.assert_allclose(written.iloc[:, -2:], model.alpha_std_, rtol=1e-6)
     assert (written.iloc[:, -2:] > 0).all(axis=None)
 
+    # A model without the frames of its fit knows them, too.
+    bare = AffineNRSfM(**(model.get_params(deep=False) | {"keep_frames": False}))
+    bare.fit(pd.read_csv(table)[list(model.feature_names_in_)])
+    save_model(bare, tmp_path / "bare.skops")
+    code, _, _ = run("transform", tmp_path / "bare.skops", table, "-o", output, "--std")
+    assert code == 0
+    again = pd.read_csv(output).iloc[:, -2:]
+    np.testing.assert_allclose(again, model.alpha_std_, rtol=1e-6)
+
     folder = tmp_path / "results"
     options = ["--no-figures", "--refinement", "none", *QUICK]
     message = fails("fit", table, "-o", folder, "--std", *options)
@@ -706,6 +715,14 @@ def test_wrong_usage_ends_with_code_2(argv, capsys):
         main(argv)
     assert error.value.code == 2
     assert "usage: isa-nrsfm" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("numbers", ["-1", "1-", "-", "2,-3", "1.5"])
+def test_wrong_numbers_of_shapes_are_said_as_they_came(numbers, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "t.csv", "-o", "d", "-k", numbers])
+    wrong = numbers.split(",")[-1]
+    assert capsys.readouterr().err.endswith(f"got {wrong!r}\n")
 
 
 @pytest.mark.parametrize("argv", [["--version"], ["--help"], ["fit", "--help"]])

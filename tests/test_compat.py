@@ -78,7 +78,7 @@ sys.modules["sklearn.utils._missing"] = None
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import plain_checks, scikit_learn
 from isa_nrsfm.datasets import make_face_tracks
-assert scikit_learn.Interval is plain_checks.Interval
+assert issubclass(scikit_learn.Interval, plain_checks.Interval)
 X = make_face_tracks(n_frames=40, n_components=1, random_state=0).data
 model = AffineNRSfM(1, random_state=0).fit(X)
 assert (scikit_learn.taken_rows(X, [1, 2]) == X[1:3]).all()

@@ -238,3 +238,25 @@ def test_layout_of_what_is_found_is_interleaved():
     found = find_landmark_columns(openface_names(), columns="eye_lmk_x_#,eye_lmk_y_#")
     assert names_layout(found.interleaved) == "interleaved"
     assert names_layout(found.x + found.y) == "planar"
+
+
+@pytest.mark.parametrize("columns", [None, "*_x,*_y"])
+def test_names_with_line_breaks_are_points_as_others(columns):
+    points = ["nose", "left\neye", "chin", "brow 1", "tip\r\nof nose", "ear", "lip"]
+    names = ["id", *named("{p}_{a}", points=points)]
+    found = find_landmark_columns(names, columns=columns)
+    assert found.points == tuple(points)
+    assert found.interleaved == names[1:]
+
+
+def test_patterns_that_match_a_part_of_a_set_say_so():
+    names = named("{a}_{p}", points=range(20))
+    with pytest.warns(UserWarning, match="leave out 20 .* first is 'x_0'"):
+        found = find_landmark_columns(names, columns="x_1#,y_1#")
+    assert found.points == tuple(map(str, range(10, 20)))
+
+
+def test_columns_that_are_named_one_by_one_are_a_choice():
+    names = named("{a}_{p}")
+    chosen = named("{a}_{p}", points=range(1, 8))
+    assert find_landmark_columns(names, columns=chosen).interleaved == chosen

@@ -15,14 +15,18 @@ from sklearn.utils import check_random_state
 
 
 class Interval:
-    """Numbers of a type between two bounds. A bound of None is infinite."""
+    """
+    Numbers of a type between two bounds. A bound of None is infinite.
+
+    True and False are no numbers.
+    """
 
     def __init__(self, type: type, left: Any, right: Any, *, closed: str):
         self.type, self.left, self.right, self.closed = type, left, right, closed
 
     def is_satisfied_by(self, value: Any) -> bool:
         """Return whether a value is such a number."""
-        if not isinstance(value, self.type):
+        if isinstance(value, bool) or not isinstance(value, self.type):
             return False
         number: Any = value
         left = -np.inf if self.left is None else self.left

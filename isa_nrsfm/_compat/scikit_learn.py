@@ -16,14 +16,14 @@ try:
     from sklearn.base import _fit_context
     from sklearn.utils._param_validation import (
         HasMethods,
-        Interval,
+        Interval as _Interval,
         StrOptions,
         validate_params,
     )
 except ImportError:
     from isa_nrsfm._compat.plain_checks import (
         HasMethods,
-        Interval,
+        Interval as _Interval,
         StrOptions,
         fit_context as _fit_context,
         validate_params,
@@ -64,6 +64,15 @@ __all__ = [
     "one_blas_thread",
     "taken_rows",
 ]
+
+
+class Interval(_Interval):
+    """Numbers of a type between two bounds. True and False are no numbers."""
+
+    def is_satisfied_by(self, value: Any) -> bool:
+        """Return whether a value is such a number."""
+        return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
+
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

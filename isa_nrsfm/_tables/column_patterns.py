@@ -65,4 +65,5 @@ def _regular_expression(pattern: str) -> re.Pattern[str]:
     """Translate a pattern into a regular expression with a group a wildcard."""
     wildcards = {"#": r"(\d+)", "*": "(.+)"}
     parts = re.split(r"([#*])", pattern)
-    return re.compile("".join(wildcards.get(part, re.escape(part)) for part in parts))
+    expression = "".join(wildcards.get(part, re.escape(part)) for part in parts)
+    return re.compile(expression, re.DOTALL)  # names may hold line breaks

@@ -16,6 +16,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Literal, NamedTuple
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_patterns import (
     columns_matching,
     covers,
@@ -31,22 +32,23 @@ _Membership = tuple[tuple[str, str, str], int | str]
 _AXES = "xyz"
 _PATTERN_SYNTAX = frozenset(",#*")
 _SEPARATORS = r"[ _.\-]"
-# x0, x_0, eye_lmk_x_0
+# x0, x_0, eye_lmk_x_0. Words may hold line breaks, which a dot matches with DOTALL.
 _AXIS_NUMBER = re.compile(
     rf"(?P<prefix>(?:.*{_SEPARATORS})?)(?P<axis>[xyzXYZ])"
-    rf"(?P<separator>{_SEPARATORS}?)(?P<digits>\d+)"
+    rf"(?P<separator>{_SEPARATORS}?)(?P<digits>\d+)",
+    re.DOTALL,
 )
 # 0x
 _NUMBER_AXIS = re.compile(r"(?P<label>\d+)(?P<separator>)(?P<axis>[xyzXYZ])")
 # 0_x, nose_x, thumb_1_x
 _LABEL_AXIS = re.compile(
-    rf"(?P<label>.*[^ _.\-])(?P<separator>{_SEPARATORS})(?P<axis>[xyzXYZ])"
+    rf"(?P<label>.*[^ _.\-])(?P<separator>{_SEPARATORS})(?P<axis>[xyzXYZ])", re.DOTALL
 )
 # x_nose
 _AXIS_LABEL = re.compile(
-    rf"(?P<axis>[xyzXYZ])(?P<separator>{_SEPARATORS})(?P<label>[^ _.\-].*)"
+    rf"(?P<axis>[xyzXYZ])(?P<separator>{_SEPARATORS})(?P<label>[^ _.\-].*)", re.DOTALL
 )
-_TRAILING_NUMBER = re.compile(r"(?P<prefix>.*?)(?P<digits>\d+)")
+_TRAILING_NUMBER = re.compile(r"(?P<prefix>.*?)(?P<digits>\d+)", re.DOTALL)
 
 
 class Coordinate(NamedTuple):
@@ -156,6 +158,11 @@ def find_landmark_columns(
     ValueError
         If there is no set of landmarks or more than one, if a point has only one of
         the two coordinates, or if two columns are named as the same coordinate.
+
+    Warns
+    -----
+    UserWarning
+        If patterns with wildcards match only a part of a set of landmarks.
 
     Examples
     --------
@@ -309,6 +316,8 @@ def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColum
     if len(set(chosen)) < len(chosen):
         twice = next(name for name in chosen if chosen.count(name) > 1)
         raise ValueError(f"the patterns {','.join(patterns)} match {twice!r} twice")
+    if any(not _PATTERN_SYNTAX.isdisjoint(pattern) for pattern in patterns):
+        _warn_of_left_out(names, chosen, ",".join(patterns))
     return LandmarkColumns(
         ",".join(patterns),
         point_names(x),
@@ -335,6 +344,31 @@ def _refuse_unpaired(
                 f"column {columns[0]!r} has no partner among the columns "
                 f"{pattern!r}{more}: every point needs an x and a y"
             )
+
+
+def _warn_of_left_out(
+    names: Sequence[Hashable], chosen: Sequence[str], pattern: str
+) -> None:
+    """Warn if patterns match only a part of a set of x and y columns."""
+    taken = set(chosen)
+    sets = {
+        coordinate.memberships[0][0]
+        for name in chosen
+        if (coordinate := parse_coordinate(name)) is not None
+    }
+    left = [
+        name
+        for name in names
+        if (coordinate := parse_coordinate(name)) is not None
+        and coordinate.axis < 2
+        and coordinate.memberships[0][0] in sets
+        and name not in taken
+    ]
+    if left:
+        warn_caller(
+            f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
+            f"{len(left)} that are named alike; the first is {left[0]!r}"
+        )
 
 
 def _refuse_repeated_header(names: Sequence[Hashable], pattern: str) -> None:

@@ -20,6 +20,9 @@ BLOCK_FRAMES = 2048
 # A block that is read needs at most this many times its own memory, copies included.
 COPIES = 8
 MEGABYTE = 2**20
+# Range of the coordinates of a frame. Squares of larger and of smaller ones leave the
+# range of double precision; fits at both ends agree with those of sizes about one.
+LARGEST, SMALLEST = 1e140, 1e-140
 # What a table has to be, besides that its numbers are float32 or float64.
 CHECKS: dict[str, Any] = {
     "dtype": [np.float64, np.float32],
@@ -98,7 +101,62 @@ def is_on_dask(X: Any) -> bool:
 
 def checked_rows(rows: Any) -> NDArray:
     """Return rows of a table as float32 or float64, without infinite values."""
-    return check_array(rows, input_name="X", ensure_min_features=0, **CHECKS)
+    return checked_range(
+        check_array(unmasked(rows), input_name="X", ensure_min_features=0, **CHECKS)
+    )
+
+
+def unmasked(X: Any) -> Any:
+    """
+    Return a masked array as one with NaN where it is masked, other tables as they are.
+
+    Parameters
+    ----------
+    X : object
+        A table.
+
+    Returns
+    -------
+    object
+        The table. Masked arrays of whole numbers become double precision.
+    """
+    if not isinstance(X, np.ma.MaskedArray):
+        return X
+    floating = X if X.dtype.kind == "f" else X.astype(np.float64)
+    return floating.filled(np.nan)
+
+
+def checked_range(X: NDArray) -> NDArray:
+    """
+    Return a table whose squares are in the range of double precision.
+
+    Parameters
+    ----------
+    X : ndarray of shape (n_frames, n_columns)
+        The table, NaN where something is missing.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_columns)
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If the largest magnitude in a row is above 1e140, or below 1e-140 and not zero.
+    """
+    highest = np.fmax.reduce(X, axis=1, initial=0.0)
+    lowest = np.fmin.reduce(X, axis=1, initial=0.0)
+    largest = np.maximum(highest, -lowest).astype(np.float64)
+    outside = (largest > LARGEST) | ((largest < SMALLEST) & (largest > 0))
+    if outside.any():
+        row = int(outside.argmax())
+        raise ValueError(
+            f"the largest coordinate of each frame of X must be between {SMALLEST:g} "
+            f"and {LARGEST:g} in magnitude, or all must be zero; got "
+            f"{largest[row]:.3g} in row {row}: give the table in another unit"
+        )
+    return X
 
 
 def column_sample(X: Any) -> Any:

@@ -32,6 +32,7 @@ from isa_nrsfm._tables.layout import (
     tracks_to_table,
     weighting_sizes,
 )
+from isa_nrsfm._tables.sources import checked_range, unmasked
 from isa_nrsfm._transformer import Decomposition
 from isa_nrsfm.baselines._orthographic_frames import OrthographicFrames
 from isa_nrsfm.baselines._shape_sequence import (
@@ -278,13 +279,14 @@ class ShapeSequenceNRSfM(
         """Return the tracks of a valid table without missing points."""
         X = validate_data(
             self,
-            X,
+            unmasked(X),
             dtype=[np.float64, np.float32],
             ensure_all_finite="allow-nan",
             ensure_min_samples=2 if reset else 1,
             ensure_min_features=2 if reset else 1,
             reset=reset,
         )
+        checked_range(X)
         missing = np.isnan(X)
         if missing.any():
             rows = np.flatnonzero(missing.any(axis=1))

@@ -417,9 +417,8 @@ def _numbers_of_shapes(text: str) -> tuple[int, ...] | tuple[str]:
         return (AUTO,)
     numbers: set[int] = set()
     for part in text.split(","):
-        first, dash, last = part.strip().partition("-")
-        low = _positive(first)
-        high = _positive(last) if dash else low
+        bounds = re.fullmatch(r"(\d+)\s*-\s*(\d+)", part.strip())
+        low, high = map(_positive, bounds.groups() if bounds else (part, part))
         if high < low or high - low >= _MOST_CHOICES:
             raise argparse.ArgumentTypeError(
                 f"expected a range of at most {_MOST_CHOICES} numbers, the smaller one "

@@ -30,7 +30,7 @@ def run_transform(args: Namespace) -> str:
     table_suffix(output)
     estimator = load_model(args.model)
     warn_of_mixed_runs(args.model)
-    if args.std and not hasattr(estimator, "alpha_std_"):
+    if args.std and not hasattr(estimator, "noise_variance_"):
         raise ValueError(
             f"--std: {args.model} was fitted with refinement="
             f"{estimator.refinement!r}, which does not know the standard deviations "

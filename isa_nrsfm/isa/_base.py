@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._tables.sources import unmasked
 
 
 class BaseSubspaceAnalysis(
@@ -45,7 +46,7 @@ class BaseSubspaceAnalysis(
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(
             self,
-            signals,
+            unmasked(signals),
             dtype=np.float64,
             ensure_min_samples=2,
             ensure_min_features=self.subspace_size,
@@ -86,7 +87,7 @@ class BaseSubspaceAnalysis(
             ``(signals - mean_) @ components_.T``; consecutive columns form a subspace.
         """
         check_is_fitted(self)
-        signals = validate_data(self, signals, dtype=np.float64, reset=False)
+        signals = validate_data(self, unmasked(signals), dtype=np.float64, reset=False)
         return (signals - self.mean_) @ self.components_.T
 
 

@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics._alignment import unit_shapes
 
 
 def as_finite(name: str, array: ArrayLike) -> NDArray[np.float64]:
     """Return an array of floats; refuse NaN and infinity."""
-    values = np.asarray(array, dtype=np.float64)
+    values = np.asarray(unmasked(array), dtype=np.float64)
     if not np.isfinite(values).all():
         n_bad = int(np.sum(~np.isfinite(values)))
         raise ValueError(f"{name} must be finite; {n_bad} entries are NaN or infinite")

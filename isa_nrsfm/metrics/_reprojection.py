@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
 from isa_nrsfm._tables.layout import LAYOUTS, Layout, table_to_tracks
+from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics._checks import check_same_shape
 
 
@@ -91,7 +92,10 @@ def _paired_tracks(
     """Return the tracks of both tables, zero where not seen, and the mask of seen."""
     tables = [
         check_array(
-            table, dtype=np.float64, ensure_all_finite="allow-nan", input_name=name
+            unmasked(table),
+            dtype=np.float64,
+            ensure_all_finite="allow-nan",
+            input_name=name,
         )
         for table, name in ((X, "X"), (X_hat, "X_hat"))
     ]

@@ -12,6 +12,7 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
+from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
     OBSERVED_COLOUR,
@@ -241,7 +242,7 @@ class ReprojectionDisplay:
         layout = estimator.layout
         labelled = hasattr(X, "iloc")  # pandas: rows have names
         display = cls(
-            observed=table_to_tracks(np.asarray(table, dtype=float), layout),
+            observed=table_to_tracks(np.asarray(unmasked(table), dtype=float), layout),
             reprojected=table_to_tracks(
                 np.asarray(estimator.reproject(table), dtype=float), layout
             ),
