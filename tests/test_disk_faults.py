@@ -12,14 +12,16 @@ import numpy as np
 import pandas as pd
 import pytest
 from disk_faults import STRIKES, disk_faults, leftovers, readable
-from export_models import face_model, faces
+from export_models import face_model
 from fit_runs import FIGURES, FILES, fit, whole_run, write_landmarks
+from layers import slow_after
 from numpy.testing import assert_array_equal
 from scipy.io import loadmat
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import (
     point_distribution_model,
     read_pdm,
@@ -128,8 +130,8 @@ def every_fault(folder, strike, prepare, act):
         yield raised, before, faults.operations
 
 
-@pytest.mark.parametrize("exists", [True, False])
-@pytest.mark.parametrize("strike", RAISED)
+@pytest.mark.parametrize("exists", slow_after(1, [True, False]))
+@pytest.mark.parametrize("strike", slow_after(1, RAISED))
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     write, check = WRITERS[name]
@@ -160,8 +162,8 @@ def test_a_file_keeps_its_permissions(tmp_path):
 
 
 @pytest.fixture(name="table", scope="module")
-def table_of_faces():
-    return faces().data[:40]
+def small_table():
+    return make_nonrigid_tracks(40, 12, 1, noise=0.01, random_state=0).data
 
 
 class TestKeepFrames:
@@ -169,13 +171,26 @@ class TestKeepFrames:
     def estimator(folder, **params):
         return AffineNRSfM(1, random_state=0, keep_frames=folder, **params)
 
-    @pytest.mark.parametrize(
-        "strike",
-        [
-            pytest.param(name, marks=[pytest.mark.slow] * (name != "disk full"))
-            for name in RAISED
-        ],
-    )
+    def test_a_full_disk_is_no_fit(self, tmp_path, table):
+        folder = tmp_path / "kept"
+        with disk_faults(folder, "disk full", 0) as faults:
+            self.estimator(folder).fit(table)
+        names = [name for name, *_ in faults.operations]
+        before = readable(folder)
+        failed = self.estimator(folder)
+        with (
+            disk_faults(folder, "disk full", names.index("write")),
+            pytest.raises(OSError, match="No space left on device") as error,
+        ):
+            failed.fit(table)
+        assert Path(error.value.filename).name == "motion.npy"
+        assert readable(folder) == before
+        assert leftovers(folder) == []
+        with pytest.raises(NotFittedError):
+            failed.transform(table)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("strike", RAISED)
     def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
         folder = tmp_path / "kept"
         first = self.estimator(folder)
