@@ -1,5 +1,7 @@
 """Tables that are read block by block: files, the fit, and what is said of bad ones."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from frame_parts import ATTRIBUTES_OF_FRAMES
@@ -195,12 +197,16 @@ class TestKeepFrames:
     def test_in_files(self, tmp_path):
         X = table()
         plain = estimator().fit(X)
-        model = estimator(keep_frames=tmp_path / "found").fit(X)
+        found = tmp_path / "found"
+        model = estimator(keep_frames=found).fit(X)
         for name in ATTRIBUTES_OF_FRAMES:
             array = getattr(model, name)
             assert isinstance(array, np.memmap)
             assert_array_equal(array, getattr(plain, name))
-            assert_array_equal(np.load(tmp_path / f"found/{name[:-1]}.npy"), array)
+            file = Path(array.filename)
+            assert (file.name, file.parents[1]) == (f"{name[:-1]}.npy", found)
+            assert_array_equal(np.load(file), array)
+        assert len(list(found.iterdir())) == 1
         assert_allclose(
             model.diagnostics().weak_deviations, plain.diagnostics().weak_deviations
         )

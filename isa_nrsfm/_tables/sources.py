@@ -122,8 +122,8 @@ def unmasked(X: Any) -> Any:
     """
     if not isinstance(X, np.ma.MaskedArray):
         return X
-    floating = X if X.dtype.kind == "f" else X.astype(np.float64)
-    return floating.filled(np.nan)
+    dtype = X.dtype if X.dtype.kind == "f" else np.float64
+    return np.ma.filled(X.astype(dtype), np.nan)
 
 
 def checked_range(X: NDArray) -> NDArray:

@@ -58,7 +58,7 @@ examples:
 
 Cells of missing points are empty. Rows that show too few points for a fit are counted
 and get empty coefficients. Files of an earlier run in the output folder are
-replaced."""
+replaced, all together at the end."""
 
 _TRANSFORM_EXAMPLES = """\
 example:
@@ -359,7 +359,9 @@ def _add_folder_options(
         + ("" if required else " (default: ./%(default)s)"),
     )
     group.add_argument(
-        "--no-figures", action="store_true", help="write no figures (png)"
+        "--no-figures",
+        action="store_true",
+        help="write no figures (png), and remove those of the run before",
     )
     return group
 

@@ -27,8 +27,8 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     estimator : AffineNRSfM
-        A fitted estimator. Arrays that are memory maps go into the file; callbacks
-        are left out.
+        A fitted estimator. Arrays that are memory maps (a path as `keep_frames`) go
+        into the file, which needs no other one; callbacks are left out.
     path : str or path-like
         The file to write, by custom with the suffix ``.skops``. An existing file is
         replaced.

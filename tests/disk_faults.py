@@ -1,0 +1,185 @@
+"""Disks that fail, and processes that are stopped, at a chosen operation on a file."""
+
+import builtins
+import contextlib
+import errno
+import io
+import os
+import signal
+from pathlib import Path
+from unittest import mock
+
+# Operations that may fail, and those that clean up, during which one may be stopped.
+WRITING = ("replace", "rename", "link", "symlink", "mkdir", "chmod", "fsync", "open")
+CLEANING = ("unlink", "remove", "rmdir")
+
+
+def disk_error(code):
+    """Return what raises an error of the disk, without the name of a file."""
+
+    def strike():
+        raise OSError(code, os.strerror(code))
+
+    return strike
+
+
+def interrupt():
+    """Do what Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def kill():
+    """Do what kill -9 does."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+# By name: what happens, whether it goes on happening when more is written, and whether
+# it happens after the operation instead of before it.
+STRIKES = {
+    "disk full": (disk_error(errno.ENOSPC), True, False),
+    "disk full for a moment": (disk_error(errno.ENOSPC), False, False),
+    "access denied": (disk_error(errno.EACCES), False, False),
+    "disk broken": (disk_error(errno.EIO), False, False),
+    "interrupted before": (interrupt, False, False),
+    "interrupted after": (interrupt, False, True),
+    "killed": (kill, False, False),
+}
+
+
+class Faults:
+    """What happens at one of the operations on files of a folder."""
+
+    def __init__(self, folder, strike, at):
+        self.folder = os.path.realpath(folder)
+        self.strike, self.lasting, self.after = STRIKES[strike]
+        self.stops = "interrupted" in strike or strike == "killed"
+        self.at, self.operations = at, []
+
+    @property
+    def struck(self):
+        """Whether there were as many operations."""
+        return 0 < self.at <= len(self.operations)
+
+    def concerns(self, *paths, dir_fd=None, **_):
+        """Tell whether an operation is on files of the folder."""
+        if dir_fd is not None:
+            return True
+        paths = [p for p in paths if isinstance(p, str | os.PathLike)]
+        inside = [os.path.abspath(p).startswith(self.folder) for p in paths]
+        return any(inside)
+
+    def run(self, name, operation, *args, full=True, **keywords):
+        """Run an operation, or let it fail."""
+        self.operations.append((name, *map(str, args[:2])))
+        number = len(self.operations)
+        strikes = number == self.at or (self.lasting and full and number > self.at > 0)
+        if strikes and not self.after:
+            self.strike()
+        result = operation(*args, **keywords)
+        if strikes and self.after:
+            if isinstance(result, io.FileIO):  # which nobody else has yet
+                io.FileIO.close(result)
+            self.strike()
+        return result
+
+
+@contextlib.contextmanager
+def disk_faults(folder, strike, at):
+    """
+    Let one operation on the files of a folder fail, or the process end there.
+
+    Operations are opening for writing, each write that reaches the disk, bringing to
+    the disk, closing, renaming, linking, making folders and changing permissions; and
+    removing, where the process is stopped. A write that fails has written a half.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder. Operations on files elsewhere are not counted.
+    strike : str
+        A key of `STRIKES`.
+    at : int
+        The number of the operation, from 1; with 0 none fails.
+
+    Yields
+    ------
+    Faults
+        With `struck`, whether there were as many, and `operations`.
+    """
+    faults = Faults(folder, strike, at)
+    real_open = io.open
+
+    class Raw(io.FileIO):
+        """A file whose writes are counted."""
+
+        def write(self, data):
+            view = memoryview(data).cast("B")
+            try:
+                return faults.run("write", super().write, view)
+            except OSError:
+                super().write(view[: len(view) // 2])
+                raise
+
+        def close(self):
+            if not self.closed:
+                super().close()
+                faults.run("close", lambda: None, full=False)
+
+    def counting_open(file, mode="r", buffering=-1, *args, **keywords):
+        """Open a file; one that is written to counts."""
+        counts = set("wxa+") & set(mode) and faults.concerns(file)
+        if not counts or "opener" in keywords:  # which calls os.open
+            return real_open(file, mode, buffering, *args, **keywords)
+        raw = faults.run("open", Raw, file, mode.replace("b", "").replace("t", ""))
+        if "b" in mode and buffering == 0:
+            return raw
+        buffered = (io.BufferedRandom if "+" in mode else io.BufferedWriter)(raw)
+        return (
+            buffered if "b" in mode else io.TextIOWrapper(buffered, *args, **keywords)
+        )
+
+    def counting(name):
+        """Return an operation of the system that counts."""
+        real = getattr(os, name)
+
+        def operation(*args, **keywords):
+            counts = name == "fsync" or faults.concerns(*args, **keywords)
+            if name == "open":
+                counts = counts and args[1] & (os.O_WRONLY | os.O_RDWR)
+            if not counts:
+                return real(*args, **keywords)
+            full = name in ("open", "mkdir", "fsync")
+            return faults.run(name, real, *args, full=full, **keywords)
+
+        return operation
+
+    names = WRITING + (CLEANING if faults.stops else ())
+    with contextlib.ExitStack() as stack:
+        for module in (io, builtins):
+            stack.enter_context(mock.patch.object(module, "open", counting_open))
+        for name in names:
+            patched = mock.patch.object(os, name, counting(name))
+            stack.enter_context(patched)
+        yield faults
+
+
+def readable(folder):
+    """Return what a reader finds in a folder: the contents of its files by their names.
+
+    Hidden files and links that lead nowhere are not found.
+    """
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    }
+
+
+def leftovers(folder):
+    """Return the names of hidden files and of links in a folder."""
+    return [
+        str(path.relative_to(folder))
+        for path in sorted(Path(folder).rglob("*"))
+        if path.name.startswith(".") or path.is_symlink()
+    ]

@@ -1,0 +1,48 @@
+"""Runs of the command fit that tests let fail, and what a folder then holds."""
+
+import hashlib
+import json
+
+import pandas as pd
+
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
+FILES = {
+    "alpha.csv",
+    "cameras.csv",
+    "model.skops",
+    "report.json",
+    "shapes.npz",
+    "viewer.html",
+}
+
+
+def write_landmarks(path):
+    """Write a table for fits that take no time."""
+    tracks = make_nonrigid_tracks(30, 12, 1, noise=0.01, random_state=0)
+    names = [f"{axis}{j}" for j in range(12) for axis in "xy"]
+    pd.DataFrame(tracks.data, columns=names).to_csv(path, index=False)
+
+
+def fit(table, folder, seed, *options):
+    """Run the command fit; return its exit code."""
+    argv = ["fit", table, "-o", folder, "-k", 1, "--random-state", seed, *options]
+    return main([str(word) for word in argv])
+
+
+def whole_run(files):
+    """Return the seed of the run that files are of, by the digests in its report.
+
+    None are of no run. Files of two runs, or of a part of one, are an error.
+    """
+    if not files:
+        return None
+    report = json.loads(files["report.json"])
+    for name, digest in report["sha256"].items():
+        assert hashlib.sha256(files[name]).hexdigest() == digest, name
+    listed = {*report["sha256"], "report.json"}
+    assert files.keys() == listed == {*report["files"], "report.json"}
+    assert FILES <= listed
+    return report["model"]["parameters"]["random_state"]
