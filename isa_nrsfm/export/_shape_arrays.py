@@ -10,7 +10,7 @@ from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._estimator import check_class
-from isa_nrsfm._tables.landmark_columns import point_names
+from isa_nrsfm.plotting._edges import names_of_points
 
 SUFFIXES = (".npz", ".mat")
 
@@ -142,17 +142,6 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
         if array.dtype.kind == "U":
             arrays[name] = array.astype(object)
     savemat(path, arrays, oned_as="column")
-
-
-def names_of_points(model: Any) -> tuple[str, ...]:
-    """Return the names of a model's points, or their numbers."""
-    n_points = len(model.mean_shape_)
-    columns = getattr(model, "feature_names_in_", None)
-    if columns is None:
-        return tuple(map(str, range(n_points)))
-    names = [str(name).strip() for name in columns]
-    x_columns = names[:n_points] if model.layout == "planar" else names[::2]
-    return point_names(x_columns)
 
 
 def names_of_components(names: Any, n_components: int) -> list[str]:
