@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         isa as isa,
         metrics as metrics,
         plotting as plotting,
+        skeletons as skeletons,
     )
     from isa_nrsfm._estimator import AffineNRSfM
     from isa_nrsfm._transformer import Decomposition, SmoothedCoefficients
@@ -54,5 +55,6 @@ else:
             "isa",
             "metrics",
             "plotting",
+            "skeletons",
         ],
     )

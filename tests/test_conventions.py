@@ -29,6 +29,7 @@ OPTIONAL = [
     "pooch",
     "pyarrow",
     "skops",
+    "yaml",
 ]
 LINT_IMPORTS = "from importlinter.cli import lint_imports_command as run; run()"
 # Where everybody finds names; each has __all__.
@@ -44,6 +45,7 @@ PUBLIC_MODULES = [
     "isa_nrsfm.isa",
     "isa_nrsfm.metrics",
     "isa_nrsfm.plotting",
+    "isa_nrsfm.skeletons",
 ]
 # Not every docstring needs an extended summary, a See Also section or an example.
 NOT_NEEDED = {"ES01", "SA01", "EX01"}

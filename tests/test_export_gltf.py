@@ -10,7 +10,11 @@ from exported_files import TYPES, Read
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import _gltf, write_glb
-from isa_nrsfm.export._drawing import edges_of, frontal_triangles, vertex_normals
+from isa_nrsfm.export._drawing import (
+    choose_drawing,
+    frontal_triangles,
+    vertex_normals,
+)
 from isa_nrsfm.export._upright import upright_basis, upright_space
 
 VALIDATE = """
@@ -157,8 +161,13 @@ def test_the_animation_swings_each_basis_shape_in_turn(written):
 def test_edges_are_lines_and_none_is_points_alone(written):
     edges = [[0, 1], [1, 2], [5, 9]]
     read = written(face_model(), edges=edges)
-    assert [p["mode"] for p in read.mesh["primitives"]] == [0, 1]
-    assert_array_equal(read.array(read.primitive(1)["indices"]), np.ravel(edges))
+    points, *lines = read.mesh["primitives"]
+    assert [p["mode"] for p in (points, *lines)] == [0, 1, 1]
+    drawn = [read.array(p["indices"]).reshape(-1, 2).tolist() for p in lines]
+    # From side to side in the middle, and those of the right side of the face.
+    assert drawn == [[[5, 9]], [[0, 1], [1, 2]]]
+    names = [read.document["materials"][p["material"]]["name"] for p in lines]
+    assert names == ["points and edges", "right"]
     assert [
         p["mode"] for p in written(face_model(), edges=None).mesh["primitives"]
     ] == [0]
@@ -202,7 +211,7 @@ def test_normals_of_points_without_triangles_look_at_the_viewer():
 
 
 def test_edges_of_triangles_are_their_sides_once():
-    edges = edges_of(np.array([[0, 1, 2], [2, 1, 3]]))
+    edges = choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4).edges
     assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
 
 

@@ -1,121 +1,96 @@
+"""What figures join, and which way is up in them."""
+
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
 from isa_nrsfm.plotting._edges import (
-    FACE_ORDERS,
-    IBUG,
-    XM2VTS,
-    choose_edges,
+    choose_layout,
     choose_origin,
-    mean_edge_length,
-    recognise_face,
+    choose_skeleton,
+    upright_turn,
 )
+from isa_nrsfm.skeletons import get_skeleton
+
+FACE = make_face_tracks(n_frames=2, random_state=0).mean_shape
+HAND = make_hand_tracks(n_frames=60, random_state=0).mean_shape
+BODY = make_body_tracks(n_frames=60, random_state=0).mean_shape
+IBUG, COCO = get_skeleton("ibug-68"), get_skeleton("coco-17")
 
 
-def mean_image(load_data, name):
-    """The mean of the complete frames, each centred and of unit size."""
-    W = load_data(name)["W2d"]
-    W = W[np.isfinite(W).all(axis=(1, 2))]
-    W = W - W.mean(axis=1, keepdims=True)
-    return (W / np.linalg.norm(W, axis=(1, 2), keepdims=True)).mean(axis=0)
-
-
-def test_curves_name_each_point_at_most_once_but_for_closed_ends_and_corners():
-    assert set(IBUG.edges.ravel()) == set(range(68))
-    # Pupils, nostrils, middle of the mouth and tip of the nose stand alone.
-    alone = {31, 36, 46, 47, 66, 67}
-    assert set(XM2VTS.edges.ravel()) == set(range(68)) - alone
-    for order in FACE_ORDERS:
-        pairs = {tuple(sorted(pair)) for pair in order.edges.tolist()}
-        assert len(pairs) == len(order.edges)
-    assert len(IBUG.edges) == 16 + 4 + 4 + 3 + 4 + 6 + 6 + 12 + 8
-    for closing in ((36, 41), (42, 47), (48, 59), (60, 67)):
-        assert closing[::-1] in map(tuple, IBUG.edges.tolist())
-
-    # The inner edges of both lips end in the corners of the mouth.
-    for corner in ((48, 60), (62, 54), (54, 63), (65, 48)):
-        assert corner in map(tuple, XM2VTS.edges.tolist())
-
-
-@pytest.mark.parametrize(
-    ("name", "order"),
-    [
-        ("ict_bu3dfe_like_68", IBUG),
-        ("faces_wild_68_combined", IBUG),
-        ("expressions_dlib_68", IBUG),
-        ("muct_68", XM2VTS),
-    ],
-)
-def test_faces_are_recognised(load_data, name, order):
-    shape = mean_image(load_data, name)
-    assert recognise_face(shape) is order
-    assert_array_equal(choose_edges("auto", shape), order.edges)
-
-
-def test_the_order_with_the_shorter_edges_is_taken():
-    face = make_face_tracks(n_frames=2, random_state=0).mean_shape
-    assert recognise_face(face) is IBUG
-    lengths = [mean_edge_length(face, order.edges) for order in FACE_ORDERS]
-    assert lengths[0] < lengths[1]
-    # The size and place of the shape do not matter.
-    assert mean_edge_length(7 * face + 3, IBUG.edges) == pytest.approx(lengths[0])
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_68_points_that_are_no_face_are_not_joined(seed):
-    rng = np.random.default_rng(seed)
-    face = make_face_tracks(n_frames=2, random_state=0).mean_shape
-    for shape in (
-        rng.standard_normal((68, 3)),
-        rng.uniform(size=(68, 2)),
-        rng.permutation(face),
-    ):
-        assert recognise_face(shape) is None
-        assert choose_edges("auto", shape) is None
-        assert choose_origin("auto", shape) == "upper"
-
-
-def test_degenerate_and_other_shapes_are_not_joined():
-    assert recognise_face(np.zeros((68, 3))) is None
-    face = make_face_tracks(n_frames=2, random_state=0).mean_shape
-    assert recognise_face(face[:67]) is None
-    assert recognise_face(np.concatenate([face, face[:8]])) is None
+def test_layouts_are_recognised_or_named():
+    assert choose_skeleton("auto", FACE) is IBUG
+    assert choose_skeleton("auto", HAND) is get_skeleton("hand-21")
+    assert choose_skeleton("auto", BODY) is None
+    assert choose_skeleton("auto", BODY, COCO.point_names) == COCO
+    assert choose_skeleton("coco-17", BODY) is COCO
+    assert choose_skeleton(COCO, BODY) is COCO
 
 
 def test_given_edges():
     shape = np.zeros((5, 3))
-    assert choose_edges(None, shape) is None
-    assert_array_equal(choose_edges([(0, 1), (4, 2)], shape), [[0, 1], [4, 2]])
+    assert choose_skeleton(None, shape) is None
+    found = choose_skeleton([(0, 1), (4, 2)], shape)
+    assert_array_equal(found.edges, [[0, 1], [4, 2]])
+    assert not found.sides.any()
+
+
+def test_the_layout_is_known_whatever_is_drawn():
+    assert choose_layout(None, FACE, None) is IBUG
+    assert choose_layout([[0, 1]], FACE, None) is IBUG
+    assert choose_layout(COCO, BODY, None) is COCO
+    assert choose_layout(None, BODY, None) is None
 
 
 @pytest.mark.parametrize(
     ("edges", "message"),
     [
-        ("face", "got 'face'"),
-        ([0, 1, 2], r"got shape \(3,\)"),
-        ([[0, 1, 2]], r"got shape \(1, 3\)"),
-        ([[0.0, 1.0]], "dtype float64"),
+        ("tree", "edges must be .* Skeleton or the name of one .*; got 'tree'"),
+        ("hand-21", "'hand-21' has 21 points, the shape 5"),
+        ([0, 1], r"shape \(n_edges, 2\).* got shape \(2,\)"),
+        ([[0.0, 1.0]], "must be integers"),
+        ([[0, 1, 2]], "got shape"),
         ([[0, 5]], "points 0 to 4; got 0 to 5"),
-        ([[-1, 2]], "points 0 to 4; got -1 to 2"),
+        ([[-1, 0]], "points 0 to 4; got -1 to 0"),
     ],
 )
 def test_bad_edges(edges, message):
     with pytest.raises(ValueError, match=message):
-        choose_edges(edges, np.zeros((5, 3)))
+        choose_skeleton(edges, np.zeros((5, 3)))
 
 
-def test_faces_stand_upright():
-    face = make_face_tracks(n_frames=2, random_state=0).mean_shape
-    assert choose_origin("auto", face) == "upper"
-    assert choose_origin("auto", face * [1, -1, 1]) == "lower"
-    assert choose_origin("lower", face) == "lower"
-    assert choose_origin("upper", face * [1, -1, 1]) == "upper"
+@pytest.mark.parametrize(("shape", "layout"), [(FACE, IBUG), (BODY, COCO)])
+def test_faces_and_bodies_tell_which_way_y_points(shape, layout):
+    assert choose_origin("auto", shape, layout) == "upper"
+    assert choose_origin("auto", shape * [1, -1, 1], layout) == "lower"
+    assert choose_origin("auto", shape * [1, -1, 1], None) == "upper"
+    assert choose_origin("lower", shape, layout) == "lower"
+    assert choose_origin("upper", shape * [1, -1, 1], layout) == "upper"
     with pytest.raises(ValueError, match="got 'top'"):
-        choose_origin("top", face)
+        choose_origin("top", shape, layout)
 
 
-def test_the_y_axis_of_real_tables(load_data):
-    assert choose_origin("auto", mean_image(load_data, "muct_68")) == "upper"
-    assert choose_origin("auto", mean_image(load_data, "ict_bu3dfe_like_68")) == "lower"
+def test_hands_do_not_tell_which_way_y_points():
+    hand = get_skeleton("hand-21")
+    assert choose_origin("auto", HAND * [1, -1, -1], hand) == "upper"
+
+
+@pytest.mark.parametrize("origin", ["upper", "lower"])
+@pytest.mark.parametrize(
+    ("shape", "layout"), [(FACE, IBUG), (BODY, COCO), (HAND, get_skeleton("hand-21"))]
+)
+def test_shapes_are_turned_upright(shape, layout, origin):
+    seen = shape if origin == "upper" else shape * [1, -1, -1]
+    tilt = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+    turned = seen @ tilt.T @ upright_turn(seen @ tilt.T, layout, origin).T
+    expected = seen @ upright_turn(seen, layout, origin).T
+    assert_allclose(turned, expected, atol=1e-9 * np.abs(shape).max())
+    below, above = turned[np.array(layout.up), 1].mean(axis=0)
+    assert (above < below) == (origin == "upper")
+
+
+def test_what_has_no_layout_stays():
+    assert_array_equal(upright_turn(BODY, None, "upper"), np.eye(3))
+    pairs = choose_skeleton([[0, 1]], BODY)
+    assert_array_equal(upright_turn(BODY, pairs, "upper"), np.eye(3))

@@ -11,8 +11,8 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting import ReprojectionDisplay
 from isa_nrsfm.plotting._axes import percent
-from isa_nrsfm.plotting._edges import IBUG
 from isa_nrsfm.plotting._reprojection import choose_frames
+from isa_nrsfm.skeletons import get_skeleton
 
 # The figures do not depend on how far the iterations of the fit got.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -54,7 +54,8 @@ def test_artists_are_the_numbers(faces, estimator):
         assert_allclose(
             display.errors_[i].get_segments(), np.stack([seen, fitted], axis=1)
         )
-        assert_allclose(display.edges_[i].get_segments(), fitted[IBUG.edges])
+        edges = get_skeleton("ibug-68").edges
+        assert_allclose(display.edges_[i].get_segments(), fitted[edges])
         assert display.observed_[i].axes is display.axes_[i]
         error = inverse_snr(faces.data[[row]], table[row].reshape(1, -1))
         assert display.inverse_snr[i] == pytest.approx(error)

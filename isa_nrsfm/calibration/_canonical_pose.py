@@ -1,16 +1,16 @@
 """Turn a shape upright and frontal."""
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm.datasets._face_model import mirror_points, neutral_shape
+from isa_nrsfm.skeletons import SKELETONS, Skeleton
 
-SCHEMES = ("ibug-68",)
 # Two directions are parallel whose sine is below this.
 PARALLEL = 1e-6
+TO_THE_VIEWER = (0.0, 0.0, -1.0)
 
 
 class CanonicalPose(NamedTuple):
@@ -41,7 +41,7 @@ def canonical_pose(
     left_right: ArrayLike | None = None,
     up: ArrayLike | None = None,
     front: ArrayLike | None = None,
-    scheme: Literal["ibug-68"] | None = None,
+    scheme: Skeleton | str | None = None,
 ) -> CanonicalPose:
     """
     Turn a shape upright and frontal, as the image of a passport shows it.
@@ -67,10 +67,12 @@ def canonical_pose(
         (n_pairs, 2), one behind and one in front of it, as for `up`. With both
         `left_right` and `up` it decides on the mirror image: where it would point away
         from the viewer, the sign of the depth is changed.
-    scheme : {"ibug-68"}, default=None
-        Fills in what is not given: for the 68 points of faces in the order of iBUG all
-        symmetric points as `left_right`, from the chin to the root of the nose as
-        `up`, and from the ends of the jaw to the tip of the nose as `front`.
+    scheme : Skeleton or str, default=None
+        The layout of the points, or its name in `isa_nrsfm.skeletons.SKELETONS`, which
+        fills in what is not given. For ``"ibug-68"`` that is all symmetric points as
+        `left_right`, from the chin to the root of the nose as `up`, and from the ends
+        of the jaw to the tip of the nose as `front`. A hand tells no more than `up`: it
+        keeps towards the viewer what it has there.
 
     Returns
     -------
@@ -81,8 +83,9 @@ def canonical_pose(
     ------
     ValueError
         If only one of the three directions is given, if two of them are parallel or
-        one is zero, if points do not exist, or if the shape is not of the shape above
-        or not finite.
+        one is zero, if points do not exist, if the scheme is not known, has another
+        number of points or tells no pose, or if the shape is not of the shape above or
+        not finite.
 
     Notes
     -----
@@ -117,6 +120,8 @@ def canonical_pose(
         left_right = pairs["left_right"] if left_right is None else left_right
         up = pairs["up"] if up is None else up
         front = pairs["front"] if front is None else front
+        if left_right is None and front is None:
+            front = TO_THE_VIEWER
     right = None if left_right is None else _principal_direction(points, left_right)
     down = None if up is None else -_direction("up", points, up)
     away = None if front is None else -_direction("front", points, front)
@@ -212,16 +217,23 @@ def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:
     return points[index[:, 1]] - points[index[:, 0]]
 
 
-def _scheme_pairs(scheme: str, n_points: int) -> dict[str, Any]:
-    """Return the pairs of points of a named scheme."""
-    if scheme not in SCHEMES:
-        raise ValueError(f"scheme must be one of {SCHEMES}; got {scheme!r}")
-    if n_points != 68:
-        raise ValueError(f"scheme={scheme!r} needs 68 points; got {n_points}")
-    mirror, x = mirror_points(), neutral_shape()[:, 0]
-    left = np.flatnonzero(x < x[mirror])
-    return {
-        "left_right": np.stack([left, mirror[left]], axis=1),
-        "up": [[8, 27]],
-        "front": [[0, 30], [16, 30]],
+def _scheme_pairs(scheme: Any, n_points: int) -> dict[str, Any]:
+    """Return the pairs of points of a layout, None for those that it has not."""
+    if isinstance(scheme, str):
+        if scheme not in SKELETONS:
+            raise ValueError(f"scheme must be one of {(*SKELETONS,)}; got {scheme!r}")
+        scheme = SKELETONS[scheme]
+    if not isinstance(scheme, Skeleton):
+        raise ValueError(f"scheme must be a Skeleton or its name; got {scheme!r}")
+    if scheme.n_points != n_points:
+        raise ValueError(
+            f"scheme={scheme.name!r} needs {scheme.n_points} points; got {n_points}"
+        )
+    if not scheme.up:
+        raise ValueError(f"scheme={scheme.name!r} does not tell which way is up")
+    pairs = {
+        "left_right": scheme.left_right,
+        "up": np.array(scheme.up),
+        "front": np.array(scheme.front),
     }
+    return {name: index if len(index) else None for name, index in pairs.items()}

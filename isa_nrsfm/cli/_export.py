@@ -20,8 +20,8 @@ from isa_nrsfm.export import (
     write_shapes,
     write_viewer,
 )
-from isa_nrsfm.export._names import names_of_points
 from isa_nrsfm.io import load_model
+from isa_nrsfm.plotting._edges import names_of_points
 
 # The options that each content has.
 _POSE = ("camera", "origin", "mirrored")

@@ -18,6 +18,7 @@ from isa_nrsfm.datasets._face_model import (
 )
 from isa_nrsfm.datasets._scene import (
     CAMERAS,
+    FRAMES_A_SECOND,
     Camera,
     centre_shapes,
     draw_motion,
@@ -138,6 +139,13 @@ def make_face_tracks(
             rest, 1 the full expression. Most faces are near rest: the strengths have
             the skewed and heavy-tailed Beta(0.4, 2) distribution. Only the "face
             width" is symmetric between -1 and 1: 2 Beta(2, 2) - 1.
+        labels : ndarray of shape (n_frames,), dtype=str
+            The strongest expression of each face, "rest" where there is none.
+        groups : ndarray of shape (n_frames,), dtype=int
+            The number of the person: 0, it is always the same one.
+        time : ndarray of shape (n_frames,)
+            Seconds, of a video with 25 frames a second. The faces do not depend on it:
+            they are in no order.
         angles : ndarray of shape (n_frames, 3)
             Yaw, pitch and roll in degrees, the rotations about the y, x and z axes
             that are applied in this order. Positive yaw turns the nose to the left of
@@ -151,6 +159,8 @@ def make_face_tracks(
     See Also
     --------
     make_nonrigid_tracks : Random points and random deformations.
+    make_hand_tracks : Hands of several people in motion.
+    make_body_tracks : Bodies of several people in motion.
 
     Examples
     --------
@@ -186,8 +196,24 @@ def make_face_tracks(
         component_names=list(COMPONENT_NAMES[:n_components]),
         neutral_shape=neutral,
         strength=strength,
+        labels=_strongest(strength),
+        groups=np.zeros(n_frames, dtype=np.intp),
+        time=np.arange(n_frames) / FRAMES_A_SECOND,
         angles=angles,
     )
+
+
+def _strongest(strength: NDArray) -> NDArray[np.str_]:
+    """Return the name of the strongest expression of each frame."""
+    expressions = [
+        k
+        for k, name in enumerate(COMPONENT_NAMES[: strength.shape[1]])
+        if name not in SIGNED_COMPONENTS
+    ]
+    if not expressions:
+        return np.full(len(strength), "rest")
+    names = np.array(COMPONENT_NAMES)[expressions]
+    return names[strength[:, expressions].argmax(axis=1)]
 
 
 def _draw_strength(

@@ -13,6 +13,8 @@ from isa_nrsfm._tables.layout import Layout, tracks_to_table
 Camera = Literal["weak_perspective", "affine", "orthographic"]
 CAMERAS: tuple[Camera, ...] = ("weak_perspective", "affine", "orthographic")
 
+# Of the videos that the tables are said to be from.
+FRAMES_A_SECOND = 25.0
 # The smaller singular value of an affine camera is at least this share of the larger.
 SMALLEST_RATIO = 0.5
 
@@ -70,6 +72,27 @@ def observe(
     alpha: NDArray,
     motion: NDArray,
     translation: NDArray,
+    **options: Any,
+) -> Bunch:
+    """Return the table seen by the cameras together with all truths.
+
+    The options are those of `observe_shapes`.
+    """
+    return observe_shapes(
+        mean_shape + np.tensordot(alpha, basis, 1),
+        motion,
+        translation,
+        mean_shape=mean_shape,
+        basis=basis,
+        alpha=alpha,
+        **options,
+    )
+
+
+def observe_shapes(
+    shapes: NDArray,
+    motion: NDArray,
+    translation: NDArray,
     *,
     noise: float,
     missing: float,
@@ -77,8 +100,7 @@ def observe(
     rng: RandomState,
     **more: Any,
 ) -> Bunch:
-    """Return the table seen by the cameras together with all truths."""
-    shapes = mean_shape + np.tensordot(alpha, basis, 1)
+    """Return the table of given shapes seen by the cameras, and the truth."""
     clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
     centred = clean - clean.mean(axis=1, keepdims=True)
     noise_variance = noise**2 * np.mean(centred**2)
@@ -94,9 +116,6 @@ def observe(
         tracks=tracks,
         clean=clean,
         visible=visible,
-        mean_shape=mean_shape,
-        basis=basis,
-        alpha=alpha,
         motion=motion,
         translation=translation,
         shapes=shapes,

@@ -1,31 +1,73 @@
 """What is drawn of a shape: triangles, edges or points alone."""
 
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from isa_nrsfm.plotting._edges import checked_links, choose_edges
+from isa_nrsfm.plotting._edges import checked_links
+from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
-# Pairs of points, or triangles.
-Links = ArrayLike | Literal["auto"] | None
+# "auto" or the name of a layout, the layout, pairs of points, or triangles.
+Links = ArrayLike | Skeleton | str | None
 
 
-def choose_links(edges: Any, shape: NDArray) -> NDArray[np.intp] | None:
+class Drawing(NamedTuple):
     """
-    Return the edges or the triangles to draw as an index array, or None for neither.
+    What is drawn of a shape, and on which side.
+
+    Attributes
+    ----------
+    links : ndarray of shape (n_edges, 2) or (n_triangles, 3)
+        Pairs of points, or triangles; none where points are drawn alone.
+    sides : ndarray of shape (n_points,)
+        The side of each point, 0 in the middle, 1 left, 2 right.
+    """
+
+    links: NDArray[np.intp]
+    sides: NDArray[np.intp]
+
+    @property
+    def edges(self) -> NDArray[np.intp]:
+        """Return pairs of points: those given, or the sides of triangles, once."""
+        if self.links.shape[1] == 2:
+            return self.links
+        sides = self.links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        return np.unique(np.sort(sides, axis=1), axis=0)
+
+    @property
+    def edges_of_sides(self) -> list[NDArray[np.intp]]:
+        """Return the pairs of points in the middle, on the left and on the right."""
+        edges = self.edges
+        of_edges = sides_of_edges(self.sides, edges)
+        return [edges[of_edges == side] for side in (MIDDLE, LEFT, RIGHT)]
+
+
+def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawing:
+    """
+    Return what to draw of a shape.
 
     Parameters
     ----------
-    edges : "auto", None or array-like of shape (n_edges, 2) or (n_triangles, 3)
-        "auto" joins 68 points that look like a face.
-    shape : ndarray of shape (n_points, 3)
-        The points to be joined, upright.
+    edges : "auto", str, Skeleton, None or array-like
+        Pairs of points (n_edges, 2) or triangles (n_triangles, 3); None for points
+        alone; for everything else what the layout joins.
+    layout : Skeleton or None
+        The layout of the points, where it is known.
+    n_points : int
+        Number of points.
     """
-    if edges is None or isinstance(edges, str):
-        return choose_edges(edges, shape)
-    return checked_links(edges, len(shape), triangles=True)
+    links = np.empty((0, 2), dtype=np.intp)
+    sides = np.zeros(n_points, dtype=np.intp)
+    if edges is None:
+        return Drawing(links, sides)
+    if not isinstance(edges, str | Skeleton):
+        links = checked_links(edges, n_points, triangles=True)
+    elif layout is not None:
+        links = layout.edges
+    return Drawing(links, sides if layout is None else layout.sides)
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
@@ -58,16 +100,6 @@ def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
     area = np.linalg.det(np.stack([b - a, c - a], axis=1))
     corners[area < 0] = corners[area < 0][:, ::-1]
     return corners
-
-
-def edges_of(links: NDArray[np.intp] | None) -> NDArray[np.intp]:
-    """Return pairs of points: those given, or the sides of triangles, each once."""
-    if links is None:
-        return np.empty((0, 2), dtype=np.intp)
-    if links.shape[1] == 2:
-        return links
-    sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    return np.unique(np.sort(sides, axis=1), axis=0)
 
 
 def vertex_normals(shape: NDArray, triangles: NDArray[np.intp]) -> NDArray:

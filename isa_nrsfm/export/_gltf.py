@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.export._drawing import (
+    Drawing,
     Links,
-    choose_links,
+    choose_drawing,
     frontal_triangles,
     vertex_normals,
 )
-from isa_nrsfm.export._names import names_of_components, names_of_points
+from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.export._upright import (
-    UPSIDE_DOWN,
     Camera,
     upright_basis,
     upright_space,
 )
 from isa_nrsfm.plotting._axes import is_dense
-from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin, names_of_points
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
@@ -34,10 +34,12 @@ VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
 # The largest index that shorts can hold; one more means something else.
 LARGEST_SHORT = 65534
+NO_EDGES = np.empty((0, 2), dtype=np.intp)
 # The animation: standard deviations, seconds for a basis shape, keys for one swing.
 AMPLITUDE, SECONDS, KEYS = 2.0, 2.0, 17
-# Matt materials, seen from both sides: that of points and edges, and that of surfaces.
-PLAIN, SURFACE = 0, 1
+# Matt materials, seen from both sides: those of points and edges in the middle, on the
+# left and on the right, and that of surfaces.
+PLAIN, LEFT, RIGHT, SURFACE = range(4)
 MATERIALS = [
     {
         "name": name,
@@ -50,6 +52,8 @@ MATERIALS = [
     }
     for name, colour in (
         ("points and edges", (0.05, 0.12, 0.25)),
+        ("left", (0.0, 0.342, 0.171)),
+        ("right", (0.604, 0.191, 0.386)),
         ("surface", (0.80, 0.66, 0.55)),
     )
 ]
@@ -77,12 +81,15 @@ def write_glb(
         A fitted model that has kept its frames.
     path : str or path-like
         The file, with the suffix ``.glb``. An existing file is replaced.
-    edges : "auto", None or array-like, default="auto"
-        What is drawn beside the points: integers of shape (n_edges, 2), pairs of points
-        to be joined; or (n_triangles, 3), the triangles of a surface, counter-clockwise
-        as seen from outside; or None for nothing. "auto" makes a surface of the
-        Delaunay triangles of the front view. More than 400 points of a surface are not
-        drawn as points.
+    edges : "auto", Skeleton, str, None or array-like, default="auto"
+        What is drawn beside the points: a layout of `isa_nrsfm.skeletons` or its name,
+        whose left and right are primitives with colours of their own; integers of shape
+        (n_edges, 2), pairs of points to be joined; or (n_triangles, 3), the triangles
+        of a surface, counter-clockwise as seen from outside; or None for nothing.
+        "auto" is the layout of hands and bodies, if one is known by the names or the
+        number and order of the points, and otherwise a surface of the Delaunay
+        triangles of the front view, on which the layout of a face is drawn. More than
+        400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -91,11 +98,11 @@ def write_glb(
         model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
-        for a y that points up. "auto" is "lower" where 68 points of a face would stand
-        on their head otherwise.
+        for a y that points up. "auto" is "lower" where a face or a body would stand on
+        its head otherwise.
     mirrored : bool, default=False
         Whether to take the mirror image in depth, which fits the table as well. Faces
-        of 68 points in the order of iBUG have the right depth without.
+        and bodies of known layouts have the right depth without.
 
     Raises
     ------
@@ -125,20 +132,23 @@ def write_glb(
     """
     if Path(path).suffix.lower() != ".glb":
         raise ValueError(f"path must end in .glb; got {os.fspath(path)}")
-    space = upright_space(model, camera, origin, mirrored)
+    space = upright_space(model, camera, origin, mirrored, edges)
     n_components = len(model.basis_)
     targets = names_of_components(names, n_components)
     mean, basis = upright_basis(space, model)
     mean = (mean - mean.mean(axis=0)) @ UPSIDE_DOWN
     factor = 1 / np.ptp(mean, axis=0).max()
     mean, basis = factor * mean, factor * (basis @ UPSIDE_DOWN)
-    if isinstance(edges, str) and edges == "auto":
-        links: NDArray | None = frontal_triangles(mean)
-    else:
-        links = choose_links(edges, mean)
+    drawing = choose_drawing(edges, space.layout, len(mean))
+    surface = None
+    if drawing.links.shape[1] == 3:
+        surface, drawing = drawing.links, drawing._replace(links=NO_EDGES)
+    elif isinstance(edges, str) and edges == "auto":
+        if space.layout is None or space.layout.kind == "face":
+            surface = frontal_triangles(mean)
 
     file = Binary()
-    primitives = _primitives(file, mean, basis, links)
+    primitives = _primitives(file, mean, basis, surface, drawing)
     used = sorted({part["material"] for part in primitives})
     for part in primitives:
         part["material"] = used.index(part["material"])
@@ -169,7 +179,7 @@ def write_glb(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"name": "shape", "mesh": 0}],
         "meshes": [mesh],
-        "materials": MATERIALS[: 1 + max(p["material"] for p in primitives)],
+        "materials": [MATERIALS[material] for material in used],
         "animations": [animation],
     }
     write_whole(path, file.with_document(document))
@@ -261,9 +271,13 @@ def _padded(content: bytes, filler: bytes) -> bytes:
 
 
 def _primitives(
-    file: Binary, mean: NDArray, basis: NDArray, links: NDArray | None
+    file: Binary,
+    mean: NDArray,
+    basis: NDArray,
+    surface: NDArray | None,
+    drawing: Drawing,
 ) -> list[dict[str, Any]]:
-    """Return the points, unless there are many on a surface, and what joins them."""
+    """Return a surface, the points, unless there are many on it, and the edges."""
     position = file.add(mean, VERTICES, bounds=True)
     drifts = [file.add(drift, VERTICES, bounds=True) for drift in basis]
     bare: dict[str, Any] = {
@@ -271,26 +285,41 @@ def _primitives(
         "targets": [{"POSITION": drift} for drift in drifts],
         "material": PLAIN,
     }
-    primitives = [bare | {"mode": POINTS}]
-    if links is None or not len(links):
-        return primitives
-    indices = file.add(links.ravel(), INDICES)
-    if links.shape[1] == 2:
-        return [*primitives, bare | {"mode": LINES, "indices": indices}]
-    normals = vertex_normals(mean, links)
+    primitives = []
+    if surface is not None:
+        primitives.append(_surface(file, mean, basis, surface, bare))
+    if surface is None or not is_dense(mean):
+        primitives.append(bare | {"mode": POINTS})
+    for side, edges in enumerate(drawing.edges_of_sides):
+        if len(edges):
+            indices = file.add(edges.ravel(), INDICES)
+            lines = {"mode": LINES, "indices": indices, "material": PLAIN + side}
+            primitives.append(bare | lines)
+    return primitives
+
+
+def _surface(
+    file: Binary,
+    mean: NDArray,
+    basis: NDArray,
+    triangles: NDArray,
+    bare: dict[str, Any],
+) -> dict[str, Any]:
+    """Return the triangles of a surface, with normals."""
+    indices = file.add(triangles.ravel(), INDICES)
+    normals = vertex_normals(mean, triangles)
     # Normals add up with the weights; what one standard deviation does to them.
-    turns = [vertex_normals(mean + drift, links) - normals for drift in basis]
-    surface = {
+    turns = [vertex_normals(mean + drift, triangles) - normals for drift in basis]
+    return {
         "attributes": bare["attributes"] | {"NORMAL": file.add(normals, VERTICES)},
         "targets": [
-            {"POSITION": drift, "NORMAL": file.add(turn, VERTICES)}
-            for drift, turn in zip(drifts, turns, strict=True)
+            target | {"NORMAL": file.add(turn, VERTICES)}
+            for target, turn in zip(bare["targets"], turns, strict=True)
         ],
         "material": SURFACE,
         "mode": TRIANGLES,
         "indices": indices,
     }
-    return [surface] if is_dense(mean) else [surface, *primitives]
 
 
 def _swings(n_components: int) -> tuple[NDArray, NDArray]:

@@ -1,19 +1,6 @@
-"""Names of a model's points and coefficients."""
+"""Names of coefficients."""
 
 from typing import Any
-
-from isa_nrsfm._tables.landmark_columns import point_names
-
-
-def names_of_points(model: Any) -> tuple[str, ...]:
-    """Return the names of a model's points, or their numbers."""
-    n_points = len(model.mean_shape_)
-    columns = getattr(model, "feature_names_in_", None)
-    if columns is None:
-        return tuple(map(str, range(n_points)))
-    names = [str(name).strip() for name in columns]
-    x_columns = names[:n_points] if model.layout == "planar" else names[::2]
-    return point_names(x_columns)
 
 
 def names_of_components(names: Any, n_components: int) -> list[str]:

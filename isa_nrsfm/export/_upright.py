@@ -25,15 +25,20 @@ from isa_nrsfm._metric_upgrade.deforming import (
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
 from isa_nrsfm._transformer import check_frames_kept
-from isa_nrsfm.calibration._canonical_pose import canonical_pose
-from isa_nrsfm.plotting._edges import IBUG, Origin, choose_origin, recognise_face
+from isa_nrsfm.plotting._edges import (
+    UPSIDE_DOWN,
+    Origin,
+    choose_layout,
+    choose_origin,
+    names_of_points,
+    upright_turn,
+)
 from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform
+from isa_nrsfm.skeletons import Skeleton
 
 Camera = Literal["weak_perspective"] | None
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
-# Half a turn about x takes shapes whose y points up to those whose y points down.
-UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
 class UprightSpace(NamedTuple):
@@ -53,16 +58,23 @@ class UprightSpace(NamedTuple):
     image_axes : ndarray of shape (3, 3)
         Diagonal; takes the axes of an image and its depth to those of the upright
         space.
+    layout : Skeleton or None
+        The layout of the points, where it is known.
     """
 
     camera: str | None
     metric: DeformationMetric | None
     transform: NDArray
     image_axes: NDArray
+    layout: Skeleton | None
 
 
 def upright_space(
-    model: Any, camera: Camera, origin: Origin, mirrored: bool
+    model: Any,
+    camera: Camera,
+    origin: Origin,
+    mirrored: bool,
+    edges: Any = "auto",
 ) -> UprightSpace:
     """
     Find the upright space of a fitted model.
@@ -79,13 +91,15 @@ def upright_space(
         Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
     mirrored : bool
         Whether to take the mirror image in depth.
+    edges : "auto", str, Skeleton, None or array-like, default="auto"
+        The layout of the points or its name; otherwise it is recognised.
 
     Returns
     -------
     UprightSpace
-        Faces of 68 points in the order of iBUG stand upright, look at the viewer and
-        have the depth that puts the nose in front. Other shapes are turned to the view
-        of the mean camera.
+        Faces and bodies of known layouts stand upright, look at the viewer and have the
+        depth that puts noses and toes in front; hands stand upright. Other shapes are
+        turned to the view of the mean camera.
 
     Raises
     ------
@@ -119,16 +133,16 @@ def upright_space(
         shape = model.mean_shape_ @ (transform @ to_metric).T
 
     image_axes = np.eye(3)
-    if choose_origin(origin, shape) == "lower":
+    layout = choose_layout(edges, shape, names_of_points(model))
+    if choose_origin(origin, shape, layout) == "lower":
         image_axes[1, 1] = -1
         transform, shape = UPSIDE_DOWN @ transform, shape @ UPSIDE_DOWN
-    if recognise_face(shape) is IBUG:
-        transform = canonical_pose(shape, scheme="ibug-68").rotation @ transform
+    transform = upright_turn(shape, layout, "upper") @ transform
     if mirrored:
         transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(told, metric, transform, image_axes)
+    return UprightSpace(told, metric, transform, image_axes, layout)
 
 
 def upright_frames(

@@ -15,17 +15,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm.export._drawing import Links, choose_links, edges_of
-from isa_nrsfm.export._names import names_of_components, names_of_points
+from isa_nrsfm.export._drawing import Links, choose_drawing
+from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.export._upright import (
-    UPSIDE_DOWN,
     Camera,
     UprightSpace,
     upright_basis,
     upright_frames,
     upright_space,
 )
-from isa_nrsfm.plotting._edges import Origin
+from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin, names_of_points
 
 # More labels than this cannot be told apart by their colours.
 MOST_LABELS = 30
@@ -73,10 +72,11 @@ def write_viewer(
         Frames have colours by them. None and NaN are rows without a label.
     n_frames : int, default=1000
         The page has no more frames than this, of rows evenly spread over the table.
-    edges : "auto", None or array-like, default="auto"
-        Pairs of points to be joined, of shape (n_edges, 2), or triangles (n_triangles,
-        3), whose sides are drawn. "auto" joins 68 points that look like a face in the
-        order of iBUG or of XM2VTS (as in MUCT).
+    edges : "auto", Skeleton, str, None or array-like, default="auto"
+        What is joined: a layout of `isa_nrsfm.skeletons` or its name, pairs of points
+        (n_edges, 2), or triangles (n_triangles, 3), whose sides are drawn. "auto" is
+        the layout that the points have by their names or by their number and order, if
+        one is known. Left and right of a layout have colours of their own.
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -85,8 +85,8 @@ def write_viewer(
         model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
-        for a y that points up. "auto" is "lower" where 68 points of a face would stand
-        on their head otherwise.
+        for a y that points up. "auto" is "lower" where a face or a body would stand on
+        its head otherwise.
     mirrored : bool, default=False
         Whether to take the mirror image in depth, which fits the table as well; the
         page can do it, too.
@@ -118,7 +118,7 @@ def write_viewer(
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"path must end in .html; got {os.fspath(path)}")
     _check_n_frames(n_frames)
-    space = upright_space(model, camera, origin, mirrored)
+    space = upright_space(model, camera, origin, mirrored, edges)
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
@@ -134,7 +134,7 @@ def write_viewer(
     rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
 
     mean, basis = upright_basis(space, model)
-    links = choose_links(edges, mean)
+    drawing = choose_drawing(edges, space.layout, len(mean))
     centre = mean.mean(axis=0)
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
@@ -149,7 +149,8 @@ def write_viewer(
         "labels": codes[rows].tolist() if categories else [],
         "count": _count(n_rows, len(seen), len(rows)),
         "shapes": _encoded(shapes, "<f4"),
-        "edges": _encoded(edges_of(links), "<u4"),
+        "edges": _encoded(drawing.edges, "<u4"),
+        "sides": drawing.sides.tolist() if drawing.sides.any() else [],
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
     }

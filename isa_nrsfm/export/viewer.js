@@ -5,6 +5,7 @@
   const model = JSON.parse(byId("model").textContent);
   const shapes = new Float32Array(bytes(model.shapes)); // mean, then basis shapes
   const edges = new Uint32Array(bytes(model.edges));
+  const sides = model.sides; // of the points: 0 middle, 1 left, 2 right; or none
   const alpha = new Float32Array(bytes(model.alpha));
   const poses = new Float32Array(bytes(model.rotations));
   const nPoints = model.points.length;
@@ -122,20 +123,30 @@
     return pen;
   }
 
-  function drawShape(pen, seen, ink, faint) {
+  // The side of an edge is that of its ends; from side to side it is in the middle.
+  function sideOf(a, b = a) {
+    const [one, other] = [sides[a] || 0, sides[b] || 0];
+    return one && other && one !== other ? 0 : one || other;
+  }
+
+  // Inks are those of the middle, the left and the right, or one for all.
+  function drawShape(pen, seen, inks, faint) {
     const level = (depth) =>
       Math.min(LEVELS - 1, Math.max(0, Math.floor((LEVELS * (depth + 1)) / 2)));
-    const levels = Array.from({ length: LEVELS }, () => ({ points: [], edges: [] }));
-    for (let i = 0; i < size; i += 3) levels[level(seen[i + 2])].points.push(i);
+    const kinds = inks.length;
+    const levels = Array.from({ length: LEVELS * kinds }, () => ({ points: [], edges: [] }));
+    const group = (depth, side) => levels[level(depth) * kinds + (side % kinds)];
+    for (let i = 0; i < size; i += 3) group(seen[i + 2], sideOf(i / 3)).points.push(i);
     for (let e = 0; e < edges.length; e += 2) {
       const [a, b] = [3 * edges[e], 3 * edges[e + 1]];
-      levels[level((seen[a + 2] + seen[b + 2]) / 2)].edges.push([a, b]);
+      group((seen[a + 2] + seen[b + 2]) / 2, sideOf(edges[e], edges[e + 1])).edges.push([a, b]);
     }
     const usual = nPoints <= 100 ? 3.2 : nPoints <= 400 ? 2.2 : 0.9;
     const radius = (edges.length ? 0.75 : 1) * usual * Math.sqrt(state.zoom);
-    pen.strokeStyle = pen.fillStyle = ink;
     pen.lineWidth = nPoints <= 400 ? 1.6 : 0.7;
-    levels.forEach((content, depth) => {
+    levels.forEach((content, number) => {
+      const depth = Math.floor(number / kinds);
+      pen.strokeStyle = pen.fillStyle = inks[number % kinds];
       pen.globalAlpha = faint * (0.35 + (0.65 * depth) / (LEVELS - 1));
       pen.beginPath();
       for (const [a, b] of content.edges) {
@@ -159,10 +170,12 @@
 
   function drawScene() {
     const pen = cleared(scene);
-    if (byId("ghost").checked) drawShape(pen, project(shapes), colour("--mean"), 0.7);
+    if (byId("ghost").checked) drawShape(pen, project(shapes), [colour("--mean")], 0.7);
     const code = state.frame >= 0 && model.labels.length ? model.labels[state.frame] : -1;
     latest = project(shapeOf(state.weights));
-    drawShape(pen, latest, code < 0 ? colour("--shape") : labelColour(code), 1);
+    const inks = [code < 0 ? colour("--shape") : labelColour(code)];
+    if (sides.length) inks.push(colour("--left"), colour("--right"));
+    drawShape(pen, latest, inks, 1);
     const row = state.frame < 0 ? "" : `frame ${model.rows[state.frame]}`;
     byId("seen").textContent = code < 0 ? row : `${row}: ${model.categories[code]}`;
   }
@@ -400,6 +413,7 @@
   byId("about").textContent = model.about;
   byId("count").textContent = model.count;
   byId("frames").hidden = !nFrames;
+  byId("sides").hidden = !sides.length;
   byId("posed").hidden = !poses.length;
   byId("frame").max = Math.max(nFrames - 1, 0);
   for (const [id, chosen] of [["across", nWeights > 1 ? 0 : -1], ["upwards", nWeights > 1 ? 1 : 0]]) {

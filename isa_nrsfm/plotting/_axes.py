@@ -11,6 +11,9 @@ PLUS_COLOUR = "#D55E00"
 MINUS_COLOUR = "#0072B2"
 OBSERVED_COLOUR = "black"
 MEAN_COLOUR = "0.55"
+# Bluish green and reddish purple of the same palette, for the sides of a body.
+LEFT_COLOUR = "#009E73"
+RIGHT_COLOUR = "#CC79A7"
 
 # Shapes of more points than this are drawn as clouds of small points, without arrows.
 MOST_SPARSE_POINTS = 400
@@ -75,6 +78,12 @@ def draw_segments(ax: Any, segments: NDArray, **kw: Any) -> Any:
 
     style: dict[str, Any] = {"linewidths": 0.8, "capstyle": "round"}
     return ax.add_collection(LineCollection(list(segments), **(style | kw)))
+
+
+def side_colours(sides: NDArray, middle: str) -> list[str]:
+    """Return the colour of each point or edge by its side: 0, 1 left or 2 right."""
+    colours = (middle, LEFT_COLOUR, RIGHT_COLOUR)
+    return [colours[side] for side in sides]
 
 
 def percent(fraction: float) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,9 +10,11 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.plotting._axes import (
+    LEFT_COLOUR,
     MEAN_COLOUR,
     MINUS_COLOUR,
     PLUS_COLOUR,
+    RIGHT_COLOUR,
     check_axes,
     check_names,
     draw_points,
@@ -20,9 +22,18 @@ from isa_nrsfm.plotting._axes import (
     hide_frame,
     is_dense,
     percent,
+    side_colours,
     wrap_title,
 )
-from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
+from isa_nrsfm.plotting._edges import (
+    Edges,
+    Origin,
+    choose_layout,
+    choose_origin,
+    choose_skeleton,
+    names_of_points,
+    upright_turn,
+)
 from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
 from isa_nrsfm.plotting._views import view_of
 
@@ -66,13 +77,15 @@ class BasisShapeDisplay:
         deformations, for the titles.
     component_names : list of str of length n_components, default=None
         Names of the basis shapes. By default their numbers, from 1.
-    edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
-        Pairs of points to be joined. "auto" joins 68 points that look like a face in
-        the order of iBUG or of XM2VTS (as in MUCT), whichever has the shorter edges.
+    edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
+            default="auto"
+        What is joined: a layout of `isa_nrsfm.skeletons` or its name, whose left and
+        right have colours of their own in the mean shape, or pairs of points. "auto" is
+        the layout that the points have by their number and order, if one is known.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
-        points up. "auto" is "lower" where 68 points of a face would stand on their
-        head otherwise.
+        points up. "auto" is "lower" where a face or a body would stand on its head
+        otherwise.
 
     Attributes
     ----------
@@ -84,6 +97,8 @@ class BasisShapeDisplay:
         The share of each basis shape in the energy of the deformations.
     component_names : list of str
         The names of the basis shapes.
+    skeleton : Skeleton or None
+        What is drawn; None for points alone.
     edges : ndarray of shape (n_edges, 2) or None
         The pairs of points that are joined.
     origin : {"upper", "lower"}
@@ -120,8 +135,9 @@ class BasisShapeDisplay:
     [1]_, so that shapes have natural proportions, and turns the mean camera's view to
     the front. Shapes of calibrated cameras are only turned. Where the cameras go round
     the object and have no mean view, their axis keeps its direction in the images and
-    the front is where the object is broadest. Depth is known up to its mirror image:
-    the side view may show the left or the right side.
+    the front is where the object is broadest. Faces, bodies and hands of known layouts
+    are then turned upright (`isa_nrsfm.calibration.canonical_pose`). Depth is known up
+    to its mirror image: the side view may show the left or the right side.
 
     References
     ----------
@@ -168,8 +184,10 @@ class BasisShapeDisplay:
                     f"shape; got shape {self.energy_share.shape}"
                 )
         self.component_names = check_names(component_names, n_components)
-        self.edges = choose_edges(edges, self.mean_shape)
-        self.origin: Literal["upper", "lower"] = choose_origin(origin, self.mean_shape)
+        layout = choose_layout(edges, self.mean_shape, None)
+        self.skeleton = choose_skeleton(edges, self.mean_shape)
+        self.edges = None if self.skeleton is None else self.skeleton.edges
+        self.origin = choose_origin(origin, self.mean_shape, layout)
 
     @classmethod
     def from_estimator(
@@ -191,13 +209,16 @@ class BasisShapeDisplay:
             A fitted estimator.
         component_names : list of str of length n_components, default=None
             Names of the basis shapes. By default their numbers, from 1.
-        edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
-            Pairs of points to be joined. "auto" joins 68 points that look like a face
-            in the order of iBUG or of XM2VTS (as in MUCT).
+        edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
+                default="auto"
+            What is joined: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+            points. "auto" is the layout that the points have by their names or by their
+            number and order, if one is known. Faces, bodies and hands of known layouts
+            stand upright, whatever is joined.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
-            that points up. "auto" is "lower" where 68 points of a face would stand on
-            their head otherwise.
+            that points up. "auto" is "lower" where a face or a body would stand on its
+            head otherwise.
         ax : array-like of matplotlib Axes, default=None
             Axes to draw on, two a shape. By default a new figure.
         **kw : dict
@@ -218,14 +239,18 @@ class BasisShapeDisplay:
         """
         check_is_fitted(estimator, "mean_shape_")
         view = view_of(estimator)
+        shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
+        layout = choose_layout(edges, shape, names)
+        chosen = choose_origin(origin, shape, layout)
+        view = upright_turn(shape, layout, chosen) @ view
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
             basis=deviation * (estimator.basis_ @ view.T),
             energy_share=estimator.energy_share_,
             component_names=component_names,
-            edges=edges,
-            origin=origin,
+            edges=choose_skeleton(edges, shape, names),
+            origin=chosen,
         )
         return display.plot(ax, **kw)
 
@@ -309,7 +334,8 @@ class BasisShapeDisplay:
             for view, axis in zip(VIEWS, pair, strict=True):
                 start = mean[:, view]
                 style = {"color": MEAN_COLOUR, "label": "mean shape"} | point_kw
-                self.mean_.append(self._draw(axis, start, style, edge_kw))
+                sided = block == 0
+                self.mean_.append(self._draw(axis, start, style, edge_kw, sided=sided))
                 if block > 0:
                     offset = drift[block - 1][:, view]
                     style = {"color": MINUS_COLOUR, "label": labels[0]} | point_kw
@@ -348,12 +374,23 @@ class BasisShapeDisplay:
         return chosen.astype(np.intp)
 
     def _draw(
-        self, axis: Any, points: NDArray, style: dict[str, Any], edge_kw: dict[str, Any]
+        self,
+        axis: Any,
+        points: NDArray,
+        style: dict[str, Any],
+        edge_kw: dict[str, Any],
+        *,
+        sided: bool = False,
     ) -> Any:
-        """Draw one shape in one view; joined points are small."""
-        if self.edges is not None:
-            line_style = {"colors": style["color"]} | edge_kw
-            draw_segments(axis, points[self.edges], **line_style)
+        """Draw one shape in one view, perhaps its sides apart; joined points small."""
+        if self.skeleton is not None:
+            colour = style["color"]
+            line_style = {"colors": colour} | edge_kw
+            if sided and colour == MEAN_COLOUR:
+                colours = side_colours(self.skeleton.edge_sides, colour)
+                line_style = {"colors": colours} | edge_kw
+                style = style | {"color": side_colours(self.skeleton.sides, colour)}
+            draw_segments(axis, points[self.skeleton.edges], **line_style)
             style = {"s": 2.0} | style
         return draw_points(axis, points, **style)
 
@@ -379,19 +416,22 @@ class BasisShapeDisplay:
 
         dots = {"marker": "o", "linestyle": "none", "markersize": 3}
         shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
+        entries = [(points.get_label(), points.get_facecolor()[0]) for points in shown]
+        if self.skeleton is not None and self.skeleton.left:
+            entries += [("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)]
         self.figure_.legend(
             handles=[
                 Line2D(
                     [],
                     [],
-                    color=points.get_facecolor()[0],
-                    label=points.get_label(),
+                    color=colour,
+                    label=label,
                     **(dots if self.edges is None else {"linewidth": 1.5}),
                 )
-                for points in shown
+                for label, colour in entries
             ],
             loc="outside lower center",
-            ncols=len(shown),
+            ncols=len(entries),
             frameon=False,
             fontsize="small",
         )

@@ -1,128 +1,74 @@
-"""Which points a figure joins: the two common orders of 68 points of a face."""
+"""Which points a figure joins, and which way is up in it."""
 
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-N_FACE_POINTS = 68
-# Mean edge length above which the points are taken for no face, in units of the root
-# mean square distance of the points from their centroid. Mean faces in their own order
-# have 0.24 to 0.32, in the other order 0.36 to 0.40; 68 random points about 1.3.
-LONGEST_MEAN_EDGE = 0.45
+from isa_nrsfm._tables.landmark_columns import point_names
+from isa_nrsfm.calibration import canonical_pose
+from isa_nrsfm.skeletons import SKELETONS, Skeleton, find_skeleton
 
-Edges = ArrayLike | Literal["auto"] | None
+# A name of a layout or "auto", the layout itself, or pairs of points.
+Edges = ArrayLike | Skeleton | str | None
 Origin = Literal["auto", "upper", "lower"]
 
-
-@dataclass(frozen=True)
-class FaceOrder:
-    """An order of 68 points of a face: what to join, and which way is up."""
-
-    name: str
-    curves: tuple[tuple[int, ...], ...]  # indices of the points along each curve
-    brows: tuple[int, ...]
-    chin: int
-
-    @property
-    def edges(self) -> NDArray[np.intp]:
-        """Pairs of points that are neighbours on a curve, shape (n_edges, 2)."""
-        return np.array([pair for c in self.curves for pair in pairwise(c)])
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def _curve(first: int, last: int, *, closed: bool = False) -> tuple[int, ...]:
-    """Return the indices first to last, and first again where the curve is closed."""
-    return (*range(first, last + 1), *((first,) if closed else ()))
-
-
-IBUG = FaceOrder(
-    name="iBUG",
-    curves=(
-        _curve(0, 16),  # jaw
-        _curve(17, 21),  # brows
-        _curve(22, 26),
-        _curve(27, 30),  # bridge of the nose
-        _curve(31, 35),  # nostrils
-        _curve(36, 41, closed=True),  # eyes
-        _curve(42, 47, closed=True),
-        _curve(48, 59, closed=True),  # outer and inner lips
-        _curve(60, 67, closed=True),
-    ),
-    brows=(*range(17, 27),),
-    chin=8,
-)
-
-# Points 31 and 36 are the pupils, 46, 47 and 67 nostrils and tip of the nose, 66 the
-# middle of the mouth: drawn, not joined.
-XM2VTS = FaceOrder(
-    name="XM2VTS",
-    curves=(
-        _curve(0, 14),  # jaw
-        _curve(15, 20, closed=True),  # brows
-        _curve(21, 26, closed=True),
-        _curve(27, 30, closed=True),  # eyes
-        _curve(32, 35, closed=True),
-        _curve(37, 45),  # nose
-        _curve(48, 59, closed=True),  # outer lips
-        (48, *_curve(60, 62), 54),  # inner edge of the lower and of the upper lip
-        (54, *_curve(63, 65), 48),
-    ),
-    brows=(*range(15, 27),),
-    chin=7,
-)
-
-FACE_ORDERS = (IBUG, XM2VTS)
-
-
-def mean_edge_length(shape: NDArray, edges: NDArray) -> float:
-    """Return the mean length of the edges relative to the size of the shape.
-
-    The size is the root mean square distance of the points from their centroid.
-    """
-    size = np.sqrt(np.mean(np.sum((shape - shape.mean(axis=0)) ** 2, axis=1)))
-    ends = shape[edges]
-    lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    return float(lengths.mean() / size) if size > 0 else np.inf
-
-
-def recognise_face(shape: NDArray) -> FaceOrder | None:
-    """Return the order of 68 points whose edges are shorter; None if both are long.
+def choose_skeleton(
+    edges: Edges, shape: NDArray, names: tuple[str, ...] | None = None
+) -> Skeleton | None:
+    """Return what to draw of a shape, or None for points alone.
 
     Parameters
     ----------
+    edges : "auto", str, Skeleton, None or array-like of shape (n_edges, 2)
+        "auto" is the layout that `find_skeleton` recognises; other texts are names of
+        layouts. Pairs of points become a skeleton of their own.
     shape : ndarray of shape (n_points, 2) or (n_points, 3)
-        Points in a frame with meaningful distances, as the viewing frame.
-    """
-    if len(shape) != N_FACE_POINTS:
-        return None
-    lengths = [mean_edge_length(shape, order.edges) for order in FACE_ORDERS]
-    best = int(np.argmin(lengths))
-    return FACE_ORDERS[best] if lengths[best] <= LONGEST_MEAN_EDGE else None
-
-
-def choose_edges(edges: Edges, shape: NDArray) -> NDArray[np.intp] | None:
-    """Return the edges to draw as an index array, or None for none.
-
-    Parameters
-    ----------
-    edges : "auto", None or array-like of shape (n_edges, 2)
-        "auto" joins 68 points that `recognise_face` takes for a face.
-    shape : ndarray of shape (n_points, 2) or (n_points, 3)
-        The points to be joined.
+        The points to be joined, in a frame with meaningful distances.
+    names : tuple of str, default=None
+        Names of the points.
     """
     if edges is None:
         return None
     if isinstance(edges, str):
-        if edges != "auto":
+        if edges == "auto":
+            return find_skeleton(len(shape), names, shape=shape)
+        if edges not in SKELETONS:
             raise ValueError(
-                f'edges must be "auto", None or an array of pairs of points; '
-                f"got {edges!r}"
+                f'edges must be "auto", None, an array of pairs of points, a Skeleton '
+                f"or the name of one ({', '.join(SKELETONS)}); got {edges!r}"
             )
-        face = recognise_face(shape)
-        return None if face is None else face.edges
-    return checked_links(edges, len(shape))
+        edges = SKELETONS[edges]
+    if isinstance(edges, Skeleton):
+        if edges.n_points != len(shape):
+            raise ValueError(
+                f"the skeleton {edges.name!r} has {edges.n_points} points, the shape "
+                f"{len(shape)}"
+            )
+        return edges
+    pairs = checked_links(edges, len(shape)).tolist()
+    return Skeleton("edges", "other", len(shape), tuple(map(tuple, pairs)), "the user")
+
+
+def choose_layout(
+    edges: Any, shape: NDArray, names: tuple[str, ...] | None
+) -> Skeleton | None:
+    """Return the layout of the points of a shape, whatever is drawn of it.
+
+    Parameters
+    ----------
+    edges : "auto", str, Skeleton, None or array-like
+        A layout or its name; everything else is recognised.
+    shape : ndarray of shape (n_points, 3)
+        The points, in a frame with meaningful distances.
+    names : tuple of str or None
+        Names of the points.
+    """
+    told = isinstance(edges, str | Skeleton)
+    return choose_skeleton(edges if told else "auto", shape, names)
 
 
 def checked_links(
@@ -145,23 +91,57 @@ def checked_links(
     return links.astype(np.intp)
 
 
-def choose_origin(origin: Origin, shape: NDArray) -> Literal["upper", "lower"]:
+def choose_origin(
+    origin: Origin, shape: NDArray, layout: Skeleton | None
+) -> Literal["upper", "lower"]:
     """Return where y is zero: "upper" if it points down in the image, else "lower".
 
     Parameters
     ----------
     origin : {"auto", "upper", "lower"}
-        "auto" is "lower" where 68 points are recognised as a face whose brows have
-        larger y than its chin, else "upper".
+        "auto" is "lower" where a face or a body would stand on its head otherwise.
+        Hands are held in any direction and do not tell.
     shape : ndarray of shape (n_points, 2) or (n_points, 3)
         The points, with the image's x and y in the first two columns.
+    layout : Skeleton or None
+        The layout of the points.
     """
     if origin == "auto":
-        face = recognise_face(shape)
-        if face is None:
+        if layout is None or not layout.up or layout.kind == "hand":
             return "upper"
-        brows = shape[list(face.brows), 1].mean()
-        return "lower" if brows > shape[face.chin, 1] else "upper"
+        below, above = shape[np.array(layout.up), 1].mean(axis=0)
+        return "lower" if above > below else "upper"
     if origin not in ("upper", "lower"):
         raise ValueError(f'origin must be "auto", "upper" or "lower"; got {origin!r}')
     return origin
+
+
+def upright_turn(
+    shape: NDArray, layout: Skeleton | None, origin: Literal["upper", "lower"]
+) -> NDArray:
+    """Return the orthogonal matrix that makes a shape stand upright and face us.
+
+    Parameters
+    ----------
+    shape : ndarray of shape (n_points, 3)
+        The shape as the mean camera sees it: x points right, y along the image's y.
+    layout : Skeleton or None
+        The layout of its points. Without one that tells what is up, the shape stays.
+    origin : {"upper", "lower"}
+        Where y is zero. The y of the turned shape has the same direction.
+    """
+    if layout is None or not layout.up:
+        return np.eye(3)
+    over = UPSIDE_DOWN if origin == "lower" else np.eye(3)
+    return over @ canonical_pose(shape @ over, scheme=layout).rotation @ over
+
+
+def names_of_points(model: Any) -> tuple[str, ...]:
+    """Return the names of a model's points, or their numbers."""
+    n_points = len(model.mean_shape_)
+    columns = getattr(model, "feature_names_in_", None)
+    if columns is None:
+        return tuple(map(str, range(n_points)))
+    names = [str(name).strip() for name in columns]
+    x_columns = names[:n_points] if model.layout == "planar" else names[::2]
+    return point_names(x_columns)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,16 +15,26 @@ from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
+    LEFT_COLOUR,
     OBSERVED_COLOUR,
     PLUS_COLOUR,
+    RIGHT_COLOUR,
     check_axes,
     draw_points,
     draw_segments,
     hide_frame,
     is_dense,
     percent,
+    side_colours,
 )
-from isa_nrsfm.plotting._edges import Edges, Origin, choose_edges, choose_origin
+from isa_nrsfm.plotting._edges import (
+    Edges,
+    Origin,
+    choose_layout,
+    choose_origin,
+    choose_skeleton,
+    names_of_points,
+)
 from isa_nrsfm.plotting._views import view_of
 
 MOST_FRAMES = 6  # unless asked for
@@ -73,13 +83,15 @@ class ReprojectionDisplay:
         Their row numbers. By default 0, 1, ...
     frame_names : list of str of length n_frames, default=None
         Names of the frames, for the titles. By default their row numbers.
-    edges : {"auto"}, None or array-like of shape (n_edges, 2), default=None
-        Pairs of points to be joined. "auto" joins 68 points that look like a face in
-        the order of iBUG or of XM2VTS, judged by the first frame.
+    edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
+            default=None
+        What is joined: a layout of `isa_nrsfm.skeletons` or its name, whose left and
+        right have colours of their own, or pairs of points. "auto" is the layout that
+        the points have by their number and order, judged by the first frame.
     origin : {"auto", "upper", "lower"}, default="upper"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
-        points up. "auto" is "lower" where 68 points of a face would stand on their
-        head otherwise, judged by the first frame.
+        points up. "auto" is "lower" where a face or a body would stand on its head
+        otherwise, judged by the first frame.
 
     Attributes
     ----------
@@ -94,6 +106,8 @@ class ReprojectionDisplay:
     inverse_snr : ndarray of shape (n_frames,)
         For each frame the squared error of its observed points relative to their
         squared distance from their centroid, a fraction.
+    skeleton : Skeleton or None
+        What is drawn; None for points alone.
     edges : ndarray of shape (n_edges, 2) or None
         The pairs of points that are joined.
     origin : {"upper", "lower"}
@@ -166,10 +180,11 @@ class ReprojectionDisplay:
                     f"frame_names must hold {len(self.frames)} names, one a frame; "
                     f"got {len(self.frame_names)}"
                 )
-        self.edges = choose_edges(edges, self.reprojected[0])
-        self.origin: Literal["upper", "lower"] = choose_origin(
-            origin, self.reprojected[0]
-        )
+        first = self.reprojected[0]
+        self.skeleton = choose_skeleton(edges, first)
+        self.edges = None if self.skeleton is None else self.skeleton.edges
+        layout = choose_layout(edges, first, None) if origin == "auto" else None
+        self.origin = choose_origin(origin, first, layout)
         self.inverse_snr = np.array(
             [
                 inverse_snr(tracks_to_table(seen[None]), tracks_to_table(fitted[None]))
@@ -208,13 +223,15 @@ class ReprojectionDisplay:
             The rows to draw, in place of random ones.
         random_state : int, RandomState instance or None, default=None
             Determines the random rows. Pass an int for the same rows at each call.
-        edges : {"auto"}, None or array-like of shape (n_edges, 2), default="auto"
-            Pairs of points to be joined. "auto" joins 68 points whose mean shape looks
-            like a face in the order of iBUG or of XM2VTS.
+        edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
+                default="auto"
+            What is joined: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+            points. "auto" is the layout that the points have by their names or by the
+            number and order of the points of the mean shape, if one is known.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
-            that points up. "auto" is "lower" where 68 points of a face would stand on
-            their head otherwise.
+            that points up. "auto" is "lower" where a face or a body would stand on its
+            head otherwise.
         ax : array-like of matplotlib Axes, default=None
             Axes to draw on, one a frame. By default a new figure.
         **kw : dict
@@ -238,7 +255,7 @@ class ReprojectionDisplay:
         rows = choose_frames(len(X), n_frames, frames, random_state)
         table = taken_rows(X, rows)
         view = view_of(estimator)
-        mean_shape = estimator.mean_shape_ @ view.T
+        mean_shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
         layout = estimator.layout
         labelled = hasattr(X, "iloc")  # pandas: rows have names
         display = cls(
@@ -248,8 +265,10 @@ class ReprojectionDisplay:
             ),
             frames=rows,
             frame_names=[str(name) for name in X.index[rows]] if labelled else None,
-            edges=choose_edges(edges, mean_shape),
-            origin=choose_origin(origin, mean_shape),
+            edges=choose_skeleton(edges, mean_shape, names),
+            origin=choose_origin(
+                origin, mean_shape, choose_layout(edges, mean_shape, names)
+            ),
         )
         return display.plot(ax, **kw)
 
@@ -317,14 +336,23 @@ class ReprojectionDisplay:
             )
         if new_figure:
             self.figure_.legend(
-                handles=[self.observed_[0], self.reprojected_[0]],
+                handles=[self.observed_[0], self.reprojected_[0], *self._side_lines()],
                 loc="outside lower center",
-                ncols=2,
+                ncols=4,
                 frameon=False,
                 fontsize="small",
                 markerscale=4.0 if is_dense(self.observed[0]) else 1.0,
             )
         return self
+
+    def _side_lines(self) -> list[Any]:
+        """Return lines for the legend in the colours of the sides, where there are."""
+        from matplotlib.lines import Line2D
+
+        if self.skeleton is None or not self.skeleton.left:
+            return []
+        sides = (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))
+        return [Line2D([], [], color=c, label=side, lw=1.5) for side, c in sides]
 
     def _panel_height(self) -> float:
         """Return the height of panels that suits most frames, in inches."""
@@ -345,11 +373,11 @@ class ReprojectionDisplay:
     ) -> None:
         """Draw one frame."""
         observed, reprojected = self.observed[i], self.reprojected[i]
-        if self.edges is not None:
-            style = {"colors": PLUS_COLOUR, "linewidths": 0.6, "alpha": 0.6}
-            self.edges_.append(
-                draw_segments(axes, reprojected[self.edges], **(style | edge_kw))
-            )
+        if self.skeleton is not None:
+            colours = side_colours(self.skeleton.edge_sides, PLUS_COLOUR)
+            style = {"colors": colours, "linewidths": 0.8, "alpha": 0.8}
+            segments = reprojected[self.skeleton.edges]
+            self.edges_.append(draw_segments(axes, segments, **(style | edge_kw)))
         circles = {"s": 14.0, "facecolors": "none", "edgecolors": OBSERVED_COLOUR}
         style = {"color": OBSERVED_COLOUR}
         if not is_dense(observed):

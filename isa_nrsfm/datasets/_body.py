@@ -1,0 +1,252 @@
+"""Draw the tracks of bodies that walk, reach and squat."""
+
+from numbers import Integral, Real
+from typing import Literal
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+from sklearn.utils import Bunch, check_random_state
+
+from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
+from isa_nrsfm._tables.layout import LAYOUTS, Layout
+from isa_nrsfm.datasets._performers import View, perform, wander
+from isa_nrsfm.datasets._scene import CAMERAS, Camera
+from isa_nrsfm.skeletons import get_skeleton
+
+ACTIONS = ("walk", "reach", "squat")
+LAYOUT_NAMES = ("coco-17", "h36m-17")
+# Millimetres: lengths of bones; half widths; points of the head from the neck, in a
+# body that faces the camera: x to its left, y down, z away from the camera.
+LENGTHS = {
+    **{"trunk": 480.0, "neck": 90.0, "upper_arm": 290.0, "forearm": 260.0},
+    **{"thigh": 430.0, "shank": 420.0, "hips": 95.0, "shoulders": 185.0},
+}
+HEAD = {
+    "nose": (0.0, -70.0, -105.0),
+    "left_eye": (32.0, -105.0, -85.0),
+    "left_ear": (75.0, -90.0, 0.0),
+    "head": (0.0, -200.0, -15.0),
+}
+STEPS_A_SECOND, MOVES_A_SECOND = 0.9, 0.5
+# Standard deviation of the logarithms of a person's size and of single bones, and
+# radians by which joints are held off their poses.
+SIZES, BONES, HELD = 0.06, 0.05, 0.08
+VIEW = View(largest_angles=(80.0, 20.0, 8.0), scales=(0.2, 0.5))
+
+
+@checked_parameters(
+    {
+        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        "n_people": [Interval(Integral, 1, None, closed="left")],
+        "scheme": [StrOptions(set(LAYOUT_NAMES))],
+        "camera": [StrOptions(set(CAMERAS))],
+        "noise": [Interval(Real, 0, None, closed="left")],
+        "missing": [Interval(Real, 0, 1, closed="left")],
+        "layout": [StrOptions(set(LAYOUTS))],
+        "random_state": ["random_state"],
+    }
+)
+def make_body_tracks(
+    n_frames: int = 400,
+    *,
+    n_people: int = 4,
+    scheme: Literal["coco-17", "h36m-17"] = "coco-17",
+    camera: Camera = "weak_perspective",
+    noise: float = 0.005,
+    missing: float = 0.0,
+    layout: Layout = "interleaved",
+    random_state: int | RandomState | None = None,
+) -> Bunch:
+    """
+    Generate the 17 landmarks of bodies that walk, reach and squat.
+
+    The bodies are drawn by hand, not measured. People come one after the other; each
+    walks on the spot, reaches up with the right arm and squats in turn, with smooth
+    changes between them.
+
+    Parameters
+    ----------
+    n_frames : int, default=400
+        Number of frames of all people, at least two for each.
+    n_people : int, default=4
+        Number of people.
+    scheme : {"coco-17", "h36m-17"}, default="coco-17"
+        Which points, and in which order: a layout of `isa_nrsfm.skeletons`.
+    camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
+        What the camera is. It goes round the person within 80, 20 and 8 degrees of yaw,
+        pitch and roll to either side, and all of it moves smoothly. Weak-perspective
+        and affine ones have 0.2 to 0.5 pixels a millimetre, orthographic ones
+        their geometric mean; affine ones moreover stretch each image, as of
+        `make_face_tracks`.
+    noise : float, default=0.005
+        Standard deviation of the Gaussian noise that is added to every coordinate,
+        divided by the root mean square of all coordinates of the tracks without
+        noise, each frame centred over its points.
+    missing : float, default=0.0
+        Share of the points that are not seen, in [0, 1). They are chosen at random
+        over the whole table, and both of their coordinates are NaN.
+    layout : {"interleaved", "planar"}, default="interleaved"
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+    random_state : int, RandomState instance or None, default=None
+        Determines all random numbers. Pass an int for reproducible tables.
+
+    Returns
+    -------
+    sklearn.utils.Bunch
+        Dictionary-like object with the attributes
+
+        data : ndarray of shape (n_frames, 34)
+            The table in pixels, with noise, NaN where a point is not seen. y points
+            down.
+        tracks : ndarray of shape (n_frames, 17, 2)
+            The same numbers, one (x, y) pair a point.
+        clean : ndarray of shape (n_frames, 17, 2)
+            The tracks without noise, complete.
+        visible : ndarray of shape (n_frames, 17), dtype=bool
+            False where a point is missing from the table.
+        shapes : ndarray of shape (n_frames, 17, 3)
+            The true points in millimetres, each frame centred over its points, before
+            the camera turns: x points to the right of the image, y down, z away from
+            the camera.
+        mean_shape : ndarray of shape (17, 3)
+            Their mean. The shapes are no linear function of a few coefficients: joints
+            turn.
+        motion : ndarray of shape (n_frames, 2, 3)
+            The cameras, in pixels a millimetre.
+        translation : ndarray of shape (n_frames, 2)
+            The centroids in pixels.
+        angles : ndarray of shape (n_frames, 3)
+            Yaw, pitch and roll of the camera in degrees, as of `make_face_tracks`.
+        labels : ndarray of shape (n_frames,), dtype=str
+            What the person does: "walk", "reach" or "squat"; between two the nearer
+            one.
+        groups : ndarray of shape (n_frames,), dtype=int
+            The number of the person, from 0. Each has lengths of bones of their own.
+        time : ndarray of shape (n_frames,)
+            Seconds since the person was first seen, at 25 frames a second.
+        noise_variance : float
+            Variance of the noise in one coordinate, in squared pixels.
+        feature_names : list of str
+            The names of the columns, x_0, y_0, x_1, ... in the order of `layout`.
+        point_names : list of str
+            The names of the points.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not of the kind or in the range given above, or there are
+        fewer than two frames for each person.
+
+    See Also
+    --------
+    make_hand_tracks : Hands of several people.
+    make_face_tracks : A face with named expressions.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.datasets import make_body_tracks
+    >>> bodies = make_body_tracks(n_frames=120, n_people=2, random_state=0)
+    >>> bodies.data.shape
+    (120, 34)
+    >>> bodies.point_names[:3]
+    ['nose', 'left_eye', 'right_eye']
+    """
+    names = get_skeleton(scheme).point_names or ()
+
+    def build(time: NDArray, weights: NDArray, rng: RandomState) -> NDArray:
+        joints = _joints(time, weights, rng)
+        return np.stack([joints[name] for name in names], axis=1)
+
+    return perform(
+        n_frames,
+        n_people,
+        ACTIONS,
+        build,
+        VIEW,
+        camera=camera,
+        noise=noise,
+        missing=missing,
+        layout=layout,
+        rng=check_random_state(random_state),
+        point_names=names,
+    )
+
+
+def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:
+    """Return the angles of the joints in radians: forwards and bent are positive."""
+    step = 2 * np.pi * (STEPS_A_SECOND * time + rng.uniform())
+    up = (1 - np.cos(2 * np.pi * (MOVES_A_SECOND * time + rng.uniform()))) / 2
+    eager = rng.uniform(0.8, 1.1, 3)
+    walk, reach, squat = (weights * eager).T
+    reach, squat = reach * up, squat * up
+    swing = np.sin(step)
+    angles = {"lean": 0.1 * reach + 0.7 * squat}
+    for side, sign in (("left", 1), ("right", -1)):
+        angles |= {
+            f"{side}_hip": 0.5 * sign * walk * swing + 1.5 * squat,
+            f"{side}_knee": walk * (0.5 - 0.4 * np.cos(step + sign * np.pi / 2))
+            + 2.0 * squat,
+            f"{side}_shoulder": -0.45 * sign * walk * swing + 1.3 * squat,
+            f"{side}_elbow": 0.3 + 0.2 * walk,
+            f"{side}_spread": np.full(len(time), 0.12),
+        }
+    angles["right_shoulder"] = angles["right_shoulder"] + 2.4 * reach
+    angles["right_spread"] = angles["right_spread"] + 0.3 * reach
+    held = HELD * wander(time, len(angles), rng).T
+    return {
+        name: angle + off
+        for (name, angle), off in zip(angles.items(), held, strict=True)
+    }
+
+
+def _joints(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:
+    """Return the joints of a new person, each (n, 3)."""
+    angle = _angles(time, weights, rng)
+    size = np.exp(SIZES * rng.standard_normal())
+    length = {
+        bone: size * value * np.exp(BONES * rng.standard_normal())
+        for bone, value in LENGTHS.items()
+    }
+    x = np.array([1.0, 0.0, 0.0])
+    pelvis = np.zeros((len(time), 3))
+    up = -_direction(-angle["lean"])
+    joints = {
+        "pelvis": pelvis,
+        "spine": pelvis + 0.5 * length["trunk"] * up,
+        "thorax": pelvis + length["trunk"] * up,
+    }
+    neck = joints["thorax"] + length["neck"] * up
+    # The head leans with the trunk, half as much.
+    ahead = _direction(np.pi / 2 - angle["lean"] / 2)
+    down = _direction(-angle["lean"] / 2)
+    for name, (left, low, back) in HEAD.items():
+        offset = size * (low * down - back * ahead)
+        joints[name] = neck + offset + size * left * x
+        if left:
+            other = name.replace("left", "right")
+            joints[other] = neck + offset - size * left * x
+    for side, sign in (("left", 1), ("right", -1)):
+        hip = pelvis + sign * length["hips"] * x
+        bend = angle[f"{side}_hip"]
+        knee = hip + length["thigh"] * _direction(bend)
+        foot = knee + length["shank"] * _direction(bend - angle[f"{side}_knee"])
+        shoulder = joints["thorax"] + sign * length["shoulders"] * x
+        raised, spread = angle[f"{side}_shoulder"], sign * angle[f"{side}_spread"]
+        elbow = shoulder + length["upper_arm"] * _direction(raised, spread)
+        wrist = elbow + length["forearm"] * _direction(
+            raised + angle[f"{side}_elbow"], spread
+        )
+        ends = {"hip": hip, "knee": knee, "ankle": foot, "foot": foot}
+        ends |= {"shoulder": shoulder, "elbow": elbow, "wrist": wrist}
+        joints |= {f"{side}_{name}": joint for name, joint in ends.items()}
+    return joints
+
+
+def _direction(forwards: NDArray, sideways: NDArray | float = 0.0) -> NDArray:
+    """Return unit vectors (n, 3) that hang down, raised forwards and sideways."""
+    across = np.broadcast_to(np.sin(sideways), forwards.shape)
+    along = np.cos(sideways)
+    return np.stack(
+        [across, along * np.cos(forwards), -along * np.sin(forwards)], axis=1
+    )

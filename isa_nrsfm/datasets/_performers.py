@@ -1,0 +1,142 @@
+"""People who do one thing after the other before a moving camera."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import RandomState
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sklearn.utils import Bunch
+
+from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm.datasets._scene import (
+    FRAMES_A_SECOND,
+    Camera,
+    centre_shapes,
+    draw_motion,
+    observe_shapes,
+)
+
+# Seconds that a pose lasts, and that it takes to go over to the next one.
+HOLD, CHANGE = 1.6, 0.6
+# Waves a second of what wanders: the camera, the way to hold a joint.
+SLOWEST, FASTEST = 0.08, 0.35
+# Centres of the people in pixels: middle of the image and largest distance from it.
+MIDDLE, AWAY = (640.0, 480.0), (160.0, 100.0)
+
+
+class View(NamedTuple):
+    """
+    How the camera moves.
+
+    Attributes
+    ----------
+    largest_angles : tuple of float
+        Largest yaw, pitch and roll in degrees.
+    scales : tuple of float
+        Smallest and largest number of pixels a millimetre.
+    """
+
+    largest_angles: tuple[float, float, float]
+    scales: tuple[float, float]
+
+
+def perform(
+    n_frames: int,
+    n_people: int,
+    poses: tuple[str, ...],
+    build: Callable[[NDArray, NDArray, RandomState], NDArray],
+    view: View,
+    *,
+    camera: Camera,
+    noise: float,
+    missing: float,
+    layout: Layout,
+    rng: RandomState,
+    point_names: tuple[str, ...],
+) -> Bunch:
+    """
+    Return the table of people who take poses in turn, with all truths.
+
+    Parameters
+    ----------
+    n_frames : int
+        Frames of all people, who come one after the other.
+    n_people : int
+        Number of people.
+    poses : tuple of str
+        Names of the poses.
+    build : callable
+        ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new
+        person, x to the right, y down, z away, at times (n,) and with weights (n,
+        n_poses) of the poses that add up to one.
+    view : View
+        How the camera moves.
+    camera, noise, missing, layout, rng
+        As of the public functions.
+    point_names : tuple of str
+        Names of the points.
+    """
+    parts = [len(part) for part in np.array_split(np.arange(n_frames), n_people)]
+    shapes, labels, groups, times, angles, scales, centres = ([] for _ in range(7))
+    for person, length in enumerate(parts):
+        time = np.arange(length) / FRAMES_A_SECOND
+        weights = _take_turns(time, len(poses), rng)
+        shapes.append(centre_shapes(build(time, weights, rng)))
+        labels.append(np.array(poses)[weights.argmax(axis=1)])
+        groups.append(np.full(length, person))
+        times.append(time)
+        angles.append(wander(time, 3, rng) * view.largest_angles)
+        shortest, longest = np.log(view.scales)
+        share = (1 + wander(time, 1, rng)[:, 0]) / 2
+        scales.append(np.exp(shortest + (longest - shortest) * share))
+        centres.append(MIDDLE + wander(time, 2, rng) * AWAY)
+    angle = np.concatenate(angles)
+    rotations = Rotation.from_euler("yxz", angle, degrees=True).as_matrix()
+    motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
+    scale = np.concatenate(scales)
+    if camera == "orthographic":
+        scale = np.full(n_frames, np.sqrt(np.prod(view.scales)))
+    all_shapes = np.concatenate(shapes)
+    return observe_shapes(
+        all_shapes,
+        scale[:, None, None] * motion,
+        np.concatenate(centres),
+        noise=noise,
+        missing=missing,
+        layout=layout,
+        rng=rng,
+        mean_shape=all_shapes.mean(axis=0),
+        labels=np.concatenate(labels),
+        groups=np.concatenate(groups),
+        time=np.concatenate(times),
+        angles=angle,
+        point_names=list(point_names),
+    )
+
+
+def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:
+    """Return n smooth functions of time, (len(time), n), between -1 and 1."""
+    frequency = rng.uniform(SLOWEST, FASTEST, (2, n))
+    phase = rng.uniform(0, 2 * np.pi, (2, n))
+    waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase)
+    return 0.6 * waves[:, 0] + 0.4 * waves[:, 1]
+
+
+def _take_turns(time: NDArray, n_poses: int, rng: RandomState) -> NDArray[np.float64]:
+    """Return the weights (len(time), n_poses) of poses that are taken in turn."""
+    duration = len(time) / FRAMES_A_SECOND
+    n_turns = max(n_poses, round(duration / HOLD))
+    rounds = [rng.permutation(n_poses) for _ in range(-(-n_turns // n_poses))]
+    turns = np.concatenate(rounds)[:n_turns]
+    length = duration / n_turns
+    change = min(CHANGE, length)
+    # From 0 to 1 round the beginning of each turn but the first.
+    begins = length * np.arange(1, n_turns)
+    passed = np.clip((time[:, None] - begins) / change + 0.5, 0.0, 1.0)
+    begun = np.insert((1 - np.cos(np.pi * passed)) / 2, 0, 1.0, axis=1)
+    share = begun - np.append(begun[:, 1:], np.zeros((len(time), 1)), axis=1)
+    weights = np.zeros((len(time), n_poses))
+    np.add.at(weights.T, turns, share.T)
+    return weights

@@ -1,0 +1,38 @@
+"""Known layouts of landmarks: what joins the points, left and right, which way is up.
+
+The layouts are those of face, hand and body trackers and of annotated data sets.
+`SKELETONS` has them by name, `find_skeleton` recognises the one of a table, and
+figures, viewer and glTF draw it. Indices, edges and names are facts of the sources that
+each `Skeleton` cites.
+"""
+
+from typing import TYPE_CHECKING
+
+from isa_nrsfm._compat.lazy import lazy_names
+
+__all__ = [
+    "SKELETONS",
+    "Skeleton",
+    "find_skeleton",
+    "get_skeleton",
+    "read_skeleton",
+    "skeleton_of_names",
+]
+
+if TYPE_CHECKING:
+    from isa_nrsfm.skeletons._files import read_skeleton, skeleton_of_names
+    from isa_nrsfm.skeletons._recognition import SKELETONS, find_skeleton, get_skeleton
+    from isa_nrsfm.skeletons._skeleton import Skeleton
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "isa_nrsfm.skeletons._files": ["read_skeleton", "skeleton_of_names"],
+            "isa_nrsfm.skeletons._recognition": [
+                "SKELETONS",
+                "find_skeleton",
+                "get_skeleton",
+            ],
+            "isa_nrsfm.skeletons._skeleton": ["Skeleton"],
+        },
+    )

@@ -1,0 +1,236 @@
+"""Layouts of faces.
+
+In all of them the lowest indices of a curve that goes across the face are on the side
+of the person's right eye, which an image shows on its left.
+"""
+
+from dataclasses import replace
+from itertools import chain
+
+from isa_nrsfm.skeletons._skeleton import Skeleton, run, shifted
+
+IBUG_68 = Skeleton(
+    name="ibug-68",
+    kind="face",
+    n_points=68,
+    curves=(
+        run(0, 16),  # jaw
+        run(17, 21),  # brows
+        run(22, 26),
+        run(27, 30),  # bridge of the nose
+        run(31, 35),  # nostrils
+        run(36, 41, closed=True),  # eyes
+        run(42, 47, closed=True),
+        run(48, 59, closed=True),  # outer and inner lips
+        run(60, 67, closed=True),
+    ),
+    source=(
+        "C. Sagonas et al., 300 Faces in-the-Wild Challenge, ICCV Workshops 2013; "
+        "https://ibug.doc.ic.ac.uk/resources/facial-point-annotations/"
+    ),
+    right=(
+        *range(0, 8),
+        *range(17, 22),
+        *(31, 32),
+        *range(36, 42),
+        *(48, 49, 50, 58, 59, 60, 61, 67),
+    ),
+    left=(
+        *range(16, 8, -1),
+        *range(26, 21, -1),
+        *(35, 34),
+        *(45, 44, 43, 42, 47, 46),
+        *(54, 53, 52, 56, 55, 64, 63, 65),
+    ),
+    up=((8, 27),),
+    front=((0, 30), (16, 30)),
+)
+
+# The same without the jaw.
+_JAW = 17
+IBUG_51 = replace(
+    IBUG_68,
+    name="ibug-51",
+    n_points=51,
+    curves=shifted(IBUG_68.curves[1:], -_JAW),
+    right=tuple(j - _JAW for j in IBUG_68.right if j >= _JAW),
+    left=tuple(j - _JAW for j in IBUG_68.left if j >= _JAW),
+    up=((57 - _JAW, 27 - _JAW),),
+    front=((36 - _JAW, 30 - _JAW), (45 - _JAW, 30 - _JAW)),
+)
+
+# Points 31 and 36 are the pupils, 46, 47 and 67 nostrils and tip of the nose, 66 the
+# middle of the mouth: drawn, not joined.
+_XM2VTS_EYES = (run(27, 30, closed=True), run(32, 35, closed=True))
+XM2VTS_68 = Skeleton(
+    name="xm2vts-68",
+    kind="face",
+    n_points=68,
+    curves=(
+        run(0, 14),  # jaw
+        run(15, 20, closed=True),  # brows
+        run(21, 26, closed=True),
+        *_XM2VTS_EYES,
+        run(37, 45),  # nose
+        run(48, 59, closed=True),  # outer lips
+        (48, *run(60, 62), 54),  # inner edge of the lower and of the upper lip
+        (54, *run(63, 65), 48),
+    ),
+    source=(
+        "K. Messer et al., XM2VTSDB: The Extended M2VTS Database, AVBPA 1999; "
+        "S. Milborrow et al., The MUCT Landmarked Face Database, PRASA 2010, "
+        "http://www.milbo.org/muct"
+    ),
+    right=(
+        *range(0, 7),
+        *range(21, 27),
+        *range(27, 32),
+        *range(37, 41),
+        46,
+        *(48, 49, 50, 59, 58, 60, 65),
+    ),
+    left=(
+        *range(14, 7, -1),
+        *range(15, 21),
+        *range(32, 37),
+        *range(45, 41, -1),
+        47,
+        *(54, 53, 52, 55, 56, 62, 63),
+    ),
+    up=((7, 37), (7, 45)),
+    front=((0, 67), (14, 67)),
+)
+
+# Eight points more, between those of the eyelids.
+_MUCT_EYES = (
+    (27, 68, 28, 69, 29, 70, 30, 71, 27),
+    (32, 72, 33, 73, 34, 74, 35, 75, 32),
+)
+MUCT_76 = replace(
+    XM2VTS_68,
+    name="muct-76",
+    n_points=76,
+    curves=(*(c for c in XM2VTS_68.curves if c not in _XM2VTS_EYES), *_MUCT_EYES),
+    source=(
+        "S. Milborrow, J. Morkel, F. Nicolls, The MUCT Landmarked Face Database, PRASA "
+        "2010, http://www.milbo.org/muct; the order round the eyes: "
+        "https://github.com/auduno/clmtrackr"
+    ),
+    right=(*XM2VTS_68.right, *range(68, 72)),
+    left=(*XM2VTS_68.left, *range(72, 76)),
+)
+
+WFLW_98 = Skeleton(
+    name="wflw-98",
+    kind="face",
+    n_points=98,
+    curves=(
+        run(0, 32),  # jaw
+        run(33, 41, closed=True),  # brows
+        run(42, 50, closed=True),
+        run(51, 54),  # bridge of the nose
+        run(55, 59),  # nostrils
+        run(60, 67, closed=True),  # eyes
+        run(68, 75, closed=True),
+        run(76, 87, closed=True),  # outer and inner lips
+        run(88, 95, closed=True),
+    ),
+    source=(
+        "W. Wu et al., Look at Boundary: A Boundary-Aware Face Alignment Algorithm, "
+        "CVPR 2018, https://wywu.github.io/projects/LAB/WFLW.html; mirror images: "
+        "https://github.com/open-mmlab/mmpose, configs/_base_/datasets/wflw.py"
+    ),
+    right=(
+        *range(0, 16),
+        *range(33, 42),
+        *(55, 56),
+        *range(60, 68),
+        *(76, 77, 78, 87, 86, 88, 89, 95, 96),
+    ),
+    left=(
+        *range(32, 16, -1),
+        *(46, 45, 44, 43, 42, 50, 49, 48, 47),
+        *(59, 58),
+        *(72, 71, 70, 69, 68, 75, 74, 73),
+        *(82, 81, 80, 83, 84, 92, 91, 93, 97),
+    ),
+    up=((16, 51),),
+    front=((0, 54), (32, 54)),
+)
+
+# The contours of the mesh: those of the right side, and in the same order the left.
+_RIGHT = (
+    (33, 7, 163, 144, 145, 153, 154, 155, 133),  # lower and upper lid
+    (33, 246, 161, 160, 159, 158, 157, 173, 133),
+    (46, 53, 52, 65, 55),  # lower and upper edge of the brow
+    (70, 63, 105, 66, 107),
+)
+_LEFT = (
+    (263, 249, 390, 373, 374, 380, 381, 382, 362),
+    (263, 466, 388, 387, 386, 385, 384, 398, 362),
+    (276, 283, 282, 295, 285),
+    (300, 293, 334, 296, 336),
+)
+# Halves of those that go across, from the middle to the right, and to the left.
+_RIGHT_HALVES = (
+    # The oval from the forehead to the chin.
+    (
+        *(10, 109, 67, 103, 54, 21, 162, 127, 234),
+        *(93, 132, 58, 172, 136, 150, 149, 176, 148, 152),
+    ),
+    (17, 84, 181, 91, 146, 61),  # lips: outer edge below and above, inner edge
+    (0, 37, 39, 40, 185, 61),
+    (14, 87, 178, 88, 95, 78),
+    (13, 82, 81, 80, 191, 78),
+    (2, 97, 98),  # nostrils
+)
+_LEFT_HALVES = (
+    (
+        *(10, 338, 297, 332, 284, 251, 389, 356, 454),
+        *(323, 361, 288, 397, 365, 379, 378, 400, 377, 152),
+    ),
+    (17, 314, 405, 321, 375, 291),
+    (0, 267, 269, 270, 409, 291),
+    (14, 317, 402, 318, 324, 308),
+    (13, 312, 311, 310, 415, 308),
+    (2, 326, 327),
+)
+_BRIDGE = (168, 6, 197, 195, 5, 4, 1, 19, 94, 2)
+_MIRROR = {
+    right: left
+    for right, left in zip(
+        chain(*_RIGHT, *_RIGHT_HALVES), chain(*_LEFT, *_LEFT_HALVES), strict=True
+    )
+    if right != left
+}
+MESH_468 = Skeleton(
+    name="mediapipe-face-468",
+    kind="face",
+    n_points=468,
+    curves=(*_RIGHT, *_LEFT, *_RIGHT_HALVES, *_LEFT_HALVES, _BRIDGE),
+    source=(
+        "Y. Kartynnik et al., Real-time Facial Surface Geometry from Monocular Video "
+        "on Mobile GPUs, 2019; contours: https://github.com/google-ai-edge/mediapipe, "
+        "mediapipe/python/solutions/face_mesh_connections.py"
+    ),
+    right=tuple(_MIRROR),
+    left=tuple(_MIRROR.values()),
+    up=((152, 168),),
+    front=((234, 1), (454, 1)),
+)
+
+# The irises, with their centres 468 and 473.
+MESH_478 = replace(
+    MESH_468,
+    name="mediapipe-face-478",
+    n_points=478,
+    curves=(
+        *MESH_468.curves,
+        run(469, 472, closed=True),
+        run(474, 477, closed=True),
+    ),
+    right=(*MESH_468.right, 468),
+    left=(*MESH_468.left, 473),
+)
+
+FACES = (IBUG_68, IBUG_51, XM2VTS_68, MUCT_76, WFLW_98, MESH_468, MESH_478)

@@ -1,0 +1,142 @@
+"""Skeletons that other programs keep beside their points."""
+
+import os
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.skeletons._skeleton import Skeleton
+
+SUFFIXES = (".yaml", ".yml")
+_LEFT_WORD = re.compile(r"left", re.IGNORECASE)
+
+
+def skeleton_of_names(
+    edges: Sequence[Sequence[str]],
+    point_names: Sequence[str],
+    *,
+    name: str,
+    source: str,
+) -> Skeleton:
+    """
+    Make a skeleton of edges between points that have names.
+
+    Parameters
+    ----------
+    edges : sequence of pairs of str
+        The names of the two points of each edge.
+    point_names : sequence of str
+        The names of all points, in their order.
+    name : str
+        What to call the skeleton.
+    source : str
+        Where it is from.
+
+    Returns
+    -------
+    Skeleton
+        Points whose names differ by the words left and right only are on the sides.
+
+    Raises
+    ------
+    ValueError
+        If an edge is not between two of the points, or two points have one name.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import skeleton_of_names
+    >>> mouse = skeleton_of_names([("snout", "leftear"), ("snout", "rightear")],
+    ...                           ["snout", "leftear", "rightear"],
+    ...                           name="mouse", source="config.yaml")
+    >>> mouse.left, mouse.right
+    ((1,), (2,))
+    """
+    names = [str(point) for point in point_names]
+    place = {point: j for j, point in enumerate(names)}
+    for edge in edges:
+        if isinstance(edge, str) or len(edge) != 2 or not {*edge} <= place.keys():
+            raise ValueError(
+                f"an edge of {name!r} should be a pair of the points "
+                f"{', '.join(names[:6])}{', ...' if len(names) > 6 else ''}; got "
+                f"{edge!r}"
+            )
+    partners = [(point, _LEFT_WORD.sub(_right_word, point)) for point in names]
+    pairs = [
+        (place[left], place[right])
+        for left, right in partners
+        if left != right and right in place
+    ]
+    return Skeleton(
+        name=name,
+        kind="other",
+        n_points=len(names),
+        curves=tuple((place[a], place[b]) for a, b in edges),
+        source=source,
+        point_names=tuple(names),
+        left=tuple(left for left, _ in pairs),
+        right=tuple(right for _, right in pairs),
+    )
+
+
+def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> Skeleton:
+    """
+    Read the skeleton of a project of DeepLabCut.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file ``config.yaml`` of the project, whose list ``skeleton`` has pairs of
+        bodyparts.
+    point_names : sequence of str
+        The names of the points of the table, in their order.
+
+    Returns
+    -------
+    Skeleton
+        The skeleton of these points.
+
+    Raises
+    ------
+    ValueError
+        If the file has no such list, or it has points that are not in the table.
+    OSError
+        If the file cannot be opened.
+    ImportError
+        If PyYAML is not installed.
+
+    See Also
+    --------
+    find_skeleton : A layout that is known.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    yaml = import_optional("yaml", extra="yaml")
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
+    edges = content.get("skeleton") if isinstance(content, dict) else None
+    if not isinstance(edges, list) or not all(isinstance(edge, list) for edge in edges):
+        raise ValueError(
+            f"{path} has no list of pairs of bodyparts that is called skeleton, as the "
+            "config.yaml of DeepLabCut has"
+        )
+    # A curve may be written as more than two bodyparts in turn.
+    try:
+        return skeleton_of_names(
+            [pair for edge in edges for pair in pairwise(edge)],
+            point_names,
+            name=Path(path).name,
+            source=f"DeepLabCut, {Path(path).name}",
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _right_word(match: re.Match[str]) -> str:
+    """Return right, written as left was."""
+    word = match[0]
+    if word.isupper():
+        return "RIGHT"
+    return "Right" if word[0].isupper() else "right"

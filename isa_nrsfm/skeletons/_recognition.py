@@ -1,0 +1,211 @@
+"""Which layout the points of a table have."""
+
+import re
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import pdist
+
+from isa_nrsfm.skeletons._bodies import BODIES
+from isa_nrsfm.skeletons._faces import FACES
+from isa_nrsfm.skeletons._skeleton import Skeleton
+
+SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
+    {skeleton.name: skeleton for skeleton in (*FACES, *BODIES)}
+)
+
+# The layouts in which the readers of `isa_nrsfm.io` find points without names.
+_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "openface": ("ibug-68",),
+        "pyfeat": ("ibug-68", "mediapipe-face-478"),
+        "mediapipe": (
+            "mediapipe-face-468",
+            "mediapipe-face-478",
+            "hand-21",
+            "mediapipe-pose-33",
+        ),
+        "pts": ("ibug-68", "ibug-51"),
+        "wflw": ("wflw-98",),
+        "coco": ("coco-17", "coco-wholebody-133"),
+    }
+)
+
+# Edges of a layout are short: so long at most is their mean, relative to the mean
+# distance of all points. Faces in their own order have 0.14 to 0.25 in single images
+# and 0.17 to 0.23 in the mean, hands 0.32 to 0.68 and 0.5, bodies 0.35 to 0.5; points
+# in any order have about 1.
+LONGEST = {"face": 0.4}
+LONGEST_OF_OTHERS = 0.7
+# Of two layouts of faces with short edges that one is taken whose edges are so many
+# times shorter: mean faces of 68 points have edges 1.28 to 1.55 times as long in the
+# wrong order as in their own. Bodies of 17 points in the order of COCO have short edges
+# in that of Human3.6M, too, and are not told apart.
+CLEARLY = {"face": 1.15}
+
+_SIDE_LETTER = re.compile(r"^([LR])(?=[A-Z][a-z])")
+_SIDE_WORDS = {"L": "left", "R": "right"}
+_NUMBERED = re.compile(r"(.*?)(\d+)")
+
+
+def get_skeleton(name: str) -> Skeleton:
+    """
+    Return a layout by its name.
+
+    Parameters
+    ----------
+    name : str
+        One of the names in `SKELETONS`.
+
+    Returns
+    -------
+    Skeleton
+        The layout.
+
+    Raises
+    ------
+    ValueError
+        If there is none of this name.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import get_skeleton
+    >>> get_skeleton("hand-21").point_names[:3]
+    ('wrist', 'thumb_cmc', 'thumb_mcp')
+    """
+    if name not in SKELETONS:
+        raise ValueError(f"the skeletons are {', '.join(SKELETONS)}; got {name!r}")
+    return SKELETONS[name]
+
+
+def find_skeleton(
+    n_points: int,
+    names: Sequence[Any] | None = None,
+    reader: str | None = None,
+    *,
+    shape: ArrayLike | None = None,
+) -> Skeleton | None:
+    """
+    Find the layout of points, where one and only one fits.
+
+    Names of points decide first, then the program that has written them, then their
+    number and order.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of points.
+    names : sequence of length n_points, default=None
+        Names of the points. They are compared without regard to upper and lower case
+        and to what is neither letter nor digit; LShoulder is left_shoulder. Points that
+        are numbered in turn, such as 0, 1, ... or kp1, kp2, ..., have no names.
+    reader : str, default=None
+        What has read the points, one of `io.FORMATS`.
+    shape : array-like of shape (n_points, 2) or (n_points, 3), default=None
+        The points in an image, or of a mean shape in true proportions. Layouts whose
+        edges would be long there do not fit; of two layouts of faces that would fit
+        that one is taken whose edges are clearly shorter.
+
+    Returns
+    -------
+    Skeleton or None
+        The layout; with its points in the order of `names` where these are its names
+        in another order. None if no layout fits or more than one.
+
+    Raises
+    ------
+    ValueError
+        If there are not `n_points` names or points of the shape.
+
+    See Also
+    --------
+    get_skeleton : A layout by its name.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import find_skeleton
+    >>> find_skeleton(21).name
+    'hand-21'
+    >>> find_skeleton(17) is None    # COCO, or Human3.6M?
+    True
+    >>> find_skeleton(17, reader="coco").name
+    'coco-17'
+    """
+    if names is not None and len(names) != n_points:
+        raise ValueError(f"names must hold {n_points} names; got {len(names)}")
+    points = None if shape is None else np.asarray(shape, dtype=np.float64)
+    if points is not None and (len(points) != n_points or points.ndim != 2):
+        raise ValueError(
+            f"shape must hold {n_points} points; got an array of shape {points.shape}"
+        )
+    fitting = [s for s in SKELETONS.values() if s.n_points == n_points]
+    if names is not None and not _numbered(list(map(str, names))):
+        return _named(fitting, [str(name) for name in names])
+    if reader is not None and reader in _OF_READERS:
+        fitting = [s for s in fitting if s.name in _OF_READERS[reader]]
+    return _only(fitting) if points is None else _shortest(fitting, points)
+
+
+def edge_length(shape: NDArray, edges: NDArray) -> float:
+    """Return the mean length of edges, relative to that of all pairs of points.
+
+    Points that are not seen, NaN, do not count; infinite where nothing is known.
+    """
+    ends = shape[edges]
+    lengths = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    distances = pdist(shape[np.isfinite(shape).all(axis=1)])
+    lengths = lengths[np.isfinite(lengths)]
+    if not lengths.size or not distances.any():
+        return np.inf
+    return float(lengths.mean() / distances.mean())
+
+
+def _only(skeletons: Sequence[Skeleton]) -> Skeleton | None:
+    """Return the single one of some layouts, or None."""
+    return skeletons[0] if len(skeletons) == 1 else None
+
+
+def _shortest(skeletons: Sequence[Skeleton], shape: NDArray) -> Skeleton | None:
+    """Return the layout whose edges are short, and clearly shorter than others'."""
+    lengths = {s.name: edge_length(shape, s.edges) for s in skeletons}
+    fitting = [
+        s
+        for s in sorted(skeletons, key=lambda s: lengths[s.name])
+        if lengths[s.name] <= LONGEST.get(s.kind, LONGEST_OF_OTHERS)
+    ]
+    if len(fitting) > 1:
+        best, second, *_ = (lengths[s.name] for s in fitting)
+        clearly = second >= CLEARLY.get(fitting[0].kind, np.inf) * best
+        fitting = fitting[:1] if clearly else []
+    return _only(fitting)
+
+
+def _named(skeletons: Sequence[Skeleton], names: Sequence[str]) -> Skeleton | None:
+    """Return the layout that has these names, in whatever order."""
+    plain = [_plain(name) for name in names]
+    for skeleton in skeletons:
+        if skeleton.point_names is None:
+            continue
+        known = {_plain(name): name for name in skeleton.point_names}
+        if known.keys() == set(plain):
+            return skeleton.reordered([known[name] for name in plain])
+    return None
+
+
+def _plain(name: str) -> str:
+    """Return what matters of the name of a point."""
+    spelled = _SIDE_LETTER.sub(lambda match: _SIDE_WORDS[match[1]], name.strip())
+    return "".join(letter for letter in spelled.lower() if letter.isalnum())
+
+
+def _numbered(names: Sequence[str]) -> bool:
+    """Tell whether names are numbers in turn, with nothing or one word before them."""
+    matches = [_NUMBERED.fullmatch(name.strip()) for name in names]
+    found = [match for match in matches if match is not None]
+    if len(found) < len(names) or len({match[1] for match in found}) > 1:
+        return False
+    numbers = [int(match[2]) for match in found]
+    return numbers == list(range(numbers[0], numbers[0] + len(numbers)))

@@ -1,0 +1,204 @@
+"""What is known of a layout of landmarks."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Kind = Literal["face", "hand", "body", "whole body", "other"]
+KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")
+MIDDLE, LEFT, RIGHT = 0, 1, 2
+
+Pairs = tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """
+    A layout of landmarks: names, what joins the points, left and right, the pose.
+
+    Points are named by their index in the layout. Left and right are those of the
+    person or animal, not of the viewer.
+
+    Parameters
+    ----------
+    name : str
+        Name of the layout.
+    kind : {"face", "hand", "body", "whole body", "other"}
+        What the points are on.
+    n_points : int
+        Number of points.
+    curves : tuple of tuples of int
+        Points along each curve, at least two a curve. A closed one ends with the point
+        that it begins with.
+    source : str
+        Where the order and the curves are documented.
+    point_names : tuple of str of length n_points or None, default=None
+        Names of the points, where the layout has them.
+    left, right : tuple of int, default=()
+        Points of the left and of the right side, which are mirror images in turn:
+        ``left[i]`` of ``right[i]``.
+    up : tuple of pairs of int, default=()
+        A lower point and one above it, as `calibration.canonical_pose` takes them.
+    front : tuple of pairs of int, default=()
+        A point and one in front of it, likewise.
+    across : tuple of pairs of int, default=()
+        Pairs of a right and a left point that tell the axis across, where not all of
+        `right` and `left` are to be taken, as those of arms and legs.
+
+    Raises
+    ------
+    ValueError
+        If points do not exist, a name is not given to one point, or the sides are not
+        of equal length or have points in common.
+
+    See Also
+    --------
+    find_skeleton : The layout of a table.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.skeletons import Skeleton
+    >>> mouse = Skeleton("mouse", "other", 4, curves=((1, 0, 2), (0, 3)),
+    ...                  source="ours", left=(1,), right=(2,))
+    >>> mouse.edges
+    array([[1, 0],
+           [0, 2],
+           [0, 3]])
+    >>> mouse.edge_sides
+    array([1, 2, 0])
+    """
+
+    name: str
+    kind: Kind
+    n_points: int
+    curves: tuple[tuple[int, ...], ...]
+    source: str
+    point_names: tuple[str, ...] | None = None
+    left: tuple[int, ...] = ()
+    right: tuple[int, ...] = ()
+    up: Pairs = ()
+    front: Pairs = ()
+    across: Pairs = ()
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit together."""
+        if self.kind not in KINDS:
+            raise ValueError(f"kind must be one of {KINDS}; got {self.kind!r}")
+        if any(len(curve) < 2 for curve in self.curves):
+            raise ValueError("a curve needs at least two points")
+        pairs = chain(self.up, self.front, self.across)
+        named = [*chain(*self.curves, *pairs), *self.left, *self.right]
+        strange = [j for j in named if not 0 <= j < self.n_points]
+        if strange:
+            raise ValueError(
+                f"the points of {self.name!r} are 0 to {self.n_points - 1}; got "
+                f"{strange[0]}"
+            )
+        names = self.point_names
+        if names is not None and len({*names}) != self.n_points:
+            raise ValueError(
+                f"point_names must hold {self.n_points} different names; got "
+                f"{len({*names})}"
+            )
+        sides = {*self.left, *self.right}
+        if len(self.left) != len(self.right) or len(sides) != 2 * len(self.left):
+            raise ValueError(
+                "left and right must have as many points each, and none in common; got "
+                f"{len(self.left)} and {len(self.right)}, {len(sides)} different ones"
+            )
+
+    @property
+    def edges(self) -> NDArray[np.intp]:
+        """Return pairs of neighbours on a curve, integers of shape (n_edges, 2)."""
+        pairs = [pair for curve in self.curves for pair in pairwise(curve)]
+        return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+    @property
+    def left_right(self) -> NDArray[np.intp]:
+        """Return the pairs (n_pairs, 2) that `canonical_pose` takes as `left_right`.
+
+        The point on the right side comes first: it is on the left for somebody who is
+        looked at.
+        """
+        pairs = self.across or tuple(zip(self.right, self.left, strict=True))
+        return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+    @property
+    def sides(self) -> NDArray[np.intp]:
+        """Return the side of each point: 0 in the middle, 1 left, 2 right."""
+        sides = np.full(self.n_points, MIDDLE)
+        sides[list(self.left)] = LEFT
+        sides[list(self.right)] = RIGHT
+        return sides
+
+    @property
+    def edge_sides(self) -> NDArray[np.intp]:
+        """Return the side of each edge; one from side to side is in the middle."""
+        return sides_of_edges(self.sides, self.edges)
+
+    def reordered(self, names: Sequence[str]) -> "Skeleton":
+        """
+        Return the same layout with its points in another order.
+
+        Parameters
+        ----------
+        names : sequence of str of length n_points
+            The names of the points in the new order.
+
+        Returns
+        -------
+        Skeleton
+            The layout, whose `point_names` are those given.
+
+        Raises
+        ------
+        ValueError
+            If the layout has no names, or other ones.
+        """
+        if self.point_names is None or sorted(names) != sorted(self.point_names):
+            raise ValueError(f"these are not the names of the points of {self.name!r}")
+        place = {name: j for j, name in enumerate(names)}
+        new = [place[name] for name in self.point_names]
+
+        def moved(points: Iterable[int]) -> tuple[int, ...]:
+            return tuple(new[j] for j in points)
+
+        def moved_pairs(pairs: Pairs) -> Pairs:
+            return tuple((new[a], new[b]) for a, b in pairs)
+
+        return replace(
+            self,
+            curves=tuple(moved(curve) for curve in self.curves),
+            point_names=tuple(names),
+            left=moved(self.left),
+            right=moved(self.right),
+            up=moved_pairs(self.up),
+            front=moved_pairs(self.front),
+            across=moved_pairs(self.across),
+        )
+
+
+def sides_of_edges(sides: NDArray, edges: NDArray) -> NDArray[np.intp]:
+    """Return the side of each edge by those of its ends; the middle where they differ.
+
+    An edge from the middle to a side is on that side.
+    """
+    first, second = sides[edges].T
+    one = np.where(first == MIDDLE, second, first)
+    return np.where((second == MIDDLE) | (second == one), one, MIDDLE)
+
+
+def run(first: int, last: int, *, closed: bool = False) -> tuple[int, ...]:
+    """Return the points first to last, and first again where the curve is closed."""
+    return (*range(first, last + 1), *((first,) if closed else ()))
+
+
+def shifted(
+    curves: Iterable[Iterable[int]], offset: int
+) -> tuple[tuple[int, ...], ...]:
+    """Return the same curves of points whose indices are larger by an offset."""
+    return tuple(tuple(j + offset for j in curve) for curve in curves)

@@ -1,0 +1,331 @@
+"""Layouts of landmarks: their tables, and which one points have."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm.calibration import canonical_pose
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.skeletons import (
+    SKELETONS,
+    Skeleton,
+    find_skeleton,
+    get_skeleton,
+    read_skeleton,
+    skeleton_of_names,
+)
+
+ALL = pytest.mark.parametrize("name", SKELETONS)
+SIZES = {
+    **{"ibug-68": 68, "ibug-51": 51, "xm2vts-68": 68, "muct-76": 76, "wflw-98": 98},
+    **{"mediapipe-face-468": 468, "mediapipe-face-478": 478, "hand-21": 21},
+    **{"coco-17": 17, "h36m-17": 17, "body-25": 25, "mediapipe-pose-33": 33},
+    "coco-wholebody-133": 133,
+}
+# The mirror image of a ring of the irises is not documented.
+RINGS = {*range(469, 473), *range(474, 478)}
+
+
+def mean_image(load_data, name):
+    """The mean of the complete frames, each centred and of unit size."""
+    W = load_data(name)["W2d"]
+    W = W[np.isfinite(W).all(axis=(1, 2))]
+    W = W - W.mean(axis=1, keepdims=True)
+    return (W / np.linalg.norm(W, axis=(1, 2), keepdims=True)).mean(axis=0)
+
+
+def undirected(edges):
+    return {frozenset(map(int, edge)) for edge in edges}
+
+
+def test_the_layouts():
+    assert {name: s.n_points for name, s in SKELETONS.items()} == SIZES
+    assert all(name == s.name for name, s in SKELETONS.items())
+
+
+@ALL
+def test_each_is_its_own_mirror_image(name):
+    skeleton = SKELETONS[name]
+    mirror = np.arange(skeleton.n_points)
+    mirror[list(skeleton.left)] = skeleton.right
+    mirror[list(skeleton.right)] = skeleton.left
+    edges = np.array([e for e in skeleton.edges if not RINGS & set(e.tolist())])
+    assert undirected(mirror[edges]) == undirected(edges)
+    assert len(undirected(edges)) == len(edges)
+    named = {*range(skeleton.n_points)} - {*skeleton.left, *skeleton.right}
+    if name.startswith("coco"):
+        assert 0 in named
+
+
+@ALL
+def test_each_has_a_source_and_joins_its_points(name):
+    skeleton = SKELETONS[name]
+    assert "20" in skeleton.source or "1999" in skeleton.source
+    joined = set(skeleton.edges.ravel().tolist())
+    alone = set(range(skeleton.n_points)) - joined
+    known = {
+        "xm2vts-68": {31, 36, 46, 47, 66, 67},
+        "muct-76": {31, 36, 46, 47, 66, 67},
+        "wflw-98": {96, 97},
+    }
+    if not name.startswith("mediapipe-face"):
+        assert alone == known.get(name, set())
+
+
+@ALL
+def test_names_with_sides_are_on_these_sides(name):
+    skeleton = SKELETONS[name]
+    for point, side in zip(skeleton.point_names or (), skeleton.sides, strict=False):
+        if "left" in point or "right" in point:
+            assert side == (1 if "left" in point else 2)
+    for left, right in zip(skeleton.left, skeleton.right, strict=True):
+        names = skeleton.point_names
+        if names and "left" in names[left]:
+            assert names[right] == names[left].replace("left", "right")
+
+
+def test_edges_of_coco_are_those_of_the_annotations():
+    # Counted from 1, as the file has them.
+    skeleton = [(16, 14), (14, 12), (17, 15), (15, 13), (12, 13), (6, 12), (7, 13)]
+    skeleton += [(6, 7), (6, 8), (7, 9), (8, 10), (9, 11), (2, 3), (1, 2), (1, 3)]
+    skeleton += [(2, 4), (3, 5), (4, 6), (5, 7)]
+    expected = undirected(np.array(skeleton) - 1)
+    assert undirected(get_skeleton("coco-17").edges) == expected
+
+
+def test_edges_between_the_sides_are_in_the_middle():
+    body = get_skeleton("coco-17")
+    sides = dict(zip(map(tuple, body.edges.tolist()), body.edge_sides, strict=True))
+    assert sides[5, 7] == 1
+    assert sides[6, 8] == 2
+    assert sides[5, 6] == 0  # from shoulder to shoulder
+    assert sides[1, 0] == 1  # from the left eye to the nose
+
+
+@pytest.mark.parametrize("name", ["coco-17", "h36m-17"])
+@pytest.mark.parametrize("seed", range(3))
+def test_bodies_are_turned_upright_and_mirrored_back(name, seed):
+    body = make_body_tracks(200, scheme=name, random_state=seed).mean_shape
+    upright = canonical_pose(body, scheme=name)
+    assert not upright.mirrored
+    # Bodies of the generator stand upright, but for how far they lean.
+    turn = Rotation.from_matrix(upright.rotation)
+    assert np.rad2deg(turn.magnitude()) < 15
+    turned = Rotation.random(random_state=seed).apply(body)
+    assert_allclose(canonical_pose(turned, scheme=name).shape, upright.shape, atol=1e-6)
+    mirrored = canonical_pose(turned * [1, 1, -1], scheme=name)
+    assert mirrored.mirrored
+    assert_allclose(mirrored.shape, upright.shape, atol=1e-6)
+
+
+def test_hands_are_turned_upright_and_keep_the_side_that_is_seen():
+    hand = make_hand_tracks(200, random_state=0).mean_shape
+    upright = canonical_pose(hand, scheme="hand-21").shape
+    palm = upright[9] - upright[0]
+    assert_allclose(palm[[0, 2]], 0, atol=1e-9)
+    assert palm[1] < 0
+    for angle in (-100, 80):
+        turned = Rotation.from_euler("z", angle, degrees=True).apply(hand)
+        again = canonical_pose(turned, scheme=get_skeleton("hand-21"))
+        assert_allclose(again.shape, upright, atol=1e-9)
+    back = canonical_pose(hand * [-1, 1, -1], scheme="hand-21").shape
+    assert_allclose(back, upright * [-1, 1, -1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("ict_bu3dfe_like_68", "ibug-68"),
+        ("faces_wild_68_combined", "ibug-68"),
+        ("expressions_dlib_68", "ibug-68"),
+        ("muct_68", "xm2vts-68"),
+        ("hands_kazuhito_21", "hand-21"),
+    ],
+)
+def test_real_tables_are_recognised(load_data, name, layout):
+    shape = mean_image(load_data, name)
+    found = find_skeleton(len(shape), shape=shape)
+    assert found is SKELETONS[layout]
+    if found.left:
+        right, left = shape[found.left_right.T]
+        assert (left[:, 0] > right[:, 0]).all()
+
+
+@pytest.mark.parametrize("name", ["ibug-68", "hand-21", "h36m-17"])
+@pytest.mark.parametrize("seed", range(5))
+def test_generated_shapes_are_recognised_in_their_own_order_only(name, seed):
+    shape = {
+        "ibug-68": make_face_tracks(n_frames=20, random_state=seed).mean_shape,
+        "hand-21": make_hand_tracks(100, random_state=seed).mean_shape,
+        "h36m-17": make_body_tracks(
+            100, scheme="h36m-17", random_state=seed
+        ).mean_shape,
+    }[name]
+    n_points = len(shape)
+    assert find_skeleton(n_points, shape=shape).name == name
+    assert find_skeleton(n_points, shape=7 * shape + 3).name == name
+    rng = np.random.default_rng(seed)
+    for other in (
+        rng.standard_normal((n_points, 3)),
+        rng.uniform(size=(n_points, 2)),
+        rng.permutation(shape),
+        np.zeros((n_points, 3)),
+    ):
+        assert find_skeleton(n_points, shape=other) is None
+
+
+def test_where_two_layouts_fit_none_is_taken():
+    assert find_skeleton(17) is None
+    assert find_skeleton(68) is None
+    body = make_body_tracks(100, random_state=0).mean_shape
+    assert find_skeleton(17, shape=body) is None
+    assert find_skeleton(42) is None
+
+
+@pytest.mark.parametrize(
+    ("n_points", "reader", "name"),
+    [
+        (68, "openface", "ibug-68"),
+        (68, "pyfeat", "ibug-68"),
+        (478, "pyfeat", "mediapipe-face-478"),
+        (51, "pts", "ibug-51"),
+        (98, "wflw", "wflw-98"),
+        (17, "coco", "coco-17"),
+        (133, "coco", "coco-wholebody-133"),
+        (33, "mediapipe", "mediapipe-pose-33"),
+        (21, "mediapipe", "hand-21"),
+        (21, "table", "hand-21"),
+    ],
+)
+def test_the_reader_tells_the_layout(n_points, reader, name):
+    assert find_skeleton(n_points, None, reader).name == name
+    numbers = [f"point{j}" for j in range(n_points)]
+    assert find_skeleton(n_points, numbers, reader).name == name
+
+
+def test_a_reader_that_writes_other_layouts_tells_none():
+    assert find_skeleton(21, reader="openface") is None
+    assert find_skeleton(17, reader="mediapipe") is None
+
+
+@pytest.mark.parametrize(
+    ("names", "name"),
+    [
+        (get_skeleton("coco-17").point_names, "coco-17"),
+        ([n.upper() for n in get_skeleton("h36m-17").point_names], "h36m-17"),
+        (get_skeleton("coco-wholebody-133").point_names, "coco-wholebody-133"),
+    ],
+)
+def test_names_tell_the_layout(names, name):
+    assert find_skeleton(len(names), names).name == name
+    # Whatever else is said.
+    assert find_skeleton(len(names), names, "mediapipe").name == name
+
+
+def test_the_names_of_openpose():
+    names = ["Nose", "Neck", "RShoulder", "RElbow", "RWrist", "LShoulder", "LElbow"]
+    names += ["LWrist", "MidHip", "RHip", "RKnee", "RAnkle", "LHip", "LKnee", "LAnkle"]
+    names += ["REye", "LEye", "REar", "LEar", "LBigToe", "LSmallToe", "LHeel"]
+    names += ["RBigToe", "RSmallToe", "RHeel"]
+    assert find_skeleton(25, names) == get_skeleton("body-25")
+
+
+def test_names_in_another_order_are_the_layout_in_that_order():
+    coco = get_skeleton("coco-17")
+    order = np.random.default_rng(0).permutation(17)
+    names = [coco.point_names[j] for j in order]
+    found = find_skeleton(17, names)
+    assert found.point_names == tuple(names)
+
+    def by_names(skeleton):
+        return {
+            tuple(skeleton.point_names[j] for j in edge)
+            for part in (skeleton.edges, skeleton.up, skeleton.front, skeleton.across)
+            for edge in np.asarray(part).tolist()
+        }
+
+    assert by_names(found) == by_names(coco)
+    assert [names[j] for j in found.left] == [coco.point_names[j] for j in coco.left]
+    shape = make_body_tracks(100, random_state=0).mean_shape
+    pose = canonical_pose(shape[order], scheme=found)
+    assert_allclose(pose.rotation, canonical_pose(shape, scheme=coco).rotation)
+
+
+def test_other_names_are_no_layout():
+    assert find_skeleton(21, [f"marker {j} of mine" for j in range(21)]) is None
+    assert find_skeleton(17, [f"joint_{chr(97 + j)}" for j in range(17)]) is None
+    # Numbers that leave some out.
+    assert find_skeleton(21, [str(j) for j in (*range(20), 21)]) is None
+
+
+def test_edges_of_names():
+    names = ["snout", "LeftEar", "RightEar", "tail", "left"]
+    mouse = skeleton_of_names(
+        [("snout", "LeftEar"), ("RightEar", "snout")], names, name="mouse", source="me"
+    )
+    assert_array_equal(mouse.edges, [[0, 1], [2, 0]])
+    assert (mouse.left, mouse.right) == ((1,), (2,))
+    with pytest.raises(ValueError, match="an edge of 'mouse' should be a pair"):
+        skeleton_of_names([("snout", "wing")], names, name="mouse", source="me")
+
+
+def test_the_skeleton_of_deeplabcut(tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text("bodyparts:\n- a\nskeleton:\n- - a\n  - b\n- [b, c, a]\n")
+    found = read_skeleton(config, ["a", "b", "c"])
+    assert found.name == "config.yaml"
+    assert_array_equal(found.edges, [[0, 1], [1, 2], [2, 0]])
+    with pytest.raises(ValueError, match=r"config.yaml.* should be a pair"):
+        read_skeleton(config, ["a", "b"])
+    config.write_text("bodyparts: [a]\n")
+    with pytest.raises(ValueError, match="no list of pairs of bodyparts"):
+        read_skeleton(config, ["a", "b"])
+    config.write_text("a: [")
+    with pytest.raises(ValueError, match="is not YAML"):
+        read_skeleton(config, ["a", "b"])
+
+
+def test_skeletons_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        get_skeleton("hand-21").name = "foot"
+    with pytest.raises(TypeError):
+        SKELETONS["mine"] = get_skeleton("hand-21")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "tree"}, "kind must be one of"),
+        ({"curves": ((0,),)}, "at least two points"),
+        ({"curves": ((0, 4),)}, "are 0 to 3; got 4"),
+        ({"up": ((-1, 2),)}, "are 0 to 3; got -1"),
+        ({"point_names": ("a", "b", "b", "c")}, "4 different names; got 3"),
+        ({"left": (0, 1), "right": (2,)}, "got 2 and 1, 3 different"),
+        ({"left": (0,), "right": (0,)}, "got 1 and 1, 1 different"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(change, message):
+    given = {"name": "x", "kind": "other", "n_points": 4, "curves": ()} | change
+    with pytest.raises(ValueError, match=message):
+        Skeleton(source="mine", **given)
+
+
+def test_bad_questions():
+    with pytest.raises(ValueError, match=r"skeletons are ibug-68, .*; got 'cat'"):
+        get_skeleton("cat")
+    with pytest.raises(ValueError, match="names must hold 3 names; got 2"):
+        find_skeleton(3, ["a", "b"])
+    with pytest.raises(ValueError, match="shape must hold 3 points"):
+        find_skeleton(3, shape=np.zeros((4, 2)))
+    with pytest.raises(ValueError, match="not the names of the points of 'hand-21'"):
+        get_skeleton("hand-21").reordered(["thumb"])
+    with pytest.raises(ValueError, match="needs 21 points; got 20"):
+        canonical_pose(np.eye(20, 3), scheme="hand-21")
+    pairs = skeleton_of_names([("a", "b")], ["a", "b"], name="ab", source="me")
+    with pytest.raises(ValueError, match="does not tell which way is up"):
+        canonical_pose(np.eye(2, 3), scheme=pairs)
+    with pytest.raises(ValueError, match="scheme must be a Skeleton or its name"):
+        canonical_pose(np.eye(2, 3), scheme=[[0, 1]])
