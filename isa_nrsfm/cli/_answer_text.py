@@ -1,87 +1,132 @@
 """What a fit says of labels, groups and times, as text for people."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from isa_nrsfm.cli._outputs import component_names
 
 
-def answer_lines(report: dict[str, Any]) -> dict[str, list[str]]:
-    """Return the sections of the text for people."""
+class Block(NamedTuple):
+    """
+    The answer of one column.
+
+    Attributes
+    ----------
+    title : str
+        What it is about.
+    head : sequence of str
+        Titles of the columns of the table.
+    rows : sequence of sequence of str
+        The table, a row for each coefficient.
+    remarks : sequence of str
+        What else is to be said.
+    """
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    remarks: Sequence[str]
+
+
+def answer_tables(report: dict[str, Any]) -> dict[str, list[Block]]:
+    """Return the answers of a report by section."""
     sections = {}
     if "labels" in report:
-        sections["Labels"] = [
-            line for label in report["labels"] for line in _label_lines(label)
-        ]
+        sections["Labels"] = [_label_block(label) for label in report["labels"]]
     if "groups" in report:
-        sections["Groups"] = _group_lines(report["groups"])
+        sections["Groups"] = [_group_block(report["groups"])]
     if "time" in report:
-        sections["Time"] = _time_lines(report["time"])
+        sections["Time"] = [_time_block(report["time"])]
     return sections
 
 
-def _label_lines(label: dict[str, Any]) -> list[str]:
+def answer_lines(report: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the answers as lines of text, by section."""
+    return {
+        section: [line for block in blocks for line in _lines(block)]
+        for section, blocks in answer_tables(report).items()
+    }
+
+
+def _lines(block: Block) -> list[str]:
+    """Lay a block out."""
+    lines = [block.title]
+    if block.rows:
+        cells = [block.head, *block.rows]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        lines += [
+            "  ".join(
+                cell.rjust(width) if column else cell.ljust(width)
+                for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in cells
+        ]
+    return [*lines, *block.remarks]
+
+
+def _label_block(label: dict[str, Any]) -> Block:
     """Say how coefficients go with a label."""
     names = component_names(len(label["values"]))
-    without = label["n_without_label"]
     title = f"{label['column']}: {label['n_frames']} frames"
     if "classes" in label:
         title += f" of {len(label['classes'])} classes"
-    if without:
-        title += f"; {without} without it are left out"
+    if label["n_without_label"]:
+        title += f"; {label['n_without_label']} without it are left out"
     what = "eta squared" if label["statistic"] == "eta_squared" else "Spearman"
-    lines = [title, f"{'':10} {what:>11} {'p':>6}"]
-    lines += [
-        f"{name:10} {value:z11.2f} {p:6.3f}"
+    rows = [
+        [name, f"{value:z.2f}", f"{p:.3f}"]
         for name, value, p in zip(
             names, label["values"], label["p_values"], strict=True
         )
     ]
+    return Block(title, ["", what, "p"], rows, [_told(label)])
+
+
+def _told(label: dict[str, Any]) -> str:
+    """Say how well all coefficients together tell a label."""
     if "not_cross_validated" in label:
-        return [*lines, f"not cross-validated: {label['not_cross_validated']}"]
+        return f"not cross-validated: {label['not_cross_validated']}"
     ours, pca = label["cross_validated"], label["cross_validated_pca"]
     if label["score"] == "accuracy":
-        lines.append(
+        return (
             f"cross-validated accuracy {100 * ours:.1f} %; of PCA of the aligned "
             f"frames {100 * pca:.1f} %, of the largest class alone "
             f"{100 * label['largest_class']:.1f} %"
         )
-    else:
-        lines.append(
-            f"cross-validated R^2 {ours:.2f}; of PCA of the aligned frames {pca:.2f}"
-        )
-    return lines
+    return f"cross-validated R^2 {ours:.2f}; of PCA of the aligned frames {pca:.2f}"
 
 
-def _group_lines(groups: dict[str, Any]) -> list[str]:
+def _group_block(groups: dict[str, Any]) -> Block:
     """Say how much coefficients differ between groups."""
     if "not_divided" in groups:
-        return [f"{groups['column']}: {groups['not_divided']}"]
+        return Block(f"{groups['column']}: {groups['not_divided']}", [], [], [])
     names = component_names(len(groups["between"]))
-    title = f"share of the variance between {groups['n_groups']} groups"
-    return [
-        f"{groups['column']}: {title}",
-        *(
-            f"{name:10} {100 * share:5.1f} %"
-            for name, share in zip(names, groups["between"], strict=True)
-        ),
+    rows = [
+        [name, f"{100 * between:.1f} %", f"{100 * within:.1f} %"]
+        for name, between, within in zip(
+            names, groups["between"], groups["within"], strict=True
+        )
     ]
+    title = f"{groups['column']}: variance between and within {groups['n_groups']}"
+    return Block(f"{title} groups", ["", "between", "within"], rows, [])
 
 
-def _time_lines(time: dict[str, Any]) -> list[str]:
+def _time_block(time: dict[str, Any]) -> Block:
     """Say what smoothing in time has found."""
     scales = np.asarray(time["time_scales"], dtype=float)
     if not len(scales):
-        return [
-            f"{time['column']}: the frames show no dynamics; coefficients are not "
-            "smoothed"
-        ]
+        title = "the frames show no dynamics; coefficients are not smoothed"
+        return Block(f"{time['column']}: {title}", [], [], [])
     listed = ", ".join(
         f"{each:.3g}" if np.isfinite(each) else "never" for each in scales[:4]
     )
-    return [
-        f"{time['column']}: times until a shape is forgotten: {listed}"
-        + (", ..." if len(scales) > 4 else ""),
-        f"smoothed coefficients differ by {time['changed_by']:.2f}, root mean square",
-    ]
+    more = ", ..." if len(scales) > 4 else ""
+    changed = f"smoothed coefficients differ by {time['changed_by']:.2f}, "
+    return Block(
+        f"{time['column']}: times until a shape is forgotten: {listed}{more}",
+        [],
+        [],
+        [f"{changed}root mean square"],
+    )

@@ -171,6 +171,20 @@ def _check_order(times: NDArray, groups: NDArray | None, name: str | None) -> No
         raise ValueError(f"--time {name}: {error}{hint}") from error
 
 
+def first_classes(asked: Answers, X: "pd.DataFrame") -> "pd.Series | None":
+    """Return the first label of few classes: the viewer colours the frames by it."""
+    from isa_nrsfm.export._viewer import MOST_LABELS
+
+    pd = import_optional("pandas", extra="io")
+    for label in asked.labels:
+        few = len(np.unique(label.values)) <= MOST_LABELS
+        if label.kind == "classes" and few:
+            values = pd.Series(None, index=X.index, dtype=object, name=label.name)
+            values[label.known] = [str(value) for value in label.values]
+            return values
+    return None
+
+
 class Answered(NamedTuple):
     """
     What a fit says of these columns.

@@ -20,6 +20,7 @@ from isa_nrsfm.cli._answers import (
     answered,
     asked_for,
     draw_answers,
+    first_classes,
 )
 from isa_nrsfm.cli._choice import choose_n_components
 from isa_nrsfm.cli._frames import Frames
@@ -35,6 +36,7 @@ from isa_nrsfm.cli._outputs import (
     write_report,
     write_results,
 )
+from isa_nrsfm.cli._page import REPORT_PAGE, write_page
 from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.cli._reading import read_frames, taken_frames
 from isa_nrsfm.cli._report import (
@@ -102,20 +104,24 @@ def fit_table(
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
     asked = asked_for(args, frames)
     figures = {} if args.no_figures else FIGURES | answer_figures(asked)
-    files = MODEL | TABLES | ARRAYS | PAGE | figures
+    about = {REPORT_PAGE: "this report with its figures, for any browser"}
+    files = about | MODEL | TABLES | ARRAYS | PAGE | figures
     inputs = [args.table]
     if table is not None:
         files, inputs = files | {Path(args.table).name: "the table"}, []
     with folder_for_writing(folder):
         check_outputs((folder / name for name in (*files, REPORT)), inputs)
-        removed = old_figures(folder) if args.no_figures else []
+        removed = old_figures(folder, files)
         clock["read"] = time.perf_counter()
         estimator, choice = _fitted(args, X, clock)
         answers = answered(asked, estimator, X, args.random_state)
         with files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            write_results(new, estimator, frames, answers.alpha, std=args.std)
+            labels = first_classes(asked, X)
+            write_results(
+                new, estimator, frames, answers.alpha, std=args.std, labels=labels
+            )
             if not args.no_figures:
                 write_figures(new, estimator, X, args.random_state)
                 draw_answers(new, asked, answers, estimator)
@@ -124,6 +130,7 @@ def fit_table(
             seconds = np.diff([*clock.values()]).round(3)
             report = {
                 "command": "fit",
+                "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args.table, args.format, frames),
                 **({} if choice is None else {"choice": choice}),
@@ -135,6 +142,7 @@ def fit_table(
                 "versions": versions(),
                 "files": files,
             }
+            write_page(new, report)
             write_report(new, report)
     return report
 

@@ -47,7 +47,7 @@ def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
         *(["--no-figures"] if args.no_figures else []),
     ]
     report = fit_table(
-        build_parser().parse_args(options),
+        build_parser().parse_args(options, Namespace(arguments=options)),
         warned,
         table=table,
         truth=lambda estimator, X: _compare(faces, estimator, X),

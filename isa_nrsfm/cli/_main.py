@@ -37,7 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         With code 2 if the arguments are wrong, with 0 after ``--help`` and
         ``--version``.
     """
-    args = build_parser().parse_args(argv)
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    args = build_parser().parse_args(arguments, Namespace(arguments=arguments))
     try:
         with _warnings_as_lines() as warned:
             report = _run(args, warned)

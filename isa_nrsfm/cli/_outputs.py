@@ -47,13 +47,14 @@ def component_names(n_components: int) -> list[str]:
     return names_of_components(None, n_components)
 
 
-def old_figures(folder: Path) -> list[str]:
-    """Return the names of the figures that the report of an earlier run lists.
+def old_figures(folder: Path, new: Iterable[str]) -> list[str]:
+    """Return the names of figures of an earlier run that no new file replaces.
 
     Of figures that no report lists, it is said that they are old.
     """
     listed = files_of_report(folder)
     figures = {*FIGURES, *(name for name in listed if name.endswith(".png"))}
+    figures -= {*new}
     old = sorted(name for name in figures if (folder / name).exists())
     others = [name for name in old if name not in listed]
     if others:
@@ -109,10 +110,12 @@ def write_results(
     further: "pd.DataFrame",
     *,
     std: bool,
+    labels: "pd.Series | None" = None,
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
-    The tables have a row for each frame, empty for those that could not be fitted.
+    The tables have a row for each frame, empty for those that could not be fitted. The
+    labels are those of the frames in the viewer.
     """
     pd = import_optional("pandas", extra="io")
     fit = fitted_frames(estimator)
@@ -132,19 +135,24 @@ def write_results(
     write_table(cameras, folder / "cameras.csv")
 
     export.write_shapes(estimator, folder / "shapes.npz")
-    _write_page(folder / "viewer.html", estimator, X)
+    _write_page(folder / "viewer.html", estimator, X, labels)
     save_model(estimator, folder / "model.skops")
 
 
-def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
+def _write_page(
+    path: Path,
+    estimator: AffineNRSfM,
+    X: "pd.DataFrame",
+    labels: "pd.Series | None",
+) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            export.write_viewer(estimator, path, X=X)
+            export.write_viewer(estimator, path, X=X, labels=labels)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        export.write_viewer(estimator, path, X=X, camera=None)
+        export.write_viewer(estimator, path, X=X, labels=labels, camera=None)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":

@@ -135,9 +135,35 @@ def versions() -> dict[str, str]:
 
 def fit_text(report: dict[str, Any], folder: Path) -> str:
     """Lay the report of a fit out for people."""
-    table, model = report["table"], report["model"]
+    width = max(map(len, report["files"]))
+    files = [f"in {folder}"]
+    files += [
+        f"  {name:{width}}  {content.partition(';')[0].partition(': the image')[0]}"
+        for name, content in report["files"].items()
+    ]
+    sections = fit_sections(report) | {"Files": files}
+    return f"{fit_title(report)}\n\n{lay_out(sections)}"
+
+
+def fit_title(report: dict[str, Any]) -> str:
+    """Say what was fitted to what."""
+    table = report["table"]
+    return (
+        f"{_shapes(report['model'])} fitted to {table['n_frames']} frames of "
+        f"{table['n_points']} points"
+    )
+
+
+def _shapes(model: dict[str, Any]) -> str:
+    """Say how many basis shapes a model has."""
     n_components = model["n_components"]
-    shapes = f"{n_components} basis shape{'s' * (n_components != 1)}"
+    return f"{n_components} basis shape{'s' * (n_components != 1)}"
+
+
+def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
+    """Return the lines of each section of the text, but for the files."""
+    table, model = report["table"], report["model"]
+    n_components, shapes = model["n_components"], _shapes(model)
     remark = ""
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count in full)"
@@ -160,30 +186,19 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
         f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f}"
         for row in model["alpha"]
     ]
-    width = max(map(len, report["files"]))
-    files = [f"in {folder}"]
-    files += [
-        f"  {name:{width}}  {content.partition(';')[0].partition(': the image')[0]}"
-        for name, content in report["files"].items()
-    ]
-    title = (
-        f"{shapes} fitted to {table['n_frames']} frames of {table['n_points']} points"
-    )
     choice = {}
     if "choice" in report:
         choice["Choice"] = _choice_lines(report["choice"])
     elif model["parameters"]["n_components"] == AUTO:
         choice["Choice"] = [f"K = {n_components}: what the table determines"]
-    sections = {
+    return {
         "Table": table_lines(table),
         **choice,
         "Fit": fit,
         "Cameras": _camera_lines(model),
         "Alpha": alpha,
         **answer_lines(report),
-        "Files": files,
     }
-    return f"{title}\n\n{lay_out(sections)}"
 
 
 def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
