@@ -458,6 +458,7 @@ def test_half_and_twice_of_whole_numbers_are_whole(value, half, twice):
     assert sensitivity.changed(value, 2.0) == twice
 
 
+@pytest.mark.slow
 def test_cases_of_artificial_tables_have_errors():
     usual = sensitivity.limited(FitLimits())
     assert 0 < sensitivity.of_instances(usual, 40, 20, K=1, missing=0.05) < 20
