@@ -16,6 +16,7 @@ from benchmarks import (
     _sets,
     _unseen,
     accuracy,
+    sensitivity,
 )
 from benchmarks._agreement import compare
 from benchmarks._classification import AlignedFrames
@@ -28,6 +29,8 @@ from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._fit import Limits as FitLimits
+from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -398,6 +401,68 @@ def test_the_prior_can_be_varied():
     other = accuracy.JOINT_OPTIONS._replace(basis_std=0.5, least_noise=0.25)
     assert accuracy.fit_set(X, "affine", 2, other).noise_variance_ != usual
     assert accuracy.fit_set(X, "affine", 2).noise_variance_ == usual
+
+
+def test_all_limits_of_a_fit_can_be_varied():
+    known = {name.split(".")[0] for name in sensitivity.STAGES}
+    stages = {
+        name
+        for name, value in FitLimits()._asdict().items()
+        if hasattr(value, "_fields")
+    }
+    assert known == stages
+    joint = {
+        f"joint.{name}"
+        for name, value in JointOptions()._asdict().items()
+        if hasattr(value, "_fields")
+    }
+    assert joint <= set(sensitivity.STAGES)
+
+
+def test_limits_are_halved_and_doubled(capsys):
+    seen = []
+
+    def case(estimator):
+        seen.append(estimator._limits.sample)
+        return 1.0
+
+    sensitivity.stage("sample", {"case": case}, None)
+    usual = FitLimits().sample
+    assert seen[:2] == [usual, usual]
+    expected = [
+        usual._replace(**{name: round(factor * value)})
+        for name, value in usual._asdict().items()
+        for factor in (0.5, 2.0)
+    ]
+    assert seen[2:] == expected
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[:2] for line in lines[2:4]] == [
+        ["first", "300"],
+        ["first", "1200"],
+    ]
+
+
+def test_limits_of_inner_stages_are_replaced():
+    limits = sensitivity.replaced(FitLimits(), ["joint", "starts"], "held_steps", 1)
+    assert limits.joint.starts.held_steps == 1
+    starts = JointOptions().starts
+    assert limits.joint._replace(starts=starts) == JointOptions()
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "twice"),
+    [(0.3, 0.15, 0.6), (1, 1, 2), (5, 2, 10), ((6, 9), (3, 4), (12, 18))],
+)
+def test_half_and_twice_of_whole_numbers_are_whole(value, half, twice):
+    assert sensitivity.changed(value, 0.5) == half
+    assert sensitivity.changed(value, 2.0) == twice
+
+
+@pytest.mark.slow
+def test_cases_of_artificial_tables_have_errors():
+    usual = sensitivity.limited(FitLimits())
+    assert 0 < sensitivity.of_instances(usual, 40, 20, K=1, missing=0.05) < 20
+    assert 50 < sensitivity.similarity(usual, 60, 30, K=1) <= 100
 
 
 def test_as_many_points_are_hidden_as_is_said():

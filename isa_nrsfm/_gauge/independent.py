@@ -30,6 +30,8 @@ class GaugeOptions(NamedTuple):
     """
     What steers the choice of the independent basis.
 
+    ``python -m benchmarks.sensitivity gauge`` shows half and twice of each.
+
     Attributes
     ----------
     max_shifts : int

@@ -2,7 +2,9 @@
 
 Each limit is a share of the numbers that a result was computed from. The unit roundoff
 is 1.1e-16; a limit stands above it by what operations of its kind were seen to lose. A
-module takes the limit of the operations that it does.
+module takes the limit of the operations that it does. None is critical: with all of
+them halved, or all doubled, ``python -m benchmarks.accuracy tables`` prints the same
+digits.
 """
 
 # Sums of squares, and what is compared with them: a few units of the last place.

@@ -7,6 +7,8 @@ class SvdOptions(NamedTuple):
     """
     How the leading singular triplets are found.
 
+    ``python -m benchmarks.sensitivity svd`` shows half and twice of each.
+
     Attributes
     ----------
     dense : int
@@ -35,6 +37,8 @@ class SampleOptions(NamedTuple):
     """
     On which frames of a large table the first stages work.
 
+    ``python -m benchmarks.sensitivity sample`` shows half and twice of each.
+
     Attributes
     ----------
     first : int
@@ -56,6 +60,8 @@ class SampleOptions(NamedTuple):
 class PaperOptions(NamedTuple):
     """
     What steers the paper's pipeline.
+
+    ``python -m benchmarks.sensitivity paper`` shows half and twice of each.
 
     Attributes
     ----------

@@ -7,6 +7,8 @@ class CompletionOptions(NamedTuple):
     """
     How missing points are filled in.
 
+    ``python -m benchmarks.sensitivity completion`` shows half and twice of each.
+
     Attributes
     ----------
     tol : float
@@ -48,6 +50,8 @@ class CompletionOptions(NamedTuple):
 class OutlierOptions(NamedTuple):
     """
     Which points are gross outliers.
+
+    ``python -m benchmarks.sensitivity outliers`` shows half and twice of each.
 
     Attributes
     ----------

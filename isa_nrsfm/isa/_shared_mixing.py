@@ -35,6 +35,8 @@ class MixingOptions(NamedTuple):
     """
     How the likeliest mixing is searched for.
 
+    ``python -m benchmarks.sensitivity gauge.mixing`` shows half and twice of each.
+
     Attributes
     ----------
     fixed_point_steps : int
