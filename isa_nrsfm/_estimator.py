@@ -382,8 +382,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             the other layout explains the table much better, or if a refinement has not
             converged.
         """
-        self._forget()
         try:
+            self._forget()
             with kept_arrays(self.keep_frames) as keep:
                 self._fit(X, y, keep)
         except BaseException:
@@ -500,12 +500,12 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         return isa
 
     def _forget(self) -> None:
-        """Remove what an earlier fit has found."""
-        for name in [name for name in vars(self) if name.endswith("_")]:
-            delattr(self, name)
+        """Remove what an earlier fit has found, first of all that there was one."""
         for name in ("_model", "_unit", "_frame_sizes", "_n_features_out"):
             if hasattr(self, name):
                 delattr(self, name)
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""

@@ -29,6 +29,7 @@ from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import PointDistributionModel, read_pdm, write_pdm
 from isa_nrsfm.io import (
+    find_format,
     load_model,
     open_table,
     read_landmarks,
@@ -140,6 +141,8 @@ def check_cells(points, failed, path, separator=","):
 
 def read_format(format, *, cells=False, **options):
     def read(path):
+        with contextlib.suppress(ValueError):
+            find_format(path)
         found = read_landmarks(path, format, **options)
         check_landmarks(found)
         if cells:

@@ -51,6 +51,8 @@ def relevant_components(
         state = part.refined(start, cameras, max_iter=options.steps).state
         # g_k and v_k, with penalty = 1 / (v_k n_frames)
         energy, uncertain = _image_energies(part, state)
+        if not energy.any():
+            return 0  # nothing deforms
         determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
         determined = np.clip(determined, options.smallest, 1.0)
         variance = np.maximum(

@@ -1,0 +1,345 @@
+"""An estimator through fits, refusals, interruptions, saving and loading, in any order.
+
+After each step it is fitted whole, and keeps its promises, or it is not fitted at all.
+The fits of very small tables tell nothing of how good a model is.
+"""
+
+import contextlib
+import copy
+import inspect
+import pickle
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.utils.validation import check_is_fitted
+
+import isa_nrsfm
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import load_model, save_model
+
+pytest.importorskip("skops", reason="needs the extra share")
+
+PACKAGE = str(Path(isa_nrsfm.__file__).parent)
+ESTIMATOR = inspect.getsourcefile(AffineNRSfM)
+# Coefficients have unit variance.
+ROUNDING = 1e-8
+# What a fit takes as it is, and what it refuses.
+KINDS = (
+    *("plain", "missing", "noise", "integers", "rigid", "named", "single precision"),
+    *("far", "large", "small", "empty row", "equal frames", "low rank"),
+    *("one line", "same points", "one far point"),
+    *("infinite", "odd", "text", "constant frame", "few frames", "one point missing"),
+)
+tables = st.tuples(st.sampled_from(KINDS), st.integers(0, 2**16))
+PARAMETERS = {
+    "n_components": [1, 2, 0, "auto", True],
+    "refinement": ["joint", "alternating", None],
+    "camera": ["affine", "weak_perspective", "orthographic"],
+    "loss": ["linear", "huber", "cauchy"],
+    "independence": ["shapes", "coefficients", None],
+    "layout": ["interleaved", "planar"],
+    "scale_frames": [True, False],
+    "keep_frames": [True, False],
+    "max_iter": [3, 30],
+    "random_state": [0, 1, None],
+    "tol": [None, 1e-3],
+}
+
+
+def table(kind, seed):
+    """Return a table of few frames and points."""
+    rng = np.random.default_rng(seed)
+    n_frames = 4 if kind == "few frames" else int(rng.integers(5, 17))
+    n_points = int(rng.integers(7, 14))
+    noise = 0.0 if kind == "low rank" else 0.02
+    seed = int(rng.integers(2**16))
+    tracks = make_nonrigid_tracks(n_frames, n_points, 1, noise=noise, random_state=seed)
+    X = tracks.data
+    pairs = X.reshape(n_frames, n_points, 2)
+    match kind:
+        case "missing":
+            pairs[rng.random((n_frames, n_points)) < 0.1] = np.nan
+        case "noise":
+            X = rng.normal(size=X.shape)
+        case "integers":
+            X = rng.integers(0, 3, X.shape)
+        case "rigid" | "equal frames":
+            X = np.repeat(X[:1], n_frames, axis=0)
+            X = X + (0.01 * rng.normal(size=X.shape) if kind == "rigid" else 0.0)
+        case "named":
+            names = [f"{axis}_{j}" for j in range(n_points) for axis in "xy"]
+            X = pd.DataFrame(X, columns=names)
+        case "single precision":
+            X = X.astype(np.float32)
+        case "far":
+            X = X + 1e6
+        case "large" | "small":
+            X = X * (1e100 if kind == "large" else 1e-100)
+        case "one line":
+            pairs[..., 1] = pairs[..., 0]
+        case "same points":
+            pairs[:, 1] = pairs[:, 0]
+        case "one far point":
+            pairs[0, 0] = 10.0 ** rng.integers(2, 6)
+        case "empty row":
+            X[rng.integers(n_frames)] = np.nan
+        case "infinite":
+            X[rng.integers(n_frames), 3] = np.inf
+        case "odd":
+            X = X[:, 1:]
+        case "text":
+            X = X.astype(str).astype(object)
+            X[0, 0] = "nose"
+        case "constant frame":
+            X[rng.integers(n_frames)] = 1.0
+        case "one point missing":
+            pairs[:, 0] = np.nan
+    return X
+
+
+@contextlib.contextmanager
+def interrupted_after(n_lines, files):
+    """Raise KeyboardInterrupt in the given line that runs of files with this path."""
+    left = n_lines
+
+    def trace(frame, event, arg):
+        nonlocal left
+        if not frame.f_code.co_filename.startswith(files):
+            return None
+        if event == "line":
+            left -= 1
+            if left == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
+
+
+@contextlib.contextmanager
+def only_own_warnings():
+    """Take warnings of the package as they come, and all others as errors."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+def rows(X, which):
+    """Return rows of an array or a DataFrame."""
+    return X.iloc[which] if isinstance(X, pd.DataFrame) else X[which]
+
+
+def is_fitted(model):
+    """Return what scikit-learn thinks."""
+    try:
+        check_is_fitted(model)
+    except NotFittedError:
+        return False
+    return True
+
+
+def assert_not_fitted(model, X, folder):
+    """Assert that an estimator does nothing that needs a fit, and says so."""
+    alpha = np.zeros((1, 1))
+    for call in (
+        lambda: model.transform(X),
+        lambda: model.decompose(X),
+        lambda: model.reconstruct(X),
+        lambda: model.reproject(X),
+        lambda: model.score(X),
+        lambda: model.inverse_transform(alpha),
+        lambda: model.diagnostics(),
+        lambda: model.mirror(),
+        lambda: model.get_feature_names_out(),
+        lambda: save_model(model, folder / "none.skops"),
+    ):
+        with pytest.raises(NotFittedError):
+            call()
+    assert not any(folder.iterdir())
+    left = [name for name in vars(model) if name.endswith("_")]
+    assert left == []
+
+
+class Estimator(RuleBasedStateMachine):
+    """One estimator, and what it should be."""
+
+    def __init__(self):
+        super().__init__()
+        self.folder = tempfile.TemporaryDirectory()
+        self.path = Path(self.folder.name)
+        self.model = AffineNRSfM(1, max_iter=3, random_state=0)
+        self.X = make_nonrigid_tracks(12, 8, 1, noise=0.02, random_state=0).data
+        self.fitted = False
+
+    def teardown(self):
+        self.folder.cleanup()
+
+    @initialize(
+        changes=st.sampled_from([{}, {"refinement": None}]), kind_and_seed=tables
+    )
+    def begin(self, changes, kind_and_seed):
+        assert_not_fitted(self.model, self.X, self.path)
+        self.model.set_params(**changes)
+        self.fit(kind_and_seed)
+
+    def note_fit(self, X):
+        """Note what the fitted model finds, which must not change any more."""
+        self.fitted, self.X = True, X
+        with only_own_warnings():
+            self.alpha = self.model.transform(X)
+        self.linear = self.model.loss == "linear"
+        self.attributes = set(vars(self.model))
+
+    @rule(kind_and_seed=tables)
+    def fit(self, kind_and_seed):
+        X = table(*kind_and_seed)
+        self.fitted = False
+        try:
+            with only_own_warnings():
+                self.model.fit(X)
+        except np.linalg.LinAlgError:  # a ValueError, but of NumPy
+            raise
+        except (ValueError, TypeError):
+            return
+        self.note_fit(X)
+
+    @rule(
+        kind_and_seed=tables,
+        lines=st.one_of(
+            st.tuples(st.integers(1, 150), st.just(ESTIMATOR)),
+            st.tuples(st.integers(1, 20_000), st.just(PACKAGE)),
+        ),
+    )
+    def interrupt(self, kind_and_seed, lines):
+        X = table(*kind_and_seed)
+        try:
+            with only_own_warnings(), interrupted_after(*lines):
+                self.model.fit(X)
+        except KeyboardInterrupt:
+            # Before the fit has begun, what was found earlier stays as it was.
+            self.fitted &= is_fitted(self.model)
+        except np.linalg.LinAlgError:
+            raise
+        except (ValueError, TypeError):
+            self.fitted = False
+        else:
+            self.note_fit(X)
+
+    @rule(data=st.data())
+    def set_params(self, data):
+        name = data.draw(st.sampled_from([*PARAMETERS]))
+        self.model.set_params(**{name: data.draw(st.sampled_from(PARAMETERS[name]))})
+
+    @rule()
+    def clone(self):
+        assert_not_fitted(clone(self.model), self.X, self.path)
+
+    @rule(how=st.sampled_from(["pickle", "deepcopy"]))
+    def copy(self, how):
+        model = self.model
+        copied = pickle.loads(pickle.dumps(model)) if how == "pickle" else None
+        self.model = copied or copy.deepcopy(model)
+
+    @precondition(lambda self: self.fitted)
+    @rule()
+    def save_and_load(self):
+        path = self.path / "model.skops"
+        save_model(self.model, path)
+        assert [*self.path.iterdir()] == [path]
+        loaded = load_model(path)
+        path.unlink()
+        assert str(loaded.get_params()) == str(self.model.get_params())
+        found, expected = (
+            {
+                name: value
+                for name, value in vars(model).items()
+                if isinstance(value, np.ndarray)
+            }
+            for model in (loaded, self.model)
+        )
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            assert_array_equal(found[name], value)
+        self.model = loaded
+
+    @precondition(lambda self: self.fitted)
+    @rule(row=st.integers(0, 9))
+    def rows_by_themselves(self, row):
+        row %= len(self.X)
+        with only_own_warnings():
+            alone = self.model.transform(rows(self.X, slice(row, row + 1)))
+            part = self.model.transform(rows(self.X, slice(row, row + 3)))
+        if self.linear:
+            assert_allclose(alone[0], self.alpha[row], rtol=0, atol=ROUNDING)
+            assert_allclose(part, self.alpha[row : row + 3], rtol=0, atol=ROUNDING)
+
+    @invariant()
+    def whole_or_not_at_all(self):
+        if not self.fitted:
+            assert_not_fitted(self.model, self.X, self.path)
+            return
+        model = self.model
+        assert set(vars(model)) == self.attributes
+        with only_own_warnings():
+            alpha = model.transform(self.X)
+        assert_array_equal(alpha, self.alpha)
+        shown = ~np.isnan(np.asarray(self.X, dtype=float)).all(axis=1)
+        assert np.isfinite(alpha[shown]).all()
+        assert np.isnan(alpha[~shown]).all()
+        if hasattr(model, "alpha_"):
+            assert_allclose(model.alpha_, alpha, rtol=0, atol=ROUNDING)
+        for name, value in vars(model).items():
+            if name.endswith("_") and isinstance(value, np.ndarray | float):
+                value = np.asarray(value)
+                per_frame = value.shape[:1] == shown.shape and value.ndim > 0
+                kept = value[shown] if per_frame else value
+                if kept.dtype.kind == "f":
+                    assert np.isfinite(kept).all(), name
+
+
+def test_frames_that_are_equal_support_one_basis_shape():
+    X = table("equal frames", 42272)
+    model = AffineNRSfM("auto", loss="huber", scale_frames=False, random_state=0)
+    with only_own_warnings():
+        model.fit(X)
+    assert len(model.basis_) == 1
+    assert_allclose(model.reproject(X), X, rtol=0, atol=1e-6)
+
+
+FEW = settings(max_examples=4, stateful_step_count=4)
+MANY = settings(max_examples=40, stateful_step_count=10)
+
+
+@pytest.mark.parametrize(
+    "examples",
+    [
+        pytest.param(FEW, id="few"),
+        pytest.param(MANY, id="many", marks=pytest.mark.slow),
+    ],
+)
+def test_an_estimator_is_fitted_whole_or_not_at_all(examples):
+    run_state_machine_as_test(Estimator, settings=examples)
