@@ -20,6 +20,7 @@ from scipy.io import loadmat
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.whole_files import ASIDE, whole_file
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import (
@@ -153,6 +154,57 @@ def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     assert n_failed >= 4  # opened, written, on the disk, closed
 
 
+def test_files_that_others_write_are_left_alone(tmp_path):
+    with whole_file(tmp_path / "slow.txt") as file:
+        file.write(OLD)
+        write_table(TABLE, tmp_path / "a.csv")
+        assert len(leftovers(tmp_path)) == 1
+    assert (tmp_path / "slow.txt").read_bytes() == OLD
+    assert sorted(os.listdir(tmp_path)) == ["a.csv", "slow.txt"]
+
+
+def test_leftovers_of_killed_processes_are_removed(tmp_path):
+    (tmp_path / f"{ASIDE}0").write_bytes(OLD)
+    stage = tmp_path / f"{ASIDE}1"
+    (stage / "new").mkdir(parents=True)
+    (stage / "current").symlink_to("new")
+    (stage / "new" / "b.csv").write_bytes(OLD)
+    for name in ("b.csv", "absent.csv"):
+        (tmp_path / name).symlink_to(Path(stage.name, "current", name))
+    (tmp_path / ".mine").write_bytes(OLD)
+    write_table(TABLE, tmp_path / "a.csv")
+    assert sorted(os.listdir(tmp_path)) == [".mine", "a.csv", "b.csv"]
+    assert not (tmp_path / "b.csv").is_symlink()
+    assert (tmp_path / "b.csv").read_bytes() == OLD
+
+
+def test_what_is_no_file_is_written_to(tmp_path):
+    pipe = tmp_path / "pipe.csv"
+    os.mkfifo(pipe)
+    reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_table(TABLE, pipe)
+    assert os.read(reading, 1000).startswith(b"x0,y0\n")
+    os.close(reading)
+    link = tmp_path / "link.csv"
+    link.symlink_to("a.csv")
+    write_table(TABLE, link)
+    is_table(tmp_path / "a.csv")
+    assert link.is_symlink()
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "getuid") or os.getuid() == 0, reason="needs a user"
+)
+def test_files_that_are_protected_stay(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(OLD)
+    path.chmod(0o440)
+    with pytest.raises(PermissionError) as error:
+        write_table(TABLE, path)
+    assert error.value.filename == str(path)
+    assert path.read_bytes() == OLD
+
+
 def test_a_file_keeps_its_permissions(tmp_path):
     path = tmp_path / "a.csv"
     path.write_bytes(OLD)
@@ -179,7 +231,7 @@ class TestKeepFrames:
         before = readable(folder)
         failed = self.estimator(folder)
         with (
-            disk_faults(folder, "disk full", names.index("write")),
+            disk_faults(folder, "disk full", names.index("write") + 1),
             pytest.raises(OSError, match="No space left on device") as error,
         ):
             failed.fit(table)
