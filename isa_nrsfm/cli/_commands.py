@@ -21,6 +21,7 @@ from isa_nrsfm._tables.landmark_columns import (
     point_names,
 )
 from isa_nrsfm.cli._choice import choose_n_components
+from isa_nrsfm.cli._drawing import chosen_edges, drawing_files, drawing_options
 from isa_nrsfm.cli._frames import Frames, choose_frames
 from isa_nrsfm.cli._outputs import (
     alpha_table,
@@ -28,6 +29,7 @@ from isa_nrsfm.cli._outputs import (
     prepare_folder,
     refuse_overwriting,
     write_figures,
+    write_page,
     write_report,
     write_results,
 )
@@ -51,6 +53,8 @@ from isa_nrsfm.io import (
     write_table,
 )
 from isa_nrsfm.io._tables import table_suffix
+from isa_nrsfm.plotting._edges import names_of_points
+from isa_nrsfm.skeletons import Skeleton
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -100,7 +104,9 @@ def fit_table(
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
-    files = prepare_folder(folder, [args.table], figures=not args.no_figures)
+    edges = chosen_edges(args, frames.columns.points, frames.skeleton)
+    inputs = [args.table, *drawing_files(args)]
+    files = prepare_folder(folder, inputs, figures=not args.no_figures)
     clock["read"] = time.perf_counter()
 
     estimator = AffineNRSfM(
@@ -125,10 +131,10 @@ def fit_table(
         estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
 
-    write_results(folder, estimator, frames, std=args.std)
+    write_results(folder, estimator, frames, std=args.std, edges=edges)
     if not args.no_figures:
-        write_figures(folder, estimator, X, args.random_state)
-    model = model_report(estimator, X, frames)
+        write_figures(folder, estimator, X, args.random_state, edges)
+    model = model_report(estimator, X, frames, edges)
     clock["write"] = time.perf_counter()
     report = {
         "command": "fit",
@@ -160,8 +166,12 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
             "of its coefficients"
         )
     frames = read_frames(args, estimator)
-    for source in (args.table, args.model):
-        refuse_overwriting(source, [output])
+    edges = chosen_edges(args, names_of_points(estimator), frames.skeleton)
+    if args.viewer is None and drawing_options(args):
+        raise ValueError("--edges and --skeleton are for --viewer")
+    outputs = [output, *([] if args.viewer is None else [Path(args.viewer)])]
+    for source in (args.table, args.model, *drawing_files(args)):
+        refuse_overwriting(source, outputs)
     X = as_fitted(estimator, frames.points[frames.usable])
     n_frames, n_components = len(X), len(estimator.basis_)
     none = np.empty((0, n_components))
@@ -172,6 +182,8 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
         quality = quality_lines(quality_report(estimator, X, fit))
     results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
+    if args.viewer is not None:
+        write_page(outputs[1], estimator, X, edges)
 
     table = table_report(args.table, args.format, frames)
     title = f"{n_components} coefficients of {n_frames} frames"
@@ -179,7 +191,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
         "Table": table_lines(table, unusable="without coefficients"),
         "Model": [args.model],
         "Quality": quality,
-        "Output": [str(output), f"{len(results)} rows"],
+        "Output": [*map(str, outputs), f"{len(results)} rows"],
     }
     return f"{title}\n\n{lay_out(sections)}"
 
@@ -187,7 +199,7 @@ def run_transform(args: Namespace, warned: list[str]) -> str:
 def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
     args.format = _format(args)
-    table, chosen, failed = _read(args)
+    table, chosen, failed, skeleton = _read(args)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
@@ -200,6 +212,7 @@ def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames
         failed=failed,
     )
     # A format says itself which of its columns are landmarks.
+    frames = frames._replace(skeleton=skeleton)
     return frames if failed is None else frames._replace(not_used={})
 
 
@@ -224,13 +237,16 @@ def _format(args: Namespace) -> str:
 
 def _read(
     args: Namespace,
-) -> "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None]":
-    """Return the table, its landmark columns and its failed rows, where known."""
+) -> (
+    "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None, "
+    "Skeleton | None]"
+):
+    """Return the table, its landmark columns, failed rows and skeleton, where known."""
     if args.format == "table":
         table = read_table(args.table)
         if args.columns is None:
-            return table, None, None
-        return table, find_landmark_columns(table.columns, args.columns), None
+            return table, None, None, None
+        return table, find_landmark_columns(table.columns, args.columns), None, None
     pd = import_optional("pandas", extra="io")
     options = {} if args.image_size is None else {"image_size": args.image_size}
     found = read_landmarks(
@@ -246,7 +262,7 @@ def _read(
         z=(),
         gaps=(),
     )
-    return table, columns, found.failed
+    return table, columns, found.failed, found.skeleton
 
 
 def _columns_of_model(

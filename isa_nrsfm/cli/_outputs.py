@@ -104,6 +104,7 @@ def write_results(
     frames: Frames,
     *,
     std: bool,
+    edges: Any = "auto",
 ) -> None:
     """Write model, coefficients, cameras, shapes and the viewer.
 
@@ -127,19 +128,19 @@ def write_results(
     write_table(cameras, folder / "cameras.csv")
 
     write_shapes(estimator, folder / "shapes.npz")
-    _write_page(folder / "viewer.html", estimator, X)
+    write_page(folder / "viewer.html", estimator, X, edges)
     save_model(estimator, folder / "model.skops")
 
 
-def _write_page(path: Path, estimator: AffineNRSfM, X: "pd.DataFrame") -> None:
+def write_page(path: Path, estimator: AffineNRSfM, X: Any, edges: Any) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            write_viewer(estimator, path, X=X)
+            write_viewer(estimator, path, X=X, edges=edges)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        write_viewer(estimator, path, X=X, camera=None)
+        write_viewer(estimator, path, X=X, edges=edges, camera=None)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
@@ -166,7 +167,11 @@ def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
 
 
 def write_figures(
-    folder: Path, estimator: AffineNRSfM, points: "pd.DataFrame", random_state: int
+    folder: Path,
+    estimator: AffineNRSfM,
+    points: "pd.DataFrame",
+    random_state: int,
+    edges: Any = "auto",
 ) -> None:
     """Draw the figures without a screen."""
     import_optional("matplotlib", extra="plot").use("Agg")
@@ -178,10 +183,10 @@ def write_figures(
     )
 
     figures = (
-        BasisShapeDisplay.from_estimator(estimator).figure_,
+        BasisShapeDisplay.from_estimator(estimator, edges=edges).figure_,
         ModeCovarianceDisplay.from_estimator(estimator).figure_,
         ReprojectionDisplay.from_estimator(
-            estimator, points, random_state=random_state
+            estimator, points, random_state=random_state, edges=edges
         ).figure_,
     )
     for name, figure in zip(FIGURES, figures, strict=True):

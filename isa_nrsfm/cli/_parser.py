@@ -9,6 +9,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._gauge.independent import INDEPENDENCE
 from isa_nrsfm._paper.block_structure import BLOCK_RECOVERIES
 from isa_nrsfm._prepare.robust import LOSSES
+from isa_nrsfm.cli._drawing import add_drawing_options
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
 from isa_nrsfm.io import FORMATS
 
@@ -89,7 +90,9 @@ def build_parser() -> argparse.ArgumentParser:
         ),
     )
     _add_table_options(fit)
-    _add_std_option(_add_folder_options(fit, required=True))
+    output = _add_folder_options(fit, required=True)
+    _add_std_option(output)
+    add_drawing_options(output, _path)
     _add_method_options(fit)
 
     transform = commands.add_parser(
@@ -113,6 +116,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="the .csv, .tsv or .parquet file to write",
     )
     _add_std_option(transform)
+    transform.add_argument(
+        "--viewer",
+        metavar="FILE",
+        type=_path,
+        help="write a page to look at the new frames in 3D, too (.html)",
+    )
+    add_drawing_options(transform, _path, "in the page of --viewer")
 
     export = commands.add_parser(
         "export", help="shape models, animated 3D, a viewer", **_manners(*EXPORT_HELP)
@@ -131,7 +141,7 @@ def build_parser() -> argparse.ArgumentParser:
             _DEMO_EXAMPLES,
         ),
     )
-    _add_folder_options(demo, required=False)
+    add_drawing_options(_add_folder_options(demo, required=False), _path)
     return parser
 
 
