@@ -178,10 +178,14 @@ def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
     """Return what the dataset of edges joins, where there is one that is not empty."""
     if "edge_names" not in file or not file["edge_names"].size:
         return None
-    names = _texts(file["edge_names"])
-    if len(names) % 2:
-        raise ValueError(f"edge_names should hold pairs; got {len(names)} names")
-    edges = list(zip(names[::2], names[1::2], strict=True))
+    shape = file["edge_names"].shape
+    if len(shape) != 2 or 2 not in shape:
+        raise ValueError(
+            f"edge_names should hold pairs of names; got the shape {shape}"
+        )
+    names = np.reshape(_texts(file["edge_names"]), shape)
+    # SLEAP writes a row for each edge; all other arrays of MATLAB's order are turned.
+    edges = (names if shape[1] == 2 else names.T).tolist()
     return skeleton_of_names(edges, nodes, name="SLEAP", source="its analysis file")
 
 
