@@ -168,6 +168,7 @@ def write_sleap(
     scores=None,
     names=("a", "b"),
     nodes=BODYPARTS,
+    edges=None,
 ):
     """Write an analysis file; tracks (frame, track, node, xy), order of the axes.
 
@@ -193,6 +194,8 @@ def write_sleap(
         file["node_names"] = np.array([name.encode() for name in nodes])
         file["track_names"] = np.array([name.encode() for name in names])
         file["provenance"] = "{}"
+        if edges is not None:
+            file["edge_names"] = np.array(edges, dtype="S")
     return path
 
 

@@ -1,5 +1,6 @@
 """The code in the pages runs, and the pages name what there is."""
 
+import ast
 import re
 from pathlib import Path
 from pkgutil import iter_modules
@@ -11,6 +12,7 @@ from scipy.io import savemat
 
 import isa_nrsfm
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.skeletons import SKELETONS
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.lint
@@ -119,3 +121,33 @@ def test_variables_of_matlab_are_the_model(sequence):
     shapes = names["S_bar"] + np.tensordot(names["Z"], names["V"].reshape(2, 3, P), 1)
     np.testing.assert_allclose(shapes.reshape(3 * F, P), names["S"], atol=1e-6)
     np.testing.assert_array_equal(names["R"][2:4], model.motion_[1])
+
+
+def examples():
+    """Return the pages of the gallery that solve a problem."""
+    return sorted((ROOT / "docs/examples/problems").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", examples(), ids=lambda path: path.stem)
+def test_examples_are_short_and_need_no_files(path):
+    source = path.read_text(encoding="utf-8")
+    tree = ast.parse(source)
+    imports = [n for n in ast.walk(tree) if isinstance(n, ast.Import | ast.ImportFrom)]
+    apart = [tree.body[0], *imports]  # the text of the page is its docstring
+    left_out = {
+        k for node in apart for k in range(node.lineno, (node.end_lineno or 0) + 1)
+    }
+    code = [
+        line
+        for k, line in enumerate(source.splitlines(), 1)
+        if k not in left_out and line.strip() and not line.lstrip().startswith("#")
+    ]
+    assert len(code) <= 40
+    assert "environ" not in source
+
+
+def test_all_layouts_are_listed():
+    listed = re.findall(
+        r"^\| `([a-z0-9-]+)` \|", text("docs/skeletons.md"), re.MULTILINE
+    )
+    assert listed == list(SKELETONS)

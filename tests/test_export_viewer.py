@@ -17,6 +17,7 @@ from exported_files import content_of
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.export import write_viewer
+from isa_nrsfm.skeletons import get_skeleton
 
 
 def numbers(text, dtype="<f4"):
@@ -155,3 +156,10 @@ def test_bad_options_are_refused(tmp_path, options, message):
 def test_other_suffixes_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"must end in \.html; got .*viewer\.txt"):
         write_viewer(face_model(), tmp_path / "viewer.txt")
+
+
+def test_the_sides_of_a_known_layout_are_told(written):
+    data = written(face_model())
+    assert data["sides"] == get_skeleton("ibug-68").sides.tolist()
+    assert written(face_model(), edges=None)["sides"] == []
+    assert written(blob_model())["sides"] == []

@@ -15,6 +15,7 @@ from isa_nrsfm.io import (
     from_movement,
     read_landmarks,
 )
+from isa_nrsfm.skeletons import get_skeleton
 
 TRACKS = files.scene()
 MESH = files.scene(n_frames=4, n_points=478)
@@ -750,3 +751,50 @@ def test_other_datasets_are_refused():
     dataset["position"].coords["space"].values = np.array(["x", "z"])
     with pytest.raises(ValueError, match="with space x and y; got x, z"):
         from_movement(dataset)
+
+
+class TestSkeletons:
+    def test_edges_of_sleap(self, tmp_path):
+        nodes = files.BODYPARTS
+        edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
+        for shape in (edges, list(zip(*edges, strict=True))):
+            path = files.write_sleap(
+                tmp_path / "a.h5", TRACKS[:, None], names=["a"], edges=shape
+            )
+            found = read_landmarks(path).skeleton
+            assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
+            assert found.point_names == tuple(nodes)
+
+    @pytest.mark.parametrize("edges", [[], None])
+    def test_sleap_without_edges(self, tmp_path, edges):
+        path = tmp_path / "a.h5"
+        files.write_sleap(path, TRACKS[:, None], names=["a"], edges=edges)
+        assert read_landmarks(path).skeleton is None
+
+    @pytest.mark.parametrize("edges", [[["tree", "root"]], [["a", "b", "c"]], ["a"]])
+    def test_bad_edges_of_sleap(self, tmp_path, edges):
+        path = tmp_path / "a.h5"
+        files.write_sleap(path, TRACKS[:, None], names=["a"], edges=edges)
+        with pytest.raises(ValueError, match="edge"):
+            read_landmarks(path)
+
+    def test_what_the_readers_tell(self, tmp_path):
+        faces = files.scene(4, 68)
+        path = files.write_openface(tmp_path / "a.csv", faces)
+        assert read_landmarks(path).skeleton.name == "ibug-68"
+        table = pd.DataFrame(
+            faces.reshape(4, -1), columns=[f"{a}_{j}" for j in range(68) for a in "xy"]
+        )
+        table.to_csv(tmp_path / "b.csv", index=False)
+        assert read_landmarks(tmp_path / "b.csv", "table").skeleton is None
+
+    def test_what_mediapipe_tells(self):
+        hand = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
+        results = [SimpleNamespace(hand_landmarks=[hand])]
+        assert from_mediapipe(results, (640, 480)).skeleton.name == "hand-21"
+
+    def test_names_of_coco_tell(self, tmp_path):
+        names = get_skeleton("coco-17").point_names
+        content = files.coco_annotations(files.scene(3, 17), names=names)
+        path = files.write_json(tmp_path / "a.json", content)
+        assert read_landmarks(path).skeleton == get_skeleton("coco-17")

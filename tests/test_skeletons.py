@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
 from isa_nrsfm.skeletons import (
@@ -329,3 +330,7 @@ def test_bad_questions():
         canonical_pose(np.eye(2, 3), scheme=pairs)
     with pytest.raises(ValueError, match="scheme must be a Skeleton or its name"):
         canonical_pose(np.eye(2, 3), scheme=[[0, 1]])
+
+
+def test_names_of_the_command_line_are_those_of_the_registry():
+    assert tuple(SKELETONS) == SKELETON_NAMES

@@ -231,3 +231,36 @@ def test_one_basis_shape_and_no_face(browser, tmp_path):
     browser.wait("viewer.state().frame >= 1")
     assert browser.complaints() == []
     assert browser.run("document.getElementById('posed').hidden")
+
+
+INK = """
+(() => {
+  const scene = document.getElementById("scene");
+  const { data } = scene.getContext("2d").getImageData(0, 0, scene.width, scene.height);
+  const sums = {};
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i + 3] < 128) continue;
+    const [red, green, blue] = data.subarray(i, i + 3);
+    const kind = green > red + 30 && green > blue ? "left"
+      : red > green + 30 && blue > green + 10 ? "right" : "other";
+    const [n, x] = sums[kind] || [0, 0];
+    sums[kind] = [n + 1, x + (i / 4) % scene.width];
+  }
+  return Object.fromEntries(Object.entries(sums).map(([k, [n, x]]) => [k, x / n]));
+})()
+"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_left_and_right_have_colours_of_their_own(browser, tmp_path, scheme):
+    path = tmp_path / "viewer.html"
+    write_viewer(face_model(), path)
+    media = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.call("Emulation.setEmulatedMedia", features=media)
+    browser.open(path.as_uri())
+    browser.run(DRAWN)
+    found = browser.run(INK)
+    browser.call("Emulation.setEmulatedMedia", features=[])
+    # The left side of a face that looks at us is on the right.
+    assert found["right"] < found["other"] < found["left"]
+    assert not browser.run("document.getElementById('sides').hidden")

@@ -9,3 +9,19 @@ REFINEMENTS = ("joint", "alternating")
 CAMERA_NAMES = ("affine", "weak_perspective", "orthographic")
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
+# The layouts in `isa_nrsfm.skeletons.SKELETONS`, in that order.
+SKELETON_NAMES = (
+    "ibug-68",
+    "ibug-51",
+    "xm2vts-68",
+    "muct-76",
+    "wflw-98",
+    "mediapipe-face-468",
+    "mediapipe-face-478",
+    "hand-21",
+    "coco-17",
+    "h36m-17",
+    "body-25",
+    "mediapipe-pose-33",
+    "coco-wholebody-133",
+)

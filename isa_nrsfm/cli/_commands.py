@@ -23,6 +23,8 @@ from isa_nrsfm.cli._answers import (
     first_classes,
 )
 from isa_nrsfm.cli._choice import choose_n_components
+from isa_nrsfm.cli._drawing import chosen_edges
+from isa_nrsfm.cli._drawing_options import drawing_files
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import (
     ARRAYS,
@@ -36,7 +38,7 @@ from isa_nrsfm.cli._outputs import (
     write_report,
     write_results,
 )
-from isa_nrsfm.cli._page import REPORT_PAGE, write_page
+from isa_nrsfm.cli._page import REPORT_PAGE, write_report_page
 from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.cli._reading import read_frames, taken_frames
 from isa_nrsfm.cli._report import (
@@ -106,9 +108,10 @@ def fit_table(
     figures = {} if args.no_figures else FIGURES | answer_figures(asked)
     about = {REPORT_PAGE: "this report with its figures, for any browser"}
     files = about | MODEL | TABLES | ARRAYS | PAGE | figures
-    inputs = [args.table]
+    edges = chosen_edges(args, frames.columns.points, frames.skeleton)
+    inputs = [args.table, *drawing_files(args)]
     if table is not None:
-        files, inputs = files | {Path(args.table).name: "the table"}, []
+        files, inputs = files | {Path(args.table).name: "the table"}, inputs[1:]
     with folder_for_writing(folder):
         check_outputs((folder / name for name in (*files, REPORT)), inputs)
         removed = old_figures(folder, files)
@@ -118,14 +121,19 @@ def fit_table(
         with files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            labels = first_classes(asked, X)
             write_results(
-                new, estimator, frames, answers.alpha, std=args.std, labels=labels
+                new,
+                estimator,
+                frames,
+                answers.alpha,
+                std=args.std,
+                labels=first_classes(asked, X),
+                edges=edges,
             )
             if not args.no_figures:
-                write_figures(new, estimator, X, args.random_state)
+                write_figures(new, estimator, X, args.random_state, edges)
                 draw_answers(new, asked, answers, estimator)
-            model = model_report(estimator, X, frames)
+            model = model_report(estimator, X, frames, edges)
             clock["write"] = time.perf_counter()
             seconds = np.diff([*clock.values()]).round(3)
             report = {
@@ -142,7 +150,7 @@ def fit_table(
                 "versions": versions(),
                 "files": files,
             }
-            write_page(new, report)
+            write_report_page(new, report)
             write_report(new, report)
     return report
 

@@ -9,6 +9,7 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.cli._commands import fit_table
+from isa_nrsfm.cli._drawing_options import drawing_options
 from isa_nrsfm.cli._outputs import component_names
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
 from isa_nrsfm.cli._report import fit_text, lay_out
@@ -45,6 +46,7 @@ def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
         *("--camera", _CAMERA),
         *("--output", str(folder)),
         *(["--no-figures"] if args.no_figures else []),
+        *drawing_options(args),
     ]
     report = fit_table(
         build_parser().parse_args(options, Namespace(arguments=options)),

@@ -4,10 +4,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm.cli._drawing import chosen_edges
+from isa_nrsfm.cli._drawing_options import drawing_files
 from isa_nrsfm.cli._export_options import SUFFIXES
 from isa_nrsfm.cli._outputs import refuse_overwriting
 from isa_nrsfm.cli._reading import as_fitted, read_frames
@@ -22,12 +21,13 @@ from isa_nrsfm.export import (
 )
 from isa_nrsfm.io import load_model
 from isa_nrsfm.plotting._edges import names_of_points
+from isa_nrsfm.skeletons import Skeleton
 
 # The options that each content has.
 _POSE = ("camera", "origin", "mirrored")
 _OPTIONS = {
-    "viewer": ("edges", "names", "label", "n_frames", "table", *_POSE),
-    "glb": ("edges", "names", *_POSE),
+    "viewer": ("edges", "skeleton", "names", "label", "n_frames", "table", *_POSE),
+    "glb": ("edges", "skeleton", "names", *_POSE),
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
 }
@@ -49,14 +49,17 @@ def run_export(args: Namespace) -> str:
     options = _options(args, content)
     estimator = load_model(args.model)
     warn_of_mixed_runs(args.model)
-    for source in filter(None, (args.model, args.table, options.get("edges"))):
-        if source != "none":
-            refuse_overwriting(source, [output])
+    for source in filter(None, (args.model, args.table, *drawing_files(args))):
+        refuse_overwriting(source, [output])
     sections = {"Model": [args.model]}
+    stored = None
     if args.table is not None:
-        options |= _table_options(args, estimator, sections)
-    if "edges" in options:
-        options["edges"] = _edges(options["edges"], estimator)
+        of_table, stored = _table_options(args, estimator, sections)
+        options |= of_table
+    options.pop("skeleton", None)
+    if "edges" in _OPTIONS[content]:
+        names, surfaces = names_of_points(estimator), content == "glb"
+        options["edges"] = chosen_edges(args, names, stored, surfaces=surfaces)
     if options.get("camera") == "none":
         options["camera"] = None
 
@@ -119,8 +122,8 @@ def _options(args: Namespace, content: str) -> dict[str, Any]:
 
 def _table_options(
     args: Namespace, estimator: AffineNRSfM, sections: dict[str, list[str]]
-) -> dict[str, Any]:
-    """Read the table that the viewer shows, and its labels."""
+) -> tuple[dict[str, Any], Skeleton | None]:
+    """Read the table that the viewer shows, its labels and its skeleton."""
     frames = read_frames(args, estimator)
     report = table_report(args.table, args.format, frames)
     sections["Table"] = table_lines(report, unusable="not shown")
@@ -133,30 +136,4 @@ def _table_options(
                 f"landmarks; it has {', '.join(other) or 'none'}"
             )
         options["labels"] = frames.other.loc[frames.usable, other[args.label]]
-    return options
-
-
-def _edges(path: str, estimator: AffineNRSfM) -> Any:
-    """Read which points are joined."""
-    if path == "none":
-        return None
-    numbers = {name: j for j, name in enumerate(names_of_points(estimator))}
-    edges: list[list[int]] = []
-    with reading(path, "a list of edges"):
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    for number, line in enumerate(lines):
-        names = [name.strip() for name in line.split(",")]
-        if not line.strip():
-            continue
-        unknown = [name for name in names if name not in numbers]
-        size = len(edges[0]) if edges else len(names)
-        if unknown or len(names) != size or size not in (2, 3):
-            raise ValueError(
-                f"{path}, line {number + 1}: expected the names of two or three points "
-                f"with commas between them, such as {', '.join([*numbers][:2])}; got "
-                f"{line!r}"
-            )
-        edges.append([numbers[name] for name in names])
-    if not edges:
-        raise ValueError(f"{path} has no edges; for points alone say --edges none")
-    return np.array(edges)
+    return options, frames.skeleton

@@ -3,6 +3,8 @@
 import argparse
 from collections.abc import Callable
 
+from isa_nrsfm.cli._drawing_options import add_drawing_options
+
 # What can be written, and the suffixes that tell it.
 SUFFIXES = {
     "viewer": (".html", ".htm"),
@@ -57,14 +59,12 @@ def add_export_options(
         help="modes of the point distribution model: their number, or the share of the "
         "variance that they have, such as 0.98 (default: as many as basis shapes)",
     )
-    group.add_argument(
-        "--edges",
-        metavar="FILE",
-        type=path,
-        help="for .html and .glb, what joins the points: a .csv file without header "
-        "that has the names of two points a line, or of three for a surface; 'none' "
-        "for points alone (default: the curves of 68 points of a face, and in .glb a "
-        "surface through all points)",
+    add_drawing_options(
+        group,
+        path,
+        "in .html and .glb",
+        "those of a layout that is known, and in .glb a surface through the points of "
+        "faces and of all else that is not known",
     )
     group.add_argument(
         "--names",

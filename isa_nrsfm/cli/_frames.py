@@ -18,6 +18,7 @@ from isa_nrsfm._tables.visibility import (
 )
 from isa_nrsfm.cli._parser import RowRule
 from isa_nrsfm.io._tables import as_numbers
+from isa_nrsfm.skeletons import Skeleton
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,7 +38,8 @@ class Frames(NamedTuple):
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     no rule skips, with the number of each row in the table as index. ``usable`` tells
     which of them show enough points to be fitted, and ``left_out`` accounts for all
-    other rows. ``seen`` tells which points each of the former shows.
+    other rows. ``seen`` tells which points each of the former shows. ``skeleton`` is
+    what the file of the table says of what joins them.
     """
 
     points: "pd.DataFrame"
@@ -48,6 +50,7 @@ class Frames(NamedTuple):
     not_used: dict[str, int]
     n_rows: int
     left_out: tuple[LeftOut, ...]
+    skeleton: Skeleton | None = None
 
 
 def choose_frames(

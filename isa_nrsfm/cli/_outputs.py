@@ -111,6 +111,7 @@ def write_results(
     *,
     std: bool,
     labels: "pd.Series | None" = None,
+    edges: Any = "auto",
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
@@ -135,24 +136,27 @@ def write_results(
     write_table(cameras, folder / "cameras.csv")
 
     export.write_shapes(estimator, folder / "shapes.npz")
-    _write_page(folder / "viewer.html", estimator, X, labels)
+    write_page(folder / "viewer.html", estimator, X, edges, labels)
     save_model(estimator, folder / "model.skops")
 
 
-def _write_page(
+def write_page(
     path: Path,
     estimator: AffineNRSfM,
-    X: "pd.DataFrame",
-    labels: "pd.Series | None",
+    X: Any,
+    edges: Any,
+    labels: "pd.Series | None" = None,
 ) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            export.write_viewer(estimator, path, X=X, labels=labels)
+            export.write_viewer(estimator, path, X=X, edges=edges, labels=labels)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        export.write_viewer(estimator, path, X=X, labels=labels, camera=None)
+        export.write_viewer(
+            estimator, path, X=X, edges=edges, labels=labels, camera=None
+        )
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
@@ -179,7 +183,11 @@ def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
 
 
 def write_figures(
-    folder: Path, estimator: AffineNRSfM, points: "pd.DataFrame", random_state: int
+    folder: Path,
+    estimator: AffineNRSfM,
+    points: "pd.DataFrame",
+    random_state: int,
+    edges: Any = "auto",
 ) -> None:
     """Draw the figures without a screen."""
     import_optional("matplotlib", extra="plot").use("Agg")
@@ -190,10 +198,10 @@ def write_figures(
     )
 
     figures = (
-        BasisShapeDisplay.from_estimator(estimator).figure_,
+        BasisShapeDisplay.from_estimator(estimator, edges=edges).figure_,
         ModeCovarianceDisplay.from_estimator(estimator).figure_,
         ReprojectionDisplay.from_estimator(
-            estimator, points, random_state=random_state
+            estimator, points, random_state=random_state, edges=edges
         ).figure_,
     )
     for name, figure in zip(FIGURES, figures, strict=True):

@@ -16,7 +16,7 @@ from isa_nrsfm.cli._report import fit_sections, fit_title
 REPORT_PAGE = "report.html"
 
 
-def write_page(folder: Path, report: dict[str, Any]) -> None:
+def write_report_page(folder: Path, report: dict[str, Any]) -> None:
     """
     Write the report of a fit as a page, with the figures of the folder in it.
 

@@ -17,6 +17,7 @@ from isa_nrsfm._parameters.choices import (
     LOSSES,
     REFINEMENTS,
 )
+from isa_nrsfm.cli._drawing_options import add_drawing_options
 from isa_nrsfm.cli._export_options import EXPORT_HELP, add_export_options
 from isa_nrsfm.io._format_names import FORMAT_NAMES, TABLE
 
@@ -97,7 +98,9 @@ def build_parser() -> argparse.ArgumentParser:
         ),
     )
     _add_table_options(fit)
-    _add_std_option(_add_folder_options(fit, required=True))
+    output = _add_folder_options(fit, required=True)
+    _add_std_option(output)
+    add_drawing_options(output, _path)
     _add_question_options(fit)
     _add_method_options(fit)
 
@@ -122,6 +125,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="the .csv, .tsv or .parquet file to write",
     )
     _add_std_option(transform)
+    transform.add_argument(
+        "--viewer",
+        metavar="FILE",
+        type=_path,
+        help="write a page to look at the new frames in 3D, too (.html)",
+    )
+    add_drawing_options(transform, _path, "in the page of --viewer")
 
     export = commands.add_parser(
         "export", help="shape models, animated 3D, a viewer", **_manners(*EXPORT_HELP)
@@ -140,7 +150,7 @@ def build_parser() -> argparse.ArgumentParser:
             _DEMO_EXAMPLES,
         ),
     )
-    _add_folder_options(demo, required=False)
+    add_drawing_options(_add_folder_options(demo, required=False), _path)
     return parser
 
 

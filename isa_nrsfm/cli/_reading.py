@@ -20,6 +20,8 @@ from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
 if TYPE_CHECKING:
     import pandas as pd
 
+    from isa_nrsfm.skeletons import Skeleton
+
 # Points and coordinates in the order of the columns.
 _SHAPES = {"interleaved": (-1, 2), "planar": (2, -1)}
 
@@ -27,12 +29,13 @@ _SHAPES = {"interleaved": (-1, 2), "planar": (2, -1)}
 def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
     args.format = _format(args)
-    table, chosen, failed = _read(args)
+    table, chosen, failed, skeleton = _read(args)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
     else:
         columns = chosen or find_landmark_columns(table.columns)
-    return taken_frames(args, table, columns, failed)
+    frames = taken_frames(args, table, columns, failed)
+    return frames._replace(skeleton=skeleton)
 
 
 def taken_frames(
@@ -74,13 +77,16 @@ def _format(args: Namespace) -> str:
 
 def _read(
     args: Namespace,
-) -> "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None]":
-    """Return the table, its landmark columns and its failed rows, where known."""
+) -> (
+    "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None, "
+    "Skeleton | None]"
+):
+    """Return the table, its landmark columns, failed rows and skeleton, where known."""
     if args.format == "table":
         table = read_table(args.table)
         if args.columns is None:
-            return table, None, None
-        return table, find_landmark_columns(table.columns, args.columns), None
+            return table, None, None, None
+        return table, find_landmark_columns(table.columns, args.columns), None, None
     pd = import_optional("pandas", extra="io")
     options = {} if args.image_size is None else {"image_size": args.image_size}
     found = read_landmarks(
@@ -96,7 +102,7 @@ def _read(
         z=(),
         gaps=(),
     )
-    return table, columns, found.failed
+    return table, columns, found.failed, found.skeleton
 
 
 def _columns_of_model(

@@ -18,6 +18,7 @@ from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
 from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.metrics import inverse_snr
+from isa_nrsfm.plotting._views import layout_of
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
@@ -88,12 +89,15 @@ def quality_lines(quality: dict[str, Any], remark: str = "") -> list[str]:
     ]
 
 
-def model_report(estimator: AffineNRSfM, X: Any, frames: Frames) -> dict[str, Any]:
+def model_report(
+    estimator: AffineNRSfM, X: Any, frames: Frames, edges: Any = "auto"
+) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
     names = component_names(len(estimator.basis_))
     # Known only where the fit has seen the table as it is.
     floor = frames.seen.all() and estimator.loss == "linear"
     ratio = getattr(estimator, "camera_noise_ratio_", None)
+    layout = layout_of(estimator, edges)
     return {
         "n_components": len(estimator.basis_),
         **quality_report(estimator, X, fitted_frames(estimator)),
@@ -104,6 +108,7 @@ def model_report(estimator: AffineNRSfM, X: Any, frames: Frames) -> dict[str, An
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
         "camera_meaning": None if ratio is None else camera_meaning(ratio),
+        "skeleton": None if layout is None else layout.name,
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": [
@@ -180,6 +185,8 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
         )
         fit.append(f"noise {unit}, standard deviation of a coordinate")
     fit.append(f"{report['seconds']['fit']:.1f} seconds")
+    if model["skeleton"] is not None:
+        fit.append(f"points recognised as {model['skeleton']}")
     alpha = [f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"]
     alpha += [
         f"{row['name']:10} {100 * row['energy_share']:6.1f} % {row['mean']:z7.2f} "

@@ -6,10 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from isa_nrsfm import Decomposition
+from isa_nrsfm.cli._drawing import chosen_edges
+from isa_nrsfm.cli._drawing_options import drawing_files, drawing_options
 from isa_nrsfm.cli._outputs import (
     alpha_table,
     beside_other_columns,
     refuse_overwriting,
+    write_page,
 )
 from isa_nrsfm.cli._reading import as_fitted, read_frames
 from isa_nrsfm.cli._report import (
@@ -22,6 +25,7 @@ from isa_nrsfm.cli._report import (
 from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import table_suffix
+from isa_nrsfm.plotting._edges import names_of_points
 
 
 def run_transform(args: Namespace) -> str:
@@ -37,8 +41,12 @@ def run_transform(args: Namespace) -> str:
             "of its coefficients"
         )
     frames = read_frames(args, estimator)
-    for source in (args.table, args.model):
-        refuse_overwriting(source, [output])
+    edges = chosen_edges(args, names_of_points(estimator), frames.skeleton)
+    if args.viewer is None and drawing_options(args):
+        raise ValueError("--edges and --skeleton are for --viewer")
+    outputs = [output, *([] if args.viewer is None else [Path(args.viewer)])]
+    for source in (args.table, args.model, *drawing_files(args)):
+        refuse_overwriting(source, outputs)
     X = as_fitted(estimator, frames.points[frames.usable])
     n_frames, n_components = len(X), len(estimator.basis_)
     none = np.empty((0, n_components))
@@ -49,6 +57,8 @@ def run_transform(args: Namespace) -> str:
         quality = quality_lines(quality_report(estimator, X, fit))
     results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
+    if args.viewer is not None:
+        write_page(outputs[1], estimator, X, edges)
 
     table = table_report(args.table, args.format, frames)
     title = f"{n_components} coefficients of {n_frames} frames"
@@ -56,6 +66,6 @@ def run_transform(args: Namespace) -> str:
         "Table": table_lines(table, unusable="without coefficients"),
         "Model": [args.model],
         "Quality": quality,
-        "Output": [str(output), f"{len(results)} rows"],
+        "Output": [*map(str, outputs), f"{len(results)} rows"],
     }
     return f"{title}\n\n{lay_out(sections)}"

@@ -77,7 +77,17 @@ def perform(
         As of the public functions.
     point_names : tuple of str
         Names of the points.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two frames for each person.
     """
+    if n_frames < 2 * n_people:
+        raise ValueError(
+            f"n_frames must be at least 2 frames for each of {n_people} people; got "
+            f"{n_frames}"
+        )
     parts = [len(part) for part in np.array_split(np.arange(n_frames), n_people)]
     shapes, labels, groups, times, angles, scales, centres = ([] for _ in range(7))
     for person, length in enumerate(parts):

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons._recognition import LAYOUTS_OF_READERS, numbered
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,6 +43,9 @@ class Landmarks:
         Name of the format, one of `isa_nrsfm.io.FORMATS`, "mediapipe" or "movement".
     point_names : tuple of str, length n_points
         Names of the points.
+    skeleton : Skeleton or None
+        What joins the points, where the file says it, or the program that has written
+        it is known for one layout (`isa_nrsfm.skeletons`).
     """
 
     points: "pd.DataFrame"
@@ -49,6 +54,7 @@ class Landmarks:
     failed: NDArray[np.bool_]
     format: str
     point_names: tuple[str, ...]
+    skeleton: Skeleton | None = None
 
 
 class IndividualRows(NamedTuple):
@@ -74,6 +80,7 @@ def assemble(
     columns: Sequence[str] | None = None,
     confidence: NDArray[np.float64] | None = None,
     failed: NDArray[np.bool_] | None = None,
+    skeleton: Skeleton | None = None,
 ) -> Landmarks:
     """
     Put landmarks together in the one form that all readers return.
@@ -94,6 +101,9 @@ def assemble(
         Confidences of the points.
     failed : ndarray of bool, shape (n_frames,), optional
         Frames for which the source says that tracking failed.
+    skeleton : Skeleton, optional
+        What joins the points. By default the layout that the format and the names of
+        the points tell, if they tell one.
 
     Returns
     -------
@@ -137,7 +147,15 @@ def assemble(
         failed=lost,
         format=format,
         point_names=tuple(point_names),
+        skeleton=skeleton or _told(format, point_names),
     )
+
+
+def _told(format: str, point_names: Sequence[str]) -> Skeleton | None:
+    """Return the layout of a format or of names; mere numbers of points tell none."""
+    if format not in LAYOUTS_OF_READERS and numbered(point_names):
+        return None
+    return find_skeleton(len(point_names), point_names, format)
 
 
 def numbered_columns(n_points: int) -> list[str]:

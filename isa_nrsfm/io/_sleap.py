@@ -17,6 +17,7 @@ from isa_nrsfm.io._landmarks import (
     name_individuals,
 )
 from isa_nrsfm.io._separated_values import header_names, read_columns
+from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _DIMS = ("frame", "track", "node", "xy")
 # Where the file does not say: SLEAP's own order, and that of its older files
@@ -39,7 +40,8 @@ def read_sleap(path: Path) -> Landmarks:
 
     In an h5 file, ``tracks`` has the points, in the order of axes that its attribute
     ``dims`` tells, and otherwise (track, xy, node, frame), as SLEAP writes it;
-    ``point_scores`` has their confidences, ``instance_scores`` those of the instances.
+    ``point_scores`` has their confidences, ``instance_scores`` those of the instances,
+    and ``edge_names`` the pairs of nodes that the skeleton joins.
     A csv file has a row for each instance, ``track, frame_idx, instance.score`` and
     ``x``, ``y`` and ``score`` of each node. Frames are counted from 0.
     """
@@ -83,6 +85,7 @@ def _read_h5(path: Path) -> Landmarks:
         stored, dims = _stored(file, len(nodes))
         tracks = _ordered(stored, dims, _DIMS)
         scores = _scores(file, "point_scores", dims, tracks.shape[:3])
+        skeleton = _skeleton(file, nodes)
         of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
     rows = each_individual(tracks, scores)
     frames: dict[str, Any] = {"frame": rows.frame}
@@ -103,6 +106,7 @@ def _read_h5(path: Path) -> Landmarks:
         pd.DataFrame(frames),
         format="sleap",
         confidence=rows.confidence,
+        skeleton=skeleton,
     )
 
 
@@ -163,6 +167,22 @@ def _scores(
         f"{name} should have the axes {', '.join(dims)} of tracks; got the shape "
         f"{stored.shape}"
     )
+
+
+def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
+    """Return what the dataset of edges joins, where there is one that is not empty."""
+    if "edge_names" not in file or not file["edge_names"].size:
+        return None
+    content = content_of(file, "edge_names")
+    shape = np.shape(content)
+    if len(shape) != 2 or 2 not in shape:
+        raise ValueError(
+            f"edge_names should hold pairs of names; got the shape {shape}"
+        )
+    names = np.reshape(_texts(content), shape)
+    # SLEAP writes a row for each edge; all other arrays of MATLAB's order are turned.
+    edges = (names if shape[1] == 2 else names.T).tolist()
+    return skeleton_of_names(edges, nodes, name="SLEAP", source="its analysis file")
 
 
 def _texts(content: Any) -> list[str]:

@@ -19,6 +19,8 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
+from isa_nrsfm.plotting._edges import choose_layout, names_of_points
+from isa_nrsfm.skeletons import Skeleton
 
 
 def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
@@ -72,6 +74,12 @@ def view_of(estimator: Any) -> NDArray:
         return viewing_transform(estimator.motion_, estimator.reference_motion_)
     scales = np.asarray(estimator.scales_)
     return np.nanmedian(scales) * euclidean_axes(estimator)
+
+
+def layout_of(estimator: Any, edges: Any = "auto") -> Skeleton | None:
+    """Return the layout of a fitted model's points, where it is given or recognised."""
+    shape = estimator.mean_shape_ @ view_of(estimator).T
+    return choose_layout(edges, shape, names_of_points(estimator))
 
 
 def euclidean_axes(estimator: Any) -> NDArray:

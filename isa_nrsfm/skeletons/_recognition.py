@@ -18,7 +18,7 @@ SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
 )
 
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
-_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "openface": ("ibug-68",),
         "pyfeat": ("ibug-68", "mediapipe-face-478"),
@@ -142,10 +142,10 @@ def find_skeleton(
             f"shape must hold {n_points} points; got an array of shape {points.shape}"
         )
     fitting = [s for s in SKELETONS.values() if s.n_points == n_points]
-    if names is not None and not _numbered(list(map(str, names))):
+    if names is not None and not numbered(list(map(str, names))):
         return _named(fitting, [str(name) for name in names])
-    if reader is not None and reader in _OF_READERS:
-        fitting = [s for s in fitting if s.name in _OF_READERS[reader]]
+    if reader is not None and reader in LAYOUTS_OF_READERS:
+        fitting = [s for s in fitting if s.name in LAYOUTS_OF_READERS[reader]]
     return _only(fitting) if points is None else _shortest(fitting, points)
 
 
@@ -201,7 +201,7 @@ def _plain(name: str) -> str:
     return "".join(letter for letter in spelled.lower() if letter.isalnum())
 
 
-def _numbered(names: Sequence[str]) -> bool:
+def numbered(names: Sequence[str]) -> bool:
     """Tell whether names are numbers in turn, with nothing or one word before them."""
     matches = [_NUMBERED.fullmatch(name.strip()) for name in names]
     found = [match for match in matches if match is not None]

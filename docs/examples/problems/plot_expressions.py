@@ -6,45 +6,32 @@ A table of landmarks, a column of labels: which expression is it? `AffineNRSfM` 
 transformer, so it goes into a `Pipeline`, and `GridSearchCV` chooses the number of
 basis shapes together with the classifier.
 
-The table is that of photos with five expressions where it is found, see
-:doc:`/gallery/index`, and otherwise artificial: faces in any pose, labelled by the
-strongest of their expressions.
+The faces are artificial, in any pose, labelled by the strongest of their expressions.
 """
 
-# sphinx_gallery_thumbnail_number = 2
-import os
-from pathlib import Path
-
+# sphinx_gallery_thumbnail_number = 1
 import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.feature_selection import f_classif
 from sklearn.metrics import ConfusionMatrixDisplay
-from sklearn.model_selection import (
-    GridSearchCV,
-    cross_val_predict,
-    cross_val_score,
-)
+from sklearn.model_selection import GridSearchCV, cross_val_predict, cross_val_score
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import StandardScaler
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
-from isa_nrsfm.plotting import BasisShapeDisplay
+from isa_nrsfm.plotting import BasisShapeDisplay, ReprojectionDisplay
 
-path = Path(os.environ.get("ISA_NRSFM_DATA", ""), "expressions_dlib_68.npz")
-if path.is_file():
-    print("photos with five expressions, landmarks by a detector")
-    with np.load(path) as stored:
-        X, labels = stored["W2d"].reshape(-1, 136), stored["labels"]
-else:
-    print("artificial faces, the strongest of their expressions being the label")
-    faces = make_face_tracks(n_frames=400, n_components=5, random_state=0)
-    X = faces.data
-    labels = np.array(faces.component_names)[faces.strength.argmax(axis=1)]
-for name, count in zip(*np.unique(labels, return_counts=True), strict=True):
-    print(f"{name:12} {count}")
+faces = make_face_tracks(n_frames=400, n_components=5, random_state=0)
+X, labels = faces.data, faces.labels
+shown = [np.argmax(faces.strength[:, k]) for k in range(5)]
+display = ReprojectionDisplay(
+    observed=faces.tracks[shown], reprojected=faces.clean[shown], edges="ibug-68"
+).plot(n_columns=5)
+for axis, i in zip(display.axes_, shown, strict=True):
+    axis.set_title(labels[i])
 
 # %%
 # The whole pipeline is searched: the shapes are fitted inside of each fold, so that the
@@ -58,32 +45,17 @@ search.fit(X, labels)
 print(search.best_params_, f"accuracy {search.best_score_:.1%}")
 
 # %%
-# PCA of the table, with as many components and with as many as the model has, for
-# comparison. Frames are centred and scaled first, which `AffineNRSfM` does by itself.
+# PCA of the table for comparison, with as many components and with as many as the model
+# has. Frames are centred and scaled first, which `AffineNRSfM` does by itself.
 
-
-def normalised(table):
-    """Return a table with each frame centred and of size one."""
-    points = table.reshape(len(table), -1, 2)
-    points = points - points.mean(axis=1, keepdims=True)
-    size = np.linalg.norm(points, axis=(1, 2), keepdims=True)
-    return (points / size).reshape(table.shape)
-
-
+centred = faces.tracks - faces.tracks.mean(axis=1, keepdims=True)
+size = np.linalg.norm(centred, axis=(1, 2), keepdims=True)
 K = search.best_params_["affinenrsfm__n_components"]
 for n_components in (K, 3 * K + 3):
-    accuracy = cross_val_score(
-        make_pipeline(
-            FunctionTransformer(normalised),
-            PCA(n_components),
-            StandardScaler(),
-            LinearDiscriminantAnalysis(),
-        ),
-        X,
-        labels,
-        cv=3,
-    )
-    print(f"PCA with {n_components} components: accuracy {accuracy.mean():.1%}")
+    steps = PCA(n_components), StandardScaler(), LinearDiscriminantAnalysis()
+    table = (centred / size).reshape(X.shape)
+    accuracy = cross_val_score(make_pipeline(*steps), table, labels, cv=3).mean()
+    print(f"PCA with {n_components} components: accuracy {accuracy:.1%}")
 
 # %%
 # Many components of PCA let the classifier undo the mixing of pose and expression, as
@@ -99,21 +71,13 @@ display = ConfusionMatrixDisplay.from_predictions(
 display.figure_.set_layout_engine("constrained")
 
 # %%
-# New rows get their label from the fitted search, with one row or with many: the
-# result for a row never depends on the others.
-
-print(search.predict(X[:3]), labels[:3])
-
-# %%
 # What tells the expressions apart are coefficients, and each is a basis shape that can
-# be looked at. This one differs most between the classes (F statistic).
+# be looked at. This one differs most between the classes (F statistic), and below are
+# its coefficients in each class.
 
 model = search.best_estimator_[0]
 strongest = f_classif(model.alpha_, labels)[0].argmax()
 BasisShapeDisplay.from_estimator(model, components=[strongest])
-
-# %%
-# Its coefficient in each class:
 
 _, axis = plt.subplots(figsize=(6, 3), layout="constrained")
 names = np.unique(labels)

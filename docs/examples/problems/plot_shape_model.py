@@ -56,29 +56,6 @@ display = BasisShapeDisplay(
 display.plot(n_columns=2)
 
 # %%
-# Is it the right one? Here the truth is known: the principal axes of the true shapes,
-# aligned likewise. The cosines of the angles between the two spaces of modes:
-
-
-def without_pose(shapes):
-    """Return shapes turned and scaled onto their mean, and flattened."""
-    for _ in range(5):
-        mean = shapes.mean(axis=0)
-        U, _, Vt = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
-        shapes = shapes @ U @ Vt
-        scale = np.sum(mean**2) / np.sum(shapes * mean, axis=(1, 2))
-        shapes = scale[:, None, None] * shapes
-    return shapes.reshape(len(shapes), -1)
-
-
-flat = without_pose(faces.shapes)
-axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)[2][:4]
-found = pdm.modes.reshape(4, 68, 3)
-U, _, Vt = np.linalg.svd(pdm.mean.T @ flat.mean(axis=0).reshape(68, 3))
-found = (found @ U @ Vt).reshape(4, -1)
-print(np.linalg.svd(axes @ found.T, compute_uv=False).round(3))
-
-# %%
 # The files
 # ---------
 #
@@ -90,11 +67,10 @@ print(np.linalg.svd(axes @ found.T, compute_uv=False).round(3))
 
 correlation = np.abs(np.corrcoef(faces.alpha.T, model.alpha_.T)[:4, 4:])
 names = [faces.component_names[k] for k in correlation.argmax(axis=0)]
-labels = np.array(faces.component_names)[faces.strength.argmax(axis=1)]
 with TemporaryDirectory() as folder:
     write_pdm(pdm, Path(folder, "pdm.txt"))
     write_glb(model, Path(folder, "face.glb"), names=names)
-    write_viewer(model, Path(folder, "viewer.html"), labels=labels, names=names)
+    write_viewer(model, Path(folder, "viewer.html"), labels=faces.labels, names=names)
     for path in sorted(Path(folder).iterdir()):
         print(f"{path.name:12} {path.stat().st_size / 1000:.0f} kB")
     again = read_pdm(Path(folder, "pdm.txt"))

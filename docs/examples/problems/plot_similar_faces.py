@@ -10,12 +10,12 @@ Here the same 200 artificial faces are seen twice, by different cameras. A query
 face of the first half, and its like is one row of the second.
 """
 
-import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.neighbors import NearestNeighbors
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.plotting import ReprojectionDisplay
 
 n_faces, K = 200, 6
 first = make_face_tracks(n_frames=n_faces, n_components=K, random_state=0)
@@ -56,18 +56,19 @@ for name, values in likeness.items():
 # face need not be the same one; it should look the same from the front.
 
 strong = np.argsort(first.strength[:, :3].max(axis=1))[-4:]
-_, axes = plt.subplots(3, 4, figsize=(8, 7), layout="constrained")
-rows = {"query": np.arange(n_faces)}
-rows |= {name: n_faces + values.argmax(axis=1) for name, values in likeness.items()}
-for (name, chosen), line in zip(rows.items(), axes, strict=True):
-    for i, axis in zip(strong, line, strict=True):
-        axis.scatter(*tracks[chosen[i]].T, s=4, color="0.2")
-        axis.set(aspect="equal", xticks=[], yticks=[])
-        axis.invert_yaxis()
-        if name != "query":
-            same = "the same face" if chosen[i] == n_faces + i else "another face"
-            axis.set_title(same, fontsize="small")
-    line[0].set_ylabel(name)
+nearest = {name: n_faces + values.argmax(axis=1) for name, values in likeness.items()}
+chosen = np.concatenate([strong, *(rows[strong] for rows in nearest.values())])
+shapes = tracks[chosen] - tracks[chosen].mean(axis=1, keepdims=True)
+display = ReprojectionDisplay(
+    observed=shapes, reprojected=shapes, edges="ibug-68"
+).plot(n_columns=4)
+titles = [
+    f"{name}: {'the same' if row == n_faces + i else 'another'}"
+    for name, rows in nearest.items()
+    for i, row in zip(strong, rows[strong], strict=True)
+]
+for axis, title in zip(display.axes_, ["query"] * 4 + titles, strict=True):
+    axis.set_title(title, fontsize="x-small")
 
 # %%
 # With scikit-learn's neighbours

@@ -1,0 +1,169 @@
+"""What joins the points in the results of commands: --edges and --skeleton."""
+
+import base64
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from exported_files import Read, content_of
+
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_body_tracks, make_hand_tracks
+from isa_nrsfm.skeletons import get_skeleton
+
+QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
+
+
+def write(scene, path, names=None):
+    """Write a scene as a table, whose points have numbers or names."""
+    names = scene.feature_names if names is None else names
+    pd.DataFrame(scene.data.round(3), columns=names).to_csv(path, index=False)
+    return path
+
+
+def edges_of(path):
+    """Return the edges of a page as a set of pairs, and the sides of its points."""
+    content = content_of(path)
+    pairs = np.frombuffer(base64.b64decode(content["edges"]), "<u4").reshape(-1, 2)
+    return {tuple(pair) for pair in pairs.tolist()}, content["sides"]
+
+
+def pairs_of(name):
+    return {tuple(edge) for edge in get_skeleton(name).edges.tolist()}
+
+
+@pytest.fixture(scope="module")
+def bodies():
+    return make_body_tracks(120, noise=0.002, random_state=0)
+
+
+@pytest.fixture(scope="module")
+def table(bodies, tmp_path_factory):
+    return write(bodies, tmp_path_factory.mktemp("bodies") / "bodies.csv")
+
+
+@pytest.fixture(scope="module")
+def folder(table, tmp_path_factory):
+    """Return the folder of a fit of bodies without names."""
+    folder = tmp_path_factory.mktemp("fit")
+    assert main(["fit", str(table), "-o", str(folder), "--no-figures", *QUICK]) == 0
+    return folder
+
+
+def test_hands_are_recognised_and_drawn(run, tmp_path):
+    path = write(make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
+    code, report, _ = run("fit", path, "-o", tmp_path, *QUICK)
+    assert code == 0
+    assert "points recognised as hand-21" in report
+    told = json.loads((tmp_path / "report.json").read_text())["model"]["skeleton"]
+    assert told == "hand-21"
+    assert edges_of(tmp_path / "viewer.html") == (pairs_of("hand-21"), [])
+
+
+def test_bodies_of_17_points_are_not_guessed(folder):
+    assert edges_of(folder / "viewer.html") == (set(), [])
+    told = json.loads((folder / "report.json").read_text())["model"]["skeleton"]
+    assert told is None
+
+
+def test_names_tell_the_layout(run, bodies, tmp_path):
+    names = [f"{name}_{axis}" for name in bodies.point_names for axis in "xy"]
+    path = write(bodies, tmp_path / "bodies.csv", names)
+    assert run("fit", path, "-o", tmp_path, "--no-figures", *QUICK)[0] == 0
+    edges, sides = edges_of(tmp_path / "viewer.html")
+    assert edges == pairs_of("coco-17")
+    assert sides == get_skeleton("coco-17").sides.tolist()
+
+
+def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkeypatch):
+    drawn = []
+    from isa_nrsfm import plotting
+
+    for display in (plotting.BasisShapeDisplay, plotting.ReprojectionDisplay):
+        plot = display.plot
+
+        def noted(self, *args, plot=plot, **kw):
+            drawn.append(self.skeleton.name)
+            return plot(self, *args, **kw)
+
+        monkeypatch.setattr(display, "plot", noted)
+    options = ["-o", tmp_path, "--skeleton", "coco-17", *QUICK]
+    assert run("fit", table, *options)[0] == 0
+    assert drawn == ["coco-17", "coco-17"]
+    assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("coco-17")
+
+
+def test_edges_of_a_file(run, table, folder, tmp_path):
+    own = tmp_path / "edges.csv"
+    own.write_text("5,7\n7,9\n")
+    fit = ["fit", table, "-o", tmp_path / "out", "--no-figures", *QUICK]
+    assert run(*fit, "--edges", own)[0] == 0
+    assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (7, 9)}
+    # Of triangles the sides are drawn, each once.
+    own.write_text("0,1,2\n2,1,3\n")
+    assert run(*fit, "--edges", own)[0] == 0
+    sides = {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
+    assert edges_of(tmp_path / "out/viewer.html")[0] == sides
+    skeleton = ["--skeleton", "coco-17"]
+    export = ["export", folder / "model.skops", "-o", tmp_path / "a.glb"]
+    assert run(*export, *skeleton)[0] == 0
+    materials = Read(tmp_path / "a.glb").document["materials"]
+    assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
+
+
+def test_the_configuration_of_deeplabcut(run, table, tmp_path):
+    config = tmp_path / "config.yaml"
+    config.write_text("skeleton:\n- ['5', '7']\n- ['6', '8']\n")
+    options = ["-o", tmp_path / "out", "--no-figures", *QUICK]
+    assert run("fit", table, *options, "--skeleton", config)[0] == 0
+    assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (6, 8)}
+
+
+def test_transform_writes_a_page_of_the_new_frames(run, table, folder, tmp_path):
+    page = tmp_path / "new.html"
+    transform = ["transform", folder / "model.skops", table]
+    transform += ["-o", tmp_path / "alpha.csv", "--skeleton", "coco-17"]
+    code, report, _ = run(*transform, "--viewer", page)
+    assert code == 0
+    assert str(page) in report
+    assert edges_of(page)[0] == pairs_of("coco-17")
+    assert len(content_of(page)["rows"]) == 120
+    code, _, error = run(*transform)
+    assert code == 1
+    assert "--edges and --skeleton are for --viewer" in error
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--skeleton", "hand-21"], "--skeleton hand-21 has 21 points, the table 17"),
+        (["--edges", "absent.csv"], "absent.csv: No such file"),
+        (["--skeleton", "absent.yaml"], "absent.yaml: No such file"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_the_fit(
+    run, table, tmp_path, options, message
+):
+    code, _, error = run("fit", table, "-o", tmp_path / "out", *options)
+    assert code == 1
+    assert message in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [["--skeleton", "cat"], ["--skeleton", "coco-17", "--edges", "none"]]
+)
+def test_options_that_mean_nothing(run, table, tmp_path, options, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("fit", table, "-o", tmp_path, *options)
+    assert stop.value.code == 2
+
+
+@pytest.mark.slow
+def test_the_demo_takes_edges(run, tmp_path):
+    options = ["-o", tmp_path, "--no-figures", "--edges", "none"]
+    code, report, _ = run("demo", *options)
+    assert code == 0
+    assert "--edges none" in report
+    assert edges_of(tmp_path / "viewer.html") == (set(), [])
