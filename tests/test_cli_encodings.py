@@ -1,4 +1,4 @@
-"""The command line with names that are not UTF-8, narrow terminals and interruptions."""
+"""The command line: names that are not UTF-8, encodings of output, interruptions."""
 
 import io
 import json
@@ -57,6 +57,16 @@ def test_files_of_points_whose_names_are_not_utf8(run, faces, tmp_path):
     assert run("fit", folder, "-o", tmp_path / "results", *QUICK)[0] == 0
     alpha = pd.read_csv(tmp_path / "results" / "alpha.csv")
     assert list(alpha["file"]) == list(found.frames["file"])
+
+
+def test_cells_are_written_as_they_are(run, faces, tmp_path):
+    """Also those that a spreadsheet takes for formulas: SECURITY.md says so."""
+    cells = ["=1+1", "+1", "-x", "@SUM(A1)", "'=1", '=HYPERLINK("x")', "a\nb"] * 6
+    table = faces.assign(note=cells[:40])
+    table.to_csv(tmp_path / "faces.csv", index=False)
+    folder = tmp_path / "results"
+    assert run("fit", tmp_path / "faces.csv", "-o", folder, *QUICK)[0] == 0
+    assert list(pd.read_csv(folder / "alpha.csv")["note"]) == cells[:40]
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "ascii", "utf-16"])
