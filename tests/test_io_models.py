@@ -4,6 +4,7 @@ import functools
 import io
 import json
 import pickle
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -310,6 +311,78 @@ def written(contents, path):
     """Write contents as save_model does, but any."""
     path.write_bytes(skops.io.dumps(contents))
     return path
+
+
+def test_files_that_unpack_to_more_than_they_have_are_refused(model, path):
+    contents = model_contents(model)
+    contents["attributes"]["objective_history_"] = np.zeros(2_000_000)
+    large = skops.io.dumps(contents)
+    with zipfile.ZipFile(io.BytesIO(large)) as whole, zipfile.ZipFile(path, "w") as zip:
+        for name in whole.namelist():
+            zip.writestr(name, whole.read(name), zipfile.ZIP_DEFLATED)
+    assert path.stat().st_size < 100_000
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"need more than the \d+ bytes that it has"):
+        load_model(path)
+    assert tracemalloc.get_traced_memory()[1] < 4_000_000
+    tracemalloc.stop()
+
+
+def test_an_array_in_many_places_is_read_once(path):
+    array = np.zeros(100_000)
+    written([array] * 50, path)
+    tracemalloc.start()
+    found = read_values(path.read_bytes())
+    assert tracemalloc.get_traced_memory()[1] < 10 * array.nbytes
+    tracemalloc.stop()
+    assert len(found) == 50
+
+
+@pytest.mark.parametrize(
+    ("case", "one", "other", "message"),
+    [
+        ("default", "alpha_", "alpha_std_", "alpha_ should have mean zero and unit"),
+        ("default", "reliability_", "energy_share_", "energy_share_ should be shares"),
+        ("weak perspective", "alpha_", "alpha_std_", "alpha_ should have mean zero"),
+    ],
+)
+def test_arrays_that_changed_places_are_refused(
+    case, one, other, message, fitted, path
+):
+    contents = model_contents(fitted(case)[0])
+    attributes = contents["attributes"]
+    attributes[one], attributes[other] = attributes[other], attributes[one]
+    with pytest.raises(ValueError, match=message):
+        load_model(written(contents, path))
+
+
+@pytest.mark.parametrize(
+    ("case", "name", "change", "message"),
+    [
+        ("default", "mean_shape_", lambda a: a[::-1], "the shapes of frames"),
+        ("default", "basis_", lambda a: a[::-1], "the shapes of frames"),
+        ("default", "basis_", lambda a: a * [1, 1, -1], "the shapes of frames"),
+        ("orthographic", "basis_", lambda a: 2 * a, "the shapes of frames"),
+        ("alternating", "basis_", lambda a: a[::-1], "the shapes of frames"),
+        ("not refined", "mean_shape_", lambda a: -a, "the shapes of frames"),
+        ("default", "singular_values_", lambda a: a[::-1], "should decrease"),
+        ("huber", "objective_history_", lambda a: a[1:], r"n_iter_ \+ 1 numbers"),
+        ("default", "alpha_", lambda a: 2 * a, "unit variance"),
+        ("planar", "alpha_", lambda a: a + 1, "mean zero"),
+        ("default", "alpha_std_", lambda a: -a, "should not be negative"),
+        ("default", "motion_", lambda a: a * np.nan, "frames that have a size"),
+        ("missing points", "alpha_", np.nan_to_num, "frames that have a size"),
+        ("weak perspective", "scales_", lambda a: a[::-1], "two rows of the rota"),
+        ("weak perspective", "motion_", lambda a: a[::-1], "two rows of the rota"),
+        ("mirrored", "rotations_", lambda a: 2 * a, "should be orthonormal"),
+    ],
+)
+def test_broken_promises_are_refused(case, name, change, message, fitted, path):
+    contents = model_contents(fitted(case)[0])
+    array = contents["attributes"][name]
+    contents["attributes"][name] = change(array).astype(array.dtype)
+    with pytest.raises(ValueError, match=message):
+        load_model(written(contents, path))
 
 
 def test_files_with_other_types_are_refused_and_the_types_named(model, path):

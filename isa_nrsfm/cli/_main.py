@@ -10,42 +10,17 @@ from typing import TextIO
 
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
 
-FINE, BAD_INPUT, INTERRUPTED, BROKEN_PIPE = 0, 1, 130, 141
+FINE, BAD_INPUT, BROKEN_PIPE = 0, 1, 141
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """
-    Run the command line.
-
-    The report goes to the standard output, and everything else (errors, warnings and,
-    on a terminal, the progress) to the standard error.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        The arguments. By default those of the process.
-
-    Returns
-    -------
-    int
-        The exit code: 0 if all went well, 1 if the table, the model or another input
-        is bad, 130 if interrupted, 141 if the reader of the output has gone.
-
-    Raises
-    ------
-    SystemExit
-        With code 2 if the arguments are wrong, with 0 after ``--help`` and
-        ``--version``.
-    """
+def run(argv: Sequence[str] | None = None) -> int:
+    """Run the command line as of `isa_nrsfm.cli.main`, but for interruptions."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     args = build_parser().parse_args(arguments, Namespace(arguments=arguments))
     try:
         with _warnings_as_lines() as warned:
             report = _run(args, warned)
-        print(report, flush=True)
-    except KeyboardInterrupt:
-        _say("interrupted")
-        return INTERRUPTED
+        _show(report)
     except BrokenPipeError:
         # Python flushes the standard output once more at exit.
         with contextlib.suppress(OSError, ValueError):
@@ -113,6 +88,15 @@ def _message(error: Exception) -> str:
 def _one_line(text: str) -> str:
     """Join the lines of a text."""
     return " ".join(text.split())
+
+
+def _show(report: str) -> None:
+    """Write the report to the standard output, in whatever encoding that has.
+
+    It is written after the results: a name that the encoding lacks is no error.
+    """
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    print(report.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _say(text: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from isa_nrsfm import AffineNRSfM, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm._compat.whole_files import refuse_replacing, write_whole
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._runs import DIGESTS, REPORT, digests_of, files_of_report
@@ -229,7 +230,7 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
 def _plain(value: Any) -> Any:
     """Turn a value into what JSON can hold."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
@@ -238,6 +239,6 @@ def _plain(value: Any) -> Any:
         return _plain(value.item())
     if isinstance(value, float):
         return value if np.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
+    if value is None or isinstance(value, int):
         return value
-    return repr(value)
+    return as_utf8(value if isinstance(value, str) else repr(value))

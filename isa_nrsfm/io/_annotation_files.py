@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
 from isa_nrsfm.io._separated_values import first_lines
 
@@ -69,7 +70,9 @@ def read_pts(path: Path) -> Landmarks:
                 f"{len(tracks[-1])}: all files must have the same number"
             )
     return _numbered(
-        np.stack(tracks), pd.DataFrame({"file": [file.name for file in files]}), "pts"
+        np.stack(tracks),
+        pd.DataFrame({"file": [as_utf8(file.name) for file in files]}),
+        "pts",
     )
 
 

@@ -20,6 +20,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.layout import LAYOUTS
+from isa_nrsfm.io._model_promises import check_promises
 from isa_nrsfm.io._model_values import (
     N_FEATURES,
     N_OUT,
@@ -175,6 +176,7 @@ def model_from_contents(contents: Any) -> AffineNRSfM:
     for name, value in found.items():
         if value is not None:
             setattr(estimator, name, checks[name](value, name))
+    check_promises(found, frames, sizes)
     model = TableModel(
         frames,
         estimator.mean_shape_,

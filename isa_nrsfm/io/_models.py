@@ -94,8 +94,9 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     ------
     ValueError
         If the file is no model file, is damaged, was written by a newer version, or has
-        entries that are missing, not known or of the wrong type or shape, or objects
-        that are not part of a model. What is wrong is named.
+        entries that are missing, not known, of the wrong type or shape or that do not
+        belong together, or objects that are not part of a model, or if it unpacks to
+        more than it is large. What is wrong is named.
     OSError
         If the file cannot be opened.
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isa_nrsfm._compat.stored_arrays import array_in
 
@@ -64,18 +65,57 @@ def read_values(contents: bytes) -> Any:
     Raises
     ------
     ValueError
-        If the file is damaged, or holds anything else.
+        If the file is damaged, holds anything else, or unpacks to more than it is
+        large.
     """
     # What damaged archives and arrays make of their readers is not documented.
     try:
-        with warnings.catch_warnings(), ZipFile(io.BytesIO(contents)) as file:
+        with warnings.catch_warnings(), ZipFile(io.BytesIO(contents)) as archive:
             warnings.simplefilter("error")
+            file = _BoundedArchive(archive, len(contents))
             return _value(json.loads(file.read("schema.json")), file)
     except Exception as error:
         raise ValueError(str(error) or type(error).__name__) from error
 
 
-def _value(node: Any, file: ZipFile) -> Any:
+class _BoundedArchive:
+    """
+    An archive of which no more is read than it has bytes.
+
+    `save_model` writes archives that are not compressed. An array that a model has in
+    two places is one file of the archive. It is read once, and is one array then, too.
+
+    Parameters
+    ----------
+    archive : ZipFile
+        The archive.
+    n_bytes : int
+        Its size.
+    """
+
+    def __init__(self, archive: ZipFile, n_bytes: int) -> None:
+        self._archive, self._n_bytes, self._n_read = archive, n_bytes, 0
+        self._arrays: dict[str, NDArray] = {}
+
+    def read(self, name: str) -> bytes:
+        """Return the content of a file of the archive, or raise."""
+        found = self._archive.getinfo(name)
+        self._n_read += found.file_size
+        if self._n_read > self._n_bytes:
+            raise ValueError(
+                f"its contents need more than the {self._n_bytes} bytes that it has: "
+                "model files are not compressed"
+            )
+        return self._archive.read(found)
+
+    def array(self, name: str) -> NDArray:
+        """Return the array in a file of the archive, or raise."""
+        if name not in self._arrays:
+            self._arrays[name] = array_in(self.read(name))
+        return self._arrays[name]
+
+
+def _value(node: Any, file: "_BoundedArchive") -> Any:
     """Return the value of a node."""
     kind, name = node["__loader__"], f"{node['__module__']}.{node['__class__']}"
     is_own = name.startswith(_OWN)
@@ -99,7 +139,7 @@ def _value(node: Any, file: ZipFile) -> Any:
     raise ValueError(f"it contains objects that are not part of a model: {name}")
 
 
-def _dict(node: Any, file: ZipFile) -> dict[str, Any]:
+def _dict(node: Any, file: "_BoundedArchive") -> dict[str, Any]:
     """Return the value of a node of a dict with keys that are text."""
     types = [
         f"{key['__module__']}.{key['__class__']}"
@@ -110,14 +150,14 @@ def _dict(node: Any, file: ZipFile) -> dict[str, Any]:
     return {key: _value(item, file) for key, item in node["content"].items()}
 
 
-def _array(node: Any, name: str, file: ZipFile) -> Any:
+def _array(node: Any, name: str, file: "_BoundedArchive") -> Any:
     """Return the value of a node of an array or of a number of numpy."""
     if name == "numpy.ndarray" and node["type"] == "json":
         items = [_value(item, file) for item in node["content"]]
         if _value(node["shape"], file) != (len(items),):
             raise ValueError("it contains an array of objects with several axes")
         return items
-    array = array_in(file.read(node["file"]))
+    array = file.array(node["file"])
     if name == "numpy.ndarray":
         return array
     number: Any = array[()]

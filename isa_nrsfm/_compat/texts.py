@@ -1,0 +1,27 @@
+"""Texts that UTF-8 cannot hold: names of files that are not UTF-8."""
+
+
+def as_utf8(text: str) -> str:
+    r"""
+    Return a text that can be written as UTF-8.
+
+    Parameters
+    ----------
+    text : str
+        The text. Python marks each byte of a file's name that is not UTF-8 by a lone
+        surrogate, a character that no encoding has (PEP 383).
+
+    Returns
+    -------
+    str
+        The text, with such characters as Python writes them: a byte 0xFF becomes the
+        six characters ``\udcff``.
+
+    Examples
+    --------
+    >>> import os
+    >>> from isa_nrsfm._compat.texts import as_utf8
+    >>> print(as_utf8("café " + os.fsdecode(b"caf\xe9")))
+    café caf\udce9
+    """
+    return text.encode("utf-8", "backslashreplace").decode()

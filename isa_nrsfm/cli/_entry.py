@@ -1,0 +1,41 @@
+"""The entry of the program: light, so that nearly all imports are inside it."""
+
+import sys
+from collections.abc import Sequence
+
+INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command line.
+
+    The report goes to the standard output, and everything else (errors, warnings and,
+    on a terminal, the progress) to the standard error. Characters that the encoding of
+    the standard output lacks are written with a backslash.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The arguments. By default those of the process.
+
+    Returns
+    -------
+    int
+        The exit code: 0 if all went well, 1 if the table, the model or another input
+        is bad, 130 if interrupted, 141 if the reader of the output has gone.
+
+    Raises
+    ------
+    SystemExit
+        With code 2 if the arguments are wrong, with 0 after ``--help`` and
+        ``--version``.
+    """
+    try:
+        # Within the try block: an interruption may come while modules are imported.
+        from isa_nrsfm.cli._main import run
+
+        return run(argv)
+    except KeyboardInterrupt:
+        print("isa-nrsfm: interrupted", file=sys.stderr, flush=True)
+        return INTERRUPTED

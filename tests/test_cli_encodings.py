@@ -1,0 +1,124 @@
+"""The command line: names that are not UTF-8, encodings of output, interruptions."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+
+from isa_nrsfm.cli import main
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.io import load_model, read_landmarks
+
+QUICK = ["-k", "2", "--isa", "fast", "--n-init", "2", "--no-figures"]
+# Names of files in Latin-1 and of no encoding at all.
+NOT_UTF8 = os.fsdecode(b"caf\xe9 \xff")
+
+
+@pytest.fixture(scope="module")
+def faces():
+    """Return a table of faces with a column that few encodings have."""
+    bunch = make_face_tracks(n_frames=40, n_components=2, random_state=0)
+    frame = pd.DataFrame(bunch.data, columns=bunch.feature_names)
+    return pd.concat([pd.Series(["Ω"] * 40, name="ομάδα"), frame], axis=1)
+
+
+def test_paths_that_are_not_utf8(run, faces, tmp_path):
+    folder = tmp_path / NOT_UTF8
+    folder.mkdir()
+    table, results = folder / f"{NOT_UTF8}.csv", folder / "results"
+    faces.to_csv(table, index=False)
+    code, out, err = run("fit", table, "-o", results, *QUICK)
+    assert (code, err) == (0, "")
+    assert "caf\\udce9 \\udcff" in out
+    report = json.loads((results / "report.json").read_text(encoding="utf-8"))
+    assert report["table"]["path"].endswith("caf\\udce9 \\udcff.csv")
+    model, alpha = results / "model.skops", folder / f"alpha {NOT_UTF8}.csv"
+    assert run("transform", model, table, "-o", alpha)[0] == 0
+    assert len(pd.read_csv(alpha)) == 40
+    page = folder / f"{NOT_UTF8}.html"
+    assert run("export", model, table, "-o", page)[0] == 0
+    assert page.stat().st_size > 0
+
+
+def test_files_of_points_whose_names_are_not_utf8(run, faces, tmp_path):
+    folder = tmp_path / os.fsdecode(b"pts \xfe")
+    folder.mkdir()
+    points = faces.iloc[:, 1:].to_numpy().reshape(40, -1, 2)
+    for i, frame in enumerate(points):
+        lines = "\n".join(f"{x} {y}" for x, y in frame)
+        text = f"version: 1\nn_points: {len(frame)}\n{{\n{lines}\n}}\n"
+        (folder / f"{i:02d} {NOT_UTF8}.pts").write_text(text)
+    found = read_landmarks(folder)
+    assert found.frames["file"][3] == "03 caf\\udce9 \\udcff.pts"
+    assert run("fit", folder, "-o", tmp_path / "results", *QUICK)[0] == 0
+    alpha = pd.read_csv(tmp_path / "results" / "alpha.csv")
+    assert list(alpha["file"]) == list(found.frames["file"])
+
+
+def test_cells_are_written_as_they_are(run, faces, tmp_path):
+    """Also those that a spreadsheet takes for formulas: SECURITY.md says so."""
+    cells = ["=1+1", "+1", "-x", "@SUM(A1)", "'=1", '=HYPERLINK("x")', "a\nb"] * 6
+    table = faces.assign(note=cells[:40])
+    table.to_csv(tmp_path / "faces.csv", index=False)
+    folder = tmp_path / "results"
+    assert run("fit", tmp_path / "faces.csv", "-o", folder, *QUICK)[0] == 0
+    assert list(pd.read_csv(folder / "alpha.csv")["note"]) == cells[:40]
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "utf-16"])
+def test_output_in_any_encoding(faces, tmp_path, monkeypatch, encoding):
+    faces.to_csv(tmp_path / "faces.csv", index=False)
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding=encoding))
+    rule = ["--skip-rows", "ομάδα=Ψ"]
+    folder = ["-o", str(tmp_path / "results")]
+    argv = ["fit", str(tmp_path / "faces.csv"), *folder, *rule, *QUICK]
+    assert main(argv) == 0
+    text = shown.getvalue().decode(encoding)
+    assert text.startswith("2 basis shapes fitted to 40 frames")
+    assert load_model(tmp_path / "results" / "model.skops").basis_.shape[0] == 2
+
+
+INTERRUPTED = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from isa_nrsfm.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.subprocess
+@pytest.mark.parametrize(
+    "module",
+    [
+        "argparse",
+        "isa_nrsfm.cli._main",
+        "numpy",
+        "scipy.linalg",
+        "sklearn.base",
+        "isa_nrsfm._estimator",
+        "pandas",
+    ],
+)
+def test_interruption_while_modules_are_imported(faces, tmp_path, module):
+    faces.to_csv(tmp_path / "faces.csv", index=False)
+    argv = ["fit", str(tmp_path / "faces.csv"), "-o", str(tmp_path / "out"), *QUICK]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, module, *argv],
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "isa-nrsfm: interrupted\n"
+    assert not (tmp_path / "out").exists()
