@@ -13,6 +13,7 @@ FILES = {
     "alpha.csv",
     "cameras.csv",
     "model.skops",
+    "report.html",
     "report.json",
     "shapes.npz",
     "viewer.html",

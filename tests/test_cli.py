@@ -34,6 +34,7 @@ FIT_FILES = {
     "shapes.npz",
     "viewer.html",
     "model.skops",
+    "report.html",
     "report.json",
 }
 FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
