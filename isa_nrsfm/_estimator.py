@@ -1,8 +1,9 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
+import copy
 import os
 from numbers import Integral, Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -417,6 +418,13 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         joint = self.refinement == "joint"
         stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
         progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+        source, options = self._checked(X)
+        fit = fit_table(source, self.n_components, options, progress)
+        self._set(fit, source)
+        progress.end()
+
+    def _checked(self, X: Any) -> tuple[Table, FitOptions]:
+        """Check a table and the options of its fit, and return both."""
         self._check_options(X)
         X = np.asarray(X) if isinstance(X, np.memmap) and not self._in_blocks else X
         source = self._opened(X, reset=True)
@@ -436,8 +444,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             self.tol,
             names,
         )
-        self._set(fit_table(source, self.n_components, options, progress), source)
-        progress.end()
+        return source, options
 
     @property
     def _in_blocks(self) -> bool:
@@ -541,3 +548,36 @@ def check_class(estimator: object, where: str) -> None:
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
         )
+
+
+class CheckedTable(NamedTuple):
+    """
+    A table that was checked for the fits of an estimator.
+
+    Attributes
+    ----------
+    source : Table
+        The table.
+    options : FitOptions
+        How it is fitted.
+    estimator : AffineNRSfM
+        The estimator, unfitted, that knows the columns of the table.
+    """
+
+    source: Table
+    options: FitOptions
+    estimator: AffineNRSfM
+
+    @classmethod
+    def of(cls, estimator: AffineNRSfM, X: Any) -> Self:
+        """Return a table X that was checked for a clone of an estimator."""
+        estimator = clone(estimator)
+        source, options = estimator._checked(X)
+        return cls(source, options, estimator)
+
+    def fitted(self, fit: Fit, source: Table) -> AffineNRSfM:
+        """Return the estimator with a fit of a part of the table, given as source."""
+        model = copy.copy(self.estimator)
+        model.set_params(n_components=len(fit.model.basis))
+        model._set(fit, source)
+        return model

@@ -12,7 +12,7 @@ refinement. All others use the frames of the sample.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from isa_nrsfm._compat.callbacks import FitProgress
+from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import reliabilities
 from isa_nrsfm._fitted_model import TableModel
@@ -39,7 +39,7 @@ from isa_nrsfm._gauge.canonical import (
     reorder_blocks,
 )
 from isa_nrsfm._gauge.independent import independent_gauge
-from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
+from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
@@ -224,8 +224,40 @@ def fit_table(
     """
     if n_components == "auto":
         n_components = _count_components(source, options)
-    # 1. Table
-    table = _scaled(source, n_components, options)
+    table = ready_table(source, n_components, options)
+    return fit_ready_table(table, n_components, options, progress)
+
+
+def fit_ready_table(
+    table: ScaledTable,
+    n_components: int,
+    options: FitOptions,
+    progress: FitProgress | NoProgress,
+    starts: Sequence[Start] = (),
+) -> Fit:
+    """
+    Fit a table that is ready.
+
+    Parameters
+    ----------
+    table : ScaledTable
+        The table, checked and scaled.
+    n_components : int
+        K.
+    options : FitOptions
+        How the table is fitted.
+    progress : FitProgress or NoProgress
+        As of `fit_table`.
+    starts : sequence of Start, default=()
+        Where the fit starts, with the joint refinement. Otherwise it searches for
+        starts, and the result of the paper's pipeline is one of them.
+
+    Returns
+    -------
+    Fit
+        The fit; with `starts` its strategy `isa` is None.
+    """
+    # 1. The rest of the table
     unit = 1.0 if options.scale_frames else float(table.sizes[0])
     outliers, used = _completed(table, n_components, options.loss)
     progress("table")
@@ -233,9 +265,11 @@ def fit_table(
     triplets, sample, factors = _factors(table, used, n_components, options.joint)
     progress("factorisation")
     # 3. and 4. The paper's pipeline
-    isa, paper = _paper_result(factors, n_components, options, progress)
+    isa, paper = None, None
+    if not starts:
+        isa, paper = _paper_result(factors, n_components, options, progress)
     # 5. Joint refinement
-    if options.joint:
+    if paper is None or options.joint:
         spectrum = Spectrum.from_singular_values(
             triplets.values,
             triplets.rest_share,
@@ -244,7 +278,16 @@ def fit_table(
             table.n_seen,
         )
         refined = _refined_jointly(
-            table, outliers, sample, factors, paper, spectrum, options, unit, progress
+            table,
+            outliers,
+            sample,
+            factors,
+            starts[0].shapes if paper is None else _stacked_shapes(paper),
+            starts,
+            spectrum,
+            options,
+            unit,
+            progress,
         )
     else:
         refined = _refined_by_paper(table, sample.W, factors, paper, options, unit)
@@ -284,7 +327,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
     """Return the number of basis shapes that a table supports."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
-        table = _scaled(source, 1, options)
+        table = ready_table(source, 1, options)
     most = largest_n_components(table.n_points)
     most = min(MOST_COMPONENTS, most, most_for_frames(len(table.sizes)))
     outliers, used = _completed(table, most, options.loss)
@@ -310,8 +353,24 @@ def _count_components(source: Table, options: FitOptions) -> int:
     return found
 
 
-def _scaled(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
-    """Return the table checked, centred and scaled."""
+def ready_table(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
+    """
+    Return a table checked, centred and scaled.
+
+    Parameters
+    ----------
+    source : Table
+        The table.
+    n_components : int
+        The largest K that it has to be large enough for.
+    options : FitOptions
+        How the table is fitted.
+
+    Returns
+    -------
+    ScaledTable
+        The table, ready for `fit_ready_table`.
+    """
     return scaled_table(
         source,
         n_components,
@@ -427,11 +486,12 @@ def _refined_jointly(
     outliers: NDArray | None,
     sample: Sample,
     factors: Factorisation,
-    paper: PaperResult,
+    paper_shapes: NDArray,
+    starts: Sequence[Start],
     spectrum: Spectrum,
     options: FitOptions,
     unit: float,
-    progress: FitProgress,
+    progress: FitProgress | NoProgress,
 ) -> Refined:
     """Return the shapes of the joint refinement, and their fit of the frames."""
     fitted = fit_jointly(
@@ -439,7 +499,7 @@ def _refined_jointly(
         table.n_seen,
         sample,
         factors,
-        _stacked_shapes(paper),
+        paper_shapes,
         spectrum=spectrum,
         camera=options.camera,
         outliers=outliers,
@@ -447,6 +507,7 @@ def _refined_jointly(
         max_iter=options.max_iter,
         tol=options.joint_tol,
         on_step=progress.step,
+        starts=starts,
     )
     progress(JOINT_STAGE)
     # Posterior of every frame
@@ -455,7 +516,7 @@ def _refined_jointly(
         fitted.noise_variance,
         spread_starts(fitted.alpha, N_STARTS),
         options.loss,
-        FrameMap.identity(len(paper.basis)),
+        FrameMap.identity(len(paper_shapes) - 1),
         options.camera,
     )
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)
