@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks._command import run
 from benchmarks._sets import is_present, load
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._fit_options import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 

@@ -21,7 +21,6 @@ import pandas as pd
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._tables.layout import (
@@ -30,6 +29,7 @@ from isa_nrsfm._tables.layout import (
     table_to_tracks,
     weighting_sizes,
 )
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import save_model, write_table
 

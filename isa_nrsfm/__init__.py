@@ -8,6 +8,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AffineNRSfM",
+    "AffineNRSfMCV",
     "Decomposition",
     "FastISA",
     "PooledFastICA",
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
         skeletons as skeletons,
     )
     from isa_nrsfm._estimator import AffineNRSfM
+    from isa_nrsfm._selection.estimator import AffineNRSfMCV
     from isa_nrsfm._transformer import Decomposition, SmoothedCoefficients
     from isa_nrsfm.analysis import WithinGroups, association
     from isa_nrsfm.isa import FastISA, PooledFastICA
@@ -40,6 +42,7 @@ else:
         __name__,
         {
             "isa_nrsfm._estimator": ["AffineNRSfM"],
+            "isa_nrsfm._selection.estimator": ["AffineNRSfMCV"],
             "isa_nrsfm._transformer": ["Decomposition", "SmoothedCoefficients"],
             "isa_nrsfm.analysis": ["WithinGroups", "association"],
             "isa_nrsfm.isa": ["FastISA", "PooledFastICA"],

@@ -1,18 +1,20 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
+import copy
 from numbers import Integral, Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import (
     clone,
 )
-from sklearn.utils import check_random_state, estimator_html_repr
+from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, FitOptions, Limits, fit_table
+from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, fit_table
+from isa_nrsfm._fit_options import FitOptions, Limits
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     full_rotations,
@@ -26,7 +28,6 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_names
-from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
 from isa_nrsfm._tables.layout import LAYOUTS, Layout
 from isa_nrsfm._tables.sources import (
@@ -410,23 +411,18 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         self.fit(X)
         return self.alpha_.copy() if self.keep_frames else self.transform(X)
 
-    def __sklearn_tags__(self) -> Any:
-        """Return the estimator's tags."""
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
-        tags.input_tags.allow_nan = True
-        return tags
-
-    def _html_repr(self) -> str:
-        """Return what a notebook shows: scikit-learn's picture, and a summary."""
-        picture = estimator_html_repr(self)
-        return picture + summary_html(self) if hasattr(self, "basis_") else picture
-
     def _fit(self, X: Any, y: Any, keep: Keep) -> None:
         """Check a table and its options, fit it, and set what was found."""
         joint = self.refinement == "joint"
         stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
         progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+        source, options = self._checked(X)
+        fit = fit_table(source, self.n_components, options, progress)
+        self._set(fit, source, keep)
+        progress.end()
+
+    def _checked(self, X: Any) -> tuple[Table, FitOptions]:
+        """Check a table and the options of its fit, and return both."""
         self._check_options(X)
         X = np.asarray(X) if isinstance(X, np.memmap) and not self._in_blocks else X
         source = self._opened(X, reset=True)
@@ -447,9 +443,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             names,
             self._limits,
         )
-        fit = fit_table(source, self.n_components, options, progress)
-        self._set(fit, source, keep)
-        progress.end()
+        return source, options
 
     @property
     def _in_blocks(self) -> bool:
@@ -564,14 +558,43 @@ def limited(limits: Limits) -> type[AffineNRSfM]:
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
 
 
-def frames_of(estimator: AffineNRSfM) -> Any:
-    """Return the fitted model of a frame: shapes, noise, starts, and its fit."""
-    return estimator._model.frames
-
-
 def check_class(estimator: object, where: str) -> None:
     """Raise if an object is not the estimator of this package."""
     if not isinstance(estimator, AffineNRSfM):
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
         )
+
+
+class CheckedTable(NamedTuple):
+    """
+    A table that was checked for the fits of an estimator.
+
+    Attributes
+    ----------
+    source : Table
+        The table.
+    options : FitOptions
+        How it is fitted.
+    estimator : AffineNRSfM
+        The estimator, unfitted, that knows the columns of the table.
+    """
+
+    source: Table
+    options: FitOptions
+    estimator: AffineNRSfM
+
+    @classmethod
+    def of(cls, estimator: AffineNRSfM, X: Any) -> Self:
+        """Return a table X that was checked for a clone of an estimator."""
+        estimator = clone(estimator)
+        source, options = estimator._checked(X)
+        return cls(source, options, estimator)
+
+    def fitted(self, fit: Fit, source: Table) -> AffineNRSfM:
+        """Return the estimator with a fit of a part of the table, given as source."""
+        model = copy.copy(self.estimator)
+        model.set_params(n_components=len(fit.model.basis))
+        with kept_arrays(model.keep_frames) as keep:
+            model._set(fit, source, keep)
+        return model

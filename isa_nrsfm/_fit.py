@@ -12,7 +12,7 @@ refinement. All others use the frames of the sample.
 """
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from isa_nrsfm._compat.callbacks import FitProgress
+from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import reliabilities
+from isa_nrsfm._fit_options import PAPER_TOL, FitOptions, Limits
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
@@ -38,29 +39,21 @@ from isa_nrsfm._gauge.canonical import (
     mode_covariance,
     reorder_blocks,
 )
-from isa_nrsfm._gauge.independent import GaugeOptions, independent_gauge
-from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
-from isa_nrsfm._joint.options import JointOptions
+from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._paper.options import PaperOptions, SampleOptions, SvdOptions
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import Triplets, block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.options import CompletionOptions, OutlierOptions
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm._tables.sources import Table
 
-# Convergence tolerances by default. JOINT_TOL: decrease of the objective of the joint
-# refinement for each frame. PAPER_TOL: gain of the paper's refinement, as a share of
-# the energy that it explains.
-JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 # Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
 STAGES = (
@@ -71,94 +64,6 @@ STAGES = (
     JOINT_STAGE,
     "gauge and coefficients",
 )
-
-
-class Limits(NamedTuple):
-    """
-    What steers the decisions of the stages, a tuple for each.
-
-    Attributes
-    ----------
-    outliers : OutlierOptions
-        Of the search for gross outliers.
-    completion : CompletionOptions
-        Of missing points.
-    svd : SvdOptions
-        Of the factorisation.
-    sample : SampleOptions
-        Of the sample.
-    paper : PaperOptions
-        Of the paper's pipeline.
-    joint : JointOptions
-        Of the joint refinement.
-    gauge : GaugeOptions
-        Of the gauge after it.
-    start_steps, start_tol : int and float
-        Largest number of steps, and tolerance, of the paper's refinement before a joint
-        one.
-    most_components : int
-        Largest number of basis shapes that ``n_components="auto"`` tries.
-    n_starts : int
-        Number of starts of the fit of a frame besides zero: coefficients of other
-        frames.
-    """
-
-    outliers: OutlierOptions = OutlierOptions()
-    completion: CompletionOptions = CompletionOptions()
-    svd: SvdOptions = SvdOptions()
-    sample: SampleOptions = SampleOptions()
-    paper: PaperOptions = PaperOptions()
-    joint: JointOptions = JointOptions()
-    gauge: GaugeOptions = GaugeOptions()
-    start_steps: int = 200
-    start_tol: float = 1e-5
-    most_components: int = 12
-    n_starts: int = 8
-
-
-class FitOptions(NamedTuple):
-    """
-    How a table is fitted: parameters of `AffineNRSfM`, checked.
-
-    Attributes
-    ----------
-    isa : object
-        The unfitted strategy, with all its parameters set.
-    default_isa : bool
-        Whether the strategy is the default one, not given by the user.
-    block_recovery, refinement, camera, independence, loss, layout, max_iter, tol
-        As of `AffineNRSfM`.
-    scale_frames : bool
-        Whether each frame gets size one. Orthographic cameras never scale frames.
-    names : ndarray of shape (2 * n_points,) or None
-        Names of the columns.
-    limits : Limits
-        What steers the stages.
-    """
-
-    isa: Any
-    default_isa: bool
-    block_recovery: str
-    refinement: str | None
-    camera: str
-    independence: str | None
-    loss: str
-    layout: Layout
-    scale_frames: bool
-    max_iter: int
-    tol: float | None
-    names: NDArray | None
-    limits: Limits
-
-    @property
-    def joint(self) -> bool:
-        """Whether the refinement is the joint one."""
-        return self.refinement == "joint"
-
-    @property
-    def joint_tol(self) -> float:
-        """Tolerance of the joint refinement."""
-        return JOINT_TOL if self.tol is None else self.tol
 
 
 class JointNumbers(NamedTuple):
@@ -267,8 +172,40 @@ def fit_table(
     """
     if n_components == "auto":
         n_components = _count_components(source, options)
-    # 1. Table
-    table = _scaled(source, n_components, options)
+    table = ready_table(source, n_components, options)
+    return fit_ready_table(table, n_components, options, progress)
+
+
+def fit_ready_table(
+    table: ScaledTable,
+    n_components: int,
+    options: FitOptions,
+    progress: FitProgress | NoProgress,
+    starts: Sequence[Start] = (),
+) -> Fit:
+    """
+    Fit a table that is ready.
+
+    Parameters
+    ----------
+    table : ScaledTable
+        The table, checked and scaled.
+    n_components : int
+        K.
+    options : FitOptions
+        How the table is fitted.
+    progress : FitProgress or NoProgress
+        As of `fit_table`.
+    starts : sequence of Start, default=()
+        Where the fit starts, with the joint refinement. Otherwise it searches for
+        starts, and the result of the paper's pipeline is one of them.
+
+    Returns
+    -------
+    Fit
+        The fit; with `starts` its strategy `isa` is None.
+    """
+    # 1. The rest of the table
     unit = 1.0 if options.scale_frames else float(table.sizes[0])
     outliers, used = _completed(table, n_components, options)
     progress("table")
@@ -278,9 +215,11 @@ def fit_table(
     )
     progress("factorisation")
     # 3. and 4. The paper's pipeline
-    isa, paper = _paper_result(factors, n_components, options, progress)
+    isa, paper = None, None
+    if not starts:
+        isa, paper = _paper_result(factors, n_components, options, progress)
     # 5. Joint refinement
-    if options.joint:
+    if paper is None or options.joint:
         spectrum = Spectrum.from_singular_values(
             triplets.values,
             triplets.rest_share,
@@ -289,7 +228,16 @@ def fit_table(
             table.n_seen,
         )
         refined = _refined_jointly(
-            table, outliers, sample, factors, paper, spectrum, options, unit, progress
+            table,
+            outliers,
+            sample,
+            factors,
+            starts[0].shapes if paper is None else _stacked_shapes(paper),
+            starts,
+            spectrum,
+            options,
+            unit,
+            progress,
         )
     else:
         refined = _refined_by_paper(table, sample.W, factors, paper, options, unit)
@@ -329,7 +277,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
     """Return the number of basis shapes that a table supports."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
-        table = _scaled(source, 1, options)
+        table = ready_table(source, 1, options)
     most = largest_n_components(table.n_points)
     most = min(options.limits.most_components, most, most_for_frames(len(table.sizes)))
     outliers, used = _completed(table, most, options)
@@ -356,8 +304,24 @@ def _count_components(source: Table, options: FitOptions) -> int:
     return found
 
 
-def _scaled(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
-    """Return the table checked, centred and scaled."""
+def ready_table(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
+    """
+    Return a table checked, centred and scaled.
+
+    Parameters
+    ----------
+    source : Table
+        The table.
+    n_components : int
+        The largest K that it has to be large enough for.
+    options : FitOptions
+        How the table is fitted.
+
+    Returns
+    -------
+    ScaledTable
+        The table, ready for `fit_ready_table`.
+    """
     return scaled_table(
         source,
         n_components,
@@ -481,11 +445,12 @@ def _refined_jointly(
     outliers: NDArray | None,
     sample: Sample,
     factors: Factorisation,
-    paper: PaperResult,
+    paper_shapes: NDArray,
+    starts: Sequence[Start],
     spectrum: Spectrum,
     options: FitOptions,
     unit: float,
-    progress: FitProgress,
+    progress: FitProgress | NoProgress,
 ) -> Refined:
     """Return the shapes of the joint refinement, and their fit of the frames."""
     fitted = fit_jointly(
@@ -493,7 +458,7 @@ def _refined_jointly(
         table.n_seen,
         sample,
         factors,
-        _stacked_shapes(paper),
+        paper_shapes,
         spectrum=spectrum,
         camera=options.camera,
         outliers=outliers,
@@ -501,6 +466,7 @@ def _refined_jointly(
         max_iter=options.max_iter,
         tol=options.joint_tol,
         on_step=progress.step,
+        starts=starts,
         options=options.limits.joint,
     )
     progress(JOINT_STAGE)
@@ -510,7 +476,7 @@ def _refined_jointly(
         fitted.noise_variance,
         spread_starts(fitted.alpha, options.limits.n_starts),
         options.loss,
-        FrameMap.identity(len(paper.basis)),
+        FrameMap.identity(len(paper_shapes) - 1),
         options.camera,
     )
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)

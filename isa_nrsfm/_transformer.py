@@ -10,7 +10,7 @@ from sklearn.base import (
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
 )
-from sklearn.utils import check_array, check_scalar
+from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
@@ -20,6 +20,7 @@ from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
+from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,
@@ -105,6 +106,18 @@ class TableTransformer(
     _model: TableModel
     _unit: float
     _frame_sizes: NDArray
+
+    def __sklearn_tags__(self) -> Any:
+        """Return the estimator's tags."""
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = ["float64", "float32"]
+        tags.input_tags.allow_nan = True
+        return tags
+
+    def _html_repr(self) -> str:
+        """Return what a notebook shows: scikit-learn's picture, and a summary."""
+        picture = estimator_html_repr(self)
+        return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
     def transform(self, X: Any) -> NDArray:
         """
@@ -473,6 +486,11 @@ class TableTransformer(
         X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
         checked_range(X)
         return Table.in_memory(X, self.n_jobs)
+
+
+def frames_of(estimator: TableTransformer) -> Any:
+    """Return the fitted model of a frame: shapes, noise, starts, and its fit."""
+    return estimator._model.frames
 
 
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:

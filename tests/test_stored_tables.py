@@ -9,7 +9,7 @@ from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit import Limits
+from isa_nrsfm._fit_options import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 

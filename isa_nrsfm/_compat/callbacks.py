@@ -110,3 +110,13 @@ class FitProgress:
         """Tell that the step has ended, if there is one."""
         if self.last_step is not None:
             self.last_step.call_on_fit_task_end(**self.about)
+
+
+class NoProgress:
+    """Stands in for `FitProgress` where nobody is told."""
+
+    def __call__(self, stage: str) -> None:
+        """Take note that a stage has ended."""
+
+    def step(self) -> None:
+        """Take note that a step begins."""

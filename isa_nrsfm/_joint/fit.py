@@ -12,7 +12,7 @@
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -101,6 +101,27 @@ class Spectrum(NamedTuple):
         return cls(noise, float(rest_share + (1 - rest_share) * beyond))
 
 
+class Start(NamedTuple):
+    """
+    Shapes and noise from which a joint fit may start, of a similar table.
+
+    Attributes
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape, and basis shapes as long as the standard deviation of their
+        coefficients.
+    noise_variance : float
+        Variance of the noise of a coordinate.
+    calibrated_first : bool
+        Whether affine cameras are preceded by calibrated ones, as they are in the
+        search for starts. Has no meaning for calibrated cameras.
+    """
+
+    shapes: NDArray
+    noise_variance: float
+    calibrated_first: bool = False
+
+
 class JointFit(NamedTuple):
     """
     Result of the joint fit of a table.
@@ -153,6 +174,7 @@ def fit_jointly(
     max_iter: int,
     tol: float,
     on_step: Callable[[], None] | None = None,
+    starts: Sequence[Start] = (),
     options: JointOptions = JOINT_OPTIONS,
 ) -> JointFit:
     """
@@ -184,13 +206,15 @@ def fit_jointly(
         Largest number of steps.
     tol, on_step
         As in `refine_joint`.
+    starts : sequence of Start, default=()
+        Where the fit starts, instead of `paper_shapes` and the search for starts.
     options : JointOptions
         The limits of all stages.
 
     Returns
     -------
     JointFit
-        The fit.
+        The fit. With `starts` its `camera_noise_ratio` is NaN.
     """
     n_shapes, _, n_points = paper_shapes.shape
     steps = Steps(max_iter, tol, on_step)
@@ -198,7 +222,10 @@ def fit_jointly(
     ready = _ready(*table, outliers, loss, steps, options)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
     # Fit of the sample (of all frames if it is the table), and judgement of the model
-    result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
+    if starts:
+        result, ratio, start = _continued_fit(first, starts, camera)
+    else:
+        result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
     result, least_noise, right = judged(first, result, start, cameras, spectrum)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
     problems = ready.problems
@@ -367,6 +394,28 @@ def _first_fit(
     if camera == "affine":
         return affine, ratio, rigid
     return result, ratio, starts[0]
+
+
+def _continued_fit(
+    problem: JointProblem, starts: Sequence[Start], camera: str
+) -> tuple[JointResult, float, JointState]:
+    """
+    Return the fit from the best of given starts, NaN, and that start.
+
+    The third number would be the `camera_noise_ratio`, which needs both camera models.
+    """
+    cameras, calibrated = CAMERAS[camera], CAMERAS["weak_perspective"]
+    fit = _calibrated_fit if cameras.calibrated else _refined
+    fits = []
+    for start in starts:
+        shapes = problem.frames.coordinates(start.shapes)
+        state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
+        if start.calibrated_first and not cameras.calibrated:
+            state = problem.aligned(state, "weak_perspective")
+            state = problem.refined(state, calibrated).state
+        state = problem.aligned(state, camera)
+        fits.append((fit(problem, state, cameras), np.nan, state))
+    return min(fits, key=lambda found: found[0].history[-1])
 
 
 def _least(results: Iterable[JointResult]) -> JointResult:

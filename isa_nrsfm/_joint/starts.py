@@ -152,6 +152,42 @@ def _leading(rows: NDArray, n: int) -> tuple[NDArray, NDArray]:
     return values, vectors
 
 
+def extended_shapes(
+    rows: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray, n_more: int
+) -> NDArray:
+    """
+    Return fitted shapes, and further basis shapes along what they leave.
+
+    Parameters
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Frames, each centred over the points that are seen; NaN for the others.
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Fitted cameras.
+    alpha : ndarray of shape (n_frames, n_shapes - 1)
+        Fitted coefficients.
+    n_more : int
+        Number of further basis shapes.
+
+    Returns
+    -------
+    ndarray of shape (n_shapes + n_more, 3, n_points)
+        The shapes, and the first principal components of the residuals ``M_i^+ (W_i -
+        M_i S_i)``, lifted to space as in `lifted_shapes`.
+    """
+    model = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
+    rest = rows - model
+    # The position of a frame is that of least squares; what is not seen leaves nothing.
+    rest = np.nan_to_num(rest - np.nanmean(rest, axis=2, keepdims=True))
+    lifted = (np.linalg.pinv(motion) @ rest).reshape(len(rows), -1)
+    values, axes = _leading(lifted, n_more)
+    more = np.zeros((n_more, *shapes.shape[1:]))
+    more[: len(values)] = (values[:, None] * axes).reshape(-1, *shapes.shape[1:])
+    return np.concatenate([shapes, more / np.sqrt(len(rows))])
+
+
 def affine_start(
     problem: JointProblem, W: NDArray, paper_shapes: NDArray
 ) -> JointState:

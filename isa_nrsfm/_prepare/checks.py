@@ -211,9 +211,13 @@ def check_size(n_frames: int, n_points: int, n_components: int) -> None:
         )
     smallest = smallest_n_frames(n_components)
     if n_frames < smallest:
+        possible = ""
+        if n_frames >= smallest_n_frames(1):
+            most = min(most_for_frames(n_frames), largest)
+            possible = f"; the largest possible n_components is {most}"
         raise ValueError(
             f"n_components={n_components} needs at least {smallest} frames (rows), "
-            f"X has n_samples={n_frames}"
+            f"X has n_samples={n_frames}{possible}"
         )
 
 

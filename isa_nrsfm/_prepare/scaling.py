@@ -87,6 +87,31 @@ class ScaledTable(NamedTuple):
         all_rows[self.shown] = values
         return all_rows
 
+    def part(self, rows: NDArray) -> "ScaledTable":
+        """
+        Return a part of the table.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (n_rows,)
+            Which rows of the table.
+
+        Returns
+        -------
+        ScaledTable
+            The table of these rows, their frames scaled as they are. Whether they are
+            enough for a fit is not checked.
+        """
+        kept = rows[self.shown]
+        return self._replace(
+            shown=self.shown[rows],
+            source=self.source._replace(blocks=self.source.blocks.subset(kept)),
+            rows=self.rows.subset(kept),
+            sizes=self.sizes[kept],
+            translation=self.translation[kept],
+            n_seen=self.n_seen[kept],
+        )
+
 
 def scaled_table(
     table: Table,

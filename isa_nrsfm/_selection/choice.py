@@ -1,0 +1,90 @@
+"""Tables of scores by the number of basis shapes, and the choice from them."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from isa_nrsfm._selection.path import Row
+
+BEST, ONE_STANDARD_ERROR = "best", "one_standard_error"
+SELECTIONS = (BEST, ONE_STANDARD_ERROR)
+
+
+def results_of(rows: Sequence[Row]) -> dict[str, Any]:
+    """
+    Return the rows of a path as the dictionary that `GridSearchCV` has.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        The rows.
+
+    Returns
+    -------
+    dict
+        `cv_results_` of `AffineNRSfMCV`.
+    """
+    scores = np.array([row.scores for row in rows])
+    mean = scores.mean(axis=1)
+    results: dict[str, Any] = {
+        "param_n_components": np.array([row.n_components for row in rows]),
+        "params": [{"n_components": row.n_components} for row in rows],
+        **{f"split{i}_test_score": scores[:, i] for i in range(scores.shape[1])},
+        "mean_test_score": mean,
+        "std_test_score": scores.std(axis=1),
+        # Scores that are not known are worse than any other.
+        "rank_test_score": rankdata(
+            -np.nan_to_num(mean, nan=-np.inf), method="min"
+        ).astype(np.int32),
+        "path_fit_time": np.array([row.path_seconds for row in rows]),
+    }
+    for name in ("fit", "score"):
+        seconds = np.array([getattr(row, f"{name}_seconds") for row in rows])
+        results[f"mean_{name}_time"] = seconds.mean(axis=1)
+        results[f"std_{name}_time"] = seconds.std(axis=1)
+    return results
+
+
+def selected(scores: NDArray, select: str) -> int:
+    """
+    Return which number of basis shapes is chosen.
+
+    Parameters
+    ----------
+    scores : ndarray of shape (n_candidates, n_splits)
+        Scores, by ascending number of basis shapes.
+    select : {"best", "one_standard_error"}
+        The best mean, or the fewest basis shapes whose mean is at most one standard
+        error of the best mean below it (Hastie, Tibshirani, Friedman, "The elements of
+        statistical learning", 2009, section 7.10).
+
+    Returns
+    -------
+    int
+        The index of the candidate.
+
+    Raises
+    ------
+    ValueError
+        If no mean is a number, or there is no standard error: there is only one split.
+    """
+    mean = scores.mean(axis=1)
+    if np.isnan(mean).all():
+        raise ValueError(
+            "no score is a number: too few points are seen to choose n_components by "
+            "points that are held out"
+        )
+    best = int(np.nanargmax(mean))
+    if select == BEST:
+        return best
+    n_splits = scores.shape[1]
+    if n_splits < 2:
+        raise ValueError(
+            f"select={select!r} needs the standard error over at least two splits; cv "
+            "has one"
+        )
+    error = scores[best].std(ddof=1) / np.sqrt(n_splits)
+    return int(np.argmax(mean >= mean[best] - error))
