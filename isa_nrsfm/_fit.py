@@ -32,14 +32,12 @@ from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
 from isa_nrsfm._gauge.canonical import (
-    canonical_gauge,
-    canonical_space,
-    euclidean_space,
     image_energies,
     mode_covariance,
     reorder_blocks,
 )
 from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._gauge.rigid import rigid_gauge
 from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
@@ -240,7 +238,7 @@ def fit_ready_table(
             progress,
         )
     else:
-        refined = _refined_by_paper(table, sample.W, factors, paper, options, unit)
+        refined = _refined_by_paper(table, factors, paper, options, unit)
     if not refined.converged:
         warn_caller(
             f"the refinement did not converge in max_iter={options.max_iter} steps; "
@@ -401,38 +399,34 @@ def _paper_result(
 
 def _refined_by_paper(
     table: ScaledTable,
-    W: NDArray,
     factors: Factorisation,
     paper: PaperResult,
     options: FitOptions,
     unit: float,
 ) -> Refined:
-    """Return the model and the frames of the paper's pipeline; W is completed."""
-    dtype, sizes = table.dtype, table.sizes[:, None, None]
-    completed = W.reshape(len(sizes), 2, -1).transpose(0, 2, 1) * sizes
+    """Return the model and the frames of the paper's pipeline."""
     shapes = _stacked_shapes(paper)
     if options.camera != "affine":
         scaled = options.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
-    # Rigid cameras and least squares coefficients, for the gauge
-    mean_shape, basis = shapes[0].T, shapes[1:].transpose(0, 2, 1)
-    rigid = RigidFrames(mean_shape, basis, options.camera).fit(completed, table.sizes)
-    motion = rigid.motion / sizes
-    # Gauge
-    if options.camera == "affine":
-        space = canonical_space(mean_shape, motion)
-    else:
-        scale = 1.0 if options.camera == "orthographic" else None
-        space = euclidean_space(mean_shape, motion, scale)
-    gauge = canonical_gauge(mean_shape, basis, motion, rigid.alpha, space)
-    mean_shape, basis = gauge.mean_shape.astype(dtype), gauge.basis.astype(dtype)
-    model = _model(
-        RigidFrames(mean_shape, basis, options.camera), mean_shape, basis, options, unit
+    source = table.source._replace(dtype=np.float64)
+
+    def model(mean_shape: NDArray, basis: NDArray) -> TableModel:
+        frames = RigidFrames(mean_shape, basis, options.camera)
+        return _model(frames, mean_shape, basis, options, unit)
+
+    # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
+    gauge = rigid_gauge(
+        shapes[0].T,
+        shapes[1:].transpose(0, 2, 1),
+        table.sizes,
+        lambda mean_shape, basis: model(mean_shape, basis).decompose(source),
+        camera=options.camera,
+        dtype=table.dtype,
     )
     return Refined(
-        model,
-        # Fitted again with the stored (rounded) shapes, so that transform agrees.
-        model.decompose(table.source),
+        model(gauge.mean_shape, gauge.basis),
+        gauge.frames.astype(table.dtype),
         reorder_blocks(paper.mode_covariance, gauge.order),
         paper.n_iter,
         paper.converged,

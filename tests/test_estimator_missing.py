@@ -75,6 +75,21 @@ def gross_scene(seed, size=0.0):
     return made, X, fitted, error(fitted, X, made.shapes)
 
 
+# --- gauge of the paper's refinement ------------------------------------------------
+
+
+@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
+@pytest.mark.parametrize("refinement", ["alternating", None])
+def test_coefficients_of_the_points_that_are_seen_are_canonical(refinement, camera):
+    """The table has frames of so few points that these leave coefficients open."""
+    X = scene(missing=0.5, n_points=16, n_frames=60).data
+    model = estimator(refinement=refinement, camera=camera).fit(X)
+    assert_allclose(model.alpha_.std(axis=0), 1.0, rtol=2e-6)
+    assert (np.mean(model.alpha_**3, axis=0) >= 0).all()
+    assert (np.diff(model.energy_share_) <= 1e-12).all()
+    assert_array_equal(model.transform(X), model.alpha_)
+
+
 # --- rows that show nothing ---------------------------------------------------------
 
 EMPTY = np.isin(np.arange(90), [0, 17, 18, 60, 89])

@@ -162,12 +162,30 @@ def canonical_gauge(
     rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
     # Others hold only rounding errors.
     moving = energy > OF_RANKS**2 * rigid
-    deviation = alpha.std(axis=0)
-    constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
-    size = np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
-    factors = np.where(moving, orientations(alpha.T) * size, 0.0)
+    sizes = coefficient_sizes(alpha)
+    factors = np.where(moving, orientations(alpha.T) * sizes, 0.0)
     scaled = factors[:, None, None] * basis
     return Gauge(mean_shape @ space.T, scaled[order] @ space.T, order, factors[order])
+
+
+def coefficient_sizes(alpha: NDArray) -> NDArray:
+    """
+    Return the sizes of coefficients that become one.
+
+    Parameters
+    ----------
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (n_components,)
+        Their standard deviations over the frames, or roots of their mean squares where
+        they do not vary.
+    """
+    deviation = alpha.std(axis=0)
+    constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
+    return np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
 
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
