@@ -16,6 +16,7 @@ from benchmarks import (
     _sets,
     _unseen,
     accuracy,
+    frame_search,
     sensitivity,
 )
 from benchmarks._agreement import compare
@@ -669,3 +670,20 @@ def test_command_refuses_what_it_does_not_know(arguments, message, capsys):
     with pytest.raises(SystemExit):
         command.main(arguments)
     assert message in capsys.readouterr().err
+
+
+def test_options_of_frames_are_varied_one_by_one():
+    (_, usual), *others = frame_search.variants()
+
+    def flat(options):
+        return np.concatenate([np.ravel(value) for value in options])
+
+    for title, changed in others:
+        ratio = flat(changed) / flat(usual)
+        assert np.sum(ratio != 1) == 1, title
+        # Whole numbers are rounded down.
+        factor = ratio[ratio != 1][0]
+        assert 1 / 3 <= factor <= 0.5 or factor == 2, title
+    n_values = len(flat(usual))
+    assert len(others) == 2 * n_values
+    assert len(list(frame_search.variants(only=["settled", "affine"]))) == 1 + 2 + 10

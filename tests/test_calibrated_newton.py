@@ -12,8 +12,7 @@ from scenes import random_rotation
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames import calibrated_newton as module
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch, calibrated_problem
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
@@ -109,13 +108,13 @@ def fitted(scene, camera, noise=NOISE**2, **options):
 
 
 def problem_of(scene, camera, noise):
-    """Return the module's inner problem, and the cameras in its coordinates."""
+    """Return the objectives of the search, and the cameras in its coordinates."""
     cameras = CAMERAS[camera]
     search = CalibratedSearch(scene.shapes, cameras.scaled)
     seen = np.isfinite(scene.tracks[..., 0])
     weights = None if seen.all() else 1.0 * seen
     products = frame_sums(frame_tracks(scene.tracks, weights), search.shapes)
-    problem = module._problem(products, np.full(len(scene.tracks), noise), cameras)
+    problem = calibrated_problem(products, np.full(len(scene.tracks), noise), cameras)
     axes = search.cameras(np.eye(3)[None])[0].T
     return problem, frames_last(scene.motion @ axes)
 
@@ -277,7 +276,7 @@ class TestDerivatives:
             step = np.zeros((n, M.shape[2]))
             step[c] = self.H
             yield tuple(
-                module._evaluate(problem, problem.cameras.moved(M, sign * step))
+                problem.evaluate(problem.cameras.moved(M, sign * step))
                 for sign in (1, -1)
             )
 
@@ -287,7 +286,7 @@ class TestDerivatives:
         scene = random_scene(camera)
         scene = scene.hidden() if gaps else scene
         problem, M = problem_of(scene, camera, NOISE**2)
-        got = module._evaluate(problem, M).value
+        got = problem.evaluate(M).value
         expected = [value(scene, i, each) for i, each in enumerate(scene.motion)]
         assert_allclose(got, NOISE**2 * np.array(expected), rtol=1e-9)
 
@@ -299,7 +298,7 @@ class TestDerivatives:
         scene = scene.hidden() if gaps else scene
         problem, M = problem_of(scene, camera, noise)
         M = self.disturbed(M, CAMERAS[camera])
-        slope = module._evaluate(problem, M).slope
+        slope = problem.evaluate(M).slope
         for c, (above, below) in enumerate(self.states(problem, M)):
             expected = -(above.value - below.value) / (4 * self.H)
             assert_allclose(slope[c], expected, rtol=1e-6, atol=1e-6)
@@ -325,7 +324,7 @@ class TestDerivatives:
         for noise in (1e-2, 1e-3, 1e-4):
             problem, M = problem_of(scene, camera, noise)
             M = self.disturbed(M, CAMERAS[camera], 0.03)
-            got = unpacked(module._evaluate(problem, M).hessian)
+            got = unpacked(problem.evaluate(M).hessian)
             expected = self.numerical_hessian(problem, M)
             size = np.abs(expected).max(axis=(0, 1))
             errors.append((np.abs(got - expected).max(axis=(0, 1)) / size).max())
@@ -339,7 +338,7 @@ class TestDerivatives:
         scene = random_scene(camera)
         problem, M = problem_of(scene, camera, noise)
         M = self.disturbed(M, CAMERAS[camera])
-        got = unpacked(module._evaluate(problem, M).hessian)
+        got = unpacked(problem.evaluate(M).hessian)
         excess = got - self.numerical_hessian(problem, M)
         least = np.linalg.eigvalsh(frames_first(excess))[:, 0]
         assert (least > -1e-5).all()
@@ -351,7 +350,7 @@ class TestDerivatives:
         rigid = scene._replace(shapes=scene.shapes[:1])
         problem, M = problem_of(rigid, camera, 0.1)
         M = self.disturbed(M, CAMERAS[camera])
-        got = unpacked(module._evaluate(problem, M).hessian)
+        got = unpacked(problem.evaluate(M).hessian)
         expected = self.numerical_hessian(problem, M)
         assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
 

@@ -262,6 +262,14 @@ class TestLargestLength:
                 size = max(size, abs(before[3]))
             assert_allclose(after, before / max(size, 1.0))
 
+    @pytest.mark.parametrize("scaled", [False, True])
+    def test_is_that_of_the_largest_turn(self, scaled):
+        cameras, half = CalibratedCameras(scaled), CalibratedCameras(scaled, 0.5)
+        step = 10 * np.random.default_rng(2).normal(size=(cameras.n_parameters, N))
+        expected = cameras.largest_length(step) / 2
+        assert half.largest_length(step) == pytest.approx(expected)
+        assert_allclose(half.limited(step), cameras.limited(2 * step) / 2)
+
     def test_other_cameras_have_none(self):
         assert AffineCameras().largest_length(np.full((6, N), 1e9)) == np.inf
         assert HeldCameras().largest_length(np.zeros((0, N))) == np.inf

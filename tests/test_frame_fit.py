@@ -8,6 +8,7 @@ from scenes import random_rotation
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.options import FRAME_OPTIONS
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._frames.projection import compose, distances, project
 from isa_nrsfm._prepare.robust import robust_weights
@@ -376,6 +377,21 @@ class TestPosteriorFrames:
         )
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
         assert_allclose(again.motion, fitted.motion, atol=1e-4)
+
+    def test_options_of_a_robust_loss(self):
+        frames, tracks = posterior_frames(0, "cauchy")
+        first = frames.posterior(tracks, FRAME_OPTIONS._replace(reweightings=0))
+        linear = frames._replace(loss="linear").posterior(tracks)
+        assert_allclose(first.alpha, linear.alpha, atol=1e-9)
+        exact = frames.posterior(tracks, FRAME_OPTIONS._replace(settled=1e-12)).alpha
+        errors = [
+            np.abs(
+                frames.posterior(tracks, FRAME_OPTIONS._replace(settled=s)).alpha
+                - exact
+            ).max()
+            for s in (0.1, 1e-3, 1e-6)
+        ]
+        assert errors[0] > errors[1] > errors[2] > 0
 
     @pytest.mark.parametrize("point", [0, 7, 12])
     @pytest.mark.parametrize("size", [2.0, 20.0])

@@ -7,7 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames import affine_newton, posterior
+from isa_nrsfm._frames.affine_newton import affine_problem
+from isa_nrsfm._frames.damped_newton import descend, newton_step
+from isa_nrsfm._frames.options import FRAME_OPTIONS
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks, whitened
 from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._linalg.packed_symmetric import unpacked
@@ -62,11 +64,11 @@ def assert_same_fits(got, expected, atol=1e-9):
 
 
 def problem_of(tracks, shapes, variance, weights=None):
-    """Return the module's inner problem, in the coordinates of white shapes."""
+    """Return the objectives of the search, in the coordinates of white shapes."""
     white, _ = whitened(shapes)
     products = frame_sums(frame_tracks(tracks, weights), white)
     variance = np.full(len(tracks), variance)
-    return affine_newton._problem(products, variance, shapes.shape[2])
+    return affine_problem(products, variance, shapes.shape[2])
 
 
 class TestOptimum:
@@ -124,16 +126,18 @@ class TestOptimum:
         for w in (None, weights):
             problem = problem_of(tracks, shapes, NOISE, w)
             alpha = np.random.default_rng(2).normal(size=(3, 5))
-            state = affine_newton._evaluate(problem, alpha)
+            state = problem.evaluate(alpha)
             h = 1e-5
             for k in range(3):
                 e = h * np.eye(3)[:, [k]]
-                above = affine_newton._evaluate(problem, alpha + e)
-                below = affine_newton._evaluate(problem, alpha - e)
-                slope = (above.explained - below.explained) / (4 * h)
+                above = problem.evaluate(alpha + e)
+                below = problem.evaluate(alpha - e)
+                slope = (below.value - above.value) / (4 * h)
                 assert_allclose(state.slope[k], slope, rtol=1e-6, atol=1e-7)
                 bend = (below.slope - above.slope) / (2 * h)
-                assert_allclose(unpacked(state.schur)[:, k], bend, rtol=1e-6, atol=1e-6)
+                assert_allclose(
+                    unpacked(state.hessian)[:, k], bend, rtol=1e-6, atol=1e-6
+                )
 
     def test_no_worse_than_alternation(self):
         tracks, shapes, _ = random_scene(0)
@@ -214,11 +218,10 @@ class TestInvariance:
     def test_more_frames_than_a_block(self):
         tracks, shapes, _ = random_scene(0)
         tracks[::2] = with_gaps(tracks[::2], 0)
-        once = fit_posterior(tracks, shapes, NOISE**2)
-        n_times = 2 * posterior.COMPLETE_BLOCK // len(tracks) + 2
-        many = fit_posterior(np.tile(tracks, (n_times, 1, 1)), shapes, NOISE**2)
-        expected = [np.concatenate([part] * n_times) for part in once]
-        assert_same_fits(many, type(once)(*expected), 1e-11)
+        expected = fit_posterior(tracks, shapes, NOISE**2)
+        small = FRAME_OPTIONS._replace(complete_block=4, weighted_block=7)
+        got = fit_posterior(tracks, shapes, NOISE**2, options=small)
+        assert_same_fits(got, expected, 1e-11)
 
     def test_memory_order(self):
         tracks, shapes, _ = random_scene(0)
@@ -474,21 +477,17 @@ def fitted_shapes(tracks, n_components):
 
 
 class TestStarts:
-    def best(self, tracks, shapes, variance, monkeypatch):
+    def best(self, tracks, shapes, variance):
         """Return the least objectives from twenty random starts."""
         rng = np.random.default_rng(0)
         starts = rng.normal(size=(20, len(shapes) - 1)) * np.repeat([1, 2], 10)[:, None]
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                posterior,
-                "_poorly_explained",
-                lambda fits, seen, variance: np.ones(len(seen), dtype=bool),
-            )
-            return fit_posterior(tracks, shapes, variance, starts=starts).objective
+        every = FRAME_OPTIONS._replace(suspicious=0.0)
+        fits = fit_posterior(tracks, shapes, variance, starts=starts, options=every)
+        return fits.objective
 
-    def test_large_motion_needs_them(self, mocap, monkeypatch):
+    def test_large_motion_needs_them(self, mocap):
         tracks, shapes, starts, variance = mocap
-        least = self.best(tracks, shapes, variance, monkeypatch)
+        least = self.best(tracks, shapes, variance)
         zero = fit_posterior(tracks, shapes, variance)
         fits = fit_posterior(tracks, shapes, variance, starts=starts)
         assert (zero.start == -1).all()
@@ -500,11 +499,11 @@ class TestStarts:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("gaps", [0.0, 0.4])
-    def test_faces_do_not(self, load_data, monkeypatch, gaps):
+    def test_faces_do_not(self, load_data, gaps):
         tracks = load_data("faces_wild_68_combined")["W2d"][::8]
         tracks, shapes, _, variance = fitted_shapes(tracks, 9)
         tracks = with_gaps(tracks[::2], 0, gaps)
-        least = self.best(tracks, shapes, variance, monkeypatch)
+        least = self.best(tracks, shapes, variance)
         fits = fit_posterior(tracks, shapes, variance)
         assert np.mean(fits.objective <= 1.001 * least) >= 0.995
         assert fits.converged.all()
@@ -515,13 +514,13 @@ class TestStarts:
         rng = np.random.default_rng(0)
         for size in (0.0, 1.0, 3.0):
             start = size * rng.normal(size=(len(shapes) - 1, len(tracks)))
-            before = affine_newton._evaluate(problem, start).explained
-            found, there = affine_newton._descend(problem, start, posterior.MAX_STEPS)
-            state = affine_newton._evaluate(problem, found)
-            assert (state.explained >= before - 1e-12 * problem.energy).all()
+            before = problem.evaluate(start)
+            found, there = descend(problem, before, FRAME_OPTIONS.max_steps)
+            state = problem.evaluate(found)
+            assert (state.value <= before.value + 1e-12 * problem.energy).all()
             assert there.mean() > 0.995
-            assert (np.linalg.eigvalsh(unpacked(state.schur).T)[there] > 0).all()
-            step, _ = affine_newton.solve_positive(state.schur, state.slope)
+            assert (np.linalg.eigvalsh(unpacked(state.hessian).T)[there] > 0).all()
+            step, _ = newton_step(state, np.zeros(len(tracks)))
             assert np.abs(step[:, there]).max() < 1e-7
 
     def test_a_start_leads_to_the_minimum_it_is_in(self):
@@ -529,9 +528,8 @@ class TestStarts:
         expected = fit_posterior(tracks, shapes, NOISE**2)
         # From the truth of each frame the search ends in the same place.
         problem = problem_of(tracks, shapes, NOISE**2)
-        found, converged = affine_newton._descend(
-            problem, alpha.T.copy(), posterior.MAX_STEPS
-        )
+        start = problem.evaluate(alpha.T.copy())
+        found, converged = descend(problem, start, FRAME_OPTIONS.max_steps)
         assert_allclose(found.T, expected.alpha, atol=1e-9)
         assert converged.all()
 
@@ -539,11 +537,8 @@ class TestStarts:
         tracks, shapes, _ = random_scene(0)
         starts = np.random.default_rng(1).normal(size=(5, 3))
         tracks[3] += 0.5 * np.random.default_rng(2).normal(size=(20, 2))
-        poor = posterior._poorly_explained(
-            fit_posterior(tracks, shapes, NOISE**2),
-            np.full(30, 20.0),
-            np.full(30, NOISE**2),
-        )
+        # By the chi-squared distribution of their objectives
+        poor = fit_posterior(tracks, shapes, NOISE**2).objective > 3 * 32 * NOISE**2
         assert poor[3]
         assert np.sum(poor) <= 2
         expected = fit_posterior(tracks, shapes, NOISE**2)

@@ -17,9 +17,8 @@ Write ``P_k = B_k W^T``, ``H_kl = <M B_k, M B_l>`` and c = (1, a). Half the grad
     H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k^T.
 
 The first step from a start takes ``H + s2 I`` in its place, half the Hessian with the
-camera held. The others are Newton steps. Where the Schur complement is not positive
-definite, or a step raised f, it is damped: a multiple of ``H + s2 I`` is added. So f
-never rises, up to rounding.
+camera held: f falls, as the camera that is best for the new coefficients is better
+still. The others are Newton steps (`damped_newton`), damped by ``H + s2 I``.
 """
 
 from typing import NamedTuple, Self
@@ -27,6 +26,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.damped_newton import State, descend, newton_step
+from isa_nrsfm._frames.options import FRAME_OPTIONS, Damping, FrameOptions
 from isa_nrsfm._frames.point_sums import (
     FrameGram,
     FrameSums,
@@ -46,20 +47,12 @@ from isa_nrsfm._linalg.packed_symmetric import (
     solve_positive,
     unpacked,
 )
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import frames_first
 
 # Ridge of ``A = S S^T``, as a share of the second moment of the shapes, and lower bound
 # of s2, as a share of the energy of the frame. They keep the result finite for
 # degenerate shapes, and are too small to change it for others.
 RIDGE = 1e-13
-# Convergence tolerance: a frame has converged when a Newton step gains less than this
-# share of its energy. Convergence is quadratic: the next step would gain far less.
-TOLERANCE = 1e-12
-# Damping below SMALLEST_DAMPING is set to zero. With LARGEST_DAMPING a step no longer
-# moves, and the search of the frame ends.
-SMALLEST_DAMPING = 0.05
-LARGEST_DAMPING = 1e8
 
 
 class AffineSearch:
@@ -70,16 +63,19 @@ class AffineSearch:
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes, rows centred.
+    options : FrameOptions
+        What steers the search.
 
     Attributes
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         The shapes in the space of `whitened`, where the search takes place.
+    first_steps : int
+        As of `FrameOptions`.
     """
 
-    first_steps = 5
-
-    def __init__(self, shapes: NDArray):
+    def __init__(self, shapes: NDArray, options: FrameOptions = FRAME_OPTIONS):
+        self._options, self.first_steps = options, options.first_steps
         self.shapes, self._space = whitened(np.ascontiguousarray(shapes))
 
     def cameras(self, motion: NDArray) -> NDArray:
@@ -115,16 +111,18 @@ class AffineSearch:
         FoundFrames
             The minima.
         """
-        problem = _problem(products, variance, n_points)
-        start = np.ascontiguousarray(initial.T)
-        alpha, converged = _descend(problem, start, max_steps)
-        state = _evaluate(problem, alpha)
+        problem = affine_problem(products, variance, n_points, self._options)
+        state = problem.evaluate(_first_step(problem, initial.T))
+        alpha, converged = descend(problem, state, max_steps - 1)
+        eliminated = _eliminated(problem, with_one(alpha))
+        state = _state(problem, alpha, *eliminated)
         prior = problem.ridge * np.einsum("ki,ki->i", alpha, alpha)
-        objective = np.maximum(products.energy - state.explained, 0.0)
+        objective = np.maximum(products.energy + state.value, 0.0)
+        covariance = problem.ridge * _inverse_hessian(state, problem.damping.largest)
         return FoundFrames(
-            _motion(state.camera),
+            _motion(eliminated[-1]),
             alpha.T,
-            frames_first(unpacked(problem.ridge * _inverse_schur(state))),
+            frames_first(unpacked(covariance)),
             objective,
             np.maximum(objective - prior, 0.0),
             converged,
@@ -134,11 +132,10 @@ class AffineSearch:
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (n_frames, 2, 3) by two steps from coefficients of zero."""
-        problem = _problem(products, variance, n_points)
-        state = _evaluate(problem, np.zeros((len(self.shapes) - 1, len(variance))))
-        # A step with the camera held, then a Newton step
-        alpha, _ = solve_positive(state.held, state.slope)
-        step, _ = _newton_step(_evaluate(problem, alpha), np.zeros(len(variance)))
+        problem = affine_problem(products, variance, n_points, self._options)
+        zero = np.zeros((len(self.shapes) - 1, len(variance)))
+        alpha = _first_step(problem, zero)
+        step, _ = problem.step(problem.evaluate(alpha), np.zeros(len(variance)))
         return _motion(_eliminated(problem, with_one(alpha + step))[-1])
 
 
@@ -147,28 +144,96 @@ def _motion(camera: NDArray) -> NDArray:
     return frames_first(camera.swapaxes(0, 1))
 
 
-class _Problem(NamedTuple):
-    """What the search for n frames needs, for `whitened` shapes."""
+class AffineProblem(NamedTuple):
+    """
+    The objectives of n frames as functions of their coefficients (K, n).
 
-    cross: NDArray  # P_k (n_shapes, 3, 2, n)
+    Attributes
+    ----------
+    cross : ndarray of shape (n_shapes, 3, 2, n)
+        P_k, for shapes that are white.
+    gram : SharedGram or FrameGram
+        Gram matrices of these shapes.
+    energy : ndarray of shape (n,)
+        ``||W||^2``.
+    ridge : ndarray of shape (n,)
+        s2, not zero.
+    precision : ndarray of shape (6, n)
+        Ridge of A, packed.
+    options : FrameOptions
+        What steers the search.
+    """
+
+    cross: NDArray
     gram: SharedGram | FrameGram
-    energy: NDArray  # ||W||^2 (n,)
-    ridge: NDArray  # s2, not zero (n,)
-    precision: NDArray  # ridge of A, packed (6, n)
+    energy: NDArray
+    ridge: NDArray
+    precision: NDArray
+    options: FrameOptions
+
+    @property
+    def damping(self) -> Damping:
+        """How steps are damped."""
+        return self.options.affine
 
     def take(self, frames: NDArray) -> Self:
         """Return the problem of some of the frames."""
-        return type(self)(
-            self.cross[..., frames],
-            self.gram.take(frames),
-            self.energy[frames],
-            self.ridge[frames],
-            self.precision[:, frames],
+        return self._replace(
+            cross=self.cross[..., frames],
+            gram=self.gram.take(frames),
+            energy=self.energy[frames],
+            ridge=self.ridge[frames],
+            precision=self.precision[:, frames],
         )
 
+    def evaluate(self, alpha: NDArray) -> State:
+        """Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n)."""
+        return _state(self, alpha, *_eliminated(self, with_one(alpha)))
 
-def _problem(products: FrameSums, variance: NDArray, n_points: float) -> _Problem:
-    """Return the problem with its ridges. The noise variances are (n_frames,)."""
+    def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return damped Newton steps (K, n), and the damping (n,).
+
+        Where the damped matrix is not positive definite, the step is that off a saddle
+        point.
+        """
+        step, positive = newton_step(state, damping)
+        failing = np.flatnonzero(~positive)
+        if len(failing):
+            damping[failing] = np.maximum(damping[failing], self.options.saddle)
+            step[:, failing] = _step_off_saddle(state.take(failing), damping[failing])
+        return step, damping
+
+    def moved(self, alpha: NDArray, step: NDArray) -> NDArray:
+        """Return coefficients after steps."""
+        return alpha + step
+
+
+def affine_problem(
+    products: FrameSums,
+    variance: NDArray,
+    n_points: float,
+    options: FrameOptions = FRAME_OPTIONS,
+) -> AffineProblem:
+    """
+    Return the objectives of frames, with ridges.
+
+    Parameters
+    ----------
+    products : FrameSums
+        Sums of the frames for shapes in the space of `whitened`.
+    variance : ndarray of shape (n_frames,)
+        Noise variances.
+    n_points : float
+        Number of points of a frame.
+    options : FrameOptions
+        What steers the search.
+
+    Returns
+    -------
+    AffineProblem
+        The objectives.
+    """
     energy, weight = products.energy, products.weight
     ridge = np.maximum(variance, RIDGE * energy)
     # A frame of zero energy: alpha is zero for any ridge.
@@ -176,31 +241,12 @@ def _problem(products: FrameSums, variance: NDArray, n_points: float) -> _Proble
     precision = np.zeros((6, len(ridge)))
     # A ridge on the diagonal: the shapes are white.
     precision[:3] = RIDGE * weight / n_points
-    return _Problem(products.cross, products.gram, energy, ridge, precision)
-
-
-class _State(NamedTuple):
-    """The objective at some coefficients of n frames, and its derivatives."""
-
-    alpha: NDArray  # (K, n)
-    camera: NDArray  # M^T (3, 2, n)
-    explained: NDArray  # ||W||^2 - f (n,)
-    slope: NDArray  # minus half the gradient of f(a) (K, n)
-    held: NDArray  # H + s2 I, half the Hessian with the camera held, packed
-    schur: NDArray  # half the Hessian of f(a), packed
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the state of some of the frames."""
-        return type(self)(*(each[..., frames] for each in self))
-
-    def put(self, frames: NDArray, other: Self) -> None:
-        """Set the state of some of the frames."""
-        for each, given in zip(self, other, strict=True):
-            each[..., frames] = given
+    cross, gram = products.cross, products.gram
+    return AffineProblem(cross, gram, energy, ridge, precision, options)
 
 
 def _eliminated(
-    problem: _Problem, c: NDArray
+    problem: AffineProblem, c: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """
     Eliminate the cameras for coefficients c (n_shapes, n).
@@ -216,87 +262,43 @@ def _eliminated(
     return T, R, half, np.einsum("bai,bri->ari", R, half)
 
 
-def _evaluate(problem: _Problem, alpha: NDArray) -> _State:
-    """Return f(a) and its derivatives at alpha (K, n), see the docstring on top."""
+def _state(
+    problem: AffineProblem,
+    alpha: NDArray,
+    T: NDArray,
+    R: NDArray,
+    half: NDArray,
+    camera: NDArray,
+) -> State:
+    """
+    Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n).
+
+    The other arrays are those of `_eliminated`. See the docstring on top.
+    """
     P, ridge = problem.cross, problem.ridge
-    c = with_one(alpha)
-    T, R, half, camera = _eliminated(problem, c)
     # ||W||^2 - f = ||R Y^T||^2 - s2 |a|^2
     explained = np.einsum("ari,ari->i", half, half)
     explained -= ridge * np.einsum("ki,ki->i", alpha, alpha)
 
     # H + s2 I, from M^T M
     images = np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :])
-    held = problem.gram.energies(images)[len(c) :]
+    held = problem.gram.energies(images)[len(alpha) + 1 :]
     held[diagonal_of(held)] += ridge
     # F_k^T, then R F_k^T for the Schur complement
     F = np.einsum("kabi,bri->kari", T[1:], camera)
     F -= P[1:]
     slope = 0.5 * np.einsum("kari,ari->ki", P[1:] - F, camera) - ridge * alpha
     F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(ridge))
-    return _State(alpha, camera, explained, slope, held, held - packed_gram(F))
+    return State(alpha, -explained, slope, held, held - packed_gram(F))
 
 
-def _descend(
-    problem: _Problem, alpha: NDArray, max_steps: int
-) -> tuple[NDArray, NDArray]:
-    """Return the last iterates from alpha (K, n), and whether they have converged."""
-    found, converged = alpha.copy(), np.zeros(alpha.shape[1], dtype=bool)
-    running, damping = np.arange(alpha.shape[1]), np.zeros(alpha.shape[1])
-    state = _evaluate(problem, alpha)
-    step, _ = solve_positive(state.held, state.slope)
-    for _ in range(max_steps):
-        # Trial step, refused where f rises
-        energy = problem.energy
-        trial = _evaluate(problem, state.alpha + step)
-        worse = np.flatnonzero(trial.explained < state.explained - OF_PRODUCTS * energy)
-        if len(worse):
-            trial.put(worse, state.take(worse))
-        state = trial
-        # Damping: less after a good step, more after a refused one
-        eased = np.where(damping > SMALLEST_DAMPING, damping / 8.0, 0.0)
-        eased[worse] = np.maximum(4.0 * damping[worse], 0.5)
-
-        # Next step, and convergence test by the decrease that it predicts
-        step, damping = _newton_step(state, eased)
-        gain = np.einsum("ki,ki->i", state.slope, step)
-        small = (damping == 0) & (gain <= TOLERANCE * energy)
-        stuck = damping >= LARGEST_DAMPING
-        leaving = small | stuck
-        if not leaving.any():
-            continue
-        # Frames that have ended leave the problem, converged ones with a last step.
-        step[:, stuck] = 0.0
-        done = running[leaving]
-        found[:, done] = (state.alpha + step)[:, leaving]
-        converged[done] = small[leaving]
-        left = np.flatnonzero(~leaving)
-        if not len(left):
-            return found, converged
-        running, damping, step = running[left], damping[left], step[:, left]
-        problem, state = problem.take(left), state.take(left)
-    found[:, running] = state.alpha
-    return found, converged
+def _first_step(problem: AffineProblem, alpha: NDArray) -> NDArray:
+    """Return coefficients (K, n) after a step from alpha with the cameras held."""
+    state = problem.evaluate(np.ascontiguousarray(alpha))
+    return alpha + solve_positive(state.definite, state.slope)[0]
 
 
-def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return damped Newton steps (K, n), and the damping (n,).
-
-    It is at least SMALLEST_DAMPING where the damped matrix is not positive definite.
-    """
-    matrix = state.schur
-    if damping.any():
-        matrix = matrix + damping * state.held
-    step, positive = solve_positive(matrix, state.slope)
-    failing = np.flatnonzero(~positive)
-    if len(failing):
-        damping[failing] = np.maximum(damping[failing], SMALLEST_DAMPING)
-        step[:, failing] = _step_off_saddle(state.take(failing), damping[failing])
-    return step, damping
-
-
-def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
+def _step_off_saddle(state: State, damping: NDArray) -> NDArray:
     """
     Return steps for frames whose Hessian is not positive definite.
 
@@ -306,7 +308,9 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
     and attacking the saddle point problem in high-dimensional non-convex optimization",
     2014).
     """
-    held, schur = (frames_first(unpacked(each)) for each in (state.held, state.schur))
+    held, schur = (
+        frames_first(unpacked(each)) for each in (state.definite, state.hessian)
+    )
     size, axes = np.linalg.eigh(held)
     size = np.maximum(size, SMALLEST_PIVOT * size[:, -1:])
     whitening = axes / np.sqrt(size)[:, None]
@@ -317,19 +321,19 @@ def _step_off_saddle(state: _State, damping: NDArray) -> NDArray:
     return np.einsum("nab,nb->an", axes, along)
 
 
-def _inverse_schur(state: _State) -> NDArray:
+def _inverse_hessian(state: State, most: float) -> NDArray:
     """
     Return the inverse of the Schur complement, packed.
 
     It is positive definite at a minimum that the frame determines. Elsewhere a multiple
-    of ``H + s2 I`` is added that is large enough.
+    of ``H + s2 I`` is added that is large enough, and below the largest damping, most.
     """
-    inverse, _, positive = invert_positive(state.schur)
+    inverse, _, positive = invert_positive(state.hessian)
     failing = np.flatnonzero(~positive)
     damping = 1.0
-    while len(failing) and damping < LARGEST_DAMPING:
+    while len(failing) and damping < most:
         part = state.take(failing)
-        matrix = part.schur + damping * part.held
+        matrix = part.hessian + damping * part.definite
         inverse[..., failing], _, positive = invert_positive(matrix)
         failing = failing[~positive]
         damping *= 10.0

@@ -15,8 +15,8 @@ times the Hessian is ::
 
 with ``F_k = M (B_k S^T + S B_k^T) - P_k^T``, ``Q = (H + s2 I)^-1`` and the second
 derivative D_cd of the camera. This is exact but for the log determinant, whose second
-derivative is replaced by the bound that A contains. Where the matrix is not positive
-definite, or a step raised F, it is damped: a multiple of ``tr(D_c A D_d^T)`` is added.
+derivative is replaced by the bound that A contains. Steps (`damped_newton`) are damped
+by ``tr(D_c A D_d^T)``.
 """
 
 from typing import NamedTuple, Self
@@ -33,39 +33,22 @@ from isa_nrsfm._frames.coefficients import (
     CoefficientPosterior,
     coefficient_posterior,
 )
+from isa_nrsfm._frames.damped_newton import State, descend, newton_step
+from isa_nrsfm._frames.options import FRAME_OPTIONS, Damping, FrameOptions
 from isa_nrsfm._frames.point_sums import FLAT, FrameSums, with_one
-from isa_nrsfm._frames.search import MAX_STEPS, FoundFrames
+from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     inverse3,
     invert_positive,
     pack3,
     pair_indices,
-    solve_positive,
     unpack3,
     unpacked,
 )
-from isa_nrsfm._linalg.rounding import OF_STEPS
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 # The least noise variance, as a share of the energy of a frame.
 RIDGE = 1e-13
-# A frame has converged when a Newton step gains less than this share of its energy.
-TOLERANCE = 1e-12
-# Objectives that differ by less than this share of the energy are equal.
-EQUAL = 1e-10
-# Damping: least value after a step that fails (FIRST_DAMPING), factors after a step
-# that fails (RAISED) and after a good one (EASED). Below SMALLEST_DAMPING it is set to
-# zero. With LARGEST_DAMPING a step no longer moves, and the search of the frame ends.
-FIRST_DAMPING = 0.1
-RAISED, EASED = 8.0, 0.1
-SMALLEST_DAMPING = 1e-3
-LARGEST_DAMPING = 1e8
-# A search with a limit is given up when the objective has to fall by more than so many
-# times the predicted gain of the next step.
-PROMISED = 10.0
-# Largest number of steps for rough cameras, and of those from reversed cameras.
-ROUGH_STEPS = 3
-REVERSED_STEPS = 6
 
 
 class CalibratedSearch:
@@ -79,18 +62,22 @@ class CalibratedSearch:
     scaled : bool
         Whether cameras have a scale of their own (weak perspective) or the scale one
         (orthographic).
+    options : FrameOptions
+        What steers the search.
 
     Attributes
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         The shapes, turned to the principal axes of the mean shape.
+    first_steps : int
+        The largest number of steps there is: no second round is needed.
     """
 
-    # Converged frames leave the search, so that no second round is needed.
-    first_steps = MAX_STEPS
-
-    def __init__(self, shapes: NDArray, scaled: bool):
-        self._models = CalibratedCameras(scaled)
+    def __init__(
+        self, shapes: NDArray, scaled: bool, options: FrameOptions = FRAME_OPTIONS
+    ):
+        self._options, self.first_steps = options, options.max_steps
+        self._models = CalibratedCameras(scaled, options.largest_turn)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         self._axes = axes
         self.shapes = np.ascontiguousarray(axes.T @ shapes)
@@ -130,9 +117,9 @@ class CalibratedSearch:
         FoundFrames
             The minima.
         """
-        problem = _problem(products, variance, self._models)
+        problem = self._problem(products, variance)
         M = _first_cameras(problem, np.ascontiguousarray(initial.T))
-        M, converged = _descend(problem, M, max_steps)
+        M, converged = descend(problem, problem.evaluate(M), max_steps)
         M, better, reached = _better_reversed(problem, M, max_steps)
         converged[better] = reached[better]
         return _found(problem, M, converged)
@@ -160,10 +147,11 @@ class CalibratedSearch:
             Which of them are new.
         """
         M = frames_last(motion @ self._axes)
-        problem = _problem(products, np.full(len(motion), noise), self._models)
+        problem = self._problem(products, np.full(len(motion), noise))
         # The cameras may not be at their minimum yet. Compare minima with minima.
-        M, _ = _descend(problem, M, REVERSED_STEPS)
-        M, better, _ = _better_reversed(problem, M, REVERSED_STEPS)
+        n_steps = self._options.reversed_steps
+        M, _ = descend(problem, problem.evaluate(M), n_steps)
+        M, better, _ = _better_reversed(problem, M, n_steps)
         motion = motion.copy()
         motion[better] = self.cameras(frames_first(M[:, :, better]))
         return motion, better
@@ -172,35 +160,110 @@ class CalibratedSearch:
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (n_frames, 2, 3) by a few steps from coefficients of zero."""
-        problem = _problem(products, variance, self._models)
+        problem = self._problem(products, variance)
         zero = np.zeros((len(self.shapes) - 1, len(variance)))
         M = _first_cameras(problem, zero)
-        return frames_first(_descend(problem, M, ROUGH_STEPS)[0])
+        M, _ = descend(problem, problem.evaluate(M), self._options.rough_steps)
+        return frames_first(M)
+
+    def _problem(self, products: FrameSums, variance: NDArray) -> "CalibratedProblem":
+        """Return the objectives of frames."""
+        return calibrated_problem(products, variance, self._models, self._options)
 
 
-class _Problem(NamedTuple):
-    """What the search for n frames needs."""
+class CalibratedProblem(NamedTuple):
+    """
+    The objectives of n frames as functions of their cameras (2, 3, n).
+
+    Attributes
+    ----------
+    products : FrameSums
+        Sums of the frames for the shapes.
+    noise : ndarray of shape (n,)
+        s2, not zero.
+    cameras : CalibratedCameras
+        Their model.
+    options : FrameOptions
+        What steers the search.
+    """
 
     products: FrameSums
-    noise: NDArray  # s2, not zero (n,)
+    noise: NDArray
     cameras: CalibratedCameras
+    options: FrameOptions
+
+    @property
+    def energy(self) -> NDArray:
+        """``||W||^2 + s2`` (n,)."""
+        return self.products.energy + self.noise
+
+    @property
+    def damping(self) -> Damping:
+        """How steps are damped."""
+        return self.options.calibrated
 
     def take(self, frames: NDArray) -> Self:
         """Return the problem of some of the frames."""
         products = self.products.take(frames)
-        return type(self)(products, self.noise[frames], self.cameras)
+        return self._replace(products=products, noise=self.noise[frames])
+
+    def evaluate(self, M: NDArray) -> State:
+        """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
+        return _state(self, M, _posterior(self, M))
+
+    def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return damped Newton steps (p, n), and the damping (n,).
+
+        It is raised until the damped matrix is positive definite.
+        """
+        rule, damping = self.damping, damping.copy()
+        step, positive = newton_step(state, damping)
+        failing = np.flatnonzero(~positive)
+        while len(failing):
+            damping[failing] = np.maximum(rule.raised * damping[failing], rule.first)
+            step[:, failing], positive = newton_step(
+                state.take(failing), damping[failing]
+            )
+            failing = failing[~positive & (damping[failing] < rule.largest)]
+        return self.cameras.limited(step), damping
+
+    def moved(self, M: NDArray, step: NDArray) -> NDArray:
+        """Return cameras after steps."""
+        return self.cameras.moved(M, step)
 
 
-def _problem(
-    products: FrameSums, variance: NDArray, cameras: CalibratedCameras
-) -> _Problem:
-    """Return the problem, with a noise that is not zero."""
+def calibrated_problem(
+    products: FrameSums,
+    variance: NDArray,
+    cameras: CalibratedCameras,
+    options: FrameOptions = FRAME_OPTIONS,
+) -> CalibratedProblem:
+    """
+    Return the objectives of frames, with a noise that is not zero.
+
+    Parameters
+    ----------
+    products : FrameSums
+        Sums of the frames for the shapes.
+    variance : ndarray of shape (n_frames,)
+        Noise variances.
+    cameras : CalibratedCameras
+        Model of the cameras.
+    options : FrameOptions
+        What steers the search.
+
+    Returns
+    -------
+    CalibratedProblem
+        The objectives.
+    """
     noise = np.maximum(variance, RIDGE * products.energy)
     noise = np.where(noise > 0, noise, 1.0)
-    return _Problem(products, noise, cameras)
+    return CalibratedProblem(products, noise, cameras, options)
 
 
-def _first_cameras(problem: _Problem, alpha: NDArray) -> NDArray:
+def _first_cameras(problem: CalibratedProblem, alpha: NDArray) -> NDArray:
     """
     Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 
@@ -256,7 +319,7 @@ def _reversed(M: NDArray) -> NDArray:
 
 
 def _better_reversed(
-    problem: _Problem, M: NDArray, max_steps: int
+    problem: CalibratedProblem, M: NDArray, max_steps: int
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the better cameras (2, 3, n) of those given and of minima from reversed ones.
@@ -264,43 +327,25 @@ def _better_reversed(
     Also returned are which of them are new (n,), and which searches converged (n,).
     """
     value = _value(problem, _posterior(problem, M))
-    limit = value - EQUAL * (problem.products.energy + problem.noise)
-    other, converged = _descend(problem, _reversed(M), max_steps, limit)
+    limit = value - problem.options.equal * problem.energy
+    start = problem.evaluate(_reversed(M))
+    other, converged = descend(problem, start, max_steps, limit)
     better = _value(problem, _posterior(problem, other)) < limit
     return np.where(better, other, M), better, converged
 
 
-class _State(NamedTuple):
-    """The objective at some cameras of n frames, and its derivatives."""
-
-    M: NDArray  # (2, 3, n)
-    value: NDArray  # s2 F (n,)
-    slope: NDArray  # minus half the gradient of s2 F along the tangents (p, n)
-    definite: NDArray  # tr(D_c A D_d^T), positive semidefinite, packed (n_pairs, n)
-    hessian: NDArray  # half the Hessian of s2 F, packed (n_pairs, n)
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the state of some of the frames."""
-        return type(self)(*(each[..., frames] for each in self))
-
-    def put(self, frames: NDArray, other: Self) -> None:
-        """Set the state of some of the frames."""
-        for each, given in zip(self, other, strict=True):
-            each[..., frames] = given
-
-
-def _value(problem: _Problem, posterior: CoefficientPosterior) -> NDArray:
+def _value(problem: CalibratedProblem, posterior: CoefficientPosterior) -> NDArray:
     """Return ``s2 F`` (n,)."""
     return posterior.objective + problem.noise * posterior.log_determinant
 
 
-def _posterior(problem: _Problem, M: NDArray) -> CoefficientPosterior:
+def _posterior(problem: CalibratedProblem, M: NDArray) -> CoefficientPosterior:
     """Return the posterior of the coefficients for cameras (2, 3, n)."""
     return coefficient_posterior(problem.products, M, problem.noise)
 
 
 def _coupling(
-    problem: _Problem, M: NDArray, posterior: CoefficientPosterior
+    problem: CalibratedProblem, M: NDArray, posterior: CoefficientPosterior
 ) -> NDArray:
     """Return ``<D_c, F_k>`` (p, K, n)."""
     products = problem.products
@@ -344,13 +389,14 @@ def _curvature(
     return first, second
 
 
-def _evaluate(problem: _Problem, M: NDArray) -> _State:
-    """Return F and its derivatives at M (2, 3, n), see the docstring on top."""
-    return _state(problem, M, _posterior(problem, M))
+def _state(
+    problem: CalibratedProblem, M: NDArray, posterior: CoefficientPosterior
+) -> State:
+    """
+    Return ``s2 F`` and its derivatives at M (2, 3, n), whose posterior is given.
 
-
-def _state(problem: _Problem, M: NDArray, posterior: CoefficientPosterior) -> _State:
-    """Return F and its derivatives at M (2, 3, n), whose posterior is given."""
+    See the docstring on top.
+    """
     noise, cameras = problem.noise, problem.cameras
     A = problem.products.gram.moments(posterior.second_moments(noise))
     G = np.einsum("rbi,bai->rai", M, unpack3(A))
@@ -365,76 +411,10 @@ def _state(problem: _Problem, M: NDArray, posterior: CoefficientPosterior) -> _S
     rows, columns = pair_indices(cameras.n_parameters)
     hessian -= np.einsum("pki,pki->pi", through[rows], coupling[columns])
     value = _value(problem, posterior)
-    return _State(M, value, -gradient, definite, hessian)
+    return State(M, value, -gradient, definite, hessian)
 
 
-def _descend(
-    problem: _Problem, M: NDArray, max_steps: int, limit: NDArray | None = None
-) -> tuple[NDArray, NDArray]:
-    """
-    Return the last iterates from cameras (2, 3, n), and whether they have converged.
-
-    With a limit (n,) the search of a frame is given up where the predicted gain says
-    that the objective will not fall below its limit.
-    """
-    found, converged = M.copy(), np.zeros(M.shape[2], dtype=bool)
-    running, damping = np.arange(M.shape[2]), np.zeros(M.shape[2])
-    limit = np.full(len(running), np.inf) if limit is None else limit
-    state = _evaluate(problem, M)
-    for _ in range(max_steps):
-        # Damped Newton step, and convergence test by the decrease that it predicts
-        step, damping = _newton_step(state, damping)
-        step = problem.cameras.limited(step)
-        energy = problem.products.energy + problem.noise
-        gain = np.einsum("ci,ci->i", state.slope, step)
-        small = (damping == 0) & (gain <= TOLERANCE * energy)
-        leaving = small | (damping >= LARGEST_DAMPING)
-        leaving |= state.value - PROMISED * gain > limit
-        # Frames that have ended leave the problem, converged ones with a last step.
-        if leaving.any():
-            last = problem.cameras.moved(state.M, np.where(small, step, 0.0))
-            found[:, :, running[leaving]] = last[:, :, leaving]
-            converged[running[leaving]] = small[leaving]
-            left = np.flatnonzero(~leaving)
-            if not len(left):
-                return found, converged
-            running, damping, step = running[left], damping[left], step[:, left]
-            limit = limit[left]
-            problem, state = problem.take(left), state.take(left)
-            energy = energy[left]
-        # Trial step, refused where the objective rises, and the next damping
-        trial = _evaluate(problem, problem.cameras.moved(state.M, step))
-        worse = np.flatnonzero(~(trial.value <= state.value + OF_STEPS * energy))
-        eased = EASED * damping
-        eased[eased < SMALLEST_DAMPING] = 0.0
-        if len(worse):
-            eased[worse] = np.maximum(RAISED * damping[worse], FIRST_DAMPING)
-            trial.put(worse, state.take(worse))
-        state, damping = trial, eased
-    found[:, :, running] = state.M
-    return found, converged
-
-
-def _newton_step(state: _State, damping: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return damped Newton steps (p, n), and the damping (n,).
-
-    It is raised until the damped matrix is positive definite.
-    """
-    damping = damping.copy()
-    matrix = state.hessian + damping * state.definite
-    step, positive = solve_positive(matrix, state.slope)
-    failing = np.flatnonzero(~positive)
-    while len(failing):
-        damping[failing] = np.maximum(RAISED * damping[failing], FIRST_DAMPING)
-        part = state.take(failing)
-        matrix = part.hessian + damping[failing] * part.definite
-        step[:, failing], positive = solve_positive(matrix, part.slope)
-        failing = failing[~positive & (damping[failing] < LARGEST_DAMPING)]
-    return step, damping
-
-
-def _found(problem: _Problem, M: NDArray, converged: NDArray) -> FoundFrames:
+def _found(problem: CalibratedProblem, M: NDArray, converged: NDArray) -> FoundFrames:
     """Return the minima of a search from their cameras (2, 3, n)."""
     noise = problem.noise
     posterior = _posterior(problem, M)

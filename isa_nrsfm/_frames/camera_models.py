@@ -22,14 +22,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.options import FRAME_OPTIONS
 from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, inverse3, unpack3
 from isa_nrsfm._linalg.polar import polar
 
 # Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
 RIDGE = 1e-9
-# Largest rotation of a camera in one step, in radians, and largest change of the
-# logarithm of its scale.
-LARGEST_TURN = 1.0
 
 
 class CameraModel(Protocol):
@@ -160,12 +158,14 @@ class CalibratedCameras:
     scaled : bool
         Whether the scales are unknown (weak perspective); otherwise they stay as they
         are (orthographic).
+    largest_turn : float
+        As of `FrameOptions`.
     """
 
     calibrated = True
 
-    def __init__(self, scaled: bool):
-        self.scaled = scaled
+    def __init__(self, scaled: bool, largest_turn: float = FRAME_OPTIONS.largest_turn):
+        self.scaled, self.largest_turn = scaled, largest_turn
         self.name = "weak_perspective" if scaled else "orthographic"
         self.n_parameters = 4 if scaled else 3
 
@@ -214,13 +214,14 @@ class CalibratedCameras:
         return np.einsum("abn,bn->an", inverse, vector)
 
     def largest_length(self, step: NDArray) -> float:
-        """Return the step length at which a camera moves by a radian or a factor e."""
+        """Return the step length at which a camera moves by the largest turn."""
         size = self._sizes(step).max(initial=0.0)
-        return LARGEST_TURN / size if size > 0 else np.inf
+        return self.largest_turn / size if size > 0 else np.inf
 
     def limited(self, step: NDArray) -> NDArray:
-        """Return steps that move no camera by more than a radian or a factor of e."""
-        return step * (LARGEST_TURN / np.maximum(self._sizes(step), LARGEST_TURN))
+        """Return steps that move no camera by more than the largest turn."""
+        most = self.largest_turn
+        return step * (most / np.maximum(self._sizes(step), most))
 
     def _sizes(self, step: NDArray) -> NDArray:
         """Return the angles of steps, or the logarithms of scales where larger."""

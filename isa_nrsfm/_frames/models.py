@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import distances
@@ -28,9 +29,6 @@ from isa_nrsfm._tables.visibility import seen_points
 UNSEEN = 1e-28
 # Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])
-# Largest number of rounds of a robust fit, and convergence tolerance of the weights.
-REWEIGHTINGS = 50
-SETTLED = 1e-4
 
 
 class FrameFit(NamedTuple):
@@ -298,8 +296,24 @@ class PosteriorFrames(NamedTuple):
             starts=self.starts,
         )
 
-    def posterior(self, tracks: NDArray) -> FramePosterior:
-        """Return the fit of frames (n, n_points, 2) of size one, before the gauge."""
+    def posterior(
+        self, tracks: NDArray, options: FrameOptions = FRAME_OPTIONS
+    ) -> FramePosterior:
+        """
+        Return the fit of frames, before the gauge.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks of frames of size one.
+        options : FrameOptions
+            What steers the fit.
+
+        Returns
+        -------
+        FramePosterior
+            The fit.
+        """
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
         fitted = partial(
@@ -307,6 +321,7 @@ class PosteriorFrames(NamedTuple):
             shapes=self.shapes,
             noise_variance=self.noise_variance,
             camera=self.camera,
+            options=options,
         )
         if self.loss == "linear":
             return fitted(tracks, starts=self.starts)
@@ -316,12 +331,12 @@ class PosteriorFrames(NamedTuple):
         seen = seen_points(tracks)
         changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
         # Then iteratively reweighted, for the frames whose weights still change
-        for _ in range(REWEIGHTINGS):
+        for _ in range(options.reweightings):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             distance = np.where(seen[changing], distance, np.inf)
             new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
-            unsettled = np.abs(new - weights[changing]).max(axis=1) > SETTLED
+            unsettled = np.abs(new - weights[changing]).max(axis=1) > options.settled
             weights[changing] = new
             changing = changing[unsettled]
             if not len(changing):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import (
     FrameSums,
     FrameTracks,
@@ -21,18 +22,9 @@ from isa_nrsfm._frames.point_sums import (
     frame_sums,
     frame_tracks,
 )
-from isa_nrsfm._frames.search import MAX_STEPS, FrameSearch
+from isa_nrsfm._frames.search import FrameSearch
 
-# Frames in a block: enough to be worth the calls, few enough for the cache. Frames
-# with missing points have a Gram matrix each.
-COMPLETE_BLOCK = 2048
-WEIGHTED_BLOCK = 512
-# Objectives that differ by less than this share of them are equal.
-EQUAL = 1e-10
-# An objective above this multiple of its expectation may be a local minimum only.
-SUSPICIOUS = 3.0
-
-SEARCHES: dict[str, Callable[[NDArray], FrameSearch]] = {
+SEARCHES: dict[str, Callable[..., FrameSearch]] = {
     "affine": AffineSearch,
     "weak_perspective": partial(CalibratedSearch, scaled=True),
     "orthographic": partial(CalibratedSearch, scaled=False),
@@ -87,6 +79,7 @@ def fit_posterior(
     weights: NDArray | None = None,
     initial: NDArray | None = None,
     starts: NDArray | None = None,
+    options: FrameOptions = FRAME_OPTIONS,
 ) -> FramePosterior:
     """
     Return the most probable camera, position and coefficients of each frame.
@@ -109,6 +102,8 @@ def fit_posterior(
     starts : ndarray of shape (n_starts, n_components), optional
         Coefficients to start from besides these, `spread_starts` for instance, for
         frames whose first fit is much worse than the noise explains.
+    options : FrameOptions
+        What steers the search.
 
     Returns
     -------
@@ -128,8 +123,8 @@ def fit_posterior(
     missing = np.isnan(tracks[..., 0]) | np.isnan(tracks[..., 1])
     seen = np.where(missing, 0.0, 1.0 if weights is None else weights)
     return _best_fits(
-        _Tracks(tracks, seen),
-        SEARCHES[camera](shapes),
+        _Tracks(tracks, seen, options),
+        SEARCHES[camera](shapes, options=options),
         noise_variance,
         initial=initial,
         starts=starts,
@@ -144,6 +139,7 @@ def fit_prepared(
     camera: str = "affine",
     initial: NDArray | None = None,
     starts: NDArray | None = None,
+    options: FrameOptions = FRAME_OPTIONS,
 ) -> FramePosterior:
     """
     Return the fits of `fit_posterior` for frames that are ready for products.
@@ -154,7 +150,7 @@ def fit_prepared(
         The frames, by their points or by their products with directions.
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes, by points (centred) or directions as the frames.
-    noise_variance, camera, initial, starts
+    noise_variance, camera, initial, starts, options
         As of `fit_posterior`.
 
     Returns
@@ -163,8 +159,8 @@ def fit_prepared(
         The best fit of each frame.
     """
     return _best_fits(
-        _Prepared(frames),
-        SEARCHES[camera](shapes),
+        _Prepared(frames, options),
+        SEARCHES[camera](shapes, options=options),
         noise_variance,
         initial=initial,
         starts=starts,
@@ -177,13 +173,14 @@ def approximate_cameras(
     noise_variance: float,
     *,
     camera: str = "affine",
+    options: FrameOptions = FRAME_OPTIONS,
 ) -> NDArray:
     """
     Return cameras close to those of `fit_prepared`, by a few steps from zero.
 
     Parameters
     ----------
-    frames, shapes, noise_variance, camera
+    frames, shapes, noise_variance, camera, options
         As of `fit_prepared`; all frames determine a camera.
 
     Returns
@@ -191,7 +188,8 @@ def approximate_cameras(
     ndarray of shape (n_frames, 2, 3)
         Cameras.
     """
-    search, prepared = SEARCHES[camera](shapes), _Prepared(frames)
+    prepared = _Prepared(frames, options)
+    search = SEARCHES[camera](shapes, options=options)
     motion = np.empty((len(frames.weight), 2, 3))
     for block, products in prepared.blocks(search.shapes):
         variance = np.full(len(block), noise_variance)
@@ -204,6 +202,7 @@ class _Tracks(NamedTuple):
 
     tracks: NDArray  # (n_frames, n_points, 2)
     weights: NDArray  # (n_frames, n_points)
+    options: FrameOptions
 
     @property
     def n_points(self) -> float:
@@ -217,7 +216,7 @@ class _Tracks(NamedTuple):
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames."""
-        return type(self)(self.tracks[frames], self.weights[frames])
+        return self._replace(tracks=self.tracks[frames], weights=self.weights[frames])
 
     def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
         """
@@ -225,15 +224,15 @@ class _Tracks(NamedTuple):
 
         Complete frames come first: they share one Gram matrix.
         """
-        tracks, weights = self
+        tracks, weights, options = self
         complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
-        for first in range(0, len(frames), COMPLETE_BLOCK):
-            block = frames[first : first + COMPLETE_BLOCK]
+        for first in range(0, len(frames), options.complete_block):
+            block = frames[first : first + options.complete_block]
             yield block, frame_sums(frame_tracks(tracks[block]), shapes)
         frames = np.flatnonzero(~complete)
-        for first in range(0, len(frames), WEIGHTED_BLOCK):
-            block = frames[first : first + WEIGHTED_BLOCK]
+        for first in range(0, len(frames), options.weighted_block):
+            block = frames[first : first + options.weighted_block]
             part = frame_tracks(tracks[block], weights[block])
             yield _determined(block, frame_sums(part, shapes), shapes)
 
@@ -242,6 +241,7 @@ class _Prepared(NamedTuple):
     """Frames that are ready for products."""
 
     frames: FrameTracks
+    options: FrameOptions
 
     @property
     def n_points(self) -> float:
@@ -257,12 +257,13 @@ class _Prepared(NamedTuple):
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames."""
-        return type(self)(self.frames.take(frames))
+        return self._replace(frames=self.frames.take(frames))
 
     def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
         """Yield the numbers of frames that determine a camera, and their sums."""
         complete = self.frames.weights is None
-        length = COMPLETE_BLOCK if complete else WEIGHTED_BLOCK
+        options = self.options
+        length = options.complete_block if complete else options.weighted_block
         for piece, part in self.frames.pieces(length):
             block, products = (
                 np.arange(piece.start, piece.stop),
@@ -295,6 +296,7 @@ def _best_fits(
     The arrays initial and starts are (n_frames, K) and (n_starts, K).
     """
     weight, n_components = frames.weight, len(search.shapes) - 1
+    options = frames.options
     n_frames = len(weight)
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
     first = np.zeros((n_frames, n_components)) if initial is None else initial
@@ -311,19 +313,21 @@ def _best_fits(
     # Second round: the few frames that have not converged, collected from all blocks
     slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
     if len(slow):
-        _put(fits, slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+        _put(fits, slow, fit(slow, fits.alpha[slow], options.max_steps))
     # Further starts for frames that are explained badly, all starts at once
-    poor = np.flatnonzero(_poorly_explained(fits, weight, variance))
+    poor = np.flatnonzero(_poorly_explained(fits, weight, variance, options))
     if len(extra) and len(poor):
         number = np.repeat(np.arange(len(extra)), len(poor))
-        others = fit(np.tile(poor, len(extra)), extra[number], MAX_STEPS)
+        others = fit(np.tile(poor, len(extra)), extra[number], options.max_steps)
         others = others._replace(start=number)
         # Of equal minima the first one is kept.
         objective = others.objective.reshape(len(extra), -1)
-        best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
+        best = np.argmax(
+            objective <= (1 + options.equal) * objective.min(axis=0), axis=0
+        )
         best = best * len(poor) + np.arange(len(poor))
         gain = fits.objective[poor] - others.objective[best]
-        better = gain > EQUAL * fits.objective[poor]
+        better = gain > options.equal * fits.objective[poor]
         _put(fits, poor[better], _take(others, best[better]))
     return fits._replace(motion=search.cameras(fits.motion))
 
@@ -377,7 +381,7 @@ def _put(fits: FramePosterior, frames: NDArray, others: FramePosterior) -> None:
 
 
 def _poorly_explained(
-    fits: FramePosterior, weight: NDArray, variance: NDArray
+    fits: FramePosterior, weight: NDArray, variance: NDArray, options: FrameOptions
 ) -> NDArray:
     """
     Return whether objectives are much larger than the noise explains.
@@ -387,7 +391,7 @@ def _poorly_explained(
     point less the eight of camera and position.
     """
     freedom = np.maximum(2.0 * weight - 8.0, 1.0)
-    return fits.objective > SUSPICIOUS * variance * freedom
+    return fits.objective > options.suspicious * variance * freedom
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

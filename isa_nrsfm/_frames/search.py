@@ -6,9 +6,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameSums
 
-# Largest number of steps of a search.
-MAX_STEPS = 60
-
 
 class FoundFrames(NamedTuple):
     """
