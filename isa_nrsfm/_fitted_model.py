@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.posterior import FramePosterior
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.checks import clean_tracks
@@ -61,16 +62,15 @@ class TableModel(NamedTuple):
         fit = partial(_fit, model=self, dtype=table.dtype)
         return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
 
-    def coefficient_posterior(self, table: Table) -> tuple[NDArray, NDArray]:
+    def posterior(self, table: Table) -> FramePosterior:
         """
-        Return mean and covariance of the coefficients of each frame by itself.
+        Return the fit of each frame by itself, of size one and before the gauge.
 
-        They are those before the gauge, where the prior is N(0, I). NaN for frames that
-        are not usable.
+        There coefficients have the prior N(0, I). NaN for frames that are not usable.
+        Only for `PosteriorFrames`.
         """
         found = table.blocks.map(partial(_posterior, model=self))
-        mean, covariance = map(np.concatenate, zip(*found, strict=True))
-        return mean, covariance
+        return FramePosterior(*map(np.concatenate, zip(*found, strict=True)))
 
     def reconstruct(
         self, table: Table, metric: DeformationMetric | None, scaled: bool
@@ -136,18 +136,17 @@ def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
     return frames.astype(dtype)
 
 
-def _posterior(rows: NDArray, model: TableModel) -> tuple[NDArray, NDArray]:
-    """Return mean and covariance of the coefficients of rows (n, 2 * n_points)."""
+def _posterior(rows: NDArray, model: TableModel) -> FramePosterior:
+    """Return the fit of rows (n, 2 * n_points) by themselves, before the gauge."""
+    assert isinstance(model.frames, PosteriorFrames)
     tracks, usable = model.usable(rows)
-    K = len(model.basis)
-    mean, covariance = (np.full((len(tracks), *s), np.nan) for s in ((K,), (K, K)))
-    if usable.any():
-        assert isinstance(model.frames, PosteriorFrames)
-        centred, _ = centred_tracks(tracks[usable])
-        sizes = model.sizes(centred)
-        found = model.frames.posterior(centred / sizes[:, None, None])
-        mean[usable], covariance[usable] = found.alpha, found.covariance
-    return mean, covariance
+    centred, _ = centred_tracks(tracks[usable])
+    sizes = model.sizes(centred)
+    found = model.frames.posterior(centred / sizes[:, None, None])
+    whole = FramePosterior.unknown(len(tracks), len(model.basis))
+    for all_frames, of_usable in zip(whole, found, strict=True):
+        all_frames[usable] = of_usable
+    return whole
 
 
 def _shapes(

@@ -221,8 +221,10 @@ class TableTransformer(
                 "smooth needs a model with refinement='joint', which knows how certain "
                 f"coefficients are; got refinement={self.refinement!r}"
             )
+        alone = self._model.posterior(table)
         mean, covariance, time_scales = smoothed_posterior(
-            *self._model.coefficient_posterior(table),
+            alone.alpha,
+            alone.covariance,
             time,
             groups,
             max_gap=max_gap,
@@ -236,6 +238,40 @@ class TableTransformer(
             deviation.astype(dtype, copy=False),
             time_scales,
         )
+
+    def rotation_covariance(self, X: Any) -> NDArray:
+        """
+        Return how certain the rotations of calibrated cameras are.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points)
+            A table with the points of the fitted one.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, 3, 3)
+            Posterior covariances, in radians squared, of the rotation vectors w by
+            which rotations R may be off: ``R exp(hat(w))``, w in the axes of the
+            shapes. They contain the uncertainty of the coefficients, but not that of
+            the shapes. NaN for rows of which too little is seen.
+
+        Raises
+        ------
+        ValueError
+            If the model has affine cameras, or was not refined jointly.
+        """
+        table = self._opened(X)
+        frames = self._model.frames
+        if self.camera_ == "affine" or not isinstance(frames, PosteriorFrames):
+            raise ValueError(
+                "rotation_covariance needs a model with calibrated cameras and "
+                f"refinement='joint'; got camera={self.camera_!r} and "
+                f"refinement={self.refinement!r}"
+            )
+        space = frames.gauge.space
+        covariance = self._model.posterior(table).turn_covariance
+        return np.asarray(space @ covariance @ space.T).astype(table.dtype, copy=False)
 
     def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """

@@ -132,8 +132,12 @@ def test_a_later_run_without_questions_takes_the_figures_away(run, tmp_path, cap
         (["--time", "mood"], "--time: expected numbers or dates; 120 of 120 frames"),
         (["--time", "same"], "--time same: times must rise .* row 1 has 1 after 1 of"),
         (["--time", "gaps"], "--time gaps: time must be known .* missing in 3 of 120"),
-        (["--fps", "0"], "expected frames a second, a number above zero; got '0'"),
+        (["--fps", "0"], "expected a number above zero; got '0'"),
         (["--fps", "5", "--time", "seconds"], "not allowed with"),
+        (["--distance", "3"], "expected two points with a comma between them"),
+        (["--distance", "3,99"], "--distance 3,99: there is no point '99'; the 14"),
+        (["--distance", "3,3"], "--distance 3,3: expected two different points"),
+        (["--unit", "3,4"], "--unit is for --distance"),
     ],
 )
 def test_refused_before_the_fit(tmp_path, capsys, options, message):

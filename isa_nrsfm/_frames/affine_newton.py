@@ -82,6 +82,10 @@ class AffineSearch:
         """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
         return motion @ self._space
 
+    def turns(self, covariance: NDArray) -> NDArray:
+        """Return the covariances, which are NaN: affine cameras have no rotation."""
+        return covariance
+
     def fit(
         self,
         products: FrameSums,
@@ -123,6 +127,7 @@ class AffineSearch:
             _motion(eliminated[-1]),
             alpha.T,
             frames_first(unpacked(covariance)),
+            np.full((len(products.energy), 3, 3), np.nan),
             objective,
             np.maximum(objective - prior, 0.0),
             converged,

@@ -87,6 +87,10 @@ class CalibratedSearch:
         """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
         return motion @ self._axes.T
 
+    def turns(self, covariance: NDArray) -> NDArray:
+        """Return covariances of rotation vectors (n, 3, 3) for the original shapes."""
+        return self._axes @ covariance @ self._axes.T
+
     def fit(
         self,
         products: FrameSums,
@@ -435,6 +439,7 @@ def _found(problem: CalibratedProblem, M: NDArray, converged: NDArray) -> FoundF
         frames_first(M),
         posterior.alpha.T,
         frames_first(covariance),
+        frames_first(noise * inverse[:3, :3]),
         posterior.objective,
         np.maximum(posterior.residual(noise), 0.0),
         converged,

@@ -47,6 +47,8 @@ class FramePosterior(NamedTuple):
         Posterior covariance of alpha in the normal approximation at the optimum
         (Laplace), with the uncertainty of camera and position: noise variance times
         the inverse of the Schur complement.
+    turn_covariance : ndarray of shape (n_frames, 3, 3)
+        As of `FoundFrames`, with the uncertainty of the coefficients.
     objective : ndarray of shape (n_frames,)
         ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2`` at the optimum, in squared
         units of the tracks. Its error is below 1e-12 of the energy of the centred
@@ -64,10 +66,26 @@ class FramePosterior(NamedTuple):
     translation: NDArray
     alpha: NDArray
     covariance: NDArray
+    turn_covariance: NDArray
     objective: NDArray
     residual: NDArray
     converged: NDArray
     start: NDArray
+
+    @classmethod
+    def unknown(cls, n_frames: int, n_components: int) -> Self:
+        """Return fits of NaN, to be filled in."""
+        return cls(
+            motion=np.full((n_frames, 2, 3), np.nan),
+            translation=np.full((n_frames, 2), np.nan),
+            alpha=np.full((n_frames, n_components), np.nan),
+            covariance=np.full((n_frames, n_components, n_components), np.nan),
+            turn_covariance=np.full((n_frames, 3, 3), np.nan),
+            objective=np.full(n_frames, np.nan),
+            residual=np.full(n_frames, np.nan),
+            converged=np.zeros(n_frames, dtype=bool),
+            start=np.full(n_frames, -1),
+        )
 
 
 def fit_posterior(
@@ -329,7 +347,10 @@ def _best_fits(
         gain = fits.objective[poor] - others.objective[best]
         better = gain > options.equal * fits.objective[poor]
         _put(fits, poor[better], _take(others, best[better]))
-    return fits._replace(motion=search.cameras(fits.motion))
+    return fits._replace(
+        motion=search.cameras(fits.motion),
+        turn_covariance=search.turns(fits.turn_covariance),
+    )
 
 
 def _fit(
@@ -340,17 +361,7 @@ def _fit(
     max_steps: int,
 ) -> FramePosterior:
     """Return the minima that frames reach from coefficients initial (n_frames, K)."""
-    n_frames, n_components = initial.shape
-    fits = FramePosterior(
-        motion=np.full((n_frames, 2, 3), np.nan),
-        translation=np.full((n_frames, 2), np.nan),
-        alpha=np.full((n_frames, n_components), np.nan),
-        covariance=np.full((n_frames, n_components, n_components), np.nan),
-        objective=np.full(n_frames, np.nan),
-        residual=np.full(n_frames, np.nan),
-        converged=np.zeros(n_frames, dtype=bool),
-        start=np.full(n_frames, -1),
-    )
+    fits = FramePosterior.unknown(*initial.shape)
     for block, products in frames.blocks(search.shapes):
         found = search.fit(
             products,
@@ -363,6 +374,7 @@ def _fit(
         fits.translation[block] = products.positions(found.motion, found.alpha)
         fits.alpha[block] = found.alpha
         fits.covariance[block] = found.covariance
+        fits.turn_covariance[block] = found.turn_covariance
         fits.objective[block] = found.objective
         fits.residual[block] = found.residual
         fits.converged[block] = found.converged

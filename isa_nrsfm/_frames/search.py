@@ -20,6 +20,9 @@ class FoundFrames(NamedTuple):
     covariance : ndarray of shape (n_frames, n_components, n_components)
         Posterior covariance of the coefficients. It contains the uncertainty of the
         camera.
+    turn_covariance : ndarray of shape (n_frames, 3, 3)
+        Posterior covariance of the rotation vectors w of ``M exp(hat(w))``, in radians
+        squared. NaN for affine cameras.
     objective : ndarray of shape (n_frames,)
         ``||W - M S||^2 + s2 |a|^2``.
     residual : ndarray of shape (n_frames,)
@@ -31,6 +34,7 @@ class FoundFrames(NamedTuple):
     motion: NDArray
     alpha: NDArray
     covariance: NDArray
+    turn_covariance: NDArray
     objective: NDArray
     residual: NDArray
     converged: NDArray
@@ -54,6 +58,9 @@ class FrameSearch(Protocol):
 
     def cameras(self, motion: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
+
+    def turns(self, covariance: NDArray) -> NDArray:
+        """Return covariances of rotation vectors (n, 3, 3) for the original shapes."""
 
     def fit(
         self,

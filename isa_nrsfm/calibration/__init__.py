@@ -33,6 +33,7 @@ __all__ = [
     "MetricUpgrade",
     "OrthonormalCameras",
     "ViewAngles",
+    "angle_deviations",
     "canonical_pose",
     "deformation_metric",
     "euclidean_frames",
@@ -59,7 +60,11 @@ if TYPE_CHECKING:
         metric_upgrade,
     )
     from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
-    from isa_nrsfm.calibration._view_angles import ViewAngles, view_angles
+    from isa_nrsfm.calibration._view_angles import (
+        ViewAngles,
+        angle_deviations,
+        view_angles,
+    )
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -83,6 +88,10 @@ else:
                 "CanonicalPose",
                 "canonical_pose",
             ],
-            "isa_nrsfm.calibration._view_angles": ["ViewAngles", "view_angles"],
+            "isa_nrsfm.calibration._view_angles": [
+                "ViewAngles",
+                "angle_deviations",
+                "view_angles",
+            ],
         },
     )

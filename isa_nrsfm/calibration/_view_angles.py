@@ -82,3 +82,71 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
         roll, x, y = euler.T
         angles[:, known] = -y + 0.0, -x + 0.0, roll + 0.0  # no minus zeros
     return ViewAngles(*angles)
+
+
+def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
+    """
+    Return the standard deviations of yaw, pitch and roll.
+
+    Parameters
+    ----------
+    angles : ViewAngles
+        The angles of rotations R.
+    covariance : array-like of shape (n_frames, 3, 3)
+        Covariances, in radians squared, of the rotation vectors w by which the
+        rotations may be off, ``R exp(hat(w))``: w is in the axes of the object. As of
+        `AffineNRSfM.rotation_covariance`, turned to these axes.
+
+    Returns
+    -------
+    ViewAngles
+        Standard deviations in degrees, to first order. They are infinite or very large
+        where the object looks straight up or down, as yaw and roll have no meaning
+        there.
+
+    Raises
+    ------
+    ValueError
+        If there is not one covariance for each frame.
+
+    Notes
+    -----
+    With ``R = Z(roll) X(x) Y(y)``, x = -pitch and y = -yaw, the rotation vector of
+    small changes is ``w = Y^T X^T e_z d(roll) + Y^T e_x dx + e_y dy``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from isa_nrsfm.calibration import angle_deviations, view_angles
+    >>> frontal = view_angles([np.eye(3)])
+    >>> np.round(angle_deviations(frontal, [np.diag([0.01, 0.04, 0.0])]), 1)
+    array([[11.5],
+           [ 5.7],
+           [ 0. ]])
+    """
+    C = np.asarray(covariance, dtype=np.float64)
+    n_frames = len(angles.yaw)
+    if C.shape != (n_frames, 3, 3):
+        raise ValueError(
+            f"covariance must be of the shape ({n_frames}, 3, 3); got {C.shape}"
+        )
+    deviations = np.full((3, n_frames), np.nan)
+    known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
+    if known.any():
+        Y = _turns([0.0, 1.0, 0.0], -angles.yaw[known])
+        X = _turns([1.0, 0.0, 0.0], -angles.pitch[known])
+        along_x, along_z = Y.swapaxes(1, 2)[:, :, 0], (X @ Y)[:, 2]
+        along_y = np.broadcast_to([0.0, 1.0, 0.0], along_x.shape)
+        # w = slope (dy, dx, d roll)
+        slope = np.stack([along_y, along_x, along_z], axis=2)
+        inverse = np.linalg.pinv(slope)
+        variance = np.einsum("nab,nbc,nac->an", inverse, C[known], inverse)
+        deviations[:, known] = np.degrees(np.sqrt(variance))
+    return ViewAngles(*deviations)
+
+
+def _turns(axis: list[float], degrees: NDArray) -> NDArray:
+    """Return rotations (n, 3, 3) about an axis by angles (n,)."""
+    return np.asarray(
+        Rotation.from_rotvec(np.outer(degrees, axis), degrees=True).as_matrix()
+    )

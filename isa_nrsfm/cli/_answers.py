@@ -1,6 +1,7 @@
 """What a fit says of the other columns of a table: labels, groups and times."""
 
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._dynamics.sequences import checked_times, sequences_of
 from isa_nrsfm.analysis import (
@@ -21,6 +23,8 @@ from isa_nrsfm.analysis import (
 from isa_nrsfm.analysis._labels import kind_of
 from isa_nrsfm.cli._frames import Frames, column_named
 from isa_nrsfm.cli._outputs import component_names, write_figure
+from isa_nrsfm.export import point_distances
+from isa_nrsfm.export._poses import point_numbers
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,6 +71,12 @@ class Answers(NamedTuple):
         Name of the column of times, or "seconds" for frames in order.
     times : ndarray of shape (n_frames,) or None
         Times of the frames.
+    distances : list of (int, int)
+        Pairs of points whose distances are asked for.
+    unit : tuple of (int, int) or None
+        Points whose distance is the unit.
+    length : float
+        Its length.
     """
 
     labels: list[Label]
@@ -74,6 +84,9 @@ class Answers(NamedTuple):
     groups: NDArray | None
     time: str | None
     times: NDArray | None
+    distances: list[tuple[int, int]]
+    unit: tuple[int, int] | None
+    length: float
 
 
 def asked_for(args: Namespace, frames: Frames) -> Answers:
@@ -106,7 +119,24 @@ def asked_for(args: Namespace, frames: Frames) -> Answers:
         )
     if times is not None:
         _check_order(times, groups, time)
-    return Answers(labels, args.group, groups, time, times)
+    names = frames.columns.points
+    distances = [_numbered(pair, names, "--distance") for pair in args.distance]
+    unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
+    if unit is not None and not distances:
+        raise ValueError("--unit is for --distance")
+    return Answers(
+        labels, args.group, groups, time, times, distances, unit, args.length
+    )
+
+
+def _numbered(
+    pair: tuple[str, str], names: Sequence[str], option: str
+) -> tuple[int, int]:
+    """Return the numbers of two points."""
+    try:
+        return point_numbers(pair, names)
+    except ValueError as error:
+        raise ValueError(f"{option} {','.join(pair)}: {error}") from error
 
 
 def _label(table: "pd.DataFrame", text: str) -> Label:
@@ -233,7 +263,24 @@ def answered(
         columns |= dict(
             zip([f"{n}_smooth" for n in names], smooth.alpha.T, strict=True)
         )
+    if asked.distances:
+        columns |= _distances(asked, estimator, X)
     return Answered(report, pd.DataFrame(columns, index=X.index), smooth)
+
+
+def _distances(
+    asked: Answers, estimator: AffineNRSfM, X: "pd.DataFrame"
+) -> dict[str, NDArray]:
+    """Return the distances that are asked for, with a warning where they are unsure."""
+    try:
+        found = point_distances(
+            estimator, asked.distances, unit=asked.unit, length=asked.length
+        )
+    except ValueError as error:
+        warn_caller(f"alpha.csv has no distances: {error}")
+        return {}
+    names = [f"distance_{a}_{b}" for a, b in asked.distances]
+    return dict(zip(names, found.T, strict=True))
 
 
 def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:

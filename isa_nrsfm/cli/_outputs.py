@@ -33,12 +33,15 @@ TABLES = {
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
     "(X, Y, Z) is x = m00 X + m01 Y + m02 Z + tx, y = m10 X + m11 Y + m12 Z + ty; of "
     "calibrated cameras a scale times two rows of a rotation; "
-    "inverse_snr is the energy of the reprojection error relative to the frame's",
+    "inverse_snr is the energy of the reprojection error relative to the frame's; yaw, "
+    "pitch and roll in degrees, zero for a frontal, upright object, where the cameras "
+    "tell them",
 }
 ARRAYS = {
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
     "a frame is mean_shape + sum_k alpha_k basis[k]",
 }
+NOT_TOLD = "viewer.html has affine shapes, and cameras.csv no angles"
 PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
 MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
 
@@ -119,12 +122,34 @@ def write_results(
     The tables have a row for each frame, empty for those that could not be fitted. The
     labels are those of the frames in the viewer.
     """
-    pd = import_optional("pandas", extra="io")
     fit = fitted_frames(estimator)
     alpha = alpha_table(fit, frames, std=std).join(further)
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
+    poses = told_poses(estimator, X, edges, NOT_TOLD)
+    cameras = camera_table(estimator, fit, X).join(poses)
+    cameras = cameras.reindex(frames.points.index)
+    cameras.insert(0, "row", cameras.index)
+    write_table(cameras, folder / "cameras.csv")
+
+    export.write_shapes(estimator, folder / "shapes.npz")
+    export.write_viewer(
+        estimator,
+        folder / "viewer.html",
+        X=X,
+        edges=edges,
+        labels=labels,
+        camera="weak_perspective" if len(poses.columns) else None,
+    )
+    save_model(estimator, folder / "model.skops")
+
+
+def camera_table(
+    estimator: AffineNRSfM, fit: Decomposition, X: "pd.DataFrame"
+) -> "pd.DataFrame":
+    """Return cameras and reprojection errors of frames, with the index of the table."""
+    pd = import_optional("pandas", extra="io")
     cameras = pd.DataFrame(
         np.hstack([fit.motion.reshape(-1, 6), fit.translation]),
         index=X.index,
@@ -132,32 +157,38 @@ def write_results(
     )
     energy, error, _ = frame_energies(X, fitted_table(estimator, fit), estimator.layout)
     cameras["inverse_snr"] = error / energy
-    cameras = cameras.reindex(frames.points.index)
-    cameras.insert(0, "row", cameras.index)
-    write_table(cameras, folder / "cameras.csv")
-
-    export.write_shapes(estimator, folder / "shapes.npz")
-    write_page(folder / "viewer.html", estimator, X, edges, labels)
-    save_model(estimator, folder / "model.skops")
+    return cameras
 
 
-def write_page(
-    path: Path,
-    estimator: AffineNRSfM,
-    X: Any,
-    edges: Any,
-    labels: "pd.Series | None" = None,
-) -> None:
+def told_poses(
+    estimator: AffineNRSfM, X: "pd.DataFrame", edges: Any, otherwise: str
+) -> "pd.DataFrame":
+    """Return yaw, pitch, roll, scale and deviations of frames as columns.
+
+    There are none, with a warning that says what is done otherwise, where the cameras
+    hardly tell the metric of space.
+    """
+    pd = import_optional("pandas", extra="io")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            poses = export.frame_poses(estimator, X, edges=edges)
+    except (ValueError, UserWarning) as error:
+        warn_caller(f"{otherwise}: {error}")
+        return pd.DataFrame(index=X.index)
+    columns = pd.DataFrame(poses._asdict(), index=X.index)
+    return columns.dropna(axis="columns", how="all")
+
+
+def write_page(path: Path, estimator: AffineNRSfM, X: Any, edges: Any) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            export.write_viewer(estimator, path, X=X, edges=edges, labels=labels)
+            export.write_viewer(estimator, path, X=X, edges=edges)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        export.write_viewer(
-            estimator, path, X=X, edges=edges, labels=labels, camera=None
-        )
+        export.write_viewer(estimator, path, X=X, edges=edges, camera=None)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":

@@ -242,6 +242,28 @@ def _add_question_options(parser: argparse.ArgumentParser) -> None:
         help="people, videos or files: how much coefficients differ between and within "
         "them; held-out frames are of others, and time does not go from one to another",
     )
+    group.add_argument(
+        "--distance",
+        metavar="POINT,POINT",
+        type=_point_pair,
+        action="append",
+        default=[],
+        help="write the distance of two points in the 3D shape of each frame to "
+        "alpha.csv, in units of that of the outer corners of the eyes; may be repeated",
+    )
+    group.add_argument(
+        "--unit",
+        metavar="POINT,POINT",
+        type=_point_pair,
+        help="two points whose distance in the mean shape is the unit of --distance",
+    )
+    group.add_argument(
+        "--length",
+        metavar="NUMBER",
+        type=_above_zero,
+        default=1.0,
+        help="the length of that unit, such as 90 for millimetres (default: 1)",
+    )
     time = group.add_mutually_exclusive_group()
     time.add_argument(
         "--time",
@@ -252,21 +274,30 @@ def _add_question_options(parser: argparse.ArgumentParser) -> None:
     time.add_argument(
         "--fps",
         metavar="NUMBER",
-        type=_frequency,
+        type=_above_zero,
         help="rows are the frames of a video, so many a second, instead of --time",
     )
 
 
-def _frequency(text: str) -> float:
+def _point_pair(text: str) -> tuple[str, str]:
+    """Read two points with a comma between them."""
+    points = [each.strip() for each in text.split(",")]
+    if len(points) != 2 or not all(points):
+        raise argparse.ArgumentTypeError(
+            "expected two points with a comma between them, such as 48,54; "
+            f"got {text!r}"
+        )
+    return points[0], points[1]
+
+
+def _above_zero(text: str) -> float:
     """Read a number above zero."""
     try:
         number = float(text)
     except ValueError:
         number = 0.0
     if not 0 < number < float("inf"):
-        raise argparse.ArgumentTypeError(
-            f"expected frames a second, a number above zero; got {text!r}"
-        )
+        raise argparse.ArgumentTypeError(f"expected a number above zero; got {text!r}")
     return number
 
 

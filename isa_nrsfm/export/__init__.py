@@ -1,7 +1,8 @@
 """Fitted models as files for other programs.
 
 Shape models for MATLAB, OpenFace and own code, animated shapes for programs that show
-glTF, and a page for a browser that lets anybody look at them. Shapes are Euclidean ones
+glTF, a page for a browser that lets anybody look at them, and what people measure: head
+pose and distances. Shapes are Euclidean ones
 as far as the cameras tell them (`isa_nrsfm.calibration`), upright and frontal.
 """
 
@@ -10,8 +11,11 @@ from typing import TYPE_CHECKING
 from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
+    "FramePoses",
     "PointDistributionModel",
     "ShapeArrays",
+    "frame_poses",
+    "point_distances",
     "point_distribution_model",
     "read_pdm",
     "shape_arrays",
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
         read_pdm,
         write_pdm,
     )
+    from isa_nrsfm.export._poses import FramePoses, frame_poses, point_distances
     from isa_nrsfm.export._shape_arrays import ShapeArrays, shape_arrays, write_shapes
     from isa_nrsfm.export._viewer import write_viewer
 else:
@@ -41,6 +46,11 @@ else:
                 "point_distribution_model",
                 "read_pdm",
                 "write_pdm",
+            ],
+            "isa_nrsfm.export._poses": [
+                "FramePoses",
+                "frame_poses",
+                "point_distances",
             ],
             "isa_nrsfm.export._shape_arrays": [
                 "ShapeArrays",

@@ -1,0 +1,240 @@
+"""Head pose and lengths of frames, as people tell them."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm.calibration import angle_deviations, view_angles
+from isa_nrsfm.export._upright import (
+    Camera,
+    UprightSpace,
+    upright_frames,
+    upright_space,
+)
+from isa_nrsfm.plotting._edges import Origin, names_of_points
+
+# The outer corners of the eyes in the order of iBUG.
+EYE_CORNERS = (36, 45)
+
+
+class FramePoses(NamedTuple):
+    """
+    Poses of frames; NaN where a frame has no camera.
+
+    Attributes
+    ----------
+    yaw, pitch, roll : ndarray of shape (n_frames,)
+        Angles in degrees, as of `isa_nrsfm.calibration.view_angles`: zero for a
+        frontal, upright object. Yaw is positive where it is turned to the viewer's
+        right, pitch where it looks up, roll where it is turned clockwise in the image.
+    scale : ndarray of shape (n_frames,)
+        Pixels, or units of the table, per unit of the shapes.
+    yaw_std, pitch_std, roll_std : ndarray of shape (n_frames,)
+        Posterior standard deviations of the angles, in degrees. NaN without a table,
+        and for models with affine cameras: these have no rotations of their own.
+    """
+
+    yaw: NDArray
+    pitch: NDArray
+    roll: NDArray
+    scale: NDArray
+    yaw_std: NDArray
+    pitch_std: NDArray
+    roll_std: NDArray
+
+
+def frame_poses(
+    model: Any,
+    X: Any = None,
+    *,
+    camera: Camera = "weak_perspective",
+    edges: Any = "auto",
+    origin: Origin = "auto",
+    mirrored: bool = False,
+) -> FramePoses:
+    """
+    Return yaw, pitch and roll of the object in each frame.
+
+    The angles are those of an upright, frontal object, where its layout is known
+    (`isa_nrsfm.skeletons`); of other objects, those of the view of the mean camera.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    X : array-like of shape (n_frames, 2 * n_points), default=None
+        A table with the points of the fitted one. By default the fitted table.
+    camera : {"weak_perspective"}, default="weak_perspective"
+        What took the images, for a model that was fitted with affine cameras. One with
+        calibrated cameras knows it.
+    edges : "auto", str, Skeleton or None, default="auto"
+        The layout of the points or its name; otherwise it is recognised.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        Where y is zero in the table: above, as in images, or below.
+    mirrored : bool, default=False
+        Whether to take the mirror image in depth.
+
+    Returns
+    -------
+    FramePoses
+        Named tuple of yaw, pitch, roll, scale and standard deviations (n_frames,).
+
+    Raises
+    ------
+    ValueError
+        If the model has kept no frames, if `camera` is None, or if the cameras see
+        fewer than three directions of space.
+
+    Warns
+    -----
+    UserWarning
+        If affine cameras hardly determine the metric of space, and so the angles.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import frame_poses
+    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
+    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> frame_poses(model.fit(faces.data)).yaw.shape
+    (100,)
+    """
+    if camera is None:
+        raise ValueError("angles need cameras that tell them; got camera=None")
+    space = upright_space(model, camera, origin, mirrored, edges)
+    if X is None:
+        motion, alpha = model.motion_, model.alpha_
+    else:
+        motion, _, alpha, _ = model.decompose(X)
+    return poses_in(space, model, motion, alpha, X)
+
+
+def poses_in(
+    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray, X: Any
+) -> FramePoses:
+    """
+    Return the poses of frames in an upright space.
+
+    Parameters
+    ----------
+    space : UprightSpace
+        The space.
+    model : AffineNRSfM
+        The model.
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    X : array-like of shape (n_frames, 2 * n_points) or None
+        The table that tells how certain rotations are; None if that is not asked for.
+
+    Returns
+    -------
+    FramePoses
+        The poses.
+    """
+    _, rotations, scales = upright_frames(space, model, motion, alpha)
+    angles = view_angles(rotations)
+    deviations = np.full((3, len(scales)), np.nan)
+    if X is not None and space.metric is None and model.refinement == "joint":
+        covariance = model.rotation_covariance(X)
+        turned = space.transform @ covariance @ space.transform.T
+        deviations = np.array(angle_deviations(angles, turned))
+    return FramePoses(*angles, np.asarray(scales), *deviations)
+
+
+def point_distances(
+    model: Any,
+    pairs: Sequence[tuple[Any, Any]],
+    X: Any = None,
+    *,
+    unit: tuple[Any, Any] | None = None,
+    length: float = 1.0,
+    camera: Camera = "weak_perspective",
+) -> NDArray:
+    """
+    Return Euclidean distances of points in the shape of each frame.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    pairs : sequence of (int or str, int or str)
+        Pairs of points, by their numbers from zero or by the names of their columns.
+    X : array-like of shape (n_frames, 2 * n_points), default=None
+        A table with the points of the fitted one. By default the fitted table.
+    unit : (int or str, int or str), default=None
+        Two points whose distance in the mean shape is `length`. By default the outer
+        corners of the eyes where the points are 68 in the order of iBUG.
+    length : float, default=1.0
+        Their distance, for instance 90 for millimetres.
+    camera : {"weak_perspective"}, default="weak_perspective"
+        As of `frame_poses`.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_pairs)
+        Distances in units of `length`; NaN where a frame has no shape.
+
+    Raises
+    ------
+    ValueError
+        If there is no such point, if `length` is not positive, if `unit` is not given
+        and the points are not those of a face, or as of `frame_poses`.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import point_distances
+    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
+    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> model = model.fit(faces.data)
+    >>> point_distances(model, [(48, 54), (62, 66)]).shape  # of the mouth
+    (100, 2)
+    """
+    if camera is None:
+        raise ValueError("distances need cameras that tell them; got camera=None")
+    if not 0 < length < np.inf:
+        raise ValueError(f"length must be a positive number; got {length}")
+    space = upright_space(model, camera, "auto", False)
+    names = names_of_points(model)
+    first, second = np.array([point_numbers(pair, names) for pair in pairs]).T
+    if unit is None:
+        if space.layout is None or space.layout.name != "ibug-68":
+            raise ValueError(
+                "unit must name two points, as these are not the 68 of a face"
+            )
+        unit = EYE_CORNERS
+    a, b = point_numbers(unit, names)
+    if X is None:
+        motion, alpha = model.motion_, model.alpha_
+    else:
+        motion, _, alpha, _ = model.decompose(X)
+    shapes = upright_frames(space, model, motion, alpha).shapes
+    mean = np.nanmean(shapes, axis=0)
+    size = np.linalg.norm(mean[a] - mean[b])
+    if not size > 0:
+        raise ValueError(f"the points {unit} of unit are in one place")
+    return np.linalg.norm(shapes[:, first] - shapes[:, second], axis=2) * length / size
+
+
+def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
+    """Return the numbers of two different points, given by number or name."""
+    found = []
+    for each in pair:
+        if str(each) in names:
+            found.append(list(names).index(str(each)))
+        elif str(each).isdecimal() and int(each) < len(names):
+            found.append(int(each))
+        else:
+            raise ValueError(
+                f"there is no point {each!r}; the {len(names)} points are "
+                f"{', '.join(list(names)[:4])}, ..."
+            )
+    if len(found) != 2 or found[0] == found[1]:
+        raise ValueError(f"expected two different points; got {tuple(pair)}")
+    return found[0], found[1]
