@@ -15,20 +15,22 @@ CLEANING = ("unlink", "remove", "rmdir")
 
 
 def disk_error(code):
-    """Return what raises an error of the disk, without the name of a file."""
+    """Return what raises an error of the disk."""
 
-    def strike():
-        raise OSError(code, os.strerror(code))
+    def strike(path):
+        # As the system does: errors of open files do not say which file it is.
+        named = [path] if isinstance(path, str | os.PathLike) else []
+        raise OSError(code, os.strerror(code), *named)
 
     return strike
 
 
-def interrupt():
+def interrupt(_path):
     """Do what Ctrl-C does."""
     raise KeyboardInterrupt
 
 
-def kill():
+def kill(_path):
     """Do what kill -9 does."""
     os.kill(os.getpid(), signal.SIGKILL)
 
@@ -73,13 +75,14 @@ class Faults:
         self.operations.append((name, *map(str, args[:2])))
         number = len(self.operations)
         strikes = number == self.at or (self.lasting and full and number > self.at > 0)
+        path = args[0] if args else None
         if strikes and not self.after:
-            self.strike()
+            self.strike(path)
         result = operation(*args, **keywords)
         if strikes and self.after:
             if isinstance(result, io.FileIO):  # which nobody else has yet
                 io.FileIO.close(result)
-            self.strike()
+            self.strike(path)
         return result
 
 

@@ -361,9 +361,9 @@ def _renaming(aside: Path, target: Path, depth: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is not None:
-            with contextlib.suppress(ValueError, TypeError):
-                inside = Path(error.filename).relative_to(aside).parts[depth:]
-                place = target.joinpath(*inside)
-                error.filename, error.filename2 = os.fspath(place), None
+        with contextlib.suppress(ValueError, TypeError):  # another file, a number
+            named = aside if error.filename is None else Path(error.filename)
+            inside = named.relative_to(aside).parts[depth:]
+            error.filename = os.fspath(target.joinpath(*inside))
+            error.filename2 = None
         raise
