@@ -39,6 +39,7 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, display):
 def test_public_names():
     assert plotting.__all__ == [
         "BasisShapeDisplay",
+        "CoefficientsDisplay",
         "ModeCovarianceDisplay",
         "ReprojectionDisplay",
     ]

@@ -128,6 +128,7 @@ def fit_table(
                 answers.alpha,
                 std=args.std,
                 labels=first_classes(asked, X),
+                times=asked.times,
                 edges=edges,
             )
             if not args.no_figures:

@@ -115,12 +115,13 @@ def write_results(
     *,
     std: bool,
     labels: "pd.Series | None" = None,
+    times: Any = None,
     edges: Any = "auto",
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
     The tables have a row for each frame, empty for those that could not be fitted. The
-    labels are those of the frames in the viewer.
+    labels and times are those of the frames in the viewer.
     """
     fit = fitted_frames(estimator)
     alpha = alpha_table(fit, frames, std=std).join(further)
@@ -140,6 +141,7 @@ def write_results(
         X=X,
         edges=edges,
         labels=labels,
+        times=times,
         camera="weak_perspective" if len(poses.columns) else None,
     )
     save_model(estimator, folder / "model.skops")
