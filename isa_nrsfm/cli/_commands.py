@@ -20,7 +20,7 @@ from isa_nrsfm._tables.landmark_columns import (
     parse_coordinate,
     point_names,
 )
-from isa_nrsfm.cli._choice import choose_n_components
+from isa_nrsfm.cli._choice import choice_report, choose_n_components
 from isa_nrsfm.cli._frames import Frames, choose_frames
 from isa_nrsfm.cli._outputs import (
     alpha_table,
@@ -100,7 +100,10 @@ def fit_table(
     X = frames.points[frames.usable]
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
-    files = prepare_folder(folder, [args.table], figures=not args.no_figures)
+    several = len(args.n_components) > 1
+    files = prepare_folder(
+        folder, [args.table], figures=not args.no_figures, choice=several
+    )
     clock["read"] = time.perf_counter()
 
     estimator = AffineNRSfM(
@@ -115,26 +118,28 @@ def fit_table(
         random_state=args.random_state,
         n_jobs=args.n_jobs,
     )
-    choice = None
-    if len(args.n_components) > 1:
-        choice = choose_n_components(estimator, X, args.n_components)
-        clock["choose"] = time.perf_counter()
-    with _progress(estimator):
-        estimator.fit(X)
+    search = None
+    if several:
+        search = choose_n_components(estimator, X, args.n_components)
+        estimator = search.best_estimator_
+        clock["choose"] = time.perf_counter() - search.refit_time_
+    else:
+        with _progress(estimator):
+            estimator.fit(X)
     if estimator.refinement == "joint":
         estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
 
     write_results(folder, estimator, frames, std=args.std)
     if not args.no_figures:
-        write_figures(folder, estimator, X, args.random_state)
+        write_figures(folder, estimator, X, args.random_state, search)
     model = model_report(estimator, X, frames)
     clock["write"] = time.perf_counter()
     report = {
         "command": "fit",
         "finished": datetime.now(UTC).isoformat(timespec="seconds"),
         "table": table_report(args.table, args.format, frames),
-        **({} if choice is None else {"choice": choice}),
+        **({} if search is None else {"choice": choice_report(search, X)}),
         "model": model,
         **{name: compute(estimator, X) for name, compute in extra.items()},
         "seconds": dict(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, Decomposition
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.cli._frames import Frames
@@ -27,6 +27,7 @@ FIGURES = {
     "mode_covariance.png": "covariance of the deformations over the images, 3x3 blocks",
     "reprojection.png": "some frames, as observed and as the model has them",
 }
+CHOICE_FIGURE = {"choice.png": "held-out error by the number of basis shapes"}
 TABLES = {
     "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
@@ -48,21 +49,20 @@ def component_names(n_components: int) -> list[str]:
 
 
 def prepare_folder(
-    folder: Path, inputs: Iterable[str], *, figures: bool
+    folder: Path, inputs: Iterable[str], *, figures: bool, choice: bool = False
 ) -> dict[str, str]:
     """Create the output folder, check that it can be written, and list its files."""
     files = MODEL | TABLES | ARRAYS | PAGE | (FIGURES if figures else {})
+    files |= CHOICE_FIGURE if figures and choice else {}
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass
     for path in inputs:
         refuse_overwriting(path, [folder / name for name in (*files, REPORT)])
-    if not figures:
-        stale = [name for name in FIGURES if (folder / name).exists()]
-        if stale:
-            warn_caller(
-                f"{folder} has figures of an earlier run: {', '.join(stale)}",
-            )
+    old = [name for name in FIGURES | CHOICE_FIGURE if name not in files]
+    stale = [name for name in old if (folder / name).exists()]
+    if stale:
+        warn_caller(f"{folder} has figures of an earlier run: {', '.join(stale)}")
     return files
 
 
@@ -166,25 +166,34 @@ def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
 
 
 def write_figures(
-    folder: Path, estimator: AffineNRSfM, points: "pd.DataFrame", random_state: int
+    folder: Path,
+    estimator: AffineNRSfM,
+    points: "pd.DataFrame",
+    random_state: int,
+    search: AffineNRSfMCV | None = None,
 ) -> None:
-    """Draw the figures without a screen."""
+    """Draw the figures without a screen, that of the choice if there was a search."""
     import_optional("matplotlib", extra="plot").use("Agg")
     plt = import_optional("matplotlib.pyplot", extra="plot")
     from isa_nrsfm.plotting import (
         BasisShapeDisplay,
+        ComponentChoiceDisplay,
         ModeCovarianceDisplay,
         ReprojectionDisplay,
     )
 
-    figures = (
+    names = [*FIGURES]
+    figures = [
         BasisShapeDisplay.from_estimator(estimator).figure_,
         ModeCovarianceDisplay.from_estimator(estimator).figure_,
         ReprojectionDisplay.from_estimator(
             estimator, points, random_state=random_state
         ).figure_,
-    )
-    for name, figure in zip(FIGURES, figures, strict=True):
+    ]
+    if search is not None:
+        names += CHOICE_FIGURE
+        figures.append(ComponentChoiceDisplay.from_estimator(search).figure_)
+    for name, figure in zip(names, figures, strict=True):
         figure.savefig(folder / name, dpi=150)
         plt.close(figure)
 

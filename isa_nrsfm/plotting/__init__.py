@@ -1,7 +1,13 @@
 """Figures of a factorisation, drawn with matplotlib."""
 
 from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
+from isa_nrsfm.plotting._component_choice import ComponentChoiceDisplay
 from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
 from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
 
-__all__ = ["BasisShapeDisplay", "ModeCovarianceDisplay", "ReprojectionDisplay"]
+__all__ = [
+    "BasisShapeDisplay",
+    "ComponentChoiceDisplay",
+    "ModeCovarianceDisplay",
+    "ReprojectionDisplay",
+]
