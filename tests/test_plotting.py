@@ -40,6 +40,7 @@ def test_public_names():
     assert plotting.__all__ == [
         "BasisShapeDisplay",
         "CoefficientsDisplay",
+        "ComponentChoiceDisplay",
         "ModeCovarianceDisplay",
         "ReprojectionDisplay",
     ]

@@ -233,6 +233,26 @@ class PosteriorFrames(NamedTuple):
         space = MIRROR[:, None] * self.gauge.space
         return self._replace(gauge=self.gauge._replace(space=space))
 
+    def of_points(self, kept: NDArray) -> "PosteriorFrames":
+        """
+        Return the model of frames that have only some of the points.
+
+        Complete frames of these points are fitted faster than frames of which the
+        others are missing, with the same cameras and coefficients.
+
+        Parameters
+        ----------
+        kept : ndarray of bool, shape (n_points,)
+            Which points.
+
+        Returns
+        -------
+        PosteriorFrames
+            The model. Its positions are images of the centroid of these points.
+        """
+        shapes = self.shapes[:, :, kept]
+        return self._replace(shapes=shapes - shapes.mean(axis=2, keepdims=True))
+
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """
         Return the most probable camera, position and coefficients.
