@@ -6,7 +6,7 @@ import pytest
 from sklearn.base import clone
 
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm.cli._choice import N_PARTS, choose_n_components
+from isa_nrsfm.cli._choice import N_PARTS, choice_report, choose_n_components
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = pd.DataFrame(make_nonrigid_tracks(48, 14, 2, noise=0.01, random_state=0).data)
@@ -18,8 +18,8 @@ def estimator():
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_errors_are_those_of_blocks_of_rows():
-    chosen = estimator()
-    found = choose_n_components(chosen, X, [1, 2, 3])
+    search = choose_n_components(estimator(), X, [1, 2, 3])
+    found = choice_report(search, X)
     expected = []
     for n_components in (1, 2, 3):
         errors = []
@@ -32,7 +32,7 @@ def test_errors_are_those_of_blocks_of_rows():
     np.testing.assert_allclose(found["held_out_error"], np.mean(expected, axis=1))
     assert found["n_components"] == [1, 2, 3]
     best = 1 + int(np.argmin(np.mean(expected, axis=1)))
-    assert found["chosen"] == chosen.n_components == best
+    assert found["chosen"] == len(search.best_estimator_.basis_) == best
 
 
 def test_too_few_frames_are_said_to_be_those_of_parts():
