@@ -31,6 +31,7 @@ from isa_nrsfm._frames.posterior import (
 )
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 # Frames of each table, evenly spread.
@@ -81,12 +82,12 @@ def tables(camera):
             continue
         X = X[np.linspace(0, len(X) - 1, min(N_FRAMES, len(X))).astype(int)]
         model = AffineNRSfM(case.n_components, camera=camera, random_state=0).fit(X)
-        yield case.title, unit_tracks(X), model._model.frames
+        yield case.title, unit_tracks(X), frames_of(model)
     made = make_nonrigid_tracks(
         N_FRAMES, 30, 3, amplitude=0.6, noise=0.05, random_state=0
     )
     model = AffineNRSfM(3, camera=camera, random_state=0).fit(made.data)
-    yield "artificial K=3", unit_tracks(made.data), model._model.frames
+    yield "artificial K=3", unit_tracks(made.data), frames_of(model)
 
 
 def found_by_search(frames, tracks):

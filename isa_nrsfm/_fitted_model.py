@@ -219,6 +219,10 @@ def held_out_energies(
     n_points = tracks.shape[1]
     folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
     seen = seen_points(tracks)
+    # Complete frames are fitted without the points, others with gaps in their place.
+    complete = None
+    if isinstance(frames, PosteriorFrames) and frames.loss == "linear" and seen.all():
+        complete = frames
     noise = signal = 0.0
     for fold in range(N_FOLDS):
         held = folds == fold
@@ -227,9 +231,16 @@ def held_out_energies(
         usable = np.flatnonzero(usable_frames(visible) & seen[:, held].any(axis=1))
         if not len(usable):
             continue
-        fit = frames.fit(visible[usable], sizes[usable])
+        origin = np.zeros(3), np.zeros((len(basis), 3))  # of mean and basis shapes
+        if complete is not None:
+            others = complete.of_points(~held)
+            fit = others.fit(tracks[usable][:, ~held], sizes[usable])
+            origin = mean_shape[~held].mean(axis=0), basis[:, ~held].mean(axis=1)
+        else:
+            fit = frames.fit(visible[usable], sizes[usable])
         # Prediction of the held-out points, and its error
-        shapes = compose(mean_shape[held], basis[:, held], fit.alpha)
+        at_origin = mean_shape[held] - origin[0], basis[:, held] - origin[1][:, None]
+        shapes = compose(*at_origin, fit.alpha)
         model = project(shapes, fit.motion, fit.translation)
         part = tracks[usable]
         centre = np.nanmean(part, axis=1, keepdims=True)

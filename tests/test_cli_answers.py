@@ -155,3 +155,13 @@ def test_refused_before_the_fit(tmp_path, capsys, options, message):
     error = capsys.readouterr().err
     assert re.search(message, error), error
     assert not (tmp_path / "out").exists()
+
+
+def test_groups_are_held_out_together(tmp_path, capsys):
+    table_of().to_csv(tmp_path / "table.csv", index=False)
+    arguments = ["fit", str(tmp_path / "table.csv"), "-k", "1,2", "--no-figures"]
+    assert main([*arguments, "--group", "person", "-o", str(tmp_path / "out")]) == 0
+    parts = report_of(tmp_path / "out")["choice"]["held_out_error_of_parts"]
+    assert np.shape(parts) == (2, 3)
+    assert main([*arguments, "--group", "same", "-o", str(tmp_path / "none")]) == 1
+    assert "needs two groups; got 1" in capsys.readouterr().err

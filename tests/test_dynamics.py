@@ -231,10 +231,10 @@ class TestSmooth:
         [
             ({"time": np.zeros(160)}, "row 1 has 0 after 0 of row 0"),
             ({"time": np.r_[np.nan, np.arange(159)]}, "missing in 1 of 160.*row 0"),
-            ({"time": np.arange(9)}, "each of the 160 rows; got 9"),
+            ({"time": np.arange(9)}, "each of the 160 frames; got 9"),
             ({"groups": np.arange(160)}, "no group has two rows"),
-            ({"groups": ["a"] * 9}, "each of the 160 rows; got 9"),
-            ({"groups": ["a"] * 159 + [None]}, "1 of 160 are missing.*row 159"),
+            ({"groups": ["a"] * 9}, "each of the 160 frames; got 9"),
+            ({"groups": ["a"] * 159 + [None]}, "missing in 1 of 160.*row 159"),
             ({"max_gap": 0}, "max_gap"),
         ],
     )

@@ -75,6 +75,51 @@ def gross_scene(seed, size=0.0):
     return made, X, fitted, error(fitted, X, made.shapes)
 
 
+# --- frames by themselves -----------------------------------------------------------
+
+
+def frames_with_outliers(n_frames=24):
+    """Return a table of little noise, and frames of it of which many points are wrong.
+
+    There the loss has many minima, and rounding errors would decide between them.
+    """
+    rng = np.random.default_rng(0)
+    X = make_nonrigid_tracks(
+        n_frames=26, n_points=10, n_components=1, noise=1e-5, random_state=0
+    ).data
+    Y = np.resize(X, (n_frames, 20)).copy()
+    wrong = rng.random((n_frames, 10)) < 0.2
+    Y.reshape(n_frames, 10, 2)[wrong] += 3 * X.std() * rng.normal(size=(wrong.sum(), 2))
+    Y.reshape(n_frames, 10, 2)[rng.random((n_frames, 10)) < 0.05] = np.nan
+    return X, Y
+
+
+@pytest.mark.parametrize(
+    "camera", slow_after(1, ["affine", "weak_perspective", "orthographic"])
+)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
+    X, Y = frames_with_outliers()
+    model = AffineNRSfM(1, loss=loss, camera=camera, random_state=0).fit(X)
+    together = model.transform(Y)
+    assert_array_equal(model.transform(Y[::-1])[::-1], together)
+    for start, stop in ((0, 2), (3, 8), (5, 22)):
+        assert_array_equal(model.transform(Y[start:stop]), together[start:stop])
+    # Alone but for the last step, the change to the public shapes.
+    alone = np.concatenate([model.transform(row[None]) for row in Y[:6]])
+    assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("loss", LOSSES[1:])
+def test_frames_that_the_model_does_not_explain_have_finite_fits(loss):
+    """Without noise, the weights of their points fall until no camera is left."""
+    X = make_nonrigid_tracks(7, 7, 1, random_state=14).data.copy()
+    X.reshape(7, 7, 2)[np.random.default_rng(14).random((7, 7)) < 0.07] = np.nan
+    model = AffineNRSfM(1, loss=loss, random_state=0).fit(X)
+    for fitted in (model.alpha_, model.alpha_std_, model.motion_, model.transform(X)):
+        assert np.isfinite(fitted).all()
+
+
 # --- gauge of the paper's refinement ------------------------------------------------
 
 

@@ -163,3 +163,16 @@ def test_the_sides_of_a_known_layout_are_told(written):
     assert data["sides"] == get_skeleton("ibug-68").sides.tolist()
     assert written(face_model(), edges=None)["sides"] == []
     assert written(blob_model())["sides"] == []
+
+
+def test_times_are_seconds_that_rise(written):
+    model = face_model()
+    n_frames = len(model.alpha_)
+    seconds = np.arange(n_frames) / 25 + 100
+    seconds[n_frames // 2 :] -= seconds[n_frames // 2] - 3  # another video
+    content = written(model, times=seconds, n_frames=n_frames)
+    found = numbers(content["times"], "<f8")
+    np.testing.assert_allclose(found, np.arange(n_frames) / 25, atol=1e-9)
+    assert not len(numbers(written(model)["times"], "<f8"))
+    few = numbers(written(model, times=seconds, n_frames=3)["times"], "<f8")
+    np.testing.assert_allclose(few, found[[0, (n_frames - 1) // 2, -1]], atol=1e-9)

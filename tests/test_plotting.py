@@ -39,6 +39,8 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, display):
 def test_public_names():
     assert plotting.__all__ == [
         "BasisShapeDisplay",
+        "CoefficientsDisplay",
+        "ComponentChoiceDisplay",
         "ModeCovarianceDisplay",
         "ReprojectionDisplay",
     ]

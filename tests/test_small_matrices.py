@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
-    FEW,
     ROWS,
     diagonal_of,
     eigh3,
@@ -22,10 +21,15 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpack3,
     unpacked,
 )
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.vectors import (
+    LANES,
+    frames_first,
+    frames_last,
+    in_lanes,
+    of_frames,
+)
 
-# One number of matrices for each of the two ways to solve, by LAPACK and by passes.
-NUMBERS = [3, FEW + 50]
+NUMBERS = [3, 98]
 
 
 def positive_matrices(seed, k, n, condition=1e3):
@@ -247,13 +251,37 @@ class TestSweep:
         assert_array_equal(unpacked(swept)[3], 0)
 
 
-def test_both_ways_agree():
-    A = positive_matrices(0, 6, FEW + 50)
-    b = np.random.default_rng(0).normal(size=(6, FEW + 50))
-    many = solve_positive(packed(A), b)[0]
-    for i in range(0, FEW + 50, 10):
-        alone = solve_positive(packed(A[..., i : i + 1]), b[:, i : i + 1])[0]
-        assert_allclose(alone[:, 0], many[:, i], rtol=1e-10)
+def test_a_matrix_is_solved_alike_whatever_its_neighbours_are():
+    """Also beside one that is not positive definite."""
+    A = packed(positive_matrices(0, 6, 98))
+    b = np.random.default_rng(0).normal(size=(6, 98))
+    A[:, 50] *= -1
+    many, inverses = solve_positive(A, b)[0], invert_positive(A)[0]
+    logarithms = invert_positive(A)[1]
+    for frames in (slice(10, 26), slice(40, 56)):
+        part = A[:, frames].copy()
+        assert_array_equal(solve_positive(part, b[:, frames])[0], many[:, frames])
+        inverse, logarithm, _ = invert_positive(part)
+        assert_array_equal(inverse, inverses[:, frames])
+        assert_array_equal(logarithm, logarithms[frames])
+
+
+@pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 40])
+def test_lanes_are_full(n):
+    frames = np.arange(3, 3 + n)
+    filled = in_lanes(frames)
+    assert len(filled) % LANES == 0
+    assert len(filled) - n < LANES
+    assert_array_equal(np.unique(filled), frames)
+
+
+def test_frames_that_are_taken_stay_last_in_memory():
+    values = np.random.default_rng(0).normal(size=(4, 3, 20))
+    frames = np.array([2, 3, 5, 19])
+    taken = of_frames(values, frames)
+    assert_array_equal(taken, values[..., frames])
+    assert taken.flags.c_contiguous
+    assert_array_equal(of_frames(values, slice(3, 7)), values[..., 3:7])
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 4), (0, 200), (3, 0)])

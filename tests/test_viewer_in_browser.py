@@ -264,3 +264,16 @@ def test_left_and_right_have_colours_of_their_own(browser, tmp_path, scheme):
     # The left side of a face that looks at us is on the right.
     assert found["right"] < found["other"] < found["left"]
     assert not browser.run("document.getElementById('sides').hidden")
+
+
+def test_videos_play_at_true_speed(browser, tmp_path):
+    path = tmp_path / "video.html"
+    seconds = np.arange(N_FRAMES) * 0.05
+    write_viewer(face_model(), path, times=seconds, n_frames=N_FRAMES)
+    browser.open(path.as_uri())
+    assert browser.run("document.getElementById('pace').value") == "true"
+    begun = browser.run("performance.now()")
+    browser.run("document.getElementById('play').click()")
+    browser.wait("viewer.state().frame >= 5")
+    passed = browser.run("performance.now()") - begun
+    assert passed >= 5 * 50

@@ -4,7 +4,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import check_array, column_or_1d
+from sklearn.utils import check_array
+
+from isa_nrsfm._tables.frame_columns import checked_column
 
 
 class Sequence(NamedTuple):
@@ -47,76 +49,18 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     """
     if time is None:
         return np.arange(n_rows, dtype=float)
-    time = np.asarray(column_or_1d(time))
-    if len(time) != n_rows:
-        raise ValueError(
-            f"time must have one number for each of the {n_rows} rows; got {len(time)}"
-        )
-    missing = np.flatnonzero(~np.isfinite(_numbers(time)))
-    if len(missing):
-        raise ValueError(
-            f"time must be known for all rows; it is missing in {len(missing)} of "
-            f"{n_rows}, the first is row {missing[0]}"
-        )
-    return _numbers(time)
+    return _numbers(checked_column("time", time, n_rows))
 
 
 def _numbers(time: NDArray) -> NDArray:
     """Return times as numbers: dates and durations in seconds."""
     if time.dtype.kind in "mM":
-        numbers = (time - time.min()) / np.timedelta64(1, "s")
-        return np.where(np.isnat(time), np.nan, numbers)
-    return check_array(
-        time,
-        dtype=np.float64,
-        ensure_2d=False,
-        ensure_all_finite=False,
-        input_name="time",
-    )
-
-
-def checked_groups(groups: Any, n_rows: int) -> NDArray:
-    """
-    Return for each row the number of its group.
-
-    Parameters
-    ----------
-    groups : array-like of shape (n_rows,) or None
-        Names or numbers of groups, such as people or videos; None for one group.
-    n_rows : int
-        Number of rows.
-
-    Returns
-    -------
-    ndarray of int, shape (n_rows,)
-        Numbers from zero, in the order of the sorted names.
-
-    Raises
-    ------
-    ValueError
-        If there is not one group for each row, or a group is missing.
-    """
-    if groups is None:
-        return np.zeros(n_rows, dtype=int)
-    groups = np.asarray(column_or_1d(groups))
-    if len(groups) != n_rows:
-        raise ValueError(
-            f"groups must have one entry for each of the {n_rows} rows; "
-            f"got {len(groups)}"
-        )
-    missing = np.array([each is None or each != each for each in groups], dtype=bool)
-    if missing.any():
-        raise ValueError(
-            f"groups must be known for all rows; {missing.sum()} of {n_rows} are "
-            f"missing, the first is row {np.argmax(missing)}"
-        )
-    if groups.dtype == object:
-        groups = groups.astype(str)
-    return np.unique(groups, return_inverse=True)[1]
+        return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
+    return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
 
 
 def sequences_of(
-    time: NDArray, groups: NDArray, max_gap: int
+    time: NDArray, groups: NDArray | None, max_gap: int
 ) -> tuple[list[Sequence], float]:
     """
     Return the sequences of a table.
@@ -125,8 +69,8 @@ def sequences_of(
     ----------
     time : ndarray of shape (n_rows,)
         Times of the rows. Within a group they rise from row to row.
-    groups : ndarray of int, shape (n_rows,)
-        Numbers of the groups. No sequence goes from one to another.
+    groups : ndarray of int, shape (n_rows,), or None
+        Numbers of the groups; None for one. No sequence goes from one to another.
     max_gap : int
         After a gap of more steps a new sequence begins.
 
@@ -142,6 +86,8 @@ def sequences_of(
     ValueError
         If times do not rise, or no group has two rows.
     """
+    if groups is None:
+        groups = np.zeros(len(time), dtype=int)
     rows_of = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
     for rows in rows_of:
         falling = np.flatnonzero(np.diff(time[rows]) <= 0)

@@ -11,12 +11,8 @@ from isa_nrsfm._dynamics.kalman import (
     observations,
     smoothed,
 )
-from isa_nrsfm._dynamics.sequences import (
-    Sequence,
-    checked_groups,
-    checked_times,
-    sequences_of,
-)
+from isa_nrsfm._dynamics.sequences import Sequence, checked_times, sequences_of
+from isa_nrsfm._tables.frame_columns import group_numbers
 
 
 def smoothed_posterior(
@@ -42,7 +38,7 @@ def smoothed_posterior(
     time : array-like of shape (n_frames,) or None
         As of `checked_times`.
     groups : array-like of shape (n_frames,) or None
-        As of `checked_groups`.
+        As of `group_numbers`.
     max_gap : int
         As of `sequences_of`.
     max_iter, tol
@@ -58,7 +54,7 @@ def smoothed_posterior(
         ``-1 / log |l|`` of the eigenvalues l of the transition, in units of time, the
         longest first; infinite where |l| is one or more. Empty without dynamics.
     """
-    times, numbers = checked_times(time, len(mean)), checked_groups(groups, len(mean))
+    times, numbers = checked_times(time, len(mean)), group_numbers(groups, len(mean))
     sequences, unit = sequences_of(times, numbers, max_gap)
     observed = observations(mean, covariance)
     filled = [_with_gaps(each, observed) for each in sequences]

@@ -47,7 +47,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     solve_positive,
     unpacked,
 )
-from isa_nrsfm._linalg.vectors import frames_first
+from isa_nrsfm._linalg.vectors import frames_first, in_lanes, of_frames
 
 # Ridge of ``A = S S^T``, as a share of the second moment of the shapes, and lower bound
 # of s2, as a share of the energy of the frame. They keep the result finite for
@@ -184,11 +184,11 @@ class AffineProblem(NamedTuple):
     def take(self, frames: NDArray) -> Self:
         """Return the problem of some of the frames."""
         return self._replace(
-            cross=self.cross[..., frames],
+            cross=of_frames(self.cross, frames),
             gram=self.gram.take(frames),
             energy=self.energy[frames],
             ridge=self.ridge[frames],
-            precision=self.precision[:, frames],
+            precision=of_frames(self.precision, frames),
         )
 
     def evaluate(self, alpha: NDArray) -> State:
@@ -203,7 +203,7 @@ class AffineProblem(NamedTuple):
         point.
         """
         step, positive = newton_step(state, damping)
-        failing = np.flatnonzero(~positive)
+        failing = in_lanes(np.flatnonzero(~positive))
         if len(failing):
             damping[failing] = np.maximum(damping[failing], self.options.saddle)
             step[:, failing] = _step_off_saddle(state.take(failing), damping[failing])
@@ -334,12 +334,12 @@ def _inverse_hessian(state: State, most: float) -> NDArray:
     of ``H + s2 I`` is added that is large enough, and below the largest damping, most.
     """
     inverse, _, positive = invert_positive(state.hessian)
-    failing = np.flatnonzero(~positive)
+    failing = in_lanes(np.flatnonzero(~positive))
     damping = 1.0
     while len(failing) and damping < most:
         part = state.take(failing)
         matrix = part.hessian + damping * part.definite
         inverse[..., failing], _, positive = invert_positive(matrix)
-        failing = failing[~positive]
+        failing = in_lanes(np.unique(failing[~positive]))
         damping *= 10.0
     return inverse

@@ -45,7 +45,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpack3,
     unpacked,
 )
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.vectors import frames_first, frames_last, in_lanes
 
 # The least noise variance, as a share of the energy of a frame.
 RIDGE = 1e-13
@@ -223,13 +223,14 @@ class CalibratedProblem(NamedTuple):
         """
         rule, damping = self.damping, damping.copy()
         step, positive = newton_step(state, damping)
-        failing = np.flatnonzero(~positive)
+        failing = in_lanes(np.flatnonzero(~positive))
         while len(failing):
             damping[failing] = np.maximum(rule.raised * damping[failing], rule.first)
             step[:, failing], positive = newton_step(
                 state.take(failing), damping[failing]
             )
-            failing = failing[~positive & (damping[failing] < rule.largest)]
+            still = ~positive & (damping[failing] < rule.largest)
+            failing = in_lanes(np.unique(failing[still]))
         return self.cameras.limited(step), damping
 
     def moved(self, M: NDArray, step: NDArray) -> NDArray:
@@ -429,7 +430,7 @@ def _found(problem: CalibratedProblem, M: NDArray, converged: NDArray) -> FoundF
     Q = -unpacked(posterior.inverse)[1:, 1:]
     through = np.einsum("kli,cli->kci", Q, _coupling(problem, M, posterior))
     inverse, _, positive = invert_positive(state.hessian)
-    bad = np.flatnonzero(~positive)
+    bad = in_lanes(np.flatnonzero(~positive))
     if len(bad):
         inverse[:, bad] = invert_positive(state.definite[:, bad])[0]
     inverse = unpacked(inverse)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.options import Damping, FrameOptions
 from isa_nrsfm._linalg.packed_symmetric import solve_positive
 from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._linalg.vectors import in_lanes, of_frames
 
 
 class State(NamedTuple):
@@ -41,7 +42,7 @@ class State(NamedTuple):
 
     def take(self, frames: NDArray) -> Self:
         """Return the state of some of the frames."""
-        return type(self)(*(each[..., frames] for each in self))
+        return type(self)(*(of_frames(each, frames) for each in self))
 
     def put(self, frames: NDArray, other: Self) -> None:
         """Set the state of some of the frames."""
@@ -140,9 +141,9 @@ def descend(
             last = problem.moved(state.position, np.where(small, step, 0.0))
             found[..., running[leaving]] = last[..., leaving]
             converged[running[leaving]] = small[leaving]
-            left = np.flatnonzero(~leaving)
+            left = in_lanes(np.flatnonzero(~leaving))
             running, limit = running[left], limit[left]
-            damping, step = damping[left], step[:, left]
+            damping, step = damping[left], of_frames(step, left)
             problem, state = problem.take(left), state.take(left)
         if not n_left or not len(running):
             break

@@ -20,6 +20,7 @@ from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import distances
+from isa_nrsfm._linalg.vectors import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, robust_weights
 from isa_nrsfm._tables.layout import measurement_matrix
 from isa_nrsfm._tables.visibility import seen_points
@@ -232,6 +233,26 @@ class PosteriorFrames(NamedTuple):
         space = MIRROR[:, None] * self.gauge.space
         return self._replace(gauge=self.gauge._replace(space=space))
 
+    def of_points(self, kept: NDArray) -> "PosteriorFrames":
+        """
+        Return the model of frames that have only some of the points.
+
+        Complete frames of these points are fitted faster than frames of which the
+        others are missing, with the same cameras and coefficients.
+
+        Parameters
+        ----------
+        kept : ndarray of bool, shape (n_points,)
+            Which points.
+
+        Returns
+        -------
+        PosteriorFrames
+            The model. Its positions are images of the centroid of these points.
+        """
+        shapes = self.shapes[:, :, kept]
+        return self._replace(shapes=shapes - shapes.mean(axis=2, keepdims=True))
+
     def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
         """
         Return the most probable camera, position and coefficients.
@@ -328,8 +349,13 @@ class PosteriorFrames(NamedTuple):
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
+        # Where too few points are left, the distant ones count, too.
+        lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
+        if len(lost):
+            weights[lost] = 1.0
+            _put(fit, lost, fitted(tracks[lost], starts=self.starts))
         seen = seen_points(tracks)
-        changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
+        changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(options.reweightings):
             part = tracks[changing]
@@ -338,7 +364,7 @@ class PosteriorFrames(NamedTuple):
             new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
             unsettled = np.abs(new - weights[changing]).max(axis=1) > options.settled
             weights[changing] = new
-            changing = changing[unsettled]
+            changing = in_lanes(np.unique(changing[unsettled]))
             if not len(changing):
                 break
             refit = fitted(
@@ -346,9 +372,18 @@ class PosteriorFrames(NamedTuple):
                 weights=weights[changing],
                 initial=fit.alpha[changing],
             )
-            for whole, values in zip(fit, refit, strict=True):
-                whole[changing] = values
+            # The weights of a frame that the model does not explain can become so
+            # unequal that no camera is left. Such a frame keeps its fit.
+            kept = np.isfinite(refit.objective)
+            changing = changing[kept]
+            _put(fit, changing, FramePosterior(*(each[kept] for each in refit)))
         return fit
+
+
+def _put(fit: FramePosterior, frames: NDArray, others: FramePosterior) -> None:
+    """Set the fits of some of the frames."""
+    for whole, values in zip(fit, others, strict=True):
+        whole[frames] = values
 
 
 def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:

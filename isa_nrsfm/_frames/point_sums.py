@@ -26,6 +26,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
     unpack3,
     unpacked,
 )
+from isa_nrsfm._linalg.vectors import of_frames
 
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
@@ -154,7 +155,7 @@ class FrameGram:
 
     def take(self, frames: NDArray) -> "FrameGram":
         """Return the Gram matrices of some of the frames."""
-        return FrameGram(self.pairs[..., frames])
+        return FrameGram(of_frames(self.pairs, frames))
 
 
 class FrameTracks(NamedTuple):
@@ -191,9 +192,9 @@ class FrameTracks(NamedTuple):
     def take(self, frames: NDArray | slice) -> Self:
         """Return some of the frames."""
         return type(self)(
-            self.weighted[..., frames],
-            None if self.weights is None else self.weights[..., frames],
-            self.centroid[:, frames],
+            of_frames(self.weighted, frames),
+            None if self.weights is None else of_frames(self.weights, frames),
+            of_frames(self.centroid, frames),
             self.weight[frames],
             self.energy[frames],
         )
@@ -244,10 +245,10 @@ class FrameSums(NamedTuple):
     def take(self, frames: NDArray) -> Self:
         """Return the sums of some of the frames."""
         return self._replace(
-            cross=self.cross[..., frames],
+            cross=of_frames(self.cross, frames),
             gram=self.gram.take(frames),
-            shape_centroid=self.shape_centroid[..., frames],
-            centroid=self.centroid[:, frames],
+            shape_centroid=of_frames(self.shape_centroid, frames),
+            centroid=of_frames(self.centroid, frames),
             weight=self.weight[frames],
             energy=self.energy[frames],
         )

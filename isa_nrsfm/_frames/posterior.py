@@ -23,6 +23,7 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
 )
 from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._linalg.vectors import in_lanes
 
 SEARCHES: dict[str, Callable[..., FrameSearch]] = {
     "affine": AffineSearch,
@@ -246,11 +247,11 @@ class _Tracks(NamedTuple):
         complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
         for first in range(0, len(frames), options.complete_block):
-            block = frames[first : first + options.complete_block]
+            block = in_lanes(frames[first : first + options.complete_block])
             yield block, frame_sums(frame_tracks(tracks[block]), shapes)
         frames = np.flatnonzero(~complete)
         for first in range(0, len(frames), options.weighted_block):
-            block = frames[first : first + options.weighted_block]
+            block = in_lanes(frames[first : first + options.weighted_block])
             part = frame_tracks(tracks[block], weights[block])
             yield _determined(block, frame_sums(part, shapes), shapes)
 
@@ -296,7 +297,7 @@ def _determined(
     frames: NDArray, products: FrameSums, shapes: NDArray
 ) -> tuple[NDArray, FrameSums]:
     """Return those of the frames (n,) that determine a camera, and their sums."""
-    usable = np.flatnonzero(determines_camera(products, shapes[0]))
+    usable = in_lanes(np.flatnonzero(determines_camera(products, shapes[0])))
     return frames[usable], products.take(usable)
 
 

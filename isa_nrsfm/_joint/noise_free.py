@@ -130,6 +130,12 @@ def fit_without_noise(
     # Cameras and coefficients of all frames for these shapes
     alpha = alpha.copy(order="F")  # sums over the frames are over rows of memory
     alpha[frames] = found.alpha
+    # The fit of a frame takes coefficients of usual sizes. Those of a basis shape that
+    # is nothing but rounding errors may be as large as numbers can be.
+    size = np.abs(alpha).max(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    shapes[1:] *= size[:, None, None]
+    alpha /= size
     fitted = partial(
         _fitted, shapes=shapes, camera=cameras.name, counted=options.counted
     )

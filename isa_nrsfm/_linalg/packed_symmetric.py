@@ -22,8 +22,6 @@ COLUMNS = (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 # A pivot below this share of its diagonal entry before elimination is rounding error.
 SMALLEST_PIVOT = 1e-13
-# For up to so many matrices LAPACK is faster than elimination by passes.
-FEW = 48
 
 
 def unpack3(packed: NDArray) -> NDArray:
@@ -201,8 +199,6 @@ def diagonal_of(packed: NDArray) -> NDArray:
 def packed_gram(rows: NDArray) -> NDArray:
     """Return the products ``A A^T`` of n matrices (k, m, n), packed: (n_pairs, n)."""
     k, _, n = rows.shape
-    if n <= FEW:
-        return np.einsum("kmn,lmn->kln", rows, rows)[pair_indices(k)]
     packed = np.empty((k * (k + 1) // 2, n))
     for i, row in enumerate(packed_rows(packed)):
         np.einsum("lmn,mn->ln", rows[i:], rows[i], out=row)
@@ -234,11 +230,6 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         Whether all pivots are positive, that is, A is positive definite.
     """
     k, n = b.shape
-    if n <= FEW:
-        matrices = unpacked(A).transpose(2, 0, 1)
-        if _cholesky(matrices) is not None:
-            x = np.linalg.solve(matrices, b.T[..., None])
-            return np.ascontiguousarray(x[..., 0].T), np.ones(n, dtype=bool)
     # Gaussian elimination, with the right side as the last entry of each row.
     rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
     diagonal = [row[0].copy() for row in rows]
@@ -255,17 +246,6 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     for i in range(k - 1, -1, -1):
         x[i] = rows[i][-1] - np.einsum("jn,jn->n", rows[i][1:-1], x[i + 1 :])
     return x, positive
-
-
-def _cholesky(matrices: NDArray) -> NDArray | None:
-    """Return Cholesky factors of matrices (n, k, k), None if one is not definite."""
-    try:
-        factors = np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        return None
-    pivots = np.diagonal(factors, axis1=1, axis2=2) ** 2
-    kept = pivots > SMALLEST_PIVOT * np.diagonal(matrices, axis1=1, axis2=2)
-    return np.asarray(factors) if kept.all() else None
 
 
 def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -287,18 +267,6 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
-    n = A.shape[1]
-    if n <= FEW:
-        matrices = unpacked(A).transpose(2, 0, 1)
-        if (factors := _cholesky(matrices)) is not None:
-            inverse = np.linalg.inv(matrices)
-            inverse = 0.5 * (inverse + inverse.swapaxes(1, 2)).transpose(1, 2, 0)
-            logarithms = np.log(np.diagonal(factors, axis1=1, axis2=2))
-            return (
-                inverse[pair_indices(len(inverse))],
-                2.0 * logarithms.sum(axis=1),
-                np.ones(n, dtype=bool),
-            )
     work = A.copy()
     log_determinant, positive = sweep(work)
     return np.negative(work, out=work), log_determinant, positive
@@ -347,7 +315,8 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
             rows[j][i - j] = scaled[j]
         rows[i][1:] = scaled[i + 1 :]
         np.negative(inverse, out=rows[i][0])
-    logarithms = np.log(inverses, where=inverses > 0, out=np.zeros_like(inverses))
+    # With where=... NumPy rounds in another way beside those that are left out.
+    logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
     return -logarithms.sum(axis=0), positive
 
 

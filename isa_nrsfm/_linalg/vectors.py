@@ -10,6 +10,54 @@ def energies(rows: NDArray) -> NDArray[np.float64]:
     return np.vecdot(flat, flat)
 
 
+# Where the number of frames is no multiple of this, sums are rounded in another way for
+# the last of them: by NumPy's einsum for a single frame, by BLAS at the edges of tiles.
+LANES = 16
+
+
+def in_lanes(frames: NDArray) -> NDArray:
+    """
+    Return numbers of frames, the last one repeated up to a multiple of `LANES`.
+
+    In arrays with the frame as the last index, the numbers that are found for a frame
+    then do not depend on how many frames there are, to the last bit. Frames that come
+    several times stay equal, and may be written to the same place.
+
+    Parameters
+    ----------
+    frames : ndarray of int, shape (n_frames,)
+        Numbers of frames.
+
+    Returns
+    -------
+    ndarray of int, shape (n_filled,)
+        The numbers, none for none.
+    """
+    return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
+
+
+def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
+    """
+    Return what belongs to some of the frames.
+
+    Parameters
+    ----------
+    values : ndarray of shape (..., n_frames)
+        Numbers of all frames.
+    frames : ndarray of int, shape (n_taken,), or slice
+        The frames.
+
+    Returns
+    -------
+    ndarray of shape (..., n_taken)
+        Their numbers, with the frame as the last axis in memory, too. Sums are rounded
+        by that order. Indexing with an array would put the frame first.
+    """
+    if isinstance(frames, slice):
+        return values[..., frames]
+    return np.take(values, frames, axis=-1)
+
+
 def frames_last(motion: NDArray) -> NDArray:
     """
     Return matrices with the frame as the last index.

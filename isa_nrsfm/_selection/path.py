@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.scikit_learn import taken_rows
@@ -39,6 +39,9 @@ from isa_nrsfm._tables.visibility import seen_points
 # Frames, at most, from which the directions of further basis shapes are found. They are
 # only a start.
 EXTENDING_FRAMES = 200
+
+# The fits of all frames are only starts, too: their tolerance is so many times larger.
+LOOSER = 4.0
 
 
 class Split(NamedTuple):
@@ -152,7 +155,8 @@ def walk(
         checked = checked._replace(options=checked.options._replace(independence=None))
     joint = checked.options.joint
     table = ready_table(checked.source, candidates[-1], checked.options)
-    parts = [_Part(X, checked, table, None)]
+    looser = checked.options._replace(tol=LOOSER * checked.options.joint_tol)
+    parts = [_Part(X, checked._replace(options=looser), table, None)]
     for number, split in enumerate(splits):
         scaled = table.part(_mask(split.train, len(table.shown)))
         _check_part(scaled, f"split {number}", candidates[-1], checked)

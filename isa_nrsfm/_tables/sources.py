@@ -22,7 +22,7 @@ COPIES = 8
 MEGABYTE = 2**20
 # Range of the coordinates of a frame. Squares of larger and of smaller ones leave the
 # range of double precision; fits at both ends agree with those of sizes about one.
-LARGEST, SMALLEST = 1e140, 1e-140
+LARGEST, SMALLEST = 2e153, 1e-150
 # What a table has to be, besides that its numbers are float32 or float64.
 CHECKS: dict[str, Any] = {
     "dtype": [np.float64, np.float32],
@@ -143,7 +143,7 @@ def checked_range(X: NDArray) -> NDArray:
     Raises
     ------
     ValueError
-        If the largest magnitude in a row is above 1e140, or below 1e-140 and not zero.
+        If the largest magnitude in a row is above 2e153, or below 1e-150 and not zero.
     """
     highest = np.fmax.reduce(X, axis=1, initial=0.0)
     lowest = np.fmin.reduce(X, axis=1, initial=0.0)

@@ -21,7 +21,8 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.analysis._labels import checked_column, group_numbers, kind_of
+from isa_nrsfm._tables.frame_columns import checked_column, group_numbers
+from isa_nrsfm.analysis._labels import kind_of
 
 if TYPE_CHECKING:
     import pandas as pd

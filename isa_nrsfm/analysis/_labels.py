@@ -1,63 +1,12 @@
-"""Labels and groups of frames, checked."""
+"""What labels of frames are."""
 
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import column_or_1d
 from sklearn.utils.multiclass import type_of_target
 
 Kind = Literal["classes", "number"]
-
-
-def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
-    """
-    Return a column with one known entry for each frame.
-
-    Parameters
-    ----------
-    name : str
-        What it is called in messages.
-    values : array-like of shape (n_frames,)
-        Numbers or names.
-    n_frames : int
-        Number of frames.
-
-    Returns
-    -------
-    ndarray of shape (n_frames,)
-        Numbers, or names as str.
-
-    Raises
-    ------
-    ValueError
-        If the length differs, or an entry is missing (None, NaN or NA).
-    """
-    column = np.asarray(column_or_1d(values))
-    if len(column) != n_frames:
-        raise ValueError(
-            f"{name} must have one entry for each of the {n_frames} frames; "
-            f"got {len(column)}"
-        )
-    missing = np.flatnonzero([_is_missing(each) for each in column])
-    if len(missing):
-        raise ValueError(
-            f"{name} must be known for all frames; it is missing in {len(missing)} of "
-            f"{n_frames}, the first is row {missing[0]}"
-        )
-    if column.dtype != object:
-        return column
-    if all(isinstance(each, int | float | np.number) for each in column):
-        return column.astype(float)
-    return column.astype(str)
-
-
-def _is_missing(value: Any) -> bool:
-    """Tell whether an entry of a column is None, NaN, NaT or NA."""
-    try:
-        return value is None or not bool(value == value)
-    except TypeError:  # pandas.NA is neither true nor false
-        return True
 
 
 def kind_of(y: NDArray, kind: str) -> Kind:
@@ -99,13 +48,3 @@ def kind_of(y: NDArray, kind: str) -> Kind:
             "for a measure of something say kind='number'"
         )
     return found
-
-
-def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
-    """Return numbers of groups from zero (n_frames,), None for None."""
-    if groups is None:
-        return None
-    found = np.unique(checked_column("groups", groups, n_frames), return_inverse=True)[
-        1
-    ]
-    return np.asarray(found)

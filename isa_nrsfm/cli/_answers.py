@@ -13,6 +13,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._dynamics.sequences import checked_times, sequences_of
+from isa_nrsfm._tables.frame_columns import group_numbers
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,
@@ -189,11 +190,10 @@ def _times(column: "pd.Series") -> NDArray:
 
 def _check_order(times: NDArray, groups: NDArray | None, name: str | None) -> None:
     """Raise unless times rise within each group."""
-    numbers = np.zeros(len(times), dtype=int)
-    if groups is not None:
-        numbers = np.unique(groups.astype(str), return_inverse=True)[1]
     try:
-        sequences_of(checked_times(times, len(times)), numbers, 1)
+        sequences_of(
+            checked_times(times, len(times)), group_numbers(groups, len(times)), 1
+        )
     except ValueError as error:
         hint = (
             "" if groups is not None else " (--group says which rows belong together)"

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import files_together, folder_for_writing
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns
@@ -22,12 +23,13 @@ from isa_nrsfm.cli._answers import (
     draw_answers,
     first_classes,
 )
-from isa_nrsfm.cli._choice import choose_n_components
+from isa_nrsfm.cli._choice import choice_report, choose_n_components
 from isa_nrsfm.cli._drawing import chosen_edges
 from isa_nrsfm.cli._drawing_options import drawing_files
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import (
     ARRAYS,
+    CHOICE_FIGURE,
     FIGURES,
     MODEL,
     PAGE,
@@ -105,7 +107,11 @@ def fit_table(
     if X.empty:
         raise ValueError(f"no row of {args.table} is left to fit{_reasons(frames)}")
     asked = asked_for(args, frames)
-    figures = {} if args.no_figures else FIGURES | answer_figures(asked)
+    several = len(args.n_components) > 1
+    figures = {}
+    if not args.no_figures:
+        choice = CHOICE_FIGURE if several else {}
+        figures = FIGURES | choice | answer_figures(asked)
     about = {REPORT_PAGE: "this report with its figures, for any browser"}
     files = about | MODEL | TABLES | ARRAYS | PAGE | figures
     edges = chosen_edges(args, frames.columns.points, frames.skeleton)
@@ -116,7 +122,7 @@ def fit_table(
         check_outputs((folder / name for name in (*files, REPORT)), inputs)
         removed = old_figures(folder, files)
         clock["read"] = time.perf_counter()
-        estimator, choice = _fitted(args, X, clock)
+        estimator, search = _fitted(args, X, asked.groups, clock)
         answers = answered(asked, estimator, X, args.random_state)
         with files_together(folder, removed=removed) as new:
             if table is not None:
@@ -128,10 +134,11 @@ def fit_table(
                 answers.alpha,
                 std=args.std,
                 labels=first_classes(asked, X),
+                times=asked.times,
                 edges=edges,
             )
             if not args.no_figures:
-                write_figures(new, estimator, X, args.random_state, edges)
+                write_figures(new, estimator, X, args.random_state, edges, search)
                 draw_answers(new, asked, answers, estimator)
             model = model_report(estimator, X, frames, edges)
             clock["write"] = time.perf_counter()
@@ -141,7 +148,7 @@ def fit_table(
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args.table, args.format, frames),
-                **({} if choice is None else {"choice": choice}),
+                **({} if search is None else {"choice": choice_report(search, X)}),
                 "model": model,
                 **answers.report,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
@@ -156,9 +163,12 @@ def fit_table(
 
 
 def _fitted(
-    args: Namespace, X: "pd.DataFrame", clock: dict[str, float]
-) -> tuple[AffineNRSfM, dict[str, Any] | None]:
-    """Return the model that the options ask for, and how K was chosen."""
+    args: Namespace,
+    X: "pd.DataFrame",
+    groups: "NDArray | None",
+    clock: dict[str, float],
+) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
+    """Return the model that the options ask for, and the search for its K."""
     estimator = AffineNRSfM(
         args.n_components[0],
         isa=_strategy(args),
@@ -171,16 +181,18 @@ def _fitted(
         random_state=args.random_state,
         n_jobs=args.n_jobs,
     )
-    choice = None
+    search = None
     if len(args.n_components) > 1:
-        choice = choose_n_components(estimator, X, args.n_components)
-        clock["choose"] = time.perf_counter()
-    with _progress(estimator):
-        estimator.fit(X)
+        search = choose_n_components(estimator, X, args.n_components, groups)
+        estimator = search.best_estimator_
+        clock["choose"] = time.perf_counter() - search.refit_time_
+    else:
+        with _progress(estimator):
+            estimator.fit(X)
     if estimator.refinement == "joint":
         estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
-    return estimator, choice
+    return estimator, search
 
 
 def _strategy(args: Namespace) -> Any:

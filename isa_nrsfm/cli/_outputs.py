@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, Decomposition, export
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
@@ -28,6 +28,7 @@ FIGURES = {
     "mode_covariance.png": "covariance of the deformations over the images, 3x3 blocks",
     "reprojection.png": "some frames, as observed and as the model has them",
 }
+CHOICE_FIGURE = {"choice.png": "held-out error by the number of basis shapes"}
 TABLES = {
     "alpha.csv": "row of the table, its other columns, the coefficients of each frame",
     "cameras.csv": "row of the table, camera of each frame: the image of a 3D point "
@@ -115,12 +116,13 @@ def write_results(
     *,
     std: bool,
     labels: "pd.Series | None" = None,
+    times: Any = None,
     edges: Any = "auto",
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
     The tables have a row for each frame, empty for those that could not be fitted. The
-    labels are those of the frames in the viewer.
+    labels and times are those of the frames in the viewer.
     """
     fit = fitted_frames(estimator)
     alpha = alpha_table(fit, frames, std=std).join(further)
@@ -140,6 +142,7 @@ def write_results(
         X=X,
         edges=edges,
         labels=labels,
+        times=times,
         camera="weak_perspective" if len(poses.columns) else None,
     )
     save_model(estimator, folder / "model.skops")
@@ -220,23 +223,29 @@ def write_figures(
     points: "pd.DataFrame",
     random_state: int,
     edges: Any = "auto",
+    search: AffineNRSfMCV | None = None,
 ) -> None:
-    """Draw the figures without a screen."""
+    """Draw the figures without a screen, that of the choice if there was a search."""
     import_optional("matplotlib", extra="plot").use("Agg")
     from isa_nrsfm.plotting import (
         BasisShapeDisplay,
+        ComponentChoiceDisplay,
         ModeCovarianceDisplay,
         ReprojectionDisplay,
     )
 
-    figures = (
+    names = [*FIGURES]
+    figures = [
         BasisShapeDisplay.from_estimator(estimator, edges=edges).figure_,
         ModeCovarianceDisplay.from_estimator(estimator).figure_,
         ReprojectionDisplay.from_estimator(
             estimator, points, random_state=random_state, edges=edges
         ).figure_,
-    )
-    for name, figure in zip(FIGURES, figures, strict=True):
+    ]
+    if search is not None:
+        names += CHOICE_FIGURE
+        figures.append(ComponentChoiceDisplay.from_estimator(search).figure_)
+    for name, figure in zip(names, figures, strict=True):
         write_figure(folder / name, figure)
 
 

@@ -250,15 +250,23 @@ def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
 
 def _choice_lines(choice: dict[str, Any]) -> list[str]:
     """Show the held-out error of each number of basis shapes."""
-    lines = ["  K   held-out error of frames that were not fitted"]
+    lines = ["  K   held-out error of frames that were not fitted, and its deviation"]
     lines += [
-        f"{k:3}   {100 * error:#.3g} %{', the least' * (k == choice['chosen'])}"
-        for k, error in zip(
-            choice["n_components"], choice["held_out_error"], strict=True
+        f"{k:3}   {100 * error:#.3g} +- {100 * deviation:#.2g} %"
+        f"{', the least' * (k == choice['chosen'])}"
+        for k, error, deviation in zip(
+            choice["n_components"],
+            choice["held_out_error"],
+            choice["held_out_error_deviation"],
+            strict=True,
         )
     ]
     if choice["chosen"] == choice["n_components"][-1]:
         lines.append("larger K may be better: this is the largest that was tried")
+    if "next" in choice:
+        following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
+        numbers = "-".join(map(str, sorted({following[0], following[-1]})))
+        lines.append(f"to try K = {numbers}, too, would take about {seconds:#.2g} s")
     return lines
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._dynamics.sequences import checked_times
 from isa_nrsfm.export._drawing import Links, choose_drawing
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.export._upright import (
@@ -42,6 +43,7 @@ def write_viewer(
     *,
     X: Any = None,
     labels: ArrayLike | None = None,
+    times: ArrayLike | None = None,
     n_frames: int = 1000,
     edges: Links = "auto",
     names: Sequence[str] | None = None,
@@ -70,6 +72,10 @@ def write_viewer(
     labels : array-like of shape (n_rows,), default=None
         Labels of the rows of the table, text or numbers, at most 30 different ones.
         Frames have colours by them. None and NaN are rows without a label.
+    times : array-like of shape (n_rows,), default=None
+        Seconds at which the rows were taken, or dates. The page plays them at true
+        speed; a row that is not later than the one before follows after the median
+        time between rows.
     n_frames : int, default=1000
         The page has no more frames than this, of rows evenly spread over the table.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
@@ -132,6 +138,7 @@ def write_viewer(
     motion, alpha = np.asarray(motion), np.asarray(alpha)
     seen = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
+    seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
     mean, basis = upright_basis(space, model)
     drawing = choose_drawing(edges, space.layout, len(mean))
@@ -153,8 +160,17 @@ def write_viewer(
         "sides": drawing.sides.tolist() if drawing.sides.any() else [],
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
+        "times": _encoded(seconds - seconds[:1], "<f8"),
     }
     write_whole(path, _page(content).encode("utf-8"))
+
+
+def _seconds(times: ArrayLike, n_rows: int) -> NDArray:
+    """Return increasing seconds of rows (n_rows,)."""
+    steps = np.diff(checked_times(times, n_rows))
+    later = steps > 0
+    typical = np.median(steps[later]) if later.any() else 1.0
+    return np.cumsum(np.insert(np.where(later, steps, typical), 0, 0.0))
 
 
 def _page(content: dict[str, Any]) -> str:

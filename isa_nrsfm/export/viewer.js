@@ -8,6 +8,7 @@
   const sides = model.sides; // of the points: 0 middle, 1 left, 2 right; or none
   const alpha = new Float32Array(bytes(model.alpha));
   const poses = new Float32Array(bytes(model.rotations));
+  const times = new Float64Array(bytes(model.times)); // seconds from the first; or none
   const nPoints = model.points.length;
   const nWeights = model.components.length;
   const nFrames = model.rows.length;
@@ -17,6 +18,7 @@
   const SWING = { amplitude: 2, seconds: 3 };
   const EYE = 6; // distance of the viewer, in radii of the mean shape
   const LEVELS = 12; // of depth, far ones drawn first and paler
+  const TRUE_SPEED = "true";
   const N_COLOURS = 8; // of the page; more labels go round the circle of hues
 
   const state = {
@@ -284,6 +286,20 @@
     state.frame = -1;
   }
 
+  function frameAfter(first, seconds) {
+    const pace = byId("pace").value;
+    if (pace !== TRUE_SPEED) return (first + Math.floor(seconds * Number(pace))) % nFrames;
+    // The last frame that has been taken by then; after the last one from the start.
+    const time = (times[first] + seconds) % (times[nFrames - 1] || 1);
+    let [low, high] = [0, nFrames - 1];
+    while (low < high) {
+      const middle = Math.ceil((low + high) / 2);
+      if (times[middle] <= time) low = middle;
+      else high = middle - 1;
+    }
+    return low;
+  }
+
   function start(what) {
     Object.assign(state, what);
     showButtons();
@@ -295,8 +311,7 @@
         state.weights[state.swinging] = SWING.amplitude * Math.sin(phase);
         showWeights();
       } else if (state.playing) {
-        const passed = Math.floor(((now - begun) / 1000) * Number(byId("pace").value));
-        const next = (Math.max(first, 0) + passed) % nFrames;
+        const next = frameAfter(Math.max(first, 0), (now - begun) / 1000);
         if (next !== state.frame) showFrame(next);
       } else return;
       state.motion = requestAnimationFrame(step);
@@ -321,6 +336,7 @@
     stop();
     if (!playing) start({ playing: true });
   });
+  if (times.length) byId("pace").add(new Option("true speed", TRUE_SPEED, true, true));
   byId("pace").addEventListener("change", () => {
     if (!state.playing) return;
     stop();

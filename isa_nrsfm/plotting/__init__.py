@@ -7,6 +7,7 @@ from isa_nrsfm._compat.lazy import lazy_names
 __all__ = [
     "BasisShapeDisplay",
     "CoefficientsDisplay",
+    "ComponentChoiceDisplay",
     "ModeCovarianceDisplay",
     "ReprojectionDisplay",
 ]
@@ -14,6 +15,7 @@ __all__ = [
 if TYPE_CHECKING:
     from isa_nrsfm.plotting._basis_shapes import BasisShapeDisplay
     from isa_nrsfm.plotting._coefficients import CoefficientsDisplay
+    from isa_nrsfm.plotting._component_choice import ComponentChoiceDisplay
     from isa_nrsfm.plotting._mode_covariance import ModeCovarianceDisplay
     from isa_nrsfm.plotting._reprojection import ReprojectionDisplay
 else:
@@ -22,6 +24,7 @@ else:
         {
             "isa_nrsfm.plotting._basis_shapes": ["BasisShapeDisplay"],
             "isa_nrsfm.plotting._coefficients": ["CoefficientsDisplay"],
+            "isa_nrsfm.plotting._component_choice": ["ComponentChoiceDisplay"],
             "isa_nrsfm.plotting._mode_covariance": ["ModeCovarianceDisplay"],
             "isa_nrsfm.plotting._reprojection": ["ReprojectionDisplay"],
         },

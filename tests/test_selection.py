@@ -1,0 +1,301 @@
+"""AffineNRSfMCV: what is tried, held out and chosen, and how near to a plain search."""
+
+from typing import ClassVar
+
+import numpy as np
+import pandas as pd
+import pytest
+import sklearn
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.model_selection import (
+    GridSearchCV,
+    GroupKFold,
+    KFold,
+    LeaveOneGroupOut,
+    cross_val_score,
+)
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer
+
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._selection.choice import selected
+from isa_nrsfm.datasets import make_nonrigid_tracks
+
+X = make_nonrigid_tracks(90, 25, 2, noise=0.01, random_state=0).data
+PERSON = np.arange(len(X)) % 6
+
+
+def inner(**parameters):
+    return AffineNRSfM(random_state=0, **parameters)
+
+
+def mean_abs_alpha(estimator, X, y=None):
+    """A scorer that depends on the basis shapes, and on the number of rows."""
+    return float(np.abs(estimator.transform(X)).mean()) + len(X)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return AffineNRSfMCV(range(1, 4), estimator=inner(), cv=3).fit(X)
+
+
+def test_the_number_that_made_the_table_is_found(fitted):
+    assert fitted.n_components_ == 2
+    assert fitted.best_index_ == 1
+    assert fitted.best_score_ == fitted.cv_results_["mean_test_score"].max()
+    assert fitted.n_splits_ == 3
+    assert fitted.refit_time_ > 0
+
+
+def test_results_are_those_of_a_plain_search(fitted):
+    plain = GridSearchCV(inner(), {"n_components": [1, 2, 3]}, cv=3).fit(X)
+    ours, theirs = fitted.cv_results_, plain.cv_results_
+    for name in ("split0_test_score", "split2_test_score", "mean_test_score"):
+        assert_allclose(ours[name], theirs[name], rtol=0.01)
+    assert_array_equal(ours["param_n_components"], [1, 2, 3])
+    assert_array_equal(ours["rank_test_score"], theirs["rank_test_score"])
+    assert ours["params"] == theirs["params"]
+    # Names and meanings are those of scikit-learn, but for one of the path.
+    assert set(ours) - set(theirs) == {"path_fit_time"}
+    assert set(theirs) <= set(ours)
+    scores = [ours[f"split{i}_test_score"] for i in range(3)]
+    assert_allclose(ours["mean_test_score"], np.mean(scores, axis=0))
+    assert_allclose(ours["std_test_score"], np.std(scores, axis=0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_cameras_and_missing_points_are_those_of_a_plain_search(camera, missing):
+    made = make_nonrigid_tracks(
+        90, 25, 2, camera=camera, noise=0.01, missing=missing, random_state=0
+    )
+    estimator = inner(camera=camera)
+    search = AffineNRSfMCV([1, 2, 3], estimator=estimator).fit(made.data)
+    for row, k in enumerate([1, 2, 3]):
+        plain = cross_val_score(estimator.set_params(n_components=k), made.data, cv=3)
+        ours = [search.cv_results_[f"split{i}_test_score"][row] for i in range(3)]
+        assert_allclose(np.mean(ours), plain.mean(), rtol=0.02)
+    assert search.n_components_ == 2
+
+
+@pytest.mark.slow
+def test_a_robust_loss_is_kept():
+    spoilt = X.copy()
+    spoilt[::7, 4] += 3.0
+    search = AffineNRSfMCV([1, 2], estimator=inner(loss="cauchy")).fit(spoilt)
+    plain = cross_val_score(inner(loss="cauchy", n_components=2), spoilt, cv=3)
+    assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.02)
+
+
+def test_the_best_estimator_is_the_fit_of_all_frames(fitted):
+    alone = inner(n_components=2).fit(X)
+    best = fitted.best_estimator_
+    assert_array_equal(best.alpha_, alone.alpha_)
+    assert best.camera_noise_ratio_ == alone.camera_noise_ratio_
+    assert best.n_components == 2
+
+
+def test_methods_are_those_of_the_best_estimator(fitted):
+    best, rows = fitted.best_estimator_, X[:7]
+    alpha = best.transform(rows)
+    assert_array_equal(fitted.transform(rows), alpha)
+    assert_array_equal(fitted.inverse_transform(alpha), best.inverse_transform(alpha))
+    assert_array_equal(fitted.reconstruct(rows), best.reconstruct(rows))
+    assert_array_equal(fitted.reproject(rows), best.reproject(rows))
+    assert_array_equal(fitted.decompose(rows).motion, best.decompose(rows).motion)
+    assert fitted.score(rows) == best.score(rows)
+    assert fitted.n_features_in_ == X.shape[1]
+    names = ["affinenrsfmcv0", "affinenrsfmcv1"]
+    assert_array_equal(fitted.get_feature_names_out(), names)
+
+
+def test_nothing_is_there_before_the_fit():
+    search = AffineNRSfMCV()
+    assert not hasattr(search, "n_features_in_")
+    with pytest.raises(NotFittedError):
+        search.transform(X)
+
+
+@pytest.mark.slow
+def test_neither_order_nor_workers_change_the_result(fitted):
+    other = AffineNRSfMCV((3, 1, 2), estimator=inner(), cv=3, n_jobs=2).fit(X)
+    for name in ("param_n_components", "split1_test_score"):
+        assert_array_equal(other.cv_results_[name], fitted.cv_results_[name])
+
+
+def test_the_parameters_are_not_changed():
+    estimator, tried = inner(n_components=5), [2, 1]
+    AffineNRSfMCV(tried, estimator=estimator).fit(X)
+    assert tried == [2, 1]
+    assert estimator.n_components == 5
+    assert not hasattr(estimator, "alpha_")
+
+
+def test_names_of_columns_are_kept():
+    names = [f"{axis}_{i}" for i in range(25) for axis in "xy"]
+    search = AffineNRSfMCV((1, 2), estimator=inner()).fit(
+        pd.DataFrame(X, columns=names)
+    )
+    assert_array_equal(search.feature_names_in_, names)
+    search.fit(X)
+    assert not hasattr(search, "feature_names_in_")
+
+
+def test_the_path_may_begin_anywhere_and_leave_gaps():
+    search = AffineNRSfMCV((2, 5), estimator=inner()).fit(X)
+    plain = cross_val_score(inner(n_components=5), X, cv=3).mean()
+    assert_allclose(search.cv_results_["mean_test_score"][1], plain, rtol=0.02)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_the_pipeline_of_the_paper_is_searched_plainly():
+    estimator = inner(refinement="alternating")
+    search = AffineNRSfMCV((1, 2), estimator=estimator).fit(X)
+    for row, k in enumerate((1, 2)):
+        plain = cross_val_score(estimator.set_params(n_components=k), X, cv=3)
+        ours = [search.cv_results_[f"split{i}_test_score"][row] for i in range(3)]
+        assert_array_equal(ours, plain)
+    assert_array_equal(search.cv_results_["path_fit_time"], 0)
+
+
+def test_a_scorer_sees_fitted_estimators_and_held_out_rows():
+    search = AffineNRSfMCV((1, 2), estimator=inner(), scoring=mean_abs_alpha).fit(X)
+    results = search.cv_results_
+    assert all(30.3 < results[f"split{i}_test_score"][1] < 31.3 for i in range(3))
+    assert search.score(X) == mean_abs_alpha(search.best_estimator_, X)
+
+
+def test_frames_of_a_group_stay_together():
+    splits = list(GroupKFold(3).split(X, groups=PERSON))
+    by_group = AffineNRSfMCV((1, 2), estimator=inner(), cv=GroupKFold(3))
+    by_group.fit(X, groups=PERSON)
+    given = AffineNRSfMCV((1, 2), estimator=inner(), cv=splits).fit(X)
+    for i in range(3):
+        name = f"split{i}_test_score"
+        assert_array_equal(by_group.cv_results_[name], given.cv_results_[name])
+
+
+def test_groups_are_routed_through_a_pipeline():
+    search = AffineNRSfMCV((1, 2), estimator=inner(), cv=LeaveOneGroupOut())
+    with sklearn.config_context(enable_metadata_routing=True):
+        pipeline = make_pipeline(FunctionTransformer(), search)
+        pipeline.fit(X, groups=PERSON)
+        assert pipeline.score(X) == pipeline[-1].score(X)
+    assert pipeline[-1].n_splits_ == 6
+
+
+def test_metadata_are_routed_to_a_scorer():
+    with sklearn.config_context(enable_metadata_routing=True):
+        search = AffineNRSfMCV((1, 2), estimator=inner(), scoring=Weighing())
+        search.fit(X, weight=np.ones(len(X)))
+    # The weights of the held-out rows only
+    assert_array_equal(search.cv_results_["split0_test_score"], [29.0, 28.0])
+
+
+class Weighing(sklearn.utils._metadata_requests._MetadataRequester):
+    """A scorer that asks for a weight of each row."""
+
+    __metadata_request__score: ClassVar = {"weight": True}
+
+    def __call__(self, estimator, X, y=None, weight=None):
+        return float(np.sum(weight)) - len(estimator.basis_)
+
+    def score(self, X, weight=None):
+        """Tell the metadata of the method."""
+
+
+@pytest.mark.parametrize("method", ["fit", "score"])
+def test_metadata_without_routing_are_refused(fitted, method):
+    with pytest.raises(TypeError, match="weight only with metadata routing"):
+        getattr(fitted, method)(X, weight=PERSON)
+
+
+def test_fewest_basis_shapes_within_one_standard_error():
+    # Means -0.03, -0.011, -0.010; the standard error of the best is 0.0015.
+    scores = np.array([[-0.03, -0.03], [-0.011, -0.011], [-0.0115, -0.0085]])
+    assert selected(scores, "best") == 2
+    assert selected(scores, "one_standard_error") == 1
+    scores[1] -= 0.0006
+    assert selected(scores, "one_standard_error") == 2
+    # A score that is not known is never chosen.
+    scores[0] = np.nan
+    assert selected(scores, "one_standard_error") == 2
+
+
+def test_fewest_basis_shapes_are_fitted():
+    scores = {1: -0.030, 2: -0.011, 3: -0.010}
+
+    def scorer(estimator, X, y=None):
+        return scores[len(estimator.basis_)] + 0.0015 * np.sign(X[0, 0] - first)
+
+    first = np.median(X[[0, 45], 0])
+    search = AffineNRSfMCV(
+        (1, 2, 3), estimator=inner(), cv=2, scoring=scorer, select="one_standard_error"
+    ).fit(X)
+    assert search.n_components_ == len(search.best_estimator_.basis_) == 2
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"n_components": (1, 8)}, "largest possible n_components is 7"),
+        ({"n_components": (1, 1)}, "different numbers of at least 1"),
+        ({"n_components": (0, 1)}, "different numbers of at least 1"),
+        ({"n_components": ()}, "must be numbers of basis shapes"),
+        ({"n_components": (1.5,)}, "must be numbers of basis shapes"),
+        ({"n_components": 3}, "must be an array-like"),
+        ({"estimator": FunctionTransformer()}, "should be an AffineNRSfM"),
+        ({"select": "smallest"}, "select"),
+    ],
+)
+def test_what_cannot_be_tried_is_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        AffineNRSfMCV(**parameters).fit(X)
+
+
+def test_the_limit_of_the_parts_is_named():
+    few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
+    with pytest.raises(
+        ValueError, match=r"9 frames, enough for n_components=3 at most"
+    ):
+        AffineNRSfMCV((3, 6)).fit(few)
+    hidden = X.copy()
+    hidden[3:, 0:2] = np.nan  # a part without this point
+    with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):
+        AffineNRSfMCV((1, 2), cv=KFold(20)).fit(hidden)
+
+
+def test_rows_without_points_are_held_out_like_others():
+    empty = X.copy()
+    empty[[0, 40]] = np.nan
+    with pytest.warns(UserWarning, match="show no point"):
+        search = AffineNRSfMCV((1, 2), estimator=inner()).fit(empty)
+    with pytest.warns(UserWarning, match="show no point"):
+        plain = cross_val_score(inner(n_components=2), empty, cv=3)
+    assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.01)
+
+
+def test_a_memory_map_is_a_table(tmp_path, fitted):
+    np.save(tmp_path / "table.npy", X)
+    stored = np.load(tmp_path / "table.npy", mmap_mode="r")
+    search = AffineNRSfMCV(range(1, 4), estimator=inner()).fit(stored)
+    name = "mean_test_score"
+    assert_allclose(search.cv_results_[name], fitted.cv_results_[name], rtol=1e-6)
+
+
+def test_fits_that_do_not_converge_are_counted():
+    search = AffineNRSfMCV((1, 2), estimator=inner(max_iter=2))
+    with pytest.warns(ConvergenceWarning, match=r"\d fit\(s\) did not converge while"):
+        search.fit(X)
+
+
+def test_lines_come_while_the_search_runs(capsys):
+    AffineNRSfMCV((1, 2), estimator=inner(), verbose=1).fit(X)
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        "[AffineNRSfMCV] n_components=1",
+        "[AffineNRSfMCV] n_components=2",
+    ]
+    assert all("held-out error" in line and line.endswith(" s") for line in lines)
