@@ -25,15 +25,22 @@ class FramePoses(NamedTuple):
 
     Attributes
     ----------
-    yaw, pitch, roll : ndarray of shape (n_frames,)
-        Angles in degrees, as of `isa_nrsfm.calibration.view_angles`: zero for a
-        frontal, upright object. Yaw is positive where it is turned to the viewer's
-        right, pitch where it looks up, roll where it is turned clockwise in the image.
+    yaw : ndarray of shape (n_frames,)
+        In degrees, as of `isa_nrsfm.calibration.view_angles`, like all three: zero for
+        a frontal, upright object. Positive where it is turned to the viewer's right.
+    pitch : ndarray of shape (n_frames,)
+        In degrees; positive where it looks up.
+    roll : ndarray of shape (n_frames,)
+        In degrees; positive where it is turned clockwise in the image.
     scale : ndarray of shape (n_frames,)
         Pixels, or units of the table, per unit of the shapes.
-    yaw_std, pitch_std, roll_std : ndarray of shape (n_frames,)
-        Posterior standard deviations of the angles, in degrees. NaN without a table,
-        and for models with affine cameras: these have no rotations of their own.
+    yaw_std : ndarray of shape (n_frames,)
+        Posterior standard deviation of yaw in degrees. Like the others NaN without a
+        table, and for models with affine cameras: these have no rotations of their own.
+    pitch_std : ndarray of shape (n_frames,)
+        That of pitch.
+    roll_std : ndarray of shape (n_frames,)
+        That of roll.
     """
 
     yaw: NDArray

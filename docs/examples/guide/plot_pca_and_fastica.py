@@ -13,6 +13,7 @@ camera is. All of it is measured here on artificial faces of which pose and expr
 are known.
 """
 
+# sphinx_gallery_thumbnail_number = 2
 import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.decomposition import PCA, FastICA
