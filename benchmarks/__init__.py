@@ -7,7 +7,8 @@ pictures; docs/benchmarks/README.md says how. Its sections are in `_fits`, `_rec
 
 `asv_suite`, with asv.conf.json, is a suite for airspeed velocity.
 
-``python -m benchmarks.accuracy``, ``.recovery``, ``.speed`` and ``.sensitivity`` print
-figures of `AffineNRSfM` alone and assert nothing. Sections are named on the command
-line, all by default; ``--seeds`` says how many random seeds each of them takes.
+``python -m benchmarks.accuracy``, ``.recovery``, ``.questions``, ``.speed`` and
+``.sensitivity`` print figures of `AffineNRSfM` alone and assert nothing. Sections are
+named on the command line, all by default; ``--seeds`` says how many random seeds each
+of them takes.
 """

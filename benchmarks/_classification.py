@@ -1,7 +1,5 @@
 """Section classification: expressions from coefficients and from other features."""
 
-import numpy as np
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.model_selection import GroupKFold, StratifiedKFold, cross_val_score
@@ -13,9 +11,9 @@ from benchmarks._jobs import Job
 from benchmarks._markdown import grid, remarks, value
 from benchmarks._methods import CALIBRATED, METHOD_TITLES, METHODS
 from benchmarks._sets import SET_TITLES, SETS, load
+from isa_nrsfm.analysis import AlignedFrames
 
 FOLDS = 5
-MAX_ROUNDS, SETTLED = 100, 1e-10
 # Methods without coefficients, or with those of another one, and a method with twice
 # as many.
 WITHOUT, MORE = ("floor", "rigid", *CALIBRATED), "joint_more"
@@ -29,59 +27,6 @@ FEATURES = {
     "true_pca": "PCA of the true 3D shapes, K",
     "true_pca_more": "PCA of the true 3D shapes, 3K + 3",
 }
-
-
-class AlignedFrames(TransformerMixin, BaseEstimator):
-    """
-    Frames moved, scaled and turned in the image to be nearest to their mean.
-
-    Parameters
-    ----------
-    turn : bool, default=True
-        Whether frames are turned; without it they are centred and scaled.
-
-    Attributes
-    ----------
-    mean_ : ndarray of shape (n_points,)
-        The mean of the aligned frames of the fit, complex numbers of mean square one.
-    """
-
-    def __init__(self, turn=True):
-        self.turn = turn
-
-    def fit(self, X, y=None):
-        """Find the mean by generalised Procrustes analysis."""
-        points = unit_points(X)
-        mean = points[0]
-        for _ in range(MAX_ROUNDS if self.turn else 0):
-            turned = nearest_turn(points, mean).mean(axis=0)
-            turned /= np.sqrt(np.mean(np.abs(turned) ** 2))
-            change = np.abs(turned - mean).max()
-            mean = turned
-            if change < SETTLED:
-                break
-        self.mean_ = mean
-        return self
-
-    def transform(self, X):
-        """Return the aligned frames as a table."""
-        points = unit_points(X)
-        if self.turn:
-            points = nearest_turn(points, self.mean_)
-        return np.ascontiguousarray(points).view(float)
-
-
-def unit_points(X):
-    """Return frames as complex numbers x + iy of mean zero and mean square one."""
-    points = np.ascontiguousarray(X, dtype=float).view(complex)
-    points = points - points.mean(axis=1, keepdims=True)
-    return points / np.sqrt(np.mean(np.abs(points) ** 2, axis=1, keepdims=True))
-
-
-def nearest_turn(points, mean):
-    """Return frames turned to be nearest to a mean."""
-    angles = np.angle(points @ mean.conj())
-    return points * np.exp(-1j * angles)[:, None]
 
 
 def features(method, chosen, seed):

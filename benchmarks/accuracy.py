@@ -558,6 +558,12 @@ SPOILS = {
 }
 
 
+def common_rotation(truth, rotations):
+    """Return C for which the products R C of true rotations are nearest to others."""
+    U, _, Vt = np.linalg.svd(np.einsum("iba,ibc->ac", truth, rotations))
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
 def turn_errors(truth, rotations):
     """
     Return the angles in degrees between rotations after one common rotation.
@@ -575,8 +581,7 @@ def turn_errors(truth, rotations):
     mirror = np.diag([1.0, 1.0, -1.0])
     angles = []
     for turned in (rotations, mirror @ rotations @ mirror):
-        U, _, Vt = np.linalg.svd(np.einsum("iba,ibc->ac", truth, turned))
-        common = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        common = common_rotation(truth, turned)
         cosine = (np.einsum("iba,ibc,ac->i", truth, turned, common) - 1) / 2
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
     return min(angles, key=np.median)

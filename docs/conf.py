@@ -79,12 +79,15 @@ sphinx_gallery_conf = {
     "within_subsection_order": ExplicitOrder(
         [
             "plot_method.py",
+            "plot_independence.py",
             "plot_cameras.py",
             "plot_choosing_k.py",
             "plot_missing_and_outliers.py",
             "plot_pose_and_units.py",
             "plot_pca_and_fastica.py",
             "plot_expressions.py",
+            "plot_labels_and_people.py",
+            "plot_motion.py",
             "plot_similar_faces.py",
             "plot_occluded_points.py",
             "plot_shape_model.py",

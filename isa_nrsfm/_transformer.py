@@ -70,7 +70,7 @@ class SmoothedCoefficients(NamedTuple):
     time_scales : ndarray of shape (n_components,) or (0,)
         Times after which the shape of a frame is forgotten, the longest first, in the
         units of `time`: ``-1 / log |l|`` with the eigenvalues l of the transition.
-        Infinite where |l| is one or more. Empty if the frames show no dynamics.
+        Infinite where ``|l|`` is one or more. Empty if the frames show no dynamics.
     """
 
     alpha: NDArray

@@ -17,10 +17,10 @@ from benchmarks import (
     _unseen,
     accuracy,
     frame_search,
+    questions,
     sensitivity,
 )
 from benchmarks._agreement import compare
-from benchmarks._classification import AlignedFrames
 from benchmarks._figures import draw_bars, draw_reprojections
 from benchmarks._isolated import run_isolated
 from benchmarks._jobs import Job, Limits, run_jobs
@@ -32,6 +32,7 @@ from benchmarks._sets import SETS, Set
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._fit_options import Limits as FitLimits
 from isa_nrsfm._joint.options import JointOptions
+from isa_nrsfm.analysis import AlignedFrames
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -557,6 +558,27 @@ def test_aligned_frames_do_not_depend_on_place_size_and_turn(tracks):
     plain = AlignedFrames(turn=False).fit_transform(tracks.data).reshape(60, -1, 2)
     np.testing.assert_allclose(plain.mean(axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.sum(plain**2, axis=(1, 2)), 30.0)
+
+
+def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image():
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(5, 20, 3))
+    turned = np.stack([S @ random_rotation(i, 3) for i, S in enumerate(truth)])
+    mirrored = turned * [1.0, 1.0, -1.0] + 3.0
+    assert questions.turned_error(mirrored, truth) == pytest.approx(0.0, abs=1e-12)
+    # Not of single frames, and not a scale.
+    mirrored[0] *= [1.0, 1.0, -1.0]
+    assert questions.turned_error(mirrored, truth) > 0.02
+    centred = truth - truth.mean(axis=1, keepdims=True)
+    assert questions.turned_error(1.1 * centred, truth) == pytest.approx(0.1)
+
+
+def test_a_common_rotation_is_found():
+    truth = np.stack([random_rotation(i, 3) for i in range(6)])
+    common = random_rotation(9, 3)
+    np.testing.assert_allclose(
+        accuracy.common_rotation(truth, truth @ common), common, atol=1e-12
+    )
 
 
 def test_equal_fits_agree(tracks):

@@ -17,7 +17,12 @@ from isa_nrsfm.skeletons import SKELETONS
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.lint
 
-PAGES = ["README.md", "docs/getting_started.md", "docs/migration.md"]
+PAGES = [
+    "README.md",
+    "docs/getting_started.md",
+    "docs/migration.md",
+    "docs/questions.md",
+]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
@@ -105,6 +110,27 @@ def test_getting_started_runs():
     assert Path("rows.png").stat().st_size
 
 
+@pytest.mark.usefixtures("tables")
+def test_the_page_of_questions_runs():
+    names = run("docs/questions.md")
+    table = names["found"].to_frame()
+    assert list(table) == ["eta_squared", "p_value"]
+    assert table["eta_squared"].max() > 0.5
+    assert names["relative"].shape == names["at_rest"].shape == (400, 4)
+    assert names["scores"].mean() > 0.9
+    # Ordered frames have dynamics, shuffled ones do not.
+    assert len(names["smooth"].time_scales) == 4
+    assert len(names["shuffled"].time_scales) == 0
+    expected = names["model"].transform(names["X"][names["order"]])
+    np.testing.assert_allclose(names["shuffled"].alpha, expected, atol=1e-10)
+    assert np.median(names["poses"].yaw_std) < 1
+    np.testing.assert_allclose(
+        names["mouth_mm"][:, 0], 90 * names["mouth"][:, 0], rtol=1e-10
+    )
+    assert Path("time.png").stat().st_size
+    assert Path("gestures.png").stat().st_size
+
+
 def test_orders_of_matlab_are_the_same_table(sequence):
     names = run("docs/migration.md")
     for table in ("X", "X_em", "X_toolbox"):
@@ -124,8 +150,8 @@ def test_variables_of_matlab_are_the_model(sequence):
 
 
 def examples():
-    """Return the pages of the gallery that solve a problem."""
-    return sorted((ROOT / "docs/examples/problems").glob("*.py"))
+    """Return the pages of the gallery."""
+    return sorted((ROOT / "docs/examples").rglob("*.py"))
 
 
 @pytest.mark.parametrize("path", examples(), ids=lambda path: path.stem)
@@ -144,6 +170,11 @@ def test_examples_are_short_and_need_no_files(path):
     ]
     assert len(code) <= 40
     assert "environ" not in source
+
+
+def test_the_order_of_the_gallery_is_complete():
+    listed = re.findall(r'"(plot_\w+\.py)"', text("docs/conf.py"))
+    assert sorted(listed) == sorted(path.name for path in examples())
 
 
 def test_all_layouts_are_listed():

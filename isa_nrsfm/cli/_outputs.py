@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, export
+from isa_nrsfm import AffineNRSfM, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
@@ -22,6 +22,8 @@ from isa_nrsfm.metrics._reprojection import frame_energies
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from isa_nrsfm import AffineNRSfMCV
 
 FIGURES = {
     "basis_shapes.png": "mean shape and basis shapes",
@@ -223,7 +225,7 @@ def write_figures(
     points: "pd.DataFrame",
     random_state: int,
     edges: Any = "auto",
-    search: AffineNRSfMCV | None = None,
+    search: "AffineNRSfMCV | None" = None,
 ) -> None:
     """Draw the figures without a screen, that of the choice if there was a search."""
     import_optional("matplotlib", extra="plot").use("Agg")

@@ -18,7 +18,6 @@ from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
 from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.metrics import inverse_snr
-from isa_nrsfm.plotting._views import layout_of
 
 _LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
 _LABEL_WIDTH = 11
@@ -93,6 +92,8 @@ def model_report(
     estimator: AffineNRSfM, X: Any, frames: Frames, edges: Any = "auto"
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
+    from isa_nrsfm.plotting._views import layout_of  # not needed by transform
+
     names = component_names(len(estimator.basis_))
     # Known only where the fit has seen the table as it is.
     floor = frames.seen.all() and estimator.loss == "linear"

@@ -26,17 +26,17 @@ class FramePoses(NamedTuple):
     Attributes
     ----------
     yaw : ndarray of shape (n_frames,)
-        Degrees, as of `isa_nrsfm.calibration.view_angles`: zero for a frontal object,
-        positive where it is turned to the viewer's right.
+        In degrees, as of `isa_nrsfm.calibration.view_angles`, like all three: zero for
+        a frontal, upright object. Positive where it is turned to the viewer's right.
     pitch : ndarray of shape (n_frames,)
-        Degrees, positive where it looks up.
+        In degrees; positive where it looks up.
     roll : ndarray of shape (n_frames,)
-        Degrees, positive where it is turned clockwise in the image.
+        In degrees; positive where it is turned clockwise in the image.
     scale : ndarray of shape (n_frames,)
         Pixels, or units of the table, per unit of the shapes.
     yaw_std : ndarray of shape (n_frames,)
-        Posterior standard deviation of yaw, in degrees. NaN without a table, and for
-        models with affine cameras: these have no rotations of their own.
+        Posterior standard deviation of yaw in degrees. Like the others NaN without a
+        table, and for models with affine cameras: these have no rotations of their own.
     pitch_std : ndarray of shape (n_frames,)
         That of pitch.
     roll_std : ndarray of shape (n_frames,)

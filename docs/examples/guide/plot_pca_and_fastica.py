@@ -13,6 +13,7 @@ camera is. All of it is measured here on artificial faces of which pose and expr
 are known.
 """
 
+# sphinx_gallery_thumbnail_number = 2
 import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.decomposition import PCA, FastICA
@@ -20,25 +21,13 @@ from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import cross_val_score
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.analysis import AlignedFrames
 from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.plotting import BasisShapeDisplay, ReprojectionDisplay
 
 K = 4
 faces = make_face_tracks(n_frames=400, n_components=K, random_state=0)
-
-
-def aligned(tracks):
-    """Return tracks, each turned, moved and scaled to the mean as near as it can be."""
-    z = tracks[..., 0] + 1j * tracks[..., 1]
-    z = z - z.mean(axis=1, keepdims=True)
-    z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    mean = z[0]
-    for _ in range(10):
-        z = z * np.exp(-1j * np.angle(z @ mean.conj()))[:, None]
-        mean = z.mean(axis=0)
-    return np.concatenate([z.real, z.imag], axis=1)
-
-
-images = aligned(faces.tracks)
+images = AlignedFrames().fit_transform(faces.data)
 model = AffineNRSfM(K, random_state=0)
 features = {
     "PCA of the table": PCA(K).fit_transform(faces.data),
@@ -56,72 +45,47 @@ features = {
 # predicts from the coefficients: of yaw and pitch, of which nothing should be there,
 # and of the expressions, of which everything should. Where the first is near zero or
 # below, the coefficients do not tell the pose.
-
-
-def explained(found, truth):
-    """Return the cross-validated R squared of each column of the truth."""
-    regression = LinearRegression()
-    return np.array([cross_val_score(regression, found, y).mean() for y in truth.T])
-
-
-pose = {name: explained(found, faces.angles[:, :2]) for name, found in features.items()}
-meant = {name: explained(found, faces.strength) for name, found in features.items()}
-print(f"{'':27}   yaw  pitch |", "  ".join(faces.component_names))
-for name in features:
-    shares = "  ".join(
-        f"{share:{len(what)}.2f}"
-        for share, what in zip(meant[name], faces.component_names, strict=True)
-    )
-    print(f"{name:27} {pose[name][0]:5.2f}  {pose[name][1]:5.2f} |  {shares}")
-
-_, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")
-at = np.arange(len(features))
-axis.barh(at - 0.2, [p.mean() for p in pose.values()], 0.38, label="yaw and pitch")
-axis.barh(at + 0.2, [m.mean() for m in meant.values()], 0.38, label="expressions")
-axis.set(yticks=at, yticklabels=features, xlabel="mean R squared", xlim=(-0.05, 1.02))
-axis.invert_yaxis()
-axis.legend(loc="upper center", bbox_to_anchor=(0.4, 1.2), ncols=2, frameon=False)
-
-# %%
-# Does a coefficient mean something?
-# ----------------------------------
 #
-# A linear regression may gather what is spread. Of a basis with a meaning, each
-# expression is a coefficient of its own: here is the largest correlation of each
-# expression with a single one.
+# A regression may gather what is spread. Of a basis with a meaning, each expression is
+# a coefficient of its own: that is the third number, the largest correlation of an
+# expression with a single coefficient, mean of the expressions.
 
-print(f"{'':27}", faces.component_names)
-for name, found in features.items():
-    correlation = np.corrcoef(faces.strength.T, found.T)[:K, K:]
-    best = np.abs(correlation).max(axis=1)
-    print(f"{name:27}", best.round(2))
+truth = {"yaw and pitch": faces.angles[:, :2], "expressions": faces.strength}
+_, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")
+print("R squared of", " and of ".join(truth), "and correlation with one coefficient")
+for at, (name, found) in enumerate(features.items()):
+    shares = {
+        what: np.mean([cross_val_score(LinearRegression(), found, y) for y in wanted.T])
+        for what, wanted in truth.items()
+    }
+    for k, share in enumerate(shares.values()):
+        axis.barh(at + 0.4 * k - 0.2, share, 0.38, color=f"C{k}")
+    single = np.abs(np.corrcoef(faces.strength.T, found.T)[:K, K:]).max(axis=1)
+    print(f"{name:27}", *(f"{s:6.2f}" for s in (*shares.values(), single.mean())))
+axis.set(yticks=range(len(features)), yticklabels=features, xlabel="mean R squared")
+axis.invert_yaxis()
+axis.legend(truth, loc="upper center", bbox_to_anchor=(0.4, 1.2), ncols=2)
 
 # %%
 # What the components show
 # ------------------------
 #
-# The same in pictures: how the first four components of PCA, and the four basis shapes
-# seen by the mean camera, move the points. Those of PCA turn the head.
+# The first four components of PCA, from two standard deviations below the mean (rings)
+# to two above (lines): they turn the head.
 
 pca = PCA(K).fit(images)
-patterns = pca.components_.reshape(K, 2, -1).transpose(0, 2, 1)
-mean_image = pca.mean_.reshape(2, -1).T
-camera = model.reference_motion_
-_, axes = plt.subplots(2, K, figsize=(9, 5.2), layout="constrained")
-for k in range(K):
-    for axis, start, move in (
-        (axes[0, k], mean_image, patterns[k] * np.sqrt(pca.explained_variance_[k])),
-        (axes[1, k], model.mean_shape_ @ camera.T, model.basis_[k] @ camera.T),
-    ):
-        largest = np.linalg.norm(move, axis=1).max() / np.ptp(start[:, 0])
-        move = 0.2 * move / largest
-        axis.quiver(*start.T, *move.T, angles="xy", scale_units="xy", scale=1)
-        axis.scatter(*(start + move).T, s=0)
-        axis.set(aspect="equal", xticks=[], yticks=[])
-        axis.margins(0.12)
-        axis.invert_yaxis()
-    axes[0, k].set_title(f"PCA {k + 1}", fontsize="medium")
-    axes[1, k].set_title(f"basis shape {k + 1}", fontsize="medium")
+size = 2 * np.sqrt(pca.explained_variance_)[:, None, None]
+mean, move = pca.mean_.reshape(-1, 2), size * pca.components_.reshape(K, -1, 2)
+display = ReprojectionDisplay(
+    observed=mean - move, reprojected=mean + move, edges="ibug-68"
+).plot(n_columns=K)
+for k, axis in enumerate(display.axes_):
+    axis.set_title(f"PCA {k + 1}")
+
+# %%
+# The basis shapes move the face:
+
+BasisShapeDisplay.from_estimator(model, n_columns=3)
 
 # %%
 # When PCA is enough

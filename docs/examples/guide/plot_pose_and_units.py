@@ -25,111 +25,90 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.calibration import canonical_pose, deformation_metric, euclidean_frames
+from isa_nrsfm.calibration import canonical_pose, view_angles
 from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export import frame_poses, point_distances
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 faces = make_face_tracks(n_frames=300, random_state=0)
 affine = AffineNRSfM(4, random_state=0).fit(faces.data)
-M = affine.mean_shape_
-print("mean of b b^T over the points of the mean shape:")
-print((M.T @ M / len(M)).round(6))
+model = AffineNRSfM(4, camera="weak_perspective", random_state=0).fit(faces.data)
+print(f"noise variance {model.camera_noise_ratio_:.2f} times that of affine cameras")
 
 # %%
 # True proportions
 # ----------------
 #
-# A fit with weak-perspective cameras has them, and rotations and scales.
-
-model = AffineNRSfM(4, camera="weak_perspective", random_state=0).fit(faces.data)
-shapes = model.reconstruct(faces.data)
-error = mean_shape_error_3d(faces.shapes, shapes, convention="frame")
-print(f"error of the 3D shapes {error:.2%} of their size")
-print(f"noise variance {model.camera_noise_ratio_:.2f} times that of affine cameras")
-
-# %%
-# A model with affine cameras gets them afterwards: `AffineNRSfM.reconstruct` with
+# A fit with weak-perspective cameras has them, and rotations and scales. A model with
+# affine cameras gets them afterwards: `AffineNRSfM.reconstruct` with
 # ``camera="weak_perspective"`` finds the metric of space in which its cameras are
-# scaled rotations. The functions that it uses give rotations and scales.
+# scaled rotations.
 
-metric = deformation_metric(affine.motion_, affine.alpha_)
-frames = euclidean_frames(
-    metric, affine.motion_, affine.alpha_, affine.mean_shape_, affine.basis_
-)
-error = mean_shape_error_3d(faces.shapes, frames.shapes, convention="frame")
-print(f"error of the 3D shapes of affine cameras {error:.2%} of their size")
+for name, each in (("weak perspective", model), ("affine", affine)):
+    shapes = each.reconstruct(faces.data, camera="weak_perspective")
+    error = mean_shape_error_3d(faces.shapes, shapes, convention="frame")
+    print(f"{name:17} error of the 3D shapes {error:.2%} of their size")
 
 # %%
 # Upright and frontal
 # -------------------
 #
-# `canonical_pose` turns a shape by what is known of its points. For 68 points in the
-# order of iBUG the scheme says it; else give pairs of points, such as
-# ``left_right=[(right_eye, left_eye)], up=[(chin, nose)], front=[(ears, nose)]``.
+# `canonical_pose` turns a shape by what is known of its points. For
+# :doc:`layouts that are known </skeletons>` the scheme says it; else give pairs of
+# points, such as ``left_right=[(right_eye, left_eye)], up=[(chin, nose)],
+# front=[(ears, nose)]``. The mean shape of affine cameras is white; the Euclidean one
+# is a face.
 
-pose = canonical_pose(shapes.mean(axis=0), scheme="ibug-68")
-before = M - M.mean(axis=0)
+upright = canonical_pose(model.mean_shape_, scheme="ibug-68").shape
 _, axes = plt.subplots(1, 4, figsize=(9, 3), layout="constrained")
-for shape, (front, side), what in (
-    (before, axes[:2], "affine (white)"),
-    (pose.shape, axes[2:], "Euclidean, upright"),
+for k, (shape, what) in enumerate(
+    ((affine.mean_shape_, "white"), (upright, "upright"))
 ):
-    front.scatter(shape[:, 0], shape[:, 1], s=6, color="0.2")
-    side.scatter(shape[:, 2], shape[:, 1], s=6, color="0.2")
-    front.set_title(f"{what}: front", fontsize="small")
-    side.set_title("side", fontsize="small")
-for axis in axes:
-    axis.set(aspect="equal", xticks=[], yticks=[])
-    axis.invert_yaxis()
+    for axis, column, side in ((axes[2 * k], 0, "front"), (axes[2 * k + 1], 2, "side")):
+        axis.scatter(shape[:, column], shape[:, 1], s=6, color="0.2")
+        axis.set(aspect="equal", xticks=[], yticks=[], title=f"{what}, {side}")
+        axis.invert_yaxis()
 
 # %%
 # Head pose
 # ---------
 #
-# The rotation of a frame, in the axes of the upright face, is the head pose. Turning
-# the shape by ``pose.rotation`` turns the rotations by its inverse. A mirror image
-# changes the sign of z on both sides, so that rotations stay rotations.
+# `frame_poses` has yaw, pitch and roll in degrees, all zero for a frontal, upright
+# face. Yaw is positive where the face is turned to the viewer's right, pitch where it
+# looks up, roll where it is turned clockwise in the image (:doc:`/conventions`). The
+# true angles are those of the true face, upright by the same definition.
+#
+# Bars, which one hardly sees, are two standard deviations. They come from the posterior
+# of the rotation of a frame, for the given shapes; only calibrated cameras have them.
+# :doc:`/questions` says how good all of it is on other faces.
 
-turn = pose.rotation
-mirror = np.diag([1.0, 1.0, np.linalg.det(turn)])
-found = Rotation.from_matrix(mirror @ model.rotations_ @ turn.T)
-
-# The true rotations, of the true face in the same upright position.
-upright = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
-true = Rotation.from_euler("yxz", faces.angles, degrees=True)
-true = true * Rotation.from_matrix(upright).inv()
-apart = np.rad2deg((found * true.inv()).magnitude())
-print(f"head pose: off by {apart.mean():.2f} degrees in the mean of the frames")
-
+poses = frame_poses(model, faces.data)
+turn = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
+true = Rotation.from_euler("yxz", faces.angles, degrees=True).as_matrix() @ turn.T
 _, axes = plt.subplots(1, 3, figsize=(9, 3), layout="constrained")
-for found_angle, true_angle, axis, name in zip(
-    found.as_euler("yxz", degrees=True).T,
-    true.as_euler("yxz", degrees=True).T,
-    axes,
-    ("yaw", "pitch", "roll"),
-    strict=True,
-):
-    axis.scatter(true_angle, found_angle, s=5, color="0.2")
+for axis, name in zip(axes, ("yaw", "pitch", "roll"), strict=True):
+    true_angle = getattr(view_angles(true), name)
+    found, deviation = getattr(poses, name), getattr(poses, f"{name}_std")
+    axis.errorbar(true_angle, found, 2 * deviation, fmt=".", ms=3, lw=1, color="0.2")
+    axis.axline((0, 0), slope=1, color="tab:blue", zorder=0)
     axis.set(xlabel=f"true {name}, degrees", ylabel=f"found {name}")
+    print(f"{name:5} off by {np.median(abs(found - true_angle)):.2f} degrees", end=", ")
+    print(f"deviation {np.median(deviation):.2f}")
 
 # %%
 # Millimetres
 # -----------
 #
-# One known length is enough. Say that the outer corners of the eyes are this far apart:
+# One known length is enough. `point_distances` measures the shape of each frame, in
+# units of that length: here the outer corners of the eyes, 36 and 45, have their true
+# distance in the mean face, and the opening of the mouth, 62 to 66, is wanted.
 
-known = np.linalg.norm(faces.neutral_shape[36] - faces.neutral_shape[45])
-corners = pose.shape[36] - pose.shape[45]
-millimetres = known / np.linalg.norm(corners)
-width = np.ptp(pose.shape[:, 0]) * millimetres
-true_width = np.ptp(faces.mean_shape[:, 0])
-print(f"width of the face: {width:.1f} mm, in truth {true_width:.1f} mm")
+known = np.linalg.norm(faces.mean_shape[36] - faces.mean_shape[45])
+found = point_distances(model, [(62, 66)], unit=(36, 45), length=known)[:, 0]
+true = np.linalg.norm(faces.shapes[:, 62] - faces.shapes[:, 66], axis=1)
+print("mouth open by, mm:", found[:5].round(1))
+print("in truth:         ", true[:5].round(1))
 
 # %%
-# How large each frame is in the image, the scale of its camera, is ``scales_`` over
-# that: pixels a millimetre. It says how far the camera was, if its focal length
-# is known.
-
-scales = model.scales_ / millimetres
-print("pixels a millimetre:", scales[:4].round(3))
-print("in truth:           ", np.linalg.norm(faces.motion[:4, 0], axis=1).round(3))
+# How large each frame is in the image, ``poses.scale``, over the unit in millimetres is
+# pixels a millimetre. It says how far the camera was, if its focal length is known.

@@ -10,19 +10,22 @@ The faces are artificial, in any pose, labelled by the strongest of their expres
 """
 
 # sphinx_gallery_thumbnail_number = 1
-import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
-from sklearn.feature_selection import f_classif
 from sklearn.metrics import ConfusionMatrixDisplay
 from sklearn.model_selection import GridSearchCV, cross_val_predict, cross_val_score
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, association
+from isa_nrsfm.analysis import AlignedFrames
 from isa_nrsfm.datasets import make_face_tracks
-from isa_nrsfm.plotting import BasisShapeDisplay, ReprojectionDisplay
+from isa_nrsfm.plotting import (
+    BasisShapeDisplay,
+    CoefficientsDisplay,
+    ReprojectionDisplay,
+)
 
 faces = make_face_tracks(n_frames=400, n_components=5, random_state=0)
 X, labels = faces.data, faces.labels
@@ -45,16 +48,13 @@ search.fit(X, labels)
 print(search.best_params_, f"accuracy {search.best_score_:.1%}")
 
 # %%
-# PCA of the table for comparison, with as many components and with as many as the model
-# has. Frames are centred and scaled first, which `AffineNRSfM` does by itself.
+# PCA for comparison, with as many components and with as many as the model has. Frames
+# are moved, scaled and turned to be nearest to their mean.
 
-centred = faces.tracks - faces.tracks.mean(axis=1, keepdims=True)
-size = np.linalg.norm(centred, axis=(1, 2), keepdims=True)
 K = search.best_params_["affinenrsfm__n_components"]
 for n_components in (K, 3 * K + 3):
-    steps = PCA(n_components), StandardScaler(), LinearDiscriminantAnalysis()
-    table = (centred / size).reshape(X.shape)
-    accuracy = cross_val_score(make_pipeline(*steps), table, labels, cv=3).mean()
+    steps = AlignedFrames(), PCA(n_components), LinearDiscriminantAnalysis()
+    accuracy = cross_val_score(make_pipeline(*steps), X, labels, cv=3).mean()
     print(f"PCA with {n_components} components: accuracy {accuracy:.1%}")
 
 # %%
@@ -72,15 +72,16 @@ display.figure_.set_layout_engine("constrained")
 
 # %%
 # What tells the expressions apart are coefficients, and each is a basis shape that can
-# be looked at. This one differs most between the classes (F statistic), and below are
-# its coefficients in each class.
+# be looked at. Eta squared is the share of the variance of a coefficient that lies
+# between the expressions. These are the two with the largest, and their basis shapes.
 
 model = search.best_estimator_[0]
-strongest = f_classif(model.alpha_, labels)[0].argmax()
-BasisShapeDisplay.from_estimator(model, components=[strongest])
+eta_squared = association(model.alpha_, labels, random_state=0).statistic
+strongest = eta_squared.argsort()[:-3:-1]
+print("eta squared:", eta_squared.round(2))
+BasisShapeDisplay.from_estimator(model, components=strongest)
 
-_, axis = plt.subplots(figsize=(6, 3), layout="constrained")
-names = np.unique(labels)
-axis.boxplot([model.alpha_[labels == name, strongest] for name in names])
-axis.set(ylabel=f"alpha_[:, {strongest}]")
-axis.set_xticks(np.arange(len(names)) + 1, names)
+names = [f"alpha {k + 1}" for k in strongest]
+CoefficientsDisplay(
+    alpha=model.alpha_[:, strongest], y=labels, component_names=names
+).plot()
