@@ -20,7 +20,7 @@ from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import distances
-from isa_nrsfm._prepare.robust import distant_points, robust_weights
+from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.layout import measurement_matrix
 from isa_nrsfm._tables.visibility import seen_points
 
@@ -312,7 +312,8 @@ class PosteriorFrames(NamedTuple):
         Returns
         -------
         FramePosterior
-            The fit.
+            The fit. With a robust loss the weights are those of the residuals, as far
+            as the points that have weights determine a camera.
         """
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
@@ -328,14 +329,19 @@ class PosteriorFrames(NamedTuple):
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
-        seen = seen_points(tracks)
-        changing = np.flatnonzero(np.isfinite(fit.alpha).all(axis=1))
+        # or with them, where the others do not determine a camera.
+        few = np.flatnonzero(np.isnan(fit.objective))
+        fit.put(few, fitted(tracks[few], starts=self.starts))
+        weights[few] = 1.0
+        seen, sizes = seen_points(tracks), robust_sizes(tracks)
+        deviation = np.sqrt(self.noise_variance)
+        changing = np.flatnonzero(np.isfinite(fit.objective))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(options.reweightings):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             distance = np.where(seen[changing], distance, np.inf)
-            new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
+            new = frame_weights(self.loss, distance, deviation, sizes[changing])
             unsettled = np.abs(new - weights[changing]).max(axis=1) > options.settled
             weights[changing] = new
             changing = changing[unsettled]
@@ -346,8 +352,10 @@ class PosteriorFrames(NamedTuple):
                 weights=weights[changing],
                 initial=fit.alpha[changing],
             )
-            for whole, values in zip(fit, refit, strict=True):
-                whole[changing] = values
+            # A frame ends before its weights leave too few points for a camera.
+            determined = np.flatnonzero(np.isfinite(refit.objective))
+            changing = changing[determined]
+            fit.put(changing, refit.take(determined))
         return fit
 
 
