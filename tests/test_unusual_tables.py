@@ -113,3 +113,13 @@ def test_flags_are_no_numbers(name):
     params = {"n_components": 1, name: True}
     with pytest.raises(ValueError, match=rf"'{name}' parameter .* Got True instead"):
         AffineNRSfM(**params).fit(X)
+
+
+@pytest.mark.parametrize("size", [1e-25, 1e25])
+def test_rotations_and_scales_of_single_precision(size):
+    table = (size * X).astype(np.float32)
+    model = estimator(camera="weak_perspective").fit(table)
+    rows = model.rotations_[:, :2]
+    expected = np.broadcast_to(np.eye(2), (30, 2, 2))
+    assert_allclose(rows @ rows.swapaxes(1, 2), expected, atol=1e-5)
+    assert_allclose(model.scales_[:, None, None] * rows, model.motion_, rtol=1e-5)

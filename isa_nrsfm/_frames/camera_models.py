@@ -336,12 +336,17 @@ def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
     scales : ndarray of shape (n_frames,)
         Their scales.
     """
+    dtype = motion.dtype
+    motion = motion.astype(
+        np.float64
+    )  # squares may leave the range of single precision
     scales = np.sqrt(np.einsum("irc,irc->i", motion, motion) / 2)
     size = np.where(scales > 0, scales, 1.0)
     rows = motion / size[:, None, None]
     (x1, y1, z1), (x2, y2, z2) = rows[:, 0].T, rows[:, 1].T
     depth = [y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2]
-    return np.concatenate([rows, np.stack(depth, axis=1)[:, None]], axis=1), scales
+    rotations = np.concatenate([rows, np.stack(depth, axis=1)[:, None]], axis=1)
+    return rotations.astype(dtype), scales.astype(dtype)
 
 
 def _cross(a: NDArray, b: NDArray) -> NDArray:
