@@ -3,38 +3,54 @@
 import numpy as np
 import pandas as pd
 import pytest
-from sklearn.base import clone
+from numpy.testing import assert_allclose
 
-from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm.cli._choice import N_PARTS, choice_report, choose_n_components
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.cli._choice import choice_report, choose_n_components, extrapolated
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
-X = pd.DataFrame(make_nonrigid_tracks(48, 14, 2, noise=0.01, random_state=0).data)
+X = pd.DataFrame(make_nonrigid_tracks(48, 20, 2, noise=0.01, random_state=0).data)
 
 
+@pytest.fixture(scope="module")
 def estimator():
-    return AffineNRSfM(1, isa=FastISA(n_init=2), refinement=None, random_state=0)
+    return AffineNRSfM(refinement=None, random_state=0)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_errors_are_those_of_blocks_of_rows():
-    search = choose_n_components(estimator(), X, [1, 2, 3])
-    found = choice_report(search, X)
-    expected = []
-    for n_components in (1, 2, 3):
-        errors = []
-        for part in np.split(np.arange(48), N_PARTS):
-            model = clone(estimator()).set_params(n_components=n_components)
-            model.fit(X.drop(index=part))
-            errors.append(-model.score(X.iloc[part]))
-        expected.append(errors)
-    np.testing.assert_allclose(found["held_out_error_of_parts"], expected)
-    np.testing.assert_allclose(found["held_out_error"], np.mean(expected, axis=1))
-    assert found["n_components"] == [1, 2, 3]
-    best = 1 + int(np.argmin(np.mean(expected, axis=1)))
-    assert found["chosen"] == len(search.best_estimator_.basis_) == best
+def test_the_report_has_what_the_search_found(estimator, capsys):
+    search = choose_n_components(estimator, X, [1, 2, 3])
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert len(told.err.splitlines()) == 3
+    report = choice_report(search, X)
+    assert report["n_components"] == [1, 2, 3]
+    parts = report["held_out_error_of_parts"]
+    assert parts.shape == (3, 3)
+    assert_allclose(report["held_out_error"], parts.mean(axis=1))
+    assert_allclose(report["held_out_error_deviation"], parts.std(axis=1))
+    best = 1 + int(np.argmin(parts.mean(axis=1)))
+    assert report["chosen"] == search.n_components_ == best
+    assert (report["seconds"] > 0).all()
 
 
-def test_too_few_frames_are_said_to_be_those_of_parts():
-    with pytest.raises(ValueError, match="tried on 2 of 3 parts of the frames; there"):
-        choose_n_components(estimator(), X[:9], [1, 2, 3])
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_what_comes_next_is_what_the_table_allows(estimator):
+    search = choose_n_components(estimator, X, [1, 2])
+    assert search.n_components_ == 2
+    following = choice_report(search, X)["next"]
+    assert following["n_components"] == [3, 4, 5]  # 20 points allow no more
+    assert following["seconds"] > 0
+    few = X.iloc[:, :28]
+    search = choose_n_components(estimator, few, [3])
+    assert "next" not in choice_report(search, few)  # 14 points allow three
+
+
+def test_seconds_go_on_along_a_line():
+    tried = np.array([1, 2, 3, 4])
+    # The first one, which searches for starts, does not count.
+    seconds = np.array([9.0, 1.0, 1.5, 2.0])
+    assert_allclose(extrapolated(tried, seconds, np.array([5, 6])), [2.5, 3.0])
+    # Larger numbers do not take less.
+    assert_allclose(extrapolated(tried, 5.0 - tried, np.array([5])), [1.0])
+    assert_allclose(extrapolated(tried[:1], seconds[:1], np.array([2, 3])), [9.0, 9.0])

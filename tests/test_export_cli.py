@@ -202,7 +202,8 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys):
     results = tmp_path / "results"
     assert main(["fit", str(tmp_path / "flat.csv"), *QUICK, str(results)]) == 0
     error = capsys.readouterr().err
-    assert "warning: viewer.html has affine shapes: a metric upgrade needs" in error
+    told = "viewer.html has affine shapes, and cameras.csv no angles: a metric upgrade"
+    assert f"warning: {told} needs" in error
     content = content_of(results / "viewer.html")
     assert content["about"].startswith("Affine shapes")
     assert content["rotations"] == ""

@@ -20,6 +20,7 @@ def test_matplotlib_is_imported_only_to_draw():
     "display",
     [
         plotting.BasisShapeDisplay(mean_shape=np.eye(3), basis=np.ones((1, 3, 3))),
+        plotting.ComponentChoiceDisplay(n_components=[1], scores=[[-0.1]]),
         plotting.ModeCovarianceDisplay(mode_covariance=np.eye(3)),
         plotting.ReprojectionDisplay(
             observed=[[[0.0, 0.0], [1.0, 1.0]]], reprojected=[[[0.0, 0.0], [1.0, 1.0]]]

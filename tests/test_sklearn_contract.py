@@ -14,14 +14,18 @@ from estimator_contract import (
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
+
+# The checks seed an estimator that they are given, but not one inside of it.
+SEEDED = AffineNRSfM(max_iter=3, random_state=0)
 
 
 def estimators():
-    """Return the estimators that are checked: both strategies and refinements."""
+    """Return estimators: both strategies and refinements, and a search."""
     return [
         AffineNRSfM(n_components=1, max_iter=3),  # few steps, for speed
         AffineNRSfM(n_components=2, isa=FastISA(n_init=2), refinement="alternating"),
+        AffineNRSfMCV((1, 2), estimator=SEEDED, cv=2),
     ]
 
 
@@ -43,9 +47,12 @@ def test_contract_on_landmark_tables(estimator, check, landmark_tables):
 @pytest.mark.filterwarnings("ignore:X does not have valid feature names:UserWarning")
 @pytest.mark.filterwarnings("ignore:X has feature names:UserWarning")
 @pytest.mark.parametrize("name", EXTRA_CHECKS)
-def test_extra_checks_on_landmark_tables(name, landmark_tables):
+@pytest.mark.parametrize("search", [False, True])
+def test_extra_checks_on_landmark_tables(name, search, landmark_tables):
     # Names, dataframes and parameters have nothing to do with the way of fitting.
-    estimator = AffineNRSfM(n_components=1, refinement=None)
+    estimator = AffineNRSfM(n_components=1, refinement=None, random_state=0)
+    if search:
+        estimator = AffineNRSfMCV((1, 2), estimator=estimator, cv=2)
     getattr(estimator_checks, name)(type(estimator).__name__, estimator)
 
 
@@ -54,5 +61,10 @@ def test_missing_points_are_allowed():
     assert all(each.__sklearn_tags__().input_tags.allow_nan for each in estimators())
 
 
-def test_checks_fail_because_their_tables_are_refused():
-    assert_only_narrow_tables_fail(AffineNRSfM(n_components=1), NARROW_TABLE_CHECKS)
+@pytest.mark.parametrize("search", [False, True])
+def test_checks_fail_because_their_tables_are_refused(search):
+    expected = dict(NARROW_TABLE_CHECKS)
+    if search:
+        del expected["check_transformer_n_iter"]  # it looks for max_iter
+    estimator = AffineNRSfMCV((1,)) if search else AffineNRSfM(n_components=1)
+    assert_only_narrow_tables_fail(estimator, expected)

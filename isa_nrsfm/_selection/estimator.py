@@ -18,7 +18,7 @@ from sklearn.base import (
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import check_cv
-from sklearn.utils import get_tags
+from sklearn.utils import get_tags, indexable
 from sklearn.utils.metadata_routing import (
     UNUSED,
     MetadataRouter,
@@ -30,6 +30,7 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     HasMethods,
+    Interval,
     StrOptions,
     fit_context,
     number_of_rows,
@@ -37,7 +38,7 @@ from isa_nrsfm._compat.scikit_learn import (
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._selection.choice import SELECTIONS, results_of, selected
-from isa_nrsfm._selection.path import Row, Split, walk
+from isa_nrsfm._selection.path import Row, Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm._transformer import Decomposition
 
@@ -62,9 +63,9 @@ class AffineNRSfMCV(
 
     Parameters
     ----------
-    n_components : array-like of int, default=(1, 2, 3, 4, 5, 6, 7, 8)
+    n_components : array-like of int, or int, default=(1, 2, 3, 4, 5, 6, 7, 8)
         The numbers of basis shapes that are tried, such as ``range(1, 9)``, in any
-        order. The path is best without large gaps.
+        order, or the only one. The path is best without large gaps.
     estimator : AffineNRSfM, default=None
         All other parameters, such as the camera; its `n_components` is not used. None
         is ``AffineNRSfM()``. A clone is fitted.
@@ -160,7 +161,7 @@ class AffineNRSfMCV(
     __metadata_request__fit: ClassVar[dict[str, str]] = {"groups": UNUSED}
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "n_components": ["array-like"],
+        "n_components": ["array-like", Interval(Integral, 1, None, closed="left")],
         "estimator": [None, HasMethods(["fit", "get_params", "set_params"])],
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
@@ -227,16 +228,17 @@ class AffineNRSfMCV(
         estimator = self._estimator()
         candidates = checked_candidates(self.n_components)
         refuse_blocks(X)
+        X, y = indexable(X, y)
         routed = self._routed("fit", params)
         scorer = self._scorer()
+        table = ready_part(estimator, X, candidates[-1])
         splits = [
             Split(np.asarray(train), np.asarray(test))
             for train, test in self._splitter().split(X, y, **routed["splitter"])
         ]
         rows = []
         for row in walk(
-            estimator,
-            X,
+            table,
             candidates,
             splits,
             partial(held_out_score, scorer=scorer, X=X, y=y, params=routed["scorer"]),
@@ -488,8 +490,8 @@ def checked_candidates(n_components: Any) -> list[int]:
 
     Parameters
     ----------
-    n_components : array-like of int
-        The numbers.
+    n_components : array-like of int, or int
+        The numbers, or the only one.
 
     Returns
     -------
@@ -501,7 +503,7 @@ def checked_candidates(n_components: Any) -> list[int]:
     ValueError
         If they are not different whole numbers above zero.
     """
-    given = np.asarray(n_components)
+    given = np.atleast_1d(np.asarray(n_components))
     if given.ndim != 1 or not len(given) or given.dtype.kind not in "iu":
         raise ValueError(
             "n_components must be numbers of basis shapes, such as range(1, 9); got "

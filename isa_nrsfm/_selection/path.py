@@ -88,13 +88,26 @@ class Row(NamedTuple):
 Scorer = Callable[[AffineNRSfM, Split], float]
 
 
-class _Part(NamedTuple):
-    """All of a table, or the rows of it that a split fits."""
+class Part(NamedTuple):
+    """
+    All of a table, or the rows of it that a split fits, ready for fits.
 
-    X: Any  # all of the table, as it was given
-    checked: CheckedTable  # the same
-    scaled: ScaledTable  # the part
-    split: Split | None  # None for all of the table
+    Attributes
+    ----------
+    X : array-like of shape (n_rows, 2 * n_points)
+        All of the table, as it was given.
+    checked : CheckedTable
+        All of the table, checked.
+    scaled : ScaledTable
+        The part.
+    split : Split or None
+        None for all of the table.
+    """
+
+    X: Any
+    checked: CheckedTable
+    scaled: ScaledTable
+    split: Split | None = None
 
 
 class _Fitted(NamedTuple):
@@ -107,9 +120,35 @@ class _Fitted(NamedTuple):
     unconverged: bool
 
 
+def ready_part(estimator: AffineNRSfM, X: Any, n_components: int) -> Part:
+    """
+    Return a table, checked and scaled once for all fits.
+
+    Parameters
+    ----------
+    estimator : AffineNRSfM
+        The estimator. Its own `n_components` is not used.
+    X : array-like of shape (n_rows, 2 * n_points)
+        The table, in memory or a memory map.
+    n_components : int
+        The largest number of basis shapes that is to be fitted.
+
+    Returns
+    -------
+    Part
+        All of the table.
+
+    Raises
+    ------
+    ValueError
+        If the table is not what `AffineNRSfM` takes, or not enough.
+    """
+    checked = CheckedTable.of(estimator, X)
+    return Part(X, checked, ready_table(checked.source, n_components, checked.options))
+
+
 def walk(
-    estimator: AffineNRSfM,
-    X: Any,
+    whole: Part,
     candidates: Sequence[int],
     splits: Sequence[Split],
     scorer: Scorer,
@@ -122,11 +161,8 @@ def walk(
 
     Parameters
     ----------
-    estimator : AffineNRSfM
-        The estimator. Its `n_components` is not used. Without the joint refinement no
-        fit starts from another one.
-    X : array-like of shape (n_rows, 2 * n_points)
-        The table, in memory or a memory map.
+    whole : Part
+        All of the table. Without the joint refinement no fit starts from another one.
     candidates : sequence of int
         Numbers of basis shapes, ascending.
     splits : sequence of Split
@@ -147,20 +183,19 @@ def walk(
     Raises
     ------
     ValueError
-        If the table, or the part of it that is fitted in a split, is not enough for one
-        of the candidates.
+        If the part of the table that is fitted in a split is not enough for one of the
+        candidates.
     """
-    checked = CheckedTable.of(estimator, X)
+    checked, table = whole.checked, whole.scaled
     if any_basis:
         checked = checked._replace(options=checked.options._replace(independence=None))
     joint = checked.options.joint
-    table = ready_table(checked.source, candidates[-1], checked.options)
     looser = checked.options._replace(tol=LOOSER * checked.options.joint_tol)
-    parts = [_Part(X, checked._replace(options=looser), table, None)]
+    parts = [whole._replace(checked=checked._replace(options=looser))]
     for number, split in enumerate(splits):
         scaled = table.part(_mask(split.train, len(table.shown)))
         _check_part(scaled, f"split {number}", candidates[-1], checked)
-        parts.append(_Part(X, checked, scaled, split))
+        parts.append(Part(whole.X, checked, scaled, split))
     before: list[Any] = [None] * len(parts)
     with Parallel(n_jobs=n_jobs) as parallel:
         for k in candidates:
@@ -239,7 +274,7 @@ def _point_report(rows: NDArray) -> PointReport:
 
 
 def _fitted(
-    part: _Part,
+    part: Part,
     n_components: int,
     scorer: Scorer,
     before: _Fitted | None,
@@ -250,7 +285,7 @@ def _fitted(
 
     Parameters
     ----------
-    part : _Part
+    part : Part
         The part.
     n_components : int
         K.
