@@ -475,6 +475,7 @@ def _refined_jointly(
     )
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
+    _check_determined(motion, table.shown)
     # Gauge of shapes, cameras and coefficients
     gauge = independent_gauge(
         fitted.shapes,
@@ -508,6 +509,18 @@ def _refined_jointly(
             fitted.gradient_norm,
         ),
     )
+
+
+def _check_determined(motion: NDArray, shown: NDArray) -> None:
+    """Refuse frames without a camera: motion (n_frames, 2, 3), shown (n_rows,)."""
+    unknown = np.isnan(motion).any(axis=(1, 2))
+    if unknown.any():
+        row = np.flatnonzero(shown)[unknown.argmax()]
+        raise ValueError(
+            f"the points that {unknown.sum()} of {len(unknown)} frame(s) show, the "
+            f"first is row {row}, do not determine a camera: they lie in a plane of "
+            "the mean shape; leave such rows out"
+        )
 
 
 def _model(

@@ -11,7 +11,7 @@ from isa_nrsfm._frames.posterior import FramePosterior
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.checks import clean_tracks
-from isa_nrsfm._prepare.robust import robust_sizes
+from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.layout import (
     Layout,
     centred_tracks,
@@ -114,11 +114,21 @@ class TableModel(NamedTuple):
         tracks = clean_tracks(tracks, self.layout, self.names)
         return tracks, usable_frames(tracks)
 
+    @property
+    def robust(self) -> bool:
+        """Whether points far from the model count less."""
+        frames = self.frames
+        return isinstance(frames, PosteriorFrames) and frames.loss != "linear"
+
+    def centred(self, tracks: NDArray) -> tuple[NDArray, NDArray]:
+        """Return centred tracks (n, n_points, 2), and what was subtracted (n, 2)."""
+        return (robustly_centred if self.robust else centred_tracks)(tracks)
+
     def sizes(self, centred: NDArray) -> NDArray:
         """Return the sizes (n,) of frames, given as centred tracks (n, n_points, 2)."""
         if self.unit is not None or not len(centred):
             return np.full(len(centred), self.unit)
-        if isinstance(self.frames, PosteriorFrames) and self.frames.loss != "linear":
+        if self.robust:
             return robust_sizes(centred)
         return weighting_sizes(centred, scale_frames=True)
 
@@ -128,7 +138,7 @@ def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
     tracks, usable = model.usable(rows)
     frames = FrameFit.unknown(len(tracks), len(model.basis))
     if usable.any():
-        centred, translation = centred_tracks(tracks[usable])
+        centred, translation = model.centred(tracks[usable])
         fit = model.frames.fit(centred, model.sizes(centred))
         fit = fit._replace(translation=fit.translation + translation)
         for whole, part in zip(frames, fit, strict=True):
@@ -140,7 +150,7 @@ def _posterior(rows: NDArray, model: TableModel) -> FramePosterior:
     """Return the fit of rows (n, 2 * n_points) by themselves, before the gauge."""
     assert isinstance(model.frames, PosteriorFrames)
     tracks, usable = model.usable(rows)
-    centred, _ = centred_tracks(tracks[usable])
+    centred, _ = model.centred(tracks[usable])
     sizes = model.sizes(centred)
     found = model.frames.posterior(centred / sizes[:, None, None])
     whole = FramePosterior.unknown(len(tracks), len(model.basis))
@@ -178,7 +188,7 @@ def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
     """Return the energies of `held_out_energies` for some rows (n, 2 * n_points)."""
     tracks, usable = model.usable(rows)
     tracks = tracks[usable]
-    sizes = model.sizes(centred_tracks(tracks)[0])
+    sizes = model.sizes(model.centred(tracks)[0])
     return held_out_energies(model.frames, model.mean_shape, model.basis, tracks, sizes)
 
 

@@ -11,7 +11,7 @@ from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.options import FRAME_OPTIONS
 from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._frames.projection import compose, distances, project
-from isa_nrsfm._prepare.robust import robust_weights
+from isa_nrsfm._prepare.robust import distant_points, robust_weights
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
 
 
@@ -405,6 +405,42 @@ class TestPosteriorFrames:
         robust = frames._replace(loss=loss).posterior(tracks).alpha - expected.alpha
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
+
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
+        frames, tracks = posterior_frames(0, loss)
+        tracks[:, 7] = np.nan
+        expected = frames.posterior(tracks)
+        for far in [1e3, 1e8, 1e16, 1e140]:
+            tracks[:, 7] = far
+            fitted = frames.posterior(tracks)
+            assert_allclose(fitted.alpha, expected.alpha, atol=1e-6)
+            assert_allclose(fitted.covariance, expected.covariance, atol=1e-6)
+
+    @pytest.mark.parametrize("noise", [1e-12, 1e-24])
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_weights_of_a_wrong_model_leave_a_camera(self, loss, noise):
+        frames, _ = posterior_frames(0, loss)
+        frames = frames._replace(noise_variance=noise)
+        n_points = frames.shapes.shape[2]
+        tracks = np.random.default_rng(0).normal(size=(200, n_points, 2))
+        for part in frames.posterior(tracks)[:4]:
+            assert np.isfinite(part).all()
+
+    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):
+        # Three points near each other, and three far: no camera without the far ones.
+        frames, tracks = posterior_frames(0, loss)
+        mean_shape = frames.shapes[0].T.copy()
+        mean_shape[:6] *= 1e-3
+        mean_shape -= mean_shape.mean(axis=0)
+        shapes = np.concatenate([mean_shape.T[None], 1e-3 * frames.shapes[1:]])
+        seen = np.arange(len(mean_shape)) < 9
+        tracks = np.where(seen[:, None], mean_shape[:, :2], np.nan)[None]
+        assert distant_points(tracks)[0, 6:9].all()
+        fitted = frames._replace(shapes=shapes).posterior(tracks)
+        images = project(mean_shape[None], fitted.motion, fitted.translation)
+        assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 
     @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
     def test_frames_are_separate(self, loss):

@@ -529,13 +529,13 @@ class TestRobustLoss:
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
     def test_weights_agree_with_the_fit(self, loss, monkeypatch):
         seen = []
-        weights = reweighting.robust_weights
+        weights = reweighting.frame_weights
 
         def recorded(*args):
             seen.append(weights(*args))
             return seen[-1]
 
-        monkeypatch.setattr(reweighting, "robust_weights", recorded)
+        monkeypatch.setattr(reweighting, "frame_weights", recorded)
         moved, where = spoilt(random_table()[0])
         fitted(moved, loss=loss, outliers=where)
         limits = JOINT_OPTIONS.reweighting

@@ -11,10 +11,12 @@ from isa_nrsfm._prepare.options import OUTLIER_OPTIONS
 from isa_nrsfm._prepare.robust import (
     TUNING,
     distant_points,
+    frame_weights,
     gross_outliers,
     median_noise,
     robust_sizes,
     robust_weights,
+    robustly_centred,
     spatial_median,
 )
 
@@ -82,6 +84,22 @@ class TestWeights:
         assert_array_equal(weights.ravel(), robust_weights(loss, distance.ravel()))
 
 
+class TestFrameWeights:
+    @pytest.mark.parametrize("loss", ROBUST)
+    def test_points_that_do_not_belong_to_their_frame_have_none(self, loss):
+        distance = np.array(
+            [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e140]]
+        )
+        weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]), 6.0)
+        expected = robust_weights(loss, distance[:, :3] / 0.5)
+        assert_array_equal(weights, np.pad(expected, ((0, 0), (0, 2))))
+
+    @pytest.mark.parametrize("loss", ROBUST)
+    def test_points_far_from_the_others_count_where_the_model_shows_them(self, loss):
+        distance = np.full((1, 9), 0.1)
+        assert (frame_weights(loss, distance, 1.0, np.ones(1)) > 0.9).all()
+
+
 class TestMedianNoise:
     def test_of_normal_noise_is_its_deviation(self):
         noise = 0.3 * np.random.default_rng(0).normal(size=(100_000, 2))
@@ -125,6 +143,33 @@ class TestSpatialMedian:
         spoilt = tracks.copy()
         spoilt[:, 5] = 1e3
         assert_allclose(spatial_median(spoilt), spatial_median(tracks), atol=0.2)
+
+    @pytest.mark.parametrize("n_points", [5, 7, 31])
+    def test_a_point_at_any_distance_costs_no_digits_of_the_others(self, n_points):
+        tracks = np.random.default_rng(0).normal(size=(20, n_points, 2))
+        spoilt = [tracks.copy() for _ in range(3)]
+        for far, each in zip([1e9, 1e16, 1e140], spoilt, strict=True):
+            each[:, 2] = far
+        near = tracks[:, np.arange(n_points) != 2]
+        expected = near - near.mean(axis=1, keepdims=True)
+        for each in spoilt:
+            centred = robustly_centred(each)[0][:, np.arange(n_points) != 2]
+            middle = centred.mean(axis=1, keepdims=True)
+            assert_allclose(centred - middle, expected, rtol=0, atol=1e-14)
+            assert np.abs(middle).max() < 3
+
+    def test_points_at_several_distances(self):
+        tracks = np.random.default_rng(0).normal(size=(20, 31, 2))
+        spoilt = tracks.copy()
+        for j, far in enumerate([1e3, 1e9, -1e30, 1e120]):
+            spoilt[:, j] = far
+        assert_allclose(spatial_median(spoilt), spatial_median(tracks), atol=0.4)
+
+    def test_of_most_points_in_one_place_is_there(self):
+        tracks = np.random.default_rng(0).normal(size=(2, 9, 2))
+        tracks[:, :5] = [3.0, -2.0]
+        tracks[:, 8] = 1e30
+        assert_allclose(spatial_median(tracks), [[3.0, -2.0]] * 2, rtol=1e-12)
 
 
 class TestSizes:

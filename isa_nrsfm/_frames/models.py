@@ -21,7 +21,7 @@ from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._linalg.vectors import in_lanes
-from isa_nrsfm._prepare.robust import distant_points, robust_weights
+from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.layout import measurement_matrix
 from isa_nrsfm._tables.visibility import seen_points
 
@@ -333,7 +333,8 @@ class PosteriorFrames(NamedTuple):
         Returns
         -------
         FramePosterior
-            The fit.
+            The fit. With a robust loss the weights are those of the residuals, as far
+            as the points that have weights determine a camera.
         """
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
@@ -353,15 +354,16 @@ class PosteriorFrames(NamedTuple):
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
-            _put(fit, lost, fitted(tracks[lost], starts=self.starts))
-        seen = seen_points(tracks)
+            fit.put(lost, fitted(tracks[lost], starts=self.starts))
+        seen, sizes = seen_points(tracks), robust_sizes(tracks)
+        deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(options.reweightings):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             distance = np.where(seen[changing], distance, np.inf)
-            new = robust_weights(self.loss, distance / np.sqrt(self.noise_variance))
+            new = frame_weights(self.loss, distance, deviation, sizes[changing])
             unsettled = np.abs(new - weights[changing]).max(axis=1) > options.settled
             weights[changing] = new
             changing = in_lanes(np.unique(changing[unsettled]))
@@ -376,14 +378,8 @@ class PosteriorFrames(NamedTuple):
             # unequal that no camera is left. Such a frame keeps its fit.
             kept = np.isfinite(refit.objective)
             changing = changing[kept]
-            _put(fit, changing, FramePosterior(*(each[kept] for each in refit)))
+            fit.put(changing, refit.take(kept))
         return fit
-
-
-def _put(fit: FramePosterior, frames: NDArray, others: FramePosterior) -> None:
-    """Set the fits of some of the frames."""
-    for whole, values in zip(fit, others, strict=True):
-        whole[frames] = values
 
 
 def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:

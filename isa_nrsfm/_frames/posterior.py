@@ -88,6 +88,15 @@ class FramePosterior(NamedTuple):
             start=np.full(n_frames, -1),
         )
 
+    def take(self, frames: NDArray) -> Self:
+        """Return the fits of some of the frames."""
+        return type(self)(*(each[frames] for each in self))
+
+    def put(self, frames: NDArray, others: Self) -> None:
+        """Set the fits of some of the frames."""
+        for each, other in zip(self, others, strict=True):
+            each[frames] = other
+
 
 def fit_posterior(
     tracks: NDArray,
@@ -332,7 +341,7 @@ def _best_fits(
     # Second round: the few frames that have not converged, collected from all blocks
     slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
     if len(slow):
-        _put(fits, slow, fit(slow, fits.alpha[slow], options.max_steps))
+        fits.put(slow, fit(slow, fits.alpha[slow], options.max_steps))
     # Further starts for frames that are explained badly, all starts at once
     poor = np.flatnonzero(_poorly_explained(fits, weight, variance, options))
     if len(extra) and len(poor):
@@ -347,7 +356,7 @@ def _best_fits(
         best = best * len(poor) + np.arange(len(poor))
         gain = fits.objective[poor] - others.objective[best]
         better = gain > options.equal * fits.objective[poor]
-        _put(fits, poor[better], _take(others, best[better]))
+        fits.put(poor[better], others.take(best[better]))
     return fits._replace(
         motion=search.cameras(fits.motion),
         turn_covariance=search.turns(fits.turn_covariance),
@@ -380,17 +389,6 @@ def _fit(
         fits.residual[block] = found.residual
         fits.converged[block] = found.converged
     return fits
-
-
-def _take(fits: FramePosterior, frames: NDArray) -> FramePosterior:
-    """Return the fits of some of the frames."""
-    return FramePosterior(*(each[frames] for each in fits))
-
-
-def _put(fits: FramePosterior, frames: NDArray, others: FramePosterior) -> None:
-    """Set the fits of some of the frames."""
-    for each, other in zip(fits, others, strict=True):
-        each[frames] = other
 
 
 def _poorly_explained(

@@ -22,7 +22,7 @@ def reprojection_error(
     Parameters
     ----------
     rows : FrameBlocks
-        Blocks of centred frames (n_frames, 2, n_points), NaN where a point is missing.
+        Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes.
     motion : ndarray of shape (n_frames, 2, 3)
@@ -36,7 +36,7 @@ def reprojection_error(
     -------
     float
         ``||W - W_hat||_F^2 / ||W||_F^2`` over the points that are seen, with the images
-        W_hat of the shapes.
+        W_hat of the shapes, and each frame of W below centred.
     """
     stacked = shapes.reshape(-1, shapes.shape[2])
     found = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
@@ -55,7 +55,7 @@ def _energies(
     images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
     images += position[:, :, None]
     np.subtract(rows, images, out=images)
-    return _energy(images), _energy(rows)
+    return _energy(images), _energy(rows - np.nanmean(rows, axis=2, keepdims=True))
 
 
 def _energy(rows: NDArray) -> float:

@@ -10,7 +10,7 @@ from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointResult, JointState
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._prepare.robust import median_noise, robust_weights
+from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
@@ -49,7 +49,7 @@ def reweighted(
         Variance of a coordinate, from the median of the residuals.
     """
     tracks = rows.whole().transpose(0, 2, 1)
-    seen = seen_points(tracks)
+    seen, sizes = seen_points(tracks), robust_sizes(tracks)
     counted, weights = used * 1.0, np.zeros(seen.shape)
     options = problem.options.reweighting
     for _ in range(options.rounds):
@@ -65,8 +65,8 @@ def reweighted(
         distance = np.linalg.norm(rest, axis=2)
         # Weights from the residuals, and convergence test
         deviation = max(median_noise(distance[seen]), OF_DISTANCES)
-        previous, weights = weights, np.zeros(seen.shape)
-        weights[seen] = robust_weights(loss, distance[seen] / deviation)
+        distance = np.where(seen, distance, np.inf)
+        previous, weights = weights, frame_weights(loss, distance, deviation, sizes)
         if np.abs(weights - previous).max() < options.settled:
             break
         # Refinement with the new weights

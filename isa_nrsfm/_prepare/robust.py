@@ -19,8 +19,9 @@ from isa_nrsfm._tables.visibility import seen_points
 TUNING = {"huber": 1.5011, "cauchy": 2.5486}
 # Median distance of normal noise in the plane, in standard deviations of a coordinate.
 MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
-# Steps to the point with the least sum of distances.
-MEDIAN_STEPS = 20
+# Steps to the middle of the nearest half of the points, and from there to the point
+# with the least sum of distances.
+HALF_STEPS, MEDIAN_STEPS = 5, 40
 
 
 def robust_weights(loss: str, distance: NDArray) -> NDArray:
@@ -45,6 +46,40 @@ def robust_weights(loss: str, distance: NDArray) -> NDArray:
     if loss == "cauchy":
         return 1.0 / (1.0 + (distance / TUNING[loss]) ** 2)
     return np.ones_like(distance)
+
+
+def frame_weights(
+    loss: str,
+    distance: NDArray,
+    deviation: float,
+    sizes: NDArray,
+    distant: float = OUTLIER_OPTIONS.distant,
+) -> NDArray:
+    """
+    Return the weights of the points of frames for a loss.
+
+    Parameters
+    ----------
+    loss : {"huber", "cauchy"}
+        The loss.
+    distance : ndarray of shape (n_frames, n_points)
+        Distances of points from the model; infinite for those that are missing.
+    deviation : float
+        Standard deviation of a coordinate.
+    sizes : ndarray of shape (n_frames,)
+        Sizes of the frames, as of `robust_sizes`.
+    distant : float
+        As of `OutlierOptions`.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_points)
+        Those of `robust_weights`; zero for points farther than `distant` sizes of the
+        frame from where the model shows them. Such points do not belong to the frame. A
+        loss that grows without limit would bend the shapes towards them.
+    """
+    belongs = distance <= distant * sizes[:, None]
+    return np.where(belongs, robust_weights(loss, distance / deviation), 0.0)
 
 
 def median_noise(distance: NDArray) -> float:
@@ -101,19 +136,59 @@ def spatial_median(tracks: NDArray) -> NDArray:
     Returns
     -------
     ndarray of shape (n_frames, 2)
-        The iterate after a fixed number of steps of Weiszfeld (1937), which starts at
-        the mean. Unlike medians of x and y it rotates with the image.
+        The iterate after a fixed number of steps of Weiszfeld (1937). It starts at the
+        mean of the half of the points that is nearest to it: a point at any distance
+        costs no digits of the others. Unlike medians of x and y it rotates with the
+        image.
     """
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
+    last_near = (seen.sum(axis=1, keepdims=True) - 1) // 2
     weights = seen * 1.0
+    for _ in range(HALF_STEPS):
+        _, distance = _weighted_middle(points, weights)
+        distance = np.where(seen, distance, np.inf)
+        median = np.take_along_axis(np.sort(distance, axis=1), last_near, axis=1)
+        weights = (distance <= median) * 1.0
+    # Where half of the points are in one place, that is the median.
+    least = np.where(median > 0, OF_DISTANCES * median, 1.0)
+    counted = np.where(median > 0, seen, distance <= median)
     for _ in range(MEDIAN_STEPS):
-        share = weights / weights.sum(axis=1, keepdims=True)
-        middle = np.einsum("ij,ijc->ic", share, points)
-        distance = np.linalg.norm(points - middle[:, None], axis=2)
-        least = OF_DISTANCES * np.max(seen * distance, axis=1, keepdims=True)
-        weights = seen / np.maximum(distance, np.where(least > 0, least, 1.0))
+        middle, distance = _weighted_middle(points, weights)
+        weights = counted / np.maximum(distance, least)
     return middle
+
+
+def _weighted_middle(points: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
+    """Return weighted means (I, 2) of points (I, J, 2), and distances (I, J) of them.
+
+    The weights are (I, J).
+    """
+    share = weights / weights.sum(axis=1, keepdims=True)
+    middle = np.einsum("ij,ijc->ic", share, points)
+    return middle, np.linalg.norm(points - middle[:, None], axis=2)
+
+
+def robustly_centred(tracks: NDArray) -> tuple[NDArray, NDArray]:
+    """
+    Return tracks centred at the spatial median of each frame, in double precision.
+
+    Parameters
+    ----------
+    tracks : ndarray of shape (n_frames, n_points, 2)
+        Tracks, NaN where a point is not seen.
+
+    Returns
+    -------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Tracks minus medians.
+    middle : ndarray of shape (n_frames, 2)
+        The medians, as of `spatial_median`.
+    """
+    # The same memory order, so that sums are the same to the last bit.
+    tracks = np.ascontiguousarray(tracks, dtype=np.float64)
+    middle = spatial_median(tracks)
+    return tracks - middle[:, None], middle
 
 
 def robust_sizes(centred: NDArray) -> NDArray:

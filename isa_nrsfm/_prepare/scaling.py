@@ -15,7 +15,8 @@ from isa_nrsfm._prepare.checks import (
     without_half_points,
 )
 from isa_nrsfm._prepare.layout_check import layout_sample, warn_if_other_layout
-from isa_nrsfm._prepare.robust import robust_sizes
+from isa_nrsfm._prepare.options import OUTLIER_OPTIONS
+from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.layout import (
     Layout,
@@ -47,13 +48,14 @@ class ScaledTable(NamedTuple):
     source : Table
         These rows before centring and scaling.
     rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), x above y, centred over the points
-        that are seen and divided by their sizes; NaN where a point is not seen. Single
-        precision where the table is large, complete and in single precision.
+        Blocks of frames (n_frames, 2, n_points), x above y, without their translation
+        and divided by their sizes; NaN where a point is not seen. Single precision
+        where the table is large, complete and in single precision.
     sizes : ndarray of shape (n_frames,)
         What the frames were divided by.
     translation : ndarray of shape (n_frames, 2)
-        What was subtracted, the centroids of the seen points.
+        What was subtracted: the centroids of the seen points, or their spatial medians
+        with a robust loss.
     n_seen : ndarray of int, shape (n_frames,)
         Number of points that are seen.
     n_points : int
@@ -138,7 +140,8 @@ def scaled_table(
     scale_frames : bool
         Whether each frame is divided by its own size, or all by a common one.
     robust : bool
-        Whether sizes are those of `robust_sizes`, or root mean squares.
+        Whether frames are centred at their `spatial_median` and their sizes are those
+        of `robust_sizes`, or at their means and sizes are root mean squares.
 
     Returns
     -------
@@ -176,9 +179,13 @@ def scaled_table(
     sampled = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
     warn_if_other_layout(blocks.take(sampled), layout, scale_frames)
     size = np.sqrt(report.square / (2 * report.n_seen))
+    translation, largest = report.translation, report.largest
     if robust:
-        robust_size = partial(_robust_sizes, layout=layout)
-        size = blocks.joined(robust_size, report.translation)
+        # A point far off must neither move the others nor cost their digits.
+        robust_places = list(blocks.map(partial(_robust_places, layout=layout)))
+        translation, size = map(np.concatenate, zip(*robust_places, strict=True))
+        reach = OUTLIER_OPTIONS.distant * size
+        largest = np.minimum(largest, np.abs(translation).max(axis=1) + reach)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
     # Single precision for large complete tables: it saves memory, and time in the SVD.
@@ -187,14 +194,14 @@ def scaled_table(
     unit_rows = partial(
         _unit_rows, layout=layout, dtype=np.float32 if single else np.float64
     )
-    rows = blocks.derive(unit_rows, report.translation, size)
-    precision = relative_precision(report, dtype, size)
+    rows = blocks.derive(unit_rows, translation, size)
+    precision = relative_precision(largest, dtype, size)
     return ScaledTable(
         shown,
         table._replace(blocks=blocks),
         rows,
         size,
-        report.translation,
+        translation,
         report.n_seen,
         n_points,
         precision,
@@ -221,10 +228,11 @@ def _examine(
     return report_frames(tracks), PointReport.from_seen(seen_points(tracks)), half
 
 
-def _robust_sizes(rows: NDArray, translation: NDArray, layout: Layout) -> NDArray:
-    """Return the robust sizes (n_rows,) of some rows (n_rows, 2 * n_points)."""
+def _robust_places(rows: NDArray, layout: Layout) -> tuple[NDArray, NDArray]:
+    """Return medians (n, 2) and robust sizes (n,) of some rows (n, 2 * n_points)."""
     tracks, _ = without_half_points(table_to_tracks(rows, layout))
-    return robust_sizes(tracks - translation[:, None])
+    centred, middle = robustly_centred(tracks)
+    return middle, robust_sizes(centred)
 
 
 def _unit_rows(

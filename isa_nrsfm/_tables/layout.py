@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._tables.visibility import (
-    FrameReport,
     centred_over_seen,
     points_coincide,
     refuse_one_place,
@@ -129,14 +128,14 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
 
 
-def relative_precision(report: FrameReport, dtype: np.dtype, sizes: NDArray) -> float:
+def relative_precision(largest: NDArray, dtype: np.dtype, sizes: NDArray) -> float:
     """
     Return the rounding error of the coordinates of a table, relative to its frames.
 
     Parameters
     ----------
-    report : FrameReport
-        What the frames show.
+    largest : ndarray of shape (n_frames,)
+        Largest magnitude of a coordinate that counts.
     dtype : dtype
         Type of the numbers of the table.
     sizes : ndarray of shape (n_frames,)
@@ -148,7 +147,7 @@ def relative_precision(report: FrameReport, dtype: np.dtype, sizes: NDArray) -> 
         Spacing of floating-point numbers at the largest coordinate of a frame, divided
         by the size of the frame: the root mean square over the frames.
     """
-    spacing = np.finfo(dtype).eps * report.largest.astype(np.float64)
+    spacing = np.finfo(dtype).eps * largest.astype(np.float64)
     return float(np.sqrt(np.mean((spacing / sizes) ** 2)))
 
 
