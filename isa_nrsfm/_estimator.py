@@ -96,9 +96,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         deformation. Shapes of frames, reprojection and score do not depend on it. Only
         for the joint refinement, without which "coefficients" is refused.
     loss : {"linear", "huber", "cauchy"}, default="linear"
-        How points count that are far from the model: with "huber" from 1.5 and with
-        "cauchy" from 2.5 standard deviations of the noise, which is estimated from the
-        median, less than by their square. Only for the joint refinement.
+        How points count that are far from the model: less than by their square with
+        "huber" from 1.5, with "cauchy" from 2.5 standard deviations of the noise; not
+        at all beyond six sizes of their frame. Only for the joint refinement.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
@@ -416,9 +416,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         joint = self.refinement == "joint"
         stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
         progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
-        source, options = self._checked(X)
+        fitted = copy.copy(self)
+        source, options = fitted._checked(X)
         fit = fit_table(source, self.n_components, options, progress)
-        self._set(fit, source, keep)
+        fitted._set(fit, source, keep)
+        self.__dict__.update(vars(fitted))  # all at once
         progress.end()
 
     def _checked(self, X: Any) -> tuple[Table, FitOptions]:
@@ -494,12 +496,10 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         return isa
 
     def _forget(self) -> None:
-        """Remove what an earlier fit has found, first of all that there was one."""
-        for name in ("_model", "_unit", "_frame_sizes", "_n_features_out"):
-            if hasattr(self, name):
-                delattr(self, name)
-        for name in [name for name in vars(self) if name.endswith("_")]:
-            delattr(self, name)
+        """Remove what an earlier fit has found, all of it at once."""
+        found = ("_model", "_unit", "_frame_sizes", "_n_features_out")
+        left = [name for name in vars(self) if not name.endswith("_")]
+        self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""

@@ -374,6 +374,20 @@ def test_frames_whose_points_lie_in_a_plane_of_the_object_are_refused():
         AffineNRSfM(1, random_state=0).fit(X)
 
 
+@pytest.mark.parametrize("kind", ["constant frame", "few frames"])
+def test_a_refusal_that_is_interrupted_leaves_nothing(kind):
+    X = table(kind, 0)
+    for n_lines in range(1, 150):
+        model = AffineNRSfM(1, max_iter=3, random_state=0)
+        with (
+            pytest.raises((KeyboardInterrupt, ValueError)),
+            only_own_warnings(),
+            interrupted_after(n_lines, ESTIMATOR),
+        ):
+            model.fit(X)
+        assert not [name for name in vars(model) if name.endswith("_")]
+
+
 FEW = settings(max_examples=4, stateful_step_count=4)
 MANY = settings(max_examples=40, stateful_step_count=10)
 

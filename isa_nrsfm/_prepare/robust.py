@@ -144,7 +144,7 @@ def spatial_median(tracks: NDArray) -> NDArray:
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
     last_near = (seen.sum(axis=1, keepdims=True) - 1) // 2
-    weights = seen * 1.0
+    weights: NDArray = seen * 1.0
     for _ in range(HALF_STEPS):
         _, distance = _weighted_middle(points, weights)
         distance = np.where(seen, distance, np.inf)
