@@ -350,10 +350,11 @@ class PosteriorFrames(NamedTuple):
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
-        # or with them, where the others do not determine a camera.
-        few = np.flatnonzero(np.isnan(fit.objective))
-        fit.put(few, fitted(tracks[few], starts=self.starts))
-        weights[few] = 1.0
+        # Where too few points are left, the distant ones count, too.
+        lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
+        if len(lost):
+            weights[lost] = 1.0
+            fit.put(lost, fitted(tracks[lost], starts=self.starts))
         seen, sizes = seen_points(tracks), robust_sizes(tracks)
         deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
@@ -373,10 +374,11 @@ class PosteriorFrames(NamedTuple):
                 weights=weights[changing],
                 initial=fit.alpha[changing],
             )
-            # A frame ends before its weights leave too few points for a camera.
-            determined = np.flatnonzero(np.isfinite(refit.objective))
-            changing = changing[determined]
-            fit.put(changing, refit.take(determined))
+            # The weights of a frame that the model does not explain can become so
+            # unequal that no camera is left. Such a frame keeps its fit.
+            kept = np.isfinite(refit.objective)
+            changing = changing[kept]
+            fit.put(changing, refit.take(kept))
         return fit
 
 
