@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._frames.damped_newton import State, descend, newton_step
 from isa_nrsfm._frames.options import FRAME_OPTIONS, Damping
+from isa_nrsfm._linalg.vectors import LANES
 
 DAMPING = Damping(first=0.1, raised=10.0, eased=0.1, least=0.01)
 
@@ -103,11 +104,13 @@ class TestEnds:
         assert_allclose(found, [1.0, 2.0], rtol=1e-15)
 
     def test_frames_that_have_ended_are_not_evaluated(self):
-        problem = Wells.of([1.0, 1.0, 1.0])
-        ended(problem, [1.0, 1.0 + 1e-3, 20.0])
-        assert problem.tried[:2] == [3, 2]
+        # Those that are left are filled up to a multiple of LANES.
+        problem = Wells.of([1.0] * 3 * LANES)
+        starts = np.repeat([1.0, 1.0 + 1e-3, 20.0], LANES)
+        ended(problem, starts)
+        assert problem.tried[:2] == [3 * LANES, 2 * LANES]
         assert problem.tried == sorted(problem.tried, reverse=True)
-        assert problem.tried[-1] == 1
+        assert problem.tried[-1] == LANES
 
     def test_tolerance_is_a_share_of_the_energy(self):
         exact, _ = ended(Wells.of([1.0]), [3.0])
