@@ -34,6 +34,7 @@ def test_the_report_has_what_the_search_found(estimator, capsys):
     assert (report["seconds"] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_what_comes_next_is_what_the_table_allows(estimator):
     search = choose_n_components(estimator, X, [1, 2])

@@ -327,6 +327,7 @@ def test_frames_that_are_equal_support_one_basis_shape():
     assert_allclose(model.reproject(X), X, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "parameters"),
     [

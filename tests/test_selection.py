@@ -152,6 +152,7 @@ def test_the_path_may_begin_anywhere_and_leave_gaps():
     assert_allclose(search.cv_results_["mean_test_score"][1], plain, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_the_pipeline_of_the_paper_is_searched_plainly():
     estimator = inner(refinement="alternating")
@@ -163,6 +164,7 @@ def test_the_pipeline_of_the_paper_is_searched_plainly():
     assert_array_equal(search.cv_results_["path_fit_time"], 0)
 
 
+@pytest.mark.slow
 def test_a_scorer_sees_fitted_estimators_and_held_out_rows():
     search = AffineNRSfMCV((1, 2), estimator=inner(), scoring=mean_abs_alpha).fit(X)
     results = search.cv_results_
@@ -170,6 +172,7 @@ def test_a_scorer_sees_fitted_estimators_and_held_out_rows():
     assert search.score(X) == mean_abs_alpha(search.best_estimator_, X)
 
 
+@pytest.mark.slow
 def test_frames_of_a_group_stay_together():
     splits = list(GroupKFold(3).split(X, groups=PERSON))
     by_group = AffineNRSfMCV((1, 2), estimator=inner(), cv=GroupKFold(3))
@@ -180,6 +183,7 @@ def test_frames_of_a_group_stay_together():
         assert_array_equal(by_group.cv_results_[name], given.cv_results_[name])
 
 
+@pytest.mark.slow
 def test_groups_are_routed_through_a_pipeline():
     search = AffineNRSfMCV((1, 2), estimator=inner(), cv=LeaveOneGroupOut())
     with sklearn.config_context(enable_metadata_routing=True):
@@ -280,6 +284,7 @@ def test_rows_without_points_are_held_out_like_others():
     assert_allclose(search.cv_results_["mean_test_score"][1], plain.mean(), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_memory_map_is_a_table(tmp_path, fitted):
     np.save(tmp_path / "table.npy", X)
     stored = np.load(tmp_path / "table.npy", mmap_mode="r")

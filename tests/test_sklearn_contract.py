@@ -11,6 +11,7 @@ from estimator_contract import (
     NARROW_TABLE_CHECKS,
     assert_only_narrow_tables_fail,
 )
+from layers import slow_after
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
@@ -20,13 +21,17 @@ from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
 SEEDED = AffineNRSfM(max_iter=3, random_state=0)
 
 
-def estimators():
-    """Return estimators: both strategies and refinements, and a search."""
+def fits():
+    """Return estimators of both strategies and refinements."""
     return [
         AffineNRSfM(n_components=1, max_iter=3),  # few steps, for speed
         AffineNRSfM(n_components=2, isa=FastISA(n_init=2), refinement="alternating"),
-        AffineNRSfMCV((1, 2), estimator=SEEDED, cv=2),
     ]
+
+
+def search():
+    """Return a search for K."""
+    return AffineNRSfMCV((1, 2), estimator=SEEDED, cv=2)
 
 
 # With 16 points few starts may end in a cycle, and they say so.
@@ -37,8 +42,16 @@ may_not_converge = pytest.mark.filterwarnings(
 
 @may_not_converge
 @pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
-@parametrize_with_checks(estimators())
+@parametrize_with_checks(fits())
 def test_contract_on_landmark_tables(estimator, check, landmark_tables):
+    check(estimator)
+
+
+@pytest.mark.slow
+@may_not_converge
+@pytest.mark.filterwarnings("ignore:layout=:UserWarning")  # the tables have none
+@parametrize_with_checks([search()])
+def test_contract_of_the_search_on_landmark_tables(estimator, check, landmark_tables):
     check(estimator)
 
 
@@ -47,24 +60,26 @@ def test_contract_on_landmark_tables(estimator, check, landmark_tables):
 @pytest.mark.filterwarnings("ignore:X does not have valid feature names:UserWarning")
 @pytest.mark.filterwarnings("ignore:X has feature names:UserWarning")
 @pytest.mark.parametrize("name", EXTRA_CHECKS)
-@pytest.mark.parametrize("search", [False, True])
-def test_extra_checks_on_landmark_tables(name, search, landmark_tables):
+@pytest.mark.parametrize("searched", slow_after(1, [False, True]))
+def test_extra_checks_on_landmark_tables(name, searched, landmark_tables):
     # Names, dataframes and parameters have nothing to do with the way of fitting.
     estimator = AffineNRSfM(n_components=1, refinement=None, random_state=0)
-    if search:
+    if searched:
         estimator = AffineNRSfMCV((1, 2), estimator=estimator, cv=2)
     getattr(estimator_checks, name)(type(estimator).__name__, estimator)
 
 
 def test_missing_points_are_allowed():
     # The checks leave NaN alone for estimators that say so.
-    assert all(each.__sklearn_tags__().input_tags.allow_nan for each in estimators())
+    assert all(
+        each.__sklearn_tags__().input_tags.allow_nan for each in (*fits(), search())
+    )
 
 
-@pytest.mark.parametrize("search", [False, True])
-def test_checks_fail_because_their_tables_are_refused(search):
+@pytest.mark.parametrize("searched", [False, True])
+def test_checks_fail_because_their_tables_are_refused(searched):
     expected = dict(NARROW_TABLE_CHECKS)
-    if search:
+    if searched:
         del expected["check_transformer_n_iter"]  # it looks for max_iter
-    estimator = AffineNRSfMCV((1,)) if search else AffineNRSfM(n_components=1)
+    estimator = AffineNRSfMCV((1,)) if searched else AffineNRSfM(n_components=1)
     assert_only_narrow_tables_fail(estimator, expected)
