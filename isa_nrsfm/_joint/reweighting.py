@@ -61,7 +61,8 @@ def reweighted(
         rest = np.where(seen[..., None], tracks - model, 0.0)
         # less the weighted mean of each frame, its position
         position = np.einsum("ij,ijc->ic", counted, rest)
-        rest -= (position / counted.sum(axis=1, keepdims=True))[:, None]
+        total = counted.sum(axis=1, keepdims=True)  # zero where no point counts
+        rest -= (position / np.where(total > 0, total, 1.0))[:, None]
         distance = np.linalg.norm(rest, axis=2)
         # Weights from the residuals, and convergence test
         deviation = max(median_noise(distance[seen]), OF_DISTANCES)

@@ -89,7 +89,9 @@ def mixed_cameras(
     ndarray of shape (n_frames, 2, 3)
         Cameras.
     """
-    unit = rows if scales is None else rows / scales[:, None, None]
+    unit = rows
+    if scales is not None:  # zero for frames without points that count
+        unit = rows / np.where(scales > 0, scales, 1.0)[:, None, None]
     P = principal_columns(unit.reshape(2 * len(unit), -1)).reshape(len(unit), 2, -1)
     if P.shape[2] < 3:
         return
