@@ -268,7 +268,7 @@ def test_infinite_values_are_refused(table, value, frame, point, axis):
 @given(
     tables(),
     st.sets(st.integers(0, 15), min_size=1),
-    st.floats(-1e6, 1e6),
+    st.floats(-1e6, 1e6).filter(lambda value: value == 0 or abs(value) > 1e-100),
     st.sampled_from([np.float32, np.float64]),
 )
 def test_frames_of_equal_points_are_refused(table, rows, value, dtype):

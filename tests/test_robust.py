@@ -170,6 +170,12 @@ class TestSpatialMedian:
         tracks[:, :5] = [3.0, -2.0]
         tracks[:, 8] = 1e30
         assert_allclose(spatial_median(tracks), [[3.0, -2.0]] * 2, rtol=1e-12)
+        # Exactly, whatever the place: their size is not that of rounding errors.
+        places = np.random.default_rng(1).normal(scale=500, size=(50, 2))
+        tracks = np.repeat(places[:, None], 68, axis=1)
+        tracks[:, 0] += [1.0, 0.0]
+        assert_array_equal(spatial_median(tracks), places)
+        assert_allclose(robust_sizes(tracks), np.sqrt(1 / 68 / 2))
 
 
 class TestSizes:

@@ -143,20 +143,37 @@ def spatial_median(tracks: NDArray) -> NDArray:
     """
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
-    last_near = (seen.sum(axis=1, keepdims=True) - 1) // 2
-    weights: NDArray = seen * 1.0
+    half: NDArray = seen * 1.0
     for _ in range(HALF_STEPS):
-        _, distance = _weighted_middle(points, weights)
-        distance = np.where(seen, distance, np.inf)
-        median = np.take_along_axis(np.sort(distance, axis=1), last_near, axis=1)
-        weights = (distance <= median) * 1.0
+        half, distance, _ = _nearest_half(points, half, seen)
+    # From here on relative to the innermost point: equal points differ by zero.
+    innermost = distance.argmin(axis=1)[:, None, None]
+    origin = np.take_along_axis(points, innermost, axis=1)
+    points = np.where(seen[..., None], points - origin, 0.0)
+    weights, distance, median = _nearest_half(points, half, seen)
     # Where half of the points are in one place, that is the median.
     least = np.where(median > 0, OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, seen, distance <= median)
     for _ in range(MEDIAN_STEPS):
         middle, distance = _weighted_middle(points, weights)
         weights = counted / np.maximum(distance, least)
-    return middle
+    return origin[:, 0] + middle
+
+
+def _nearest_half(
+    points: NDArray, weights: NDArray, seen: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the half of the points nearest to the weighted mean of each frame.
+
+    The points are (I, J, 2); weights, seen and the half, as weights 0 and 1, are
+    (I, J). The distances from the mean (I, J), infinite for points not seen, and those
+    of the last of the half (I, 1) come with it.
+    """
+    _, distance = _weighted_middle(points, weights)
+    distance = np.where(seen, distance, np.inf)
+    last = (seen.sum(axis=1, keepdims=True) - 1) // 2
+    median = np.take_along_axis(np.sort(distance, axis=1), last, axis=1)
+    return (distance <= median) * 1.0, distance, median
 
 
 def _weighted_middle(points: NDArray, weights: NDArray) -> tuple[NDArray, NDArray]:
