@@ -727,6 +727,7 @@ class TestCompressibleNRSfM:
             CompressibleNRSfM(2).fit(X)
 
 
+@pytest.mark.slow
 # The tables of the checks have no layout.
 @pytest.mark.filterwarnings("ignore:layout=:UserWarning")
 @parametrize_with_checks(

@@ -56,6 +56,7 @@ no_warnings = pytest.mark.filterwarnings(
 
 class TestContract:
     # Their base class does what the checks look at; the raw ones are for both.
+    @pytest.mark.slow
     @no_warnings
     @parametrize_with_checks(
         [BlockMatrixNRSfM(n_components=1)],

@@ -6,6 +6,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
+from layers import slow_after
 
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
@@ -94,17 +95,20 @@ def write_coco(folder, tracks, lost):
 
 @pytest.mark.parametrize(
     "write",
-    [
-        write_openface,
-        write_pyfeat,
-        write_mediapipe,
-        write_pts,
-        write_wflw,
-        write_deeplabcut,
-        write_deeplabcut_h5,
-        write_sleap,
-        write_coco,
-    ],
+    slow_after(
+        4,
+        [
+            write_openface,
+            write_pyfeat,
+            write_mediapipe,
+            write_pts,
+            write_wflw,
+            write_deeplabcut,
+            write_deeplabcut_h5,
+            write_sleap,
+            write_coco,
+        ],
+    ),
     ids=lambda write: write.__name__.removeprefix("write_"),
 )
 def test_files_are_fitted_and_transformed(write, run, tracks, lost, tmp_path):

@@ -44,7 +44,7 @@ for library in ("h5py", "tables", "pyarrow", "skops"):
 REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
 # What the reading of a small file may take: seconds, and bytes besides what is used.
 SECONDS, MEMORY = 60, 2**31
-QUICK, ALL = 20, 500
+QUICK, ALL = 8, 500
 
 TRACKS = files.scene(n_frames=4)
 OLD_MODEL = Path(__file__).with_name("saved_models") / "0b_alternating.skops"

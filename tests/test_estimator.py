@@ -965,7 +965,7 @@ def test_frames_count_by_their_size_or_alike():
 
 
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=9)], ids=["pooled", "fast"])
+@pytest.mark.parametrize("isa", slow_after(1, [None, FastISA(n_init=9)]))
 def test_same_seed_gives_the_same_result_to_the_bit(isa):
     first, second, other = (
         estimator(isa=isa, random_state=seed).fit(TABLE) for seed in (4, 4, 5)
@@ -985,7 +985,7 @@ def test_fitting_again_forgets_the_first_table(model):
 
 
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=18)], ids=["pooled", "fast"])
+@pytest.mark.parametrize("isa", slow_after(1, [None, FastISA(n_init=18)]))
 def test_results_do_not_depend_on_n_jobs(isa):
     first, second = (estimator(isa=isa, n_jobs=n).fit(TABLE) for n in (1, 2))
     assert_array_equal(first.alpha_, second.alpha_)
@@ -993,7 +993,7 @@ def test_results_do_not_depend_on_n_jobs(isa):
 
 
 @may_not_converge
-@pytest.mark.parametrize("isa", [None, FastISA(n_init=3)], ids=["pooled", "fast"])
+@pytest.mark.parametrize("isa", slow_after(1, [None, FastISA(n_init=3)]))
 def test_results_do_not_depend_on_the_threads_of_blas(isa):
     table = make_face_tracks(2000, n_components=4, random_state=0).data
     models = []

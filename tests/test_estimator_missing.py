@@ -97,7 +97,7 @@ def frames_with_outliers(n_frames=24):
 @pytest.mark.parametrize(
     "camera", slow_after(1, ["affine", "weak_perspective", "orthographic"])
 )
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", slow_after(2, LOSSES))
 def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     X, Y = frames_with_outliers()
     model = AffineNRSfM(1, loss=loss, camera=camera, random_state=0).fit(X)
@@ -123,8 +123,10 @@ def test_frames_that_the_model_does_not_explain_have_finite_fits(loss):
 # --- gauge of the paper's refinement ------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
-@pytest.mark.parametrize("refinement", ["alternating", None])
+@pytest.mark.parametrize(
+    "camera", slow_after(2, ["affine", "weak_perspective", "orthographic"])
+)
+@pytest.mark.parametrize("refinement", slow_after(1, ["alternating", None]))
 def test_coefficients_of_the_points_that_are_seen_are_canonical(refinement, camera):
     """The table has frames of so few points that these leave coefficients open."""
     X = scene(missing=0.5, n_points=16, n_frames=60).data

@@ -123,6 +123,7 @@ class TestOptimality:
 
 
 class TestInvariances:
+    @pytest.mark.slow
     def test_n_jobs_change_no_bit(self):
         signals = few_samples()
         one, two = (

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import skops.io
+from layers import slow_after
 from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -149,7 +150,7 @@ def assert_same(loaded, saved):
             assert_same(getattr(loaded, name), part)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_after(8, CASES))
 def test_loaded_model_equals_the_saved_one(case, fitted, path):
     model, table = fitted(case)
     save_model(model, path)
@@ -213,7 +214,7 @@ def test_loaded_model_takes_missing_points(model, path):
     np.testing.assert_array_equal(loaded.transform(HOLED), model.transform(HOLED))
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_after(8, CASES))
 def test_files_hold_plain_values_under_public_names(case, fitted, path):
     save_model(fitted(case)[0], path)
     assert skops.io.get_untrusted_types(file=path) == []
@@ -514,7 +515,7 @@ def mutants(contents, step=1):
         inside.update(before)
 
 
-@pytest.mark.parametrize("case", ["weak perspective", "alternating"])
+@pytest.mark.parametrize("case", slow_after(1, ["alternating", "weak perspective"]))
 def test_altered_entries_are_found(case, fitted, path):
     model = pickle.loads(pickle.dumps(fitted(case)[0]))
     random = np.random.RandomState(0)

@@ -216,8 +216,10 @@ class TestSpectrum:
         assert found.missing == pytest.approx(2 / 6)
 
 
-EACH = pytest.mark.parametrize("camera", CAMERAS)
-CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+EACH = pytest.mark.parametrize("camera", slow_after(2, CAMERAS))
+CALIBRATED = pytest.mark.parametrize(
+    "camera", slow_after(1, ["weak_perspective", "orthographic"])
+)
 GAPS = pytest.mark.parametrize("gaps", [False, True])
 GAPS_ARE_SLOW = pytest.mark.parametrize("gaps", slow_after(1, [False, True]))
 
@@ -364,7 +366,7 @@ class TestCameraNoiseRatio:
 
 class TestNumberOfComponents:
     @EACH
-    @pytest.mark.parametrize("n_components", [1, 3])
+    @pytest.mark.parametrize("n_components", slow_after(1, [3, 1]))
     def test_is_the_true_one(self, camera, n_components):
         tracks, _ = table_of(
             camera, n_frames=120, deviation=0.02, n_components=n_components

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose
 
 from isa_nrsfm import AffineNRSfM
@@ -88,7 +89,7 @@ def test_the_page_has_all_attributes():
 
 # The paper's pipeline says so of tables with as few points as this one.
 @pytest.mark.filterwarnings("ignore:FastICA did not converge")
-@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating", None]))
 @pytest.mark.parametrize("column", range(len(COLUMNS)))
 def test_attributes_have_the_units_of_the_page(column, refinement):
     settings = COLUMNS[column] | {"refinement": refinement}
