@@ -426,7 +426,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     def _checked(self, X: Any) -> tuple[Table, FitOptions]:
         """Check a table and the options of its fit, and return both."""
         self._check_options(X)
-        X = np.asarray(X) if isinstance(X, np.memmap) and not self._in_blocks else X
+        if isinstance(X, np.memmap) and self.refinement != "joint":
+            X = np.asarray(X)
         source = self._opened(X, reset=True)
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
@@ -447,11 +448,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         )
         return source, options
 
-    @property
-    def _in_blocks(self) -> bool:
-        """Whether the fit reads a table block by block."""
-        return self.refinement == "joint" and self.loss == "linear"
-
     def _check_options(self, X: Any) -> None:
         """Refuse options that do not go together, or not with a table."""
         only_joint = {
@@ -465,11 +461,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
                     f"{name}={getattr(self, name)!r} needs refinement='joint'; "
                     f"got refinement={self.refinement!r}"
                 )
-        if not self._in_blocks and (is_on_dask(X) or isinstance(X, StoredTable)):
+        stored = is_on_dask(X) or isinstance(X, StoredTable)
+        if stored and self.refinement != "joint":
             raise ValueError(
-                "tables that are not in memory need refinement='joint' and "
-                f"loss='linear'; got refinement={self.refinement!r} and "
-                f"loss={self.loss!r}"
+                "tables that are not in memory need refinement='joint'; "
+                f"got refinement={self.refinement!r}"
             )
 
     def _strategy(self) -> Any:

@@ -47,7 +47,7 @@ from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import Triplets, block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.robust import gross_outliers
+from isa_nrsfm._prepare.robust import outliers_of_table
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import Table
@@ -341,8 +341,7 @@ def _completed(
     outliers, used, complete = None, table.rows, table.complete
     limits = options.limits
     if options.loss != "linear":
-        tracks = table.rows.whole().transpose(0, 2, 1)
-        outliers = gross_outliers(tracks, limits.outliers)
+        outliers = outliers_of_table(table.rows, table.n_points, limits.outliers)
         used = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
     if not complete:

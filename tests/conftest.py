@@ -6,6 +6,7 @@ os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before scipy is imported
 # Before numpy is imported: the tables of the tests are too small for more threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import gc
 from collections import Counter
 from pathlib import Path
 
@@ -31,6 +32,12 @@ def _data_folder():
     named = os.environ.get("ISA_NRSFM_DATA")
     checkout = Path(__file__).resolve().parents[1]
     return Path(named) if named else checkout.parent / "shared" / "data"
+
+
+def pytest_collection_finish():
+    """Keep the collected tests out of each search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_terminal_summary(terminalreporter):

@@ -8,6 +8,7 @@ import sys
 
 import pandas as pd
 import pytest
+from layers import slow_after
 
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
@@ -69,7 +70,7 @@ def test_cells_are_written_as_they_are(run, faces, tmp_path):
     assert list(pd.read_csv(folder / "alpha.csv")["note"]) == cells[:40]
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "utf-16"])
+@pytest.mark.parametrize("encoding", slow_after(1, ["cp1252", "ascii", "utf-16"]))
 def test_output_in_any_encoding(faces, tmp_path, monkeypatch, encoding):
     faces.to_csv(tmp_path / "faces.csv", index=False)
     shown = io.BytesIO()

@@ -6,6 +6,7 @@ import signal
 import joblib
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose
 from sklearn.model_selection import GridSearchCV
 
@@ -52,11 +53,20 @@ def cluster():
 
 
 class TestThreads:
-    @pytest.mark.parametrize("missing", [0.0, 0.1])
+    @pytest.mark.parametrize("missing", slow_after(1, [0.1, 0.0]))
     def test_fit_is_that_in_memory(self, missing):
         X = table(missing)
         model = AffineNRSfM(K, random_state=0).fit(chunked(X, columns=16))
         assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
+
+    def test_robust_fit_is_that_in_memory(self):
+        X = table(0.1)
+        wrong = np.random.default_rng(1).random(X.shape) < 0.03
+        X = np.where(wrong, 3 * X, X)
+        model = AffineNRSfM(K, loss="huber", random_state=0)
+        found = model.fit(chunked(X, columns=16))
+        expected = AffineNRSfM(K, loss="huber", random_state=0).fit(X)
+        assert_same_model(found, expected)
 
     def test_rows_that_show_nothing_are_left_out(self):
         X = table()
@@ -102,7 +112,7 @@ class TestThreads:
         with pytest.raises(ValueError, match="got n_features=39"):
             AffineNRSfM(K).fit(chunked(table())[:, :39])
         with pytest.raises(ValueError, match=r"not in memory need refinement='joint'"):
-            AffineNRSfM(K, loss="huber").fit(chunked(table()))
+            AffineNRSfM(K, refinement="alternating").fit(chunked(table()))
         X = table()
         X[200, 3] = np.inf
         with pytest.raises(ValueError, match="infinity"):

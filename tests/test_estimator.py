@@ -572,7 +572,7 @@ TABLE_KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", TABLE_KINDS)
+@pytest.mark.parametrize("kind", slow_after(6, TABLE_KINDS))
 @may_not_converge
 def test_results_do_not_depend_on_how_the_table_is_kept(kind, tmp_path):
     before = TABLE.copy()

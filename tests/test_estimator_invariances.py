@@ -152,15 +152,18 @@ def with_changes(tracks, *names):
 # Several at once where nothing can hide: none undoes what another does.
 @pytest.mark.parametrize(
     "changes",
-    [
-        ("image moved", "image turned", "other unit"),
-        ("frames moved", "tiny unit"),
-        ("image mirrored", "huge unit"),
-        ("axes exchanged", "one frame rescaled"),
-        ("one frame turned",),
-        ("one frame mirrored",),
-        ("frames turned", "frames rescaled"),
-    ],
+    slow_after(
+        4,
+        [
+            ("image moved", "image turned", "other unit"),
+            ("frames moved", "tiny unit"),
+            ("image mirrored", "huge unit"),
+            ("axes exchanged", "one frame rescaled"),
+            ("one frame turned",),
+            ("one frame mirrored",),
+            ("frames turned", "frames rescaled"),
+        ],
+    ),
     ids=", ".join,
 )
 def test_coefficients_do_not_depend_on_the_images_placement(

@@ -131,7 +131,7 @@ def table(n_components, seed, **params):
     ).data
 
 
-@pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@pytest.mark.parametrize("refinement", slow_after(2, ["joint", "alternating", None]))
 def test_score_is_minus_the_error_and_the_same_each_time(refinement):
     X = table(2, 0, missing=0.1)
     model = AffineNRSfM(2, refinement=refinement, random_state=0).fit(X)

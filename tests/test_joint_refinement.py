@@ -105,7 +105,7 @@ KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
 
 class TestHistory:
     @KINDS
-    @pytest.mark.parametrize("penalty", [0.0, 10.0])
+    @pytest.mark.parametrize("penalty", slow_after(1, [10.0, 0.0]))
     def test_falls_from_the_objective_at_the_start_to_that_at_the_end(
         self, kind, penalty
     ):
@@ -196,7 +196,7 @@ class TestOptimum:
             scene, refined(scene, disturbed(scene.truth, 2, size), tol=1e-7), expected
         )
 
-    @pytest.mark.parametrize("factor", [1e-4, 1e2])
+    @pytest.mark.parametrize("factor", slow_after(1, [1e-4, 1e2]))
     def test_is_the_same_from_a_wrong_noise_variance(self, factor):
         scene, expected = optimum()
         start = disturbed(scene.truth)

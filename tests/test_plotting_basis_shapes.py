@@ -103,7 +103,7 @@ def test_another_affinity_of_space_changes_nothing(faces):
                     faces.mean_shape @ faces.mean_shape.T, atol=1e-6)  # fmt: skip
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "orthographic"]))
 def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     faces = make_face_tracks(
         n_frames=120, n_components=2, camera=camera, random_state=0

@@ -106,7 +106,7 @@ def test_attributes_have_the_units_of_the_page(column, refinement):
         assert_times(getattr(ten, name), getattr(one, name), FACTORS[word], name)
 
 
-@pytest.mark.parametrize("column", range(len(COLUMNS)))
+@pytest.mark.parametrize("column", slow_after(2, range(len(COLUMNS))))
 def test_methods_have_the_units_of_the_attributes(column):
     settings = COLUMNS[column]
     X = table(settings["camera"])[:20]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
-from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.frames import JointFrames, WeightedRows
 from isa_nrsfm._joint.many_points import (
     has_many_points,
     in_all_points,
@@ -37,7 +37,6 @@ from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.visibility import seen_points
 
 
 class Spectrum(NamedTuple):
@@ -243,9 +242,9 @@ def fit_jointly(
     if ready.wide:
         result, problem = in_all_points(result, problem, rows, refined)
     noise, n_fitted = result.state.noise, 0
-    if ready.used is not None:
+    if ready.left_out is not None:
         # This noise variance is the residual's after the coefficients were fitted.
-        result, noise = reweighted(problem, rows, ready.used, result, loss, refined)
+        result, noise = reweighted(problem, rows, ready.left_out, result, loss, refined)
         n_fitted = n_shapes - 1
     shapes = problem.frames.points(result.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
@@ -310,7 +309,7 @@ class _Ready(NamedTuple):
 
     problems: list[JointProblem]  # of larger and larger samples, and of all frames
     wide: bool  # whether frames are given by directions
-    used: NDArray | None  # (n_frames, n_points), points without outliers; robust losses
+    left_out: NDArray | None  # (n_frames, n_points), outliers; robust losses only
 
 
 def _ready(
@@ -330,17 +329,16 @@ def _ready(
     complete = bool((n_seen == n_points).all())
     wide = has_many_points(n_points, n_shapes, options.many_points)
     wide = wide and complete and loss == "linear"
-    used = None
+    left_out = None
+    if loss != "linear":
+        none = np.zeros((n_frames, n_points), dtype=bool)
+        left_out = none if outliers is None else outliers
     if wide:
         frames = JointFrames.from_directions(rows, leading_directions(factors))
-    elif loss == "linear":
+    elif left_out is None or not left_out.any():
         frames = JointFrames.from_points(rows, complete)
     else:
-        used = seen_points(rows.whole().transpose(0, 2, 1))
-        if outliers is not None:
-            used &= ~outliers
-        weights = None if used.all() else used * 1.0
-        frames = JointFrames.from_points(rows, complete, weights)
+        frames = JointFrames.from_weighted(rows.derive(WeightedRows.without, left_out))
     small = n_frames <= options.few_frames
     steps = steps._replace(effort=options.small if small else options.large)
     problem = JointProblem(frames, steps, 0.0, options)
@@ -356,7 +354,7 @@ def _ready(
         )
         for part in sample.parts
     ]
-    return _Ready([*problems, problem], wide, used)
+    return _Ready([*problems, problem], wide, left_out)
 
 
 def _first_fit(

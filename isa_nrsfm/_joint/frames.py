@@ -19,6 +19,28 @@ from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
 
+class WeightedRows(NamedTuple):
+    """
+    Frames of a table with a weight for each point.
+
+    Attributes
+    ----------
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Frames, NaN where a point is missing.
+    weights : ndarray of shape (n_frames, n_points)
+        Weights, zero where a point is missing.
+    """
+
+    rows: NDArray
+    weights: NDArray
+
+    @classmethod
+    def without(cls, rows: NDArray, left_out: NDArray) -> Self:
+        """Return frames of which some points (n_frames, n_points) do not count."""
+        seen = seen_points(rows.transpose(0, 2, 1))
+        return cls(rows, (seen & ~left_out) * 1.0)
+
+
 class JointFrames(NamedTuple):
     """
     Frames of a table, ready for passes over them.
@@ -41,9 +63,7 @@ class JointFrames(NamedTuple):
         return self.blocks.n_frames
 
     @classmethod
-    def from_points(
-        cls, rows: FrameBlocks, complete: bool, weights: NDArray | None = None
-    ) -> Self:
+    def from_points(cls, rows: FrameBlocks, complete: bool) -> Self:
         """
         Return frames given by their points.
 
@@ -53,17 +73,18 @@ class JointFrames(NamedTuple):
             Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
         complete : bool
             Whether no point is missing.
-        weights : ndarray of shape (n_frames, n_points), optional
-            Weights of the points, by default one for those that are seen.
 
         Returns
         -------
         JointFrames
-            The frames.
+            The frames. All points that are seen have weight one.
         """
-        if weights is not None:
-            return cls(rows.derive(_weighted_frames, weights), None)
         return cls(rows.derive(partial(_plain_frames, complete=complete)), None)
+
+    @classmethod
+    def from_weighted(cls, weighted: FrameBlocks) -> Self:
+        """Return frames given by their points, from blocks of `WeightedRows`."""
+        return cls(weighted.derive(_weighted_frames), None)
 
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
@@ -109,9 +130,9 @@ def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
     return frame_tracks(tracks, None if complete else seen_points(tracks) * 1.0)
 
 
-def _weighted_frames(rows: NDArray, weights: NDArray) -> FrameTracks:
-    """Return frames of rows (n_frames, 2, n_points), weights (n_frames, n_points)."""
-    return frame_tracks(rows.transpose(0, 2, 1), weights)
+def _weighted_frames(block: WeightedRows) -> FrameTracks:
+    """Return frames with weights."""
+    return frame_tracks(block.rows.transpose(0, 2, 1), block.weights)
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:

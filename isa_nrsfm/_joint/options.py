@@ -244,10 +244,14 @@ class ReweightingOptions(NamedTuple):
         Largest number of rounds of reweighting.
     settled : float
         Convergence tolerance: no weight changes by more.
+    model_frames, fewest_shown : int
+        As of `CompletionOptions`, for the median of the residuals.
     """
 
     rounds: int = 20
     settled: float = 1e-2
+    model_frames: int = 10_000
+    fewest_shown: int = 200
 
 
 class RelevanceOptions(NamedTuple):

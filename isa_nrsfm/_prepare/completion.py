@@ -23,7 +23,7 @@ from scipy.linalg import eigh
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._prepare.options import COMPLETION_OPTIONS, CompletionOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import order_by_halves, spread
+from isa_nrsfm._tables.ordering import representative_frames
 from isa_nrsfm._tables.visibility import seen_points
 
 RIGID_RANK = 3
@@ -160,47 +160,12 @@ def complete_rows(
         The frames, centred over all points, as of `complete_tracks`. The model of a
         table with many frames is that of some of them.
     """
-    n_frames = rows.n_frames
-    frames = np.arange(n_frames)
-    if n_frames > options.model_frames:
-        frames = _model_frames(rows, n_points, options)
+    frames = representative_frames(
+        rows, n_points, options.model_frames, options.fewest_shown
+    )
     tracks = rows.take(frames).transpose(0, 2, 1)
     model = completion_model(tracks, np.ones(len(tracks)), n_components, options)
     return rows.derive(partial(_filled_rows, model=model, options=options))
-
-
-def _model_frames(
-    rows: FrameBlocks, n_points: int, options: CompletionOptions
-) -> NDArray:
-    """
-    Return the frames (n_chosen,) from which the model of a large table is found.
-
-    They are spread evenly over the order of `order_by_halves`, so that they do not
-    depend on the order of the table. For each point that too few of them show, frames
-    that show it are added, spread in the same way.
-    """
-    order = order_by_halves(rows)
-    chosen = np.zeros(len(order), dtype=bool)
-    chosen[spread(order, options.model_frames)] = True
-    shown = np.zeros(n_points)
-    for block in rows.map(_seen_rows, chosen):
-        shown += block.sum(axis=0)
-    fewest = options.fewest_shown
-    for point in map(int, np.flatnonzero(shown < fewest)):
-        seen = rows.joined(partial(_sees, point=point))
-        showing = order[seen[order]]
-        chosen[spread(showing, min(fewest, len(showing)))] = True
-    return np.flatnonzero(chosen)
-
-
-def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:
-    """Return which points (n_chosen, n_points) the chosen frames of a block show."""
-    return ~np.isnan(rows[chosen, 0])
-
-
-def _sees(rows: NDArray, point: int) -> NDArray:
-    """Return which frames (n_frames,) of a block show a point."""
-    return ~np.isnan(rows[:, 0, point])
 
 
 def _filled_rows(

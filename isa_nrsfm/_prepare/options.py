@@ -69,6 +69,8 @@ class OutlierOptions(NamedTuple):
     largest_share : float
         If a larger share of a frame's points are gross outliers, the frame is unusual,
         and none of its points is marked.
+    model_frames, fewest_shown : int
+        As of `CompletionOptions`.
     """
 
     distant: float = 6.0
@@ -76,6 +78,8 @@ class OutlierOptions(NamedTuple):
     rounds: int = 100
     settled: float = 1e-2
     largest_share: float = 0.4
+    model_frames: int = 10_000
+    fewest_shown: int = 200
 
 
 class LayoutOptions(NamedTuple):

@@ -6,11 +6,16 @@ falls with its distance from the model in units of the noise. Fit and weights al
 until they agree.
 """
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._prepare.options import OUTLIER_OPTIONS, OutlierOptions
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.ordering import representative_frames
 from isa_nrsfm._tables.visibility import seen_points
 
 # Tuning constant c of a loss, in standard deviations of a coordinate. With these, the
@@ -226,6 +231,48 @@ def robust_sizes(centred: NDArray) -> NDArray:
     return _sizes(_squares(centred))
 
 
+class _RigidObject(NamedTuple):
+    """A rigid factorisation, and how far from it points may be."""
+
+    axes: NDArray  # (n_points, 3), orthonormal columns
+    limit: NDArray  # (n_points,), the largest distance of a point that belongs to it
+    settled: float  # the largest change of a filled-in coordinate at the end
+
+
+def outliers_of_table(
+    rows: FrameBlocks, n_points: int, options: OutlierOptions = OUTLIER_OPTIONS
+) -> NDArray:
+    """
+    Tell which points of a table are far from any rigid object.
+
+    Parameters
+    ----------
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), each divided by its size; NaN where a
+        point is not seen.
+    n_points : int
+        Number of points.
+    options : OutlierOptions
+        Which points are gross outliers.
+
+    Returns
+    -------
+    ndarray of bool, shape (n_frames, n_points)
+        Those of `gross_outliers`. The rigid object of a table with many frames is that
+        of some of them.
+    """
+    if rows.n_frames <= options.model_frames:
+        return gross_outliers(rows.whole().transpose(0, 2, 1), options)
+    frames = representative_frames(
+        rows, n_points, options.model_frames, options.fewest_shown
+    )
+    chosen = rows.take(frames).transpose(0, 2, 1)
+    _, rigid_object = _rigid_search(chosen, options)
+    return rows.joined(
+        partial(_outliers_of_frames, rigid_object=rigid_object, options=options)
+    )
+
+
 def gross_outliers(
     tracks: NDArray, options: OutlierOptions = OUTLIER_OPTIONS
 ) -> NDArray:
@@ -246,27 +293,91 @@ def gross_outliers(
         typical distance, the larger one of the table and of this point. None
         in frames with many such points.
     """
+    hidden, _ = _rigid_search(tracks, options)
+    return _unless_many(hidden, tracks, options)
+
+
+def _rigid_search(
+    tracks: NDArray, options: OutlierOptions
+) -> tuple[NDArray, _RigidObject]:
+    """Return which points (I, J) of tracks (I, J, 2) are hidden, and the object.
+
+    Hidden are the points that are not seen, and those far from the object of the
+    others. Factorisation and hiding alternate.
+    """
+    target, hidden = _start_of_hiding(tracks, options)
     seen = seen_points(tracks)
-    hidden = ~seen | distant_points(tracks, options.distant)
-    target = tracks - spatial_median(tracks)[:, None]
     filled = np.where(hidden[..., None], 0.0, target)
     for _ in range(options.rounds):
-        # Rigid factorisation, rank 3, of the filled tracks.
-        translation = filled.mean(axis=1, keepdims=True)
-        rows = (filled - translation).transpose(0, 2, 1).reshape(-1, tracks.shape[1])
+        # Rigid factorisation, rank 3, of the filled tracks
+        rows = filled - filled.mean(axis=1, keepdims=True)
+        rows = rows.transpose(0, 2, 1).reshape(-1, tracks.shape[1])
         axes = np.linalg.eigh(rows.T @ rows)[1][:, -3:]
-        rigid = (rows @ axes @ axes.T).reshape(len(tracks), 2, -1).transpose(0, 2, 1)
-        rigid = rigid + translation
-        # Hide what is too far from it, and fill hidden points in from it.
+        rigid = _rigid_part(filled, axes)
+        # What is typical, of the table and of each point
         distance = np.linalg.norm(target - rigid, axis=2)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
-        limit = options.gross * np.maximum(typical, of_point)
-        previous, hidden = hidden, ~(distance <= limit)
-        moved = np.abs(np.where(hidden[..., None], rigid, target) - filled).max()
-        filled = np.where(hidden[..., None], rigid, target)
-        if (hidden == previous).all() and moved <= options.settled * typical:
+        rigid_object = _RigidObject(
+            axes,
+            options.gross * np.maximum(typical, of_point),
+            options.settled * typical,
+        )
+        # Hide what is too far, and fill hidden points in
+        previous, hidden = hidden, ~(distance <= rigid_object.limit)
+        before, filled = filled, np.where(hidden[..., None], rigid, target)
+        moved = np.abs(filled - before).max()
+        if (hidden == previous).all() and moved <= rigid_object.settled:
             break
+    return hidden, rigid_object
+
+
+def _outliers_of_frames(
+    rows: NDArray, rigid_object: _RigidObject, options: OutlierOptions
+) -> NDArray:
+    """Return the gross outliers (n, J) of frames (n, 2, J), for a given object.
+
+    Each frame ends by itself: its result does not depend on the others.
+    """
+    tracks = rows.transpose(0, 2, 1)
+    target, hidden = _start_of_hiding(tracks, options)
+    filled = np.where(hidden[..., None], 0.0, target)
+    active = np.arange(len(tracks))
+    for _ in range(options.rounds):
+        rigid = _rigid_part(filled[active], rigid_object.axes)
+        distance = np.linalg.norm(target[active] - rigid, axis=2)
+        new = ~(distance <= rigid_object.limit)
+        changed = (new != hidden[active]).any(axis=1)
+        after = np.where(new[..., None], rigid, target[active])
+        moved = np.abs(after - filled[active]).max(axis=(1, 2))
+        hidden[active], filled[active] = new, after
+        active = active[changed | (moved > rigid_object.settled)]
+        if not len(active):
+            break
+    return _unless_many(hidden, tracks, options)
+
+
+def _start_of_hiding(
+    tracks: NDArray, options: OutlierOptions
+) -> tuple[NDArray, NDArray]:
+    """Return tracks (I, J, 2) from their medians, and the points (I, J) hidden first.
+
+    Hidden are at first the points that are not seen or far from all others.
+    """
+    hidden = ~seen_points(tracks) | distant_points(tracks, options.distant)
+    return tracks - spatial_median(tracks)[:, None], hidden
+
+
+def _rigid_part(filled: NDArray, axes: NDArray) -> NDArray:
+    """Return the rigid part of frames (n, J, 2) without gaps, for axes (J, 3)."""
+    translation = filled.mean(axis=1, keepdims=True)
+    rows = (filled - translation).transpose(0, 2, 1)
+    return (rows @ axes @ axes.T).transpose(0, 2, 1) + translation
+
+
+def _unless_many(hidden: NDArray, tracks: NDArray, options: OutlierOptions) -> NDArray:
+    """Return the seen points among the hidden ones, none of frames with many."""
+    seen = seen_points(tracks)
     gross = hidden & seen
     few = gross.sum(axis=1) <= options.largest_share * seen.sum(axis=1)
     return gross & few[:, None]
