@@ -227,6 +227,7 @@ def fit_ready_table(
         )
         refined = _refined_jointly(
             table,
+            used,
             outliers,
             sample,
             factors,
@@ -283,6 +284,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
     _, paper = _paper_result(factors, most, options, lambda stage: None)
     found = count_components(
         table.rows,
+        used,
         table.n_seen,
         sample,
         factors,
@@ -435,6 +437,7 @@ def _refined_by_paper(
 
 def _refined_jointly(
     table: ScaledTable,
+    completed: FrameBlocks,
     outliers: NDArray | None,
     sample: Sample,
     factors: Factorisation,
@@ -448,6 +451,7 @@ def _refined_jointly(
     """Return the shapes of the joint refinement, and their fit of the frames."""
     fitted = fit_jointly(
         table.rows,
+        completed,
         table.n_seen,
         sample,
         factors,

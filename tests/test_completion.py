@@ -92,6 +92,25 @@ def test_the_input_is_not_changed():
     assert_array_equal(centred, before)
 
 
+@pytest.mark.parametrize("missing", [0.05, 0.4])
+def test_a_model_of_many_points_is_found_from_some_of_them(missing):
+    scene = make_face_tracks(80, noise=0.01, random_state=0)
+    seen = random_mask(scene.tracks.shape[:2], missing, 0)
+    # Frames that see few of the points from which the model is found, or none.
+    seen[:8] = random_mask((8, 68), 0.9, 1, least=6)
+    tracks = hide(scene.tracks, seen)
+    errors = [
+        np.sqrt(np.mean((completed(tracks, 3, **params) - scene.tracks)[8:] ** 2))
+        for params in ({}, {"model_points": 30})
+    ]
+    assert errors[1] < (1 + COMPLETION_OPTIONS.tol) * errors[0]
+    # Whatever the order of the points.
+    order = np.random.default_rng(2).permutation(68)
+    first = completed(tracks, 3, model_points=30)[:, order]
+    other = completed(tracks[:, order], 3, model_points=30)
+    assert_allclose(other, first, atol=1e-9 * np.abs(first).max())
+
+
 # --- the model ----------------------------------------------------------------------
 
 

@@ -97,7 +97,14 @@ def fitted(
         paper_shapes[0] = factors.rigid_shape
         paper_shapes[1 : len(triples) + 1] = 0.1 * triples[:n_components]
     n_seen = np.isfinite(tracks[..., 0]).sum(axis=1)
-    before = rows_of(tracks), n_seen, sample, factors, paper_shapes
+    before = (
+        rows_of(tracks),
+        rows_of(completed),
+        n_seen,
+        sample,
+        factors,
+        paper_shapes,
+    )
     options = {
         "camera": "affine",
         "loss": "linear",

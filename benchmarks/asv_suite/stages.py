@@ -229,6 +229,7 @@ class JointRefinement(Stage):
     def run(self):
         return fit_jointly(
             self.rows,
+            self.rows,
             self.n_seen,
             self.sample,
             self.of_sample,

@@ -161,6 +161,7 @@ class JointFit(NamedTuple):
 @one_blas_thread
 def fit_jointly(
     rows: FrameBlocks,
+    completed: FrameBlocks,
     n_seen: NDArray,
     sample: Sample,
     factors: Factorisation,
@@ -184,6 +185,8 @@ def fit_jointly(
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
         NaN where a point is missing.
+    completed : FrameBlocks
+        The same frames with missing points, and outliers, filled in.
     n_seen : ndarray of int, shape (n_frames,)
         Number of points that each frame shows.
     sample : Sample
@@ -217,7 +220,7 @@ def fit_jointly(
     """
     n_shapes, _, n_points = paper_shapes.shape
     steps = Steps(max_iter, tol, on_step)
-    table = rows, n_seen, sample, factors, paper_shapes
+    table = rows, completed, n_seen, sample, factors, paper_shapes
     ready = _ready(*table, outliers, loss, steps, options)
     first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
     # Fit of the sample (of all frames if it is the table), and judgement of the model
@@ -238,9 +241,13 @@ def fit_jointly(
     # Fits of larger samples, and of all frames
     for larger in problems[1:]:
         result = refined(larger, larger.aligned(result.state, camera))
-    # Further directions, or robust weights
+    # Further directions, then the points that are seen, and robust weights
     if ready.wide:
-        result, problem = in_all_points(result, problem, rows, refined)
+        result, problem = in_all_points(result, problem, completed, refined)
+    if ready.wide and ready.seen is not None:
+        shapes = problem.frames.points(result.state.shapes)
+        problem = problem.with_frames(ready.seen)
+        result = refined(problem, result.state._replace(shapes=shapes))
     noise, n_fitted = result.state.noise, 0
     if ready.left_out is not None:
         # This noise variance is the residual's after the coefficients were fitted.
@@ -268,6 +275,7 @@ def fit_jointly(
 @one_blas_thread
 def count_components(
     rows: FrameBlocks,
+    completed: FrameBlocks,
     n_seen: NDArray,
     sample: Sample,
     factors: Factorisation,
@@ -285,7 +293,7 @@ def count_components(
 
     Parameters
     ----------
-    rows, n_seen, sample, factors, paper_shapes
+    rows, completed, n_seen, sample, factors, paper_shapes
         As of `fit_jointly`, with more basis shapes than are expected.
     camera, outliers, loss, max_iter, tol, options
         As of `fit_jointly`.
@@ -297,7 +305,7 @@ def count_components(
         relevant.
     """
     steps = Steps(max_iter, tol)
-    table = rows, n_seen, sample, factors, paper_shapes
+    table = rows, completed, n_seen, sample, factors, paper_shapes
     ready = _ready(*table, outliers, loss, steps, options)
     first = ready.problems[0]
     result, *_ = _first_fit(first, sample, factors, paper_shapes, camera)
@@ -308,12 +316,14 @@ class _Ready(NamedTuple):
     """A table that is ready for the joint fit."""
 
     problems: list[JointProblem]  # of larger and larger samples, and of all frames
-    wide: bool  # whether frames are given by directions
+    wide: bool  # whether they are of completed frames, given by directions
+    seen: JointFrames | None  # by their points; None where directions tell all
     left_out: NDArray | None  # (n_frames, n_points), outliers; robust losses only
 
 
 def _ready(
     rows: FrameBlocks,
+    completed: FrameBlocks,
     n_seen: NDArray,
     sample: Sample,
     factors: Factorisation,
@@ -327,18 +337,19 @@ def _ready(
     n_shapes, _, n_points = paper_shapes.shape
     n_frames = len(n_seen)
     complete = bool((n_seen == n_points).all())
-    wide = has_many_points(n_points, n_shapes, options.many_points)
-    wide = wide and complete and loss == "linear"
     left_out = None
     if loss != "linear":
         none = np.zeros((n_frames, n_points), dtype=bool)
         left_out = none if outliers is None else outliers
-    if wide:
-        frames = JointFrames.from_directions(rows, leading_directions(factors))
-    elif left_out is None or not left_out.any():
-        frames = JointFrames.from_points(rows, complete)
+    # Many points: completed frames, given by directions, before those that are seen
+    wide = has_many_points(n_points, n_shapes, options.many_points)
+    seen, directions = None, leading_directions(factors)
+    if not (wide and complete and left_out is None):
+        seen = _seen_frames(rows, complete, left_out)
+    if wide or seen is None:
+        frames = JointFrames.from_directions(completed, directions)
     else:
-        frames = JointFrames.from_weighted(rows.derive(WeightedRows.without, left_out))
+        frames = seen
     small = n_frames <= options.few_frames
     steps = steps._replace(effort=options.small if small else options.large)
     problem = JointProblem(frames, steps, 0.0, options)
@@ -354,7 +365,16 @@ def _ready(
         )
         for part in sample.parts
     ]
-    return _Ready([*problems, problem], wide, left_out)
+    return _Ready([*problems, problem], wide, seen, left_out)
+
+
+def _seen_frames(
+    rows: FrameBlocks, complete: bool, left_out: NDArray | None
+) -> JointFrames:
+    """Return frames given by the points that are seen and not left out."""
+    if left_out is None or not left_out.any():
+        return JointFrames.from_points(rows, complete)
+    return JointFrames.from_weighted(rows.derive(WeightedRows.without, left_out))
 
 
 def _first_fit(

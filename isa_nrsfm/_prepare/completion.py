@@ -23,7 +23,7 @@ from scipy.linalg import eigh
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._prepare.options import COMPLETION_OPTIONS, CompletionOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import representative_frames
+from isa_nrsfm._tables.ordering import representative_frames, spread
 from isa_nrsfm._tables.visibility import seen_points
 
 RIGID_RANK = 3
@@ -57,6 +57,20 @@ class _Frames(NamedTuple):
     rows: NDArray
     pattern: NDArray
     patterns: NDArray
+
+    def of_points(self, points: NDArray) -> "tuple[_Frames, NDArray, NDArray]":
+        """Return frames with only some points, which frames these are, and a shift.
+
+        Frames that see none of the points are left out of them. The shift (n_kept, 2)
+        is the centroid of the points that are left.
+        """
+        patterns = self.patterns[:, points]
+        kept = np.flatnonzero(patterns.sum(axis=1)[self.pattern])
+        pattern = self.pattern[kept]
+        rows, seen = self.rows[kept][:, :, points], patterns[pattern]
+        shift = rows.sum(axis=2) / seen.sum(axis=1)[:, None]
+        rows = (rows - shift[:, :, None]) * seen[:, None]
+        return _Frames(rows, pattern, patterns), kept, shift
 
 
 class _Posterior(NamedTuple):
@@ -198,7 +212,13 @@ def completion_model(
     """
     rank = _possible_rank(3 * n_components + 3, centred.shape[1])
     frames, _ = _by_pattern(centred, seen_points(centred), sizes)
-    return _fit(frames, rank, options)
+    points = _model_points(frames, options.model_points)
+    if points is None:
+        return _fit(frames, rank, options)
+    part, kept, shift = frames.of_points(points)
+    model = _fit(part, _possible_rank(rank, len(points)), options)
+    model = _of_all_points(model, part, frames, kept, shift, options)
+    return _converged(model, frames, options.max_iter, options, is_fitted=True)[0]
 
 
 def filled_in(
@@ -258,7 +278,10 @@ def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
     """
     seen = seen_points(centred)
     frames, _ = _by_pattern(centred, seen, sizes)
-    rank = _possible_rank(RIGID_RANK, seen.shape[1])
+    points = _model_points(frames, COMPLETION_OPTIONS.model_points)
+    if points is not None:
+        frames, _, _ = frames.of_points(points)
+    rank = _possible_rank(RIGID_RANK, frames.rows.shape[2])
     return _fit(frames, rank, COMPLETION_OPTIONS).noise
 
 
@@ -287,24 +310,54 @@ def _by_pattern(
     return _Frames(rows, pattern[order], seen[first].astype(np.float64)), order
 
 
+def _model_points(frames: _Frames, most: int) -> NDArray | None:
+    """Return the points from which the model of many points is found first.
+
+    They are spread evenly over the points in the order of their mean energy, so that
+    they do not depend on the order of the points. None stands for all points.
+    """
+    if frames.rows.shape[2] <= most:
+        return None
+    n_shown = np.bincount(frames.pattern) @ frames.patterns
+    energy = np.einsum("icj,icj->j", frames.rows, frames.rows) / n_shown
+    return np.sort(spread(np.argsort(energy, kind="stable"), most))
+
+
 def _fit(frames: _Frames, rank: int, options: CompletionOptions) -> CompletionModel:
     """Return the model of frames by EM, the rank raised from that of a rigid object."""
     # The rank at most doubles from one to the next.
     ranks = [rank]
     while ranks[0] > RIGID_RANK:
         ranks.insert(0, max(RIGID_RANK, (ranks[0] + 1) // 2))
-    rows = frames.rows
-    model = CompletionModel(np.zeros((0, rows.shape[2])), np.inf)
+    residual = frames.rows
+    model = CompletionModel(np.zeros((0, residual.shape[2])), np.inf)
     for wanted in ranks:
-        model = _grown(model, wanted, rows, frames, options.least_weight)
+        model = _grown(model, wanted, residual, frames, options.least_weight)
         last = wanted == rank
-        for step in range(options.max_iter if last else options.steps_while_growing):
-            before = model.noise
-            model, rows, mean_square = _em_step(model, frames, options)
-            stands_still = step > 0 and model.noise > (1.0 - options.tol) * before
-            if stands_still or mean_square < options.exact:
-                break
+        most = options.max_iter if last else options.steps_while_growing
+        model, residual = _converged(model, frames, most, options)
     return model
+
+
+def _converged(
+    model: CompletionModel,
+    frames: _Frames,
+    most_steps: int,
+    options: CompletionOptions,
+    is_fitted: bool = False,
+) -> tuple[CompletionModel, NDArray]:
+    """Return the model after steps of EM, and the residual (n_frames, 2, n_points).
+
+    The noise of a model that is not fitted yet is only a guess.
+    """
+    for step in range(most_steps):
+        before = model.noise
+        model, residual, mean_square = _em_step(model, frames, options)
+        falls = model.noise <= (1.0 - options.tol) * before
+        stands_still = (is_fitted or step > 0) and not falls
+        if stands_still or mean_square < options.exact:
+            break
+    return model, residual
 
 
 def _grown(
@@ -438,20 +491,54 @@ def _em_step(
         products += of_pattern.T @ (noise * cross)
     n_numbers = 2.0 * np.bincount(frames.pattern) @ frames.patterns.sum(axis=1)
 
-    # M step: least squares for the column of B of each point. A point seen in fewer
-    # rows than the rank needs the ridge.
-    mean_moment = _symmetric(moment[None], rank, upper)[0] / (2 * len(rows))
-    per_point = _symmetric(moments, rank, upper)
-    per_point[:, range(rank), range(rank)] += OF_DIFFERENCES * len(rows)
-    B = np.linalg.solve(per_point, products[..., None])[..., 0].T
-    B -= B.mean(axis=1, keepdims=True)  # the translation takes what is common
+    # M step
+    B = _columns(moments, products, len(rows))
     # Rescale so that the mean of E[z z^T] is I, as in the prior: parameter expansion,
     # which makes EM faster (Liu, Rubin and Wu 1998).
+    mean_moment = _symmetric(moment[None], rank, upper)[0] / (2 * len(rows))
     B = np.linalg.cholesky(mean_moment).T @ B
     # Noise variance: residual energy over degrees of freedom. This is the fixed point
     # of EM's own step for the variance (MacKay 1992).
     freedom = max(n_numbers - n_fitted, options.least_freedom * n_numbers)
     return CompletionModel(B, energy / freedom), residual, energy / n_numbers
+
+
+def _columns(moments: NDArray, products: NDArray, n_frames: int) -> NDArray:
+    """Return B (rank, n_points), the least squares for each point.
+
+    The arguments are, for each point, sums over the rows that see it: packed
+    ``E[z z^T]`` (n_points, n_pairs) and ``E[(w - t) z]`` (n_points, rank).
+    """
+    rank = products.shape[1]
+    per_point = _symmetric(moments, rank, np.triu_indices(rank))
+    # A point seen in fewer rows than the rank needs the ridge.
+    per_point[:, range(rank), range(rank)] += OF_DIFFERENCES * n_frames
+    B: NDArray = np.linalg.solve(per_point, products[..., None])[..., 0].T
+    return B - B.mean(axis=1, keepdims=True)  # the translation takes what is common
+
+
+def _of_all_points(
+    model: CompletionModel,
+    part: _Frames,
+    frames: _Frames,
+    kept: NDArray,
+    shift: NDArray,
+    options: CompletionOptions,
+) -> CompletionModel:
+    """Return the model of some points, `part`, for all points: one M step.
+
+    The part has only the kept frames (n_kept,), moved by the shift (n_kept, 2).
+    """
+    rank, n_points = len(model.B), frames.rows.shape[2]
+    upper = np.triu_indices(rank)
+    moments, products = np.zeros((n_points, len(upper[0]))), np.zeros((n_points, rank))
+    for block, (z, t, _, _), _ in _posteriors(part, model, options.block_numbers):
+        seen = frames.patterns[frames.pattern[kept[block]]]
+        position = t + shift[block][:, :, None]
+        moved = (frames.rows[kept[block]] - position) * seen[:, None]
+        moments += seen.T @ (z.swapaxes(1, 2) @ z)[:, upper[0], upper[1]]
+        products += moved.reshape(-1, n_points).T @ z.reshape(-1, rank)
+    return CompletionModel(_columns(moments, products, len(part.rows)), model.noise)
 
 
 def _symmetric(packed: NDArray, size: int, upper: tuple[NDArray, ...]) -> NDArray:

@@ -34,6 +34,8 @@ class CompletionOptions(NamedTuple):
         With more frames than this the model is found from that many of them.
     fewest_shown : int
         Frames are added for each point that fewer of these show.
+    model_points : int
+        With more points than this the model is first found from that many of them.
     """
 
     tol: float = 0.05
@@ -45,6 +47,7 @@ class CompletionOptions(NamedTuple):
     block_numbers: int = 2**20
     model_frames: int = 10_000
     fewest_shown: int = 200
+    model_points: int = 300
 
 
 class OutlierOptions(NamedTuple):
