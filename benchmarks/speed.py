@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
+from sklearn.utils.extmath import randomized_svd
 
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
@@ -30,7 +31,7 @@ from isa_nrsfm._tables.layout import (
     weighting_sizes,
 )
 from isa_nrsfm._transformer import frames_of
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model, write_table
 
 # Random starts against which the fit of a frame is held, and how far they are spread,
@@ -109,6 +110,47 @@ def fits(options):
                 f"{1e3 * fit:10.1f}{1e3 * svd:9.1f}",
                 flush=True,
             )
+
+
+def large(options):
+    """Fits of large tables: many frames, and many points with and without gaps."""
+    heading("", "fit ms", "ms of")
+
+    def line(title, candidate, reference, what):
+        least, median, most, own, other = paired_ratio(
+            candidate, reference, options.pairs
+        )
+        print(
+            f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
+            f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {what}",
+            flush=True,
+        )
+
+    X = make_nonrigid_tracks(8000, 68, n_components=9, noise=0.02, random_state=0).data
+    W, model = measured(X, True), AffineNRSfM(9, random_state=0)
+    line(
+        "8000 x 68, K=9",
+        partial(model.fit, X),
+        partial(np.linalg.svd, W, full_matrices=False),
+        "thin SVD",
+    )
+    X = make_nonrigid_tracks(
+        2500, 7308, n_components=8, noise=0.02, random_state=0
+    ).data
+    W, model = measured(X, True), AffineNRSfM(8, random_state=0)
+    for dtype in (np.float64, np.float32):
+        line(
+            f"2500 x 7308, {np.dtype(dtype)}",
+            partial(model.fit, X.astype(dtype)),
+            partial(randomized_svd, W.astype(dtype), 27, n_iter=4, random_state=0),
+            "randomized_svd",
+        )
+    line(
+        "5 % missing",
+        partial(model.fit, with_holes(X, 0.05)),
+        partial(model.fit, X),
+        "complete",
+    )
 
 
 def with_holes(X, share, seed=0):
@@ -266,6 +308,7 @@ def start(options):
 SECTIONS = {
     "start": start,
     "fits": fits,
+    "large": large,
     "new_frames": new_frames,
     "optima": optima,
     "fastisa": fastisa_iteration,
