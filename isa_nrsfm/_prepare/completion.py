@@ -174,9 +174,10 @@ def complete_rows(
         The frames, centred over all points, as of `complete_tracks`. The model of a
         table with many frames is that of some of them.
     """
-    frames = representative_frames(
-        rows, n_points, options.model_frames, options.fewest_shown
-    )
+    # Of many points fewer frames are enough, for as many numbers.
+    most = options.model_frames * options.model_points // n_points
+    most = np.clip(most, options.fewest_shown, options.model_frames)
+    frames = representative_frames(rows, n_points, int(most), options.fewest_shown)
     tracks = rows.take(frames).transpose(0, 2, 1)
     model = completion_model(tracks, np.ones(len(tracks)), n_components, options)
     return rows.derive(partial(_filled_rows, model=model, options=options))

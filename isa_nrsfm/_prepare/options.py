@@ -35,7 +35,8 @@ class CompletionOptions(NamedTuple):
     fewest_shown : int
         Frames are added for each point that fewer of these show.
     model_points : int
-        With more points than this the model is first found from that many of them.
+        With more points than this the model is first found from that many of them, and
+        in all points from fewer frames, for as many numbers.
     """
 
     tol: float = 0.05
