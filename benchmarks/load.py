@@ -1,11 +1,12 @@
 """
 Fit tables in two processes for minutes while workers are killed, and look for harm.
 
-Run ``python -m benchmarks.load [--minutes N]``. One process fits dask arrays on a
-cluster of two workers, the other runs restarts and the choice of K with ``n_jobs=2`` on
-joblib's loky. In each a worker is killed every minute. Every result is compared with
-that of the same table in memory, with one job and nothing killed. The last lines say
-whether memory, file handles and threads of the two processes stay as they are.
+Run ``python -m benchmarks.load [--minutes N] [--tables N]``. One process fits dask
+arrays on a cluster of two workers, the other runs restarts and the choice of K with
+``n_jobs=2`` on joblib's loky. In each a worker is killed every minute. Every result is
+compared with that of the same table in memory, with one job and nothing killed. The
+last lines say whether memory, file handles and threads of the two processes stay as
+they are.
 
 With loky a worker that dies ends the call with ``TerminatedWorkerError``, as joblib has
 it. The call is made again, which has to give the same result.
@@ -51,6 +52,8 @@ class Load(NamedTuple):
 
     Attributes
     ----------
+    seconds : float
+        How long it took.
     n_killed : int
         Workers that were killed.
     n_ended : int
@@ -63,6 +66,7 @@ class Load(NamedTuple):
         How many there are before the load, and after it.
     """
 
+    seconds: float
     n_killed: int
     n_ended: int
     differences: list
@@ -71,18 +75,24 @@ class Load(NamedTuple):
     threads: tuple
 
     @property
+    def resident(self):
+        """Largest resident megabytes of the first minute, and of the last."""
+        times, sizes = np.transpose(self.memory)
+        first = sizes[times <= max(MINUTE, times[0])]
+        last = sizes[times >= times[-1] - MINUTE]
+        return first.max(), last.max()
+
+    @property
     def growth(self):
         """Largest resident memory of the last minute over that of the first."""
-        end = self.memory[-1][0]
-        first = max(size for since, size in self.memory if since <= MINUTE)
-        last = max(size for since, size in self.memory if since >= end - MINUTE)
+        first, last = self.resident
         return last / first
 
     @property
     def harm(self):
         """What is not as it should be, a list of texts."""
         harm = {
-            "results differ": not max(self.differences) <= EQUAL,
+            "results differ": not np.max(self.differences) <= EQUAL,
             "memory grows": self.growth > FLAT,
             "file handles are left": self.handles[1] > self.handles[0],
             "threads are left": self.threads[1] > self.threads[0],
@@ -92,7 +102,7 @@ class Load(NamedTuple):
 
 def drawn_table(rng):
     """Return a table of a random size, of which every other one misses points."""
-    n_frames, n_points = int(rng.integers(40, 400)), int(rng.integers(10, 40))
+    n_frames, n_points = int(rng.integers(40, 200)), int(rng.integers(10, 30))
     seed = int(rng.integers(2**31))
     tracks = make_nonrigid_tracks(n_frames, n_points, 1, noise=0.02, random_state=seed)
     X = tracks.data
@@ -119,7 +129,7 @@ def difference(found, expected):
 def fit_with_dask(X, disturbed):
     """Return the results of a table, as a dask array or in memory."""
     if disturbed:
-        X = dask.array.from_array(X, chunks=(len(X) // 3 + 1, X.shape[1]))
+        X = dask.array.from_array(X, chunks=(len(X) // 2 + 1, X.shape[1]))
     return results(AffineNRSfM(1, random_state=0).fit(X), X)
 
 
@@ -139,8 +149,15 @@ def dask_workers():
     """Start two workers of dask; yield a function that lists their process numbers."""
     # The scheduler keeps books of all it has done: it has a process of its own.
     options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
-    with SubprocessCluster(**options) as cluster, distributed.Client(cluster):
-        yield partial(descendants, "spawn_main")
+    with SubprocessCluster(**options) as cluster, distributed.Client(cluster) as client:
+
+        def running():
+            # One that has not yet begun to work is not started anew when it dies.
+            n_ready = len(client.scheduler_info()["workers"])
+            return descendants("spawn_main") if n_ready == options["n_workers"] else []
+
+        client.wait_for_workers(options["n_workers"])
+        yield running
 
 
 @contextmanager
@@ -168,13 +185,34 @@ BACKENDS = {
 }
 
 
-def kill(workers, pause, stop, killed):
-    """Kill a worker after each pause, until stop is set; add its number to killed."""
-    while not stop.wait(pause):
-        for pid in workers()[:1]:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
+@contextmanager
+def killing(workers, pause, done):
+    """
+    Kill a worker after each pause; yield the list of those that were killed.
+
+    No more than one is killed for each thing that is done: what is begun again may
+    take longer than the pause.
+    """
+    killed, stop = [], threading.Event()
+
+    def kill():
+        n_done = -1
+        while not stop.wait(pause):
+            if len(done) == n_done:
+                continue
+            for pid in workers()[:1]:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                    killed.append(pid)
+                    n_done = len(done)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    try:
+        yield killed
+    finally:
+        stop.set()
+        thread.join()
 
 
 def resources():
@@ -194,16 +232,18 @@ def settled(before, patience=10.0):
         time.sleep(0.2)
 
 
-def under_load(backend, seconds, pause=MINUTE):
+def under_load(backend, seconds, n_tables=1, pause=MINUTE):
     """
-    Fit tables until the time is over.
+    Fit tables until the time is over and there are as many as asked for.
 
     Parameters
     ----------
     backend : {"dask", "loky"}
         Whose workers are killed.
     seconds : float
-        The time.
+        The least time.
+    n_tables : int, default=1
+        The least number of tables.
     pause : float, default=60
         Seconds between two workers that are killed.
 
@@ -212,7 +252,6 @@ def under_load(backend, seconds, pause=MINUTE):
     Load
         What became of it.
     """
-    warnings.simplefilter("ignore")
     started, fitted = BACKENDS[backend]
     rng = np.random.default_rng(0)
 
@@ -222,13 +261,10 @@ def under_load(backend, seconds, pause=MINUTE):
 
     undisturbed()  # what is imported stays
     before, n_ended = resources(), 0
-    differences, memory, killed = [], [], []
-    with started() as workers:
-        stop = threading.Event()
-        killing = threading.Thread(target=kill, args=(workers, pause, stop, killed))
-        killing.start()
+    differences, memory, passed = [], [], 0.0
+    with started() as workers, killing(workers, pause, memory) as killed:
         start = time.monotonic()
-        while (since := time.monotonic() - start) < seconds or not memory:
+        while passed < seconds or len(memory) < n_tables:
             X, found = drawn_table(rng), None
             while found is None:
                 try:
@@ -237,24 +273,23 @@ def under_load(backend, seconds, pause=MINUTE):
                     n_ended += 1
             differences.append(difference(found, fitted(X, False)))
             gc.collect()
-            memory.append((since, psutil.Process().memory_info().rss / MEGABYTE))
-        stop.set()
-        killing.join()
+            passed = time.monotonic() - start
+            memory.append((passed, psutil.Process().memory_info().rss / MEGABYTE))
     # joblib keeps a pipe of an executor that is broken until it has made the next one.
     undisturbed()
     handles, threads = zip(before, settled(before), strict=True)
-    return Load(len(killed), n_ended, differences, memory, handles, threads)
+    return Load(passed, len(killed), n_ended, differences, memory, handles, threads)
 
 
 def described(backend, load):
     """Return what became of a process, as some lines of text."""
-    (_, first), (_, last) = load.memory[0], load.memory[-1]
+    first, last = load.resident
     return (
-        f"{backend}: {len(load.memory)} tables, {load.n_killed} workers killed, "
-        f"{load.n_ended} calls made again\n"
-        f"  largest difference {max(load.differences):.1e}\n"
-        f"  resident {first:.0f} MB at first, {last:.0f} MB at last, "
-        f"growth {load.growth:.3f}\n"
+        f"{backend}: {len(load.memory)} tables in {load.seconds / MINUTE:.1f} minutes, "
+        f"{load.n_killed} workers killed, {load.n_ended} calls made again\n"
+        f"  largest difference {np.max(load.differences):.1e}\n"
+        f"  at most {first:.0f} MB in the first minute, {last:.0f} MB in the last, "
+        f"{load.growth:.3f} times as much\n"
         f"  file handles before and after {load.handles}, threads {load.threads}\n"
         f"  {', '.join(load.harm) or 'no harm'}"
     )
@@ -264,12 +299,17 @@ def main():
     """Run both processes, print what became of them, and return an exit code."""
     parser = argparse.ArgumentParser(description=__doc__.strip().splitlines()[0])
     parser.add_argument(
-        "--minutes", type=float, default=10.0, help="how long (default %(default)s)"
+        "--minutes", type=float, default=10.0, help="at least (default %(default)s)"
     )
-    seconds = MINUTE * parser.parse_args().minutes
+    parser.add_argument(
+        "--tables", type=int, default=200, help="each, at least (default %(default)s)"
+    )
+    args = parser.parse_args()
+    least = (MINUTE * args.minutes, args.tables)
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(len(BACKENDS), mp_context=spawn) as executor:
-        runs = {name: executor.submit(under_load, name, seconds) for name in BACKENDS}
+    options = {"initializer": warnings.simplefilter, "initargs": ("ignore",)}
+    with ProcessPoolExecutor(len(BACKENDS), spawn, **options) as executor:
+        runs = {name: executor.submit(under_load, name, *least) for name in BACKENDS}
         loads = {name: run.result() for name, run in runs.items()}
     for name, load in loads.items():
         print(described(name, load))
