@@ -19,7 +19,7 @@ both_iterations = pytest.mark.parametrize("accelerated", [True, False])
 
 @pytest.fixture
 def cameras():
-    return Rotation.random(20, rng=0).as_matrix()[:, :2]
+    return Rotation.random(20, np.random.default_rng(0)).as_matrix()[:, :2]
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ class TestNuclearNormShapes:
 
     def test_turning_space_and_signs_of_frames(self, W, cameras):
         shapes = solve(W, cameras, max_iter=50).shapes
-        turn = Rotation.random(rng=1).as_matrix()
+        turn = Rotation.random(None, np.random.default_rng(1)).as_matrix()
         turned = solve(W, cameras @ turn.T, max_iter=50).shapes
         assert_allclose(turned, shapes @ turn.T, atol=1e-10)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (20, 1, 1))

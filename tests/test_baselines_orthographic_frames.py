@@ -24,7 +24,7 @@ def model(noise_variance=1e-12, depth=1.0):
 def frames(given, noise=0.0, n_frames=N_FRAMES):
     """Return tracks of random frames, with their cameras and coefficients."""
     rng = np.random.default_rng(1)
-    cameras = Rotation.random(n_frames, rng=rng).as_matrix()[:, :2]
+    cameras = Rotation.random(n_frames, rng).as_matrix()[:, :2]
     alpha = rng.normal(size=(n_frames, N_COMPONENTS))
     tracks = compose(given.mean_shape, given.basis, alpha) @ cameras.swapaxes(1, 2)
     tracks += noise * rng.normal(size=tracks.shape)
@@ -77,7 +77,7 @@ def test_quadratic_model():
     given = model(0.3)
     rng = np.random.default_rng(2)
     track = frames(given, 0.5, 1)[0][0]
-    R = Rotation.random(rng=rng).as_matrix()[:2]
+    R = Rotation.random(None, rng).as_matrix()[:2]
     a = rng.normal(size=N_COMPONENTS)
     shapes = np.concatenate([given.mean_shape[None], given.basis]).swapaxes(1, 2)
     slope, curvature, scale = _orthographic_frames._quadratic_model(

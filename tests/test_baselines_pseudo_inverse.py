@@ -21,7 +21,7 @@ N_FRAMES, N_POINTS = 12, 9
 
 @pytest.fixture
 def cameras():
-    return Rotation.random(N_FRAMES, rng=0).as_matrix()[:, :2]
+    return Rotation.random(N_FRAMES, np.random.default_rng(0)).as_matrix()[:, :2]
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ def random_scene(camera, seed=0, noise=NOISE, n_frames=20, depth=1.0):
     shapes = rng.normal(size=(4, 3, 20)) * np.array([1.0, 0.8, 0.6 * depth])[:, None]
     shapes[1:] *= 0.2
     shapes -= shapes.mean(axis=2, keepdims=True)
-    motion = Rotation.random(n_frames, rng=rng).as_matrix()[:, :2]
+    motion = Rotation.random(n_frames, rng).as_matrix()[:, :2]
     if camera == "weak_perspective":
         motion = rng.uniform(0.5, 2.0, n_frames)[:, None, None] * motion
     translation = rng.normal(size=(n_frames, 2))
@@ -144,7 +144,7 @@ class TestMinimum:
             found = value(scene, i, M, noise)
             ends = []
             for _ in range(8):
-                start = scale * Rotation.random(rng=rng).as_matrix()[:2]
+                start = scale * Rotation.random(None, rng).as_matrix()[:2]
                 result = minimize(
                     lambda step, i=i, start=start: value(
                         scene, i, moved(start, step), noise

@@ -28,7 +28,7 @@ def random_cameras(seed=0, name="weak_perspective", n=N):
     rng = np.random.default_rng(seed)
     if name == "affine":
         return rng.normal(size=(2, 3, n))
-    rows = Rotation.random(n, rng=rng).as_matrix()[:, :2]
+    rows = Rotation.random(n, rng).as_matrix()[:, :2]
     if name == "weak_perspective":
         rows = rng.uniform(0.3, 3.0, n)[:, None, None] * rows
     return frames_last(rows)

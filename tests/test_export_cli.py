@@ -123,6 +123,20 @@ def test_other_edges_are_refused(export, tmp_path, text):
     )
 
 
+def test_edges_in_other_encodings_are_refused(export, tmp_path):
+    path = tmp_path / "edges.csv"
+    path.write_text("00,01\n", encoding="utf-8-sig")
+    read = Read(export("a.glb", "--edges", path)[0])
+    assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1]
+    path.write_text("00,01\n", encoding="utf-16")
+    _, _, error = export("b.glb", "--edges", path)
+    expected = "edges.csv cannot be read as a list of edges: its text is not in UTF-8"
+    assert expected in error
+    path.write_text("00,01\n", encoding="utf-16-le")  # no byte order mark
+    _, _, error = export("b.glb", "--edges", path)
+    assert "edges.csv, line 1: expected the names of two or three points" in error
+
+
 def test_a_file_without_edges_is_refused(export, tmp_path):
     (tmp_path / "edges.csv").write_text("\n")
     _, _, error = export("a.glb", "--edges", tmp_path / "edges.csv")

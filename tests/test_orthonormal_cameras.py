@@ -61,7 +61,7 @@ class TestExactCameras:
         assert_allclose(gram(found.cameras), gram(cameras), atol=2e-4)
 
     def test_of_a_rigid_object_are_in_three_columns(self):
-        cameras = Rotation.random(20, rng=0).as_matrix()[:, :2]
+        cameras = Rotation.random(20, np.random.default_rng(0)).as_matrix()[:, :2]
         mixing = np.random.default_rng(0).normal(size=(3, 3))
         found = orthonormal_cameras(cameras.reshape(-1, 3) @ mixing)
         assert_allclose(gram(found.cameras), gram(cameras), atol=1e-8)
@@ -136,7 +136,7 @@ class TestResult:
 class TestNoise:
     def test_price_is_what_noise_costs(self):
         rng = np.random.default_rng(0)
-        cameras = Rotation.random(3000, rng=0).as_matrix()[:, :2]
+        cameras = Rotation.random(3000, np.random.default_rng(0)).as_matrix()[:, :2]
         Q = rng.normal(size=(5, 3))
         P = cameras.reshape(-1, 3) @ np.linalg.pinv(Q)
         deviation = 1e-3
@@ -227,7 +227,11 @@ class TestPrincipalColumns:
         assert_allclose(np.abs(cosines), np.eye(rank), atol=1e-8)
 
     def test_columns_of_cameras_are_so_long(self):
-        cameras = Rotation.random(5000, rng=0).as_matrix()[:, :2].reshape(-1, 3)
+        cameras = (
+            Rotation.random(5000, np.random.default_rng(0))
+            .as_matrix()[:, :2]
+            .reshape(-1, 3)
+        )
         lengths = np.linalg.norm(principal_columns(cameras), axis=0)
         assert_allclose(lengths, np.linalg.norm(cameras, axis=0), rtol=0.03)
 
@@ -246,7 +250,7 @@ class TestPrincipalColumns:
 
 
 def test_residuals_of_orthonormal_rows_are_zero():
-    cameras = Rotation.random(5, rng=0).as_matrix()[:, :2]
+    cameras = Rotation.random(5, np.random.default_rng(0)).as_matrix()[:, :2]
     assert_allclose(orthonormality_residuals(cameras), np.zeros((3, 5)), atol=1e-14)
 
 

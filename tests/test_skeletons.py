@@ -284,9 +284,17 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
     config.write_text("bodyparts: [a]\n")
     with pytest.raises(ValueError, match="no list of pairs of bodyparts"):
         read_skeleton(config, ["a", "b"])
-    config.write_text("a: [")
-    with pytest.raises(ValueError, match="is not YAML"):
-        read_skeleton(config, ["a", "b"])
+    for damaged in (b"a: [", b"skeleton:\n- [a, b\xe9]\n"):
+        config.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"config.yaml is not YAML"):
+            read_skeleton(config, ["a", "b"])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_the_skeleton_of_deeplabcut_in_any_unicode(tmp_path, encoding):
+    config = tmp_path / "config.yaml"
+    config.write_text("skeleton:\n- [né, Ω]\n", encoding=encoding)
+    assert_array_equal(read_skeleton(config, ["né", "Ω"]).edges, [[0, 1]])
 
 
 def test_skeletons_cannot_be_changed():

@@ -46,7 +46,9 @@ def reading(
             error.filename = os.fspath(path)
             raise
         said = str(error).strip().partition("\n")[0]
-        if not isinstance(error, ValueError | OSError):
+        if isinstance(error, UnicodeDecodeError):
+            said = f"its text is not in {error.encoding.upper()} ({said})"
+        elif not isinstance(error, ValueError | OSError):
             said = f"{type(error).__name__}: {said}"
         raise ValueError(
             f"{os.fspath(path)} cannot be read as {what}: {said}"

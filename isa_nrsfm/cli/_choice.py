@@ -142,5 +142,6 @@ def extrapolated(
     if len(tried) > 2:
         tried, seconds = tried[1:], seconds[1:]
     degree = min(len(tried) - 1, 1)
-    line = np.polynomial.Polynomial.fit(tried, seconds, degree)
+    # The numbers as they are: one alone has no range to be scaled by.
+    line = np.polynomial.Polynomial.fit(tried, seconds, degree, domain=[])
     return np.maximum(line(following), seconds[-1])

@@ -110,10 +110,10 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
     --------
     find_skeleton : A layout that is known.
     """
-    text = Path(path).read_text(encoding="utf-8")
+    written = Path(path).read_bytes()  # YAML tells UTF-8 and UTF-16 apart itself
     yaml = import_optional("yaml", extra="yaml")
     try:
-        content = yaml.safe_load(text)
+        content = yaml.safe_load(written)
     except yaml.YAMLError as error:
         raise ValueError(f"{path} is not YAML: {error}") from error
     edges = content.get("skeleton") if isinstance(content, dict) else None
