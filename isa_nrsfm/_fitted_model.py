@@ -55,11 +55,15 @@ class TableModel(NamedTuple):
     names: NDArray | None
     unit: float | None
 
-    def decompose(self, table: Table) -> FrameFit:
-        """Return cameras, positions and coefficients of the frames of a table."""
+    def decompose(self, table: Table, deviations: bool = True) -> FrameFit:
+        """
+        Return cameras, positions and coefficients of the frames of a table.
+
+        Without deviations the standard deviations of the coefficients are NaN.
+        """
         K = len(self.basis)
         shapes = ((2, 3), (2,), (K,), (K,))
-        fit = partial(_fit, model=self, dtype=table.dtype)
+        fit = partial(_fit, model=self, dtype=table.dtype, deviations=deviations)
         return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
 
     def posterior(self, table: Table) -> FramePosterior:
@@ -133,13 +137,15 @@ class TableModel(NamedTuple):
         return weighting_sizes(centred, scale_frames=True)
 
 
-def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
+def _fit(
+    rows: NDArray, model: TableModel, dtype: Any, deviations: bool = False
+) -> FrameFit:
     """Return the fit of some rows (n, 2 * n_points); NaN for those not usable."""
     tracks, usable = model.usable(rows)
     frames = FrameFit.unknown(len(tracks), len(model.basis))
     if usable.any():
         centred, translation = model.centred(tracks[usable])
-        fit = model.frames.fit(centred, model.sizes(centred))
+        fit = model.frames.fit(centred, model.sizes(centred), deviations)
         fit = fit._replace(translation=fit.translation + translation)
         for whole, part in zip(frames, fit, strict=True):
             whole[usable] = part
@@ -244,10 +250,10 @@ def held_out_energies(
         origin = np.zeros(3), np.zeros((len(basis), 3))  # of mean and basis shapes
         if complete is not None:
             others = complete.of_points(~held)
-            fit = others.fit(tracks[usable][:, ~held], sizes[usable])
+            fit = others.fit(tracks[usable][:, ~held], sizes[usable], False)
             origin = mean_shape[~held].mean(axis=0), basis[:, ~held].mean(axis=1)
         else:
-            fit = frames.fit(visible[usable], sizes[usable])
+            fit = frames.fit(visible[usable], sizes[usable], False)
         # Prediction of the held-out points, and its error
         at_origin = mean_shape[held] - origin[0], basis[:, held] - origin[1][:, None]
         shapes = compose(*at_origin, fit.alpha)

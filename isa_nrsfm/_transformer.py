@@ -136,7 +136,7 @@ class TableTransformer(
             Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
             too little is seen.
         """
-        return self.decompose(X).alpha
+        return self._model.decompose(self._opened(X), deviations=False).alpha
 
     def decompose(self, X: Any) -> Decomposition:
         """
