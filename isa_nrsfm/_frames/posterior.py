@@ -21,9 +21,11 @@ from isa_nrsfm._frames.point_sums import (
     determines_camera,
     frame_sums,
     frame_tracks,
+    shared_gram,
 )
 from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
+from isa_nrsfm._tables.visibility import seen_points
 
 SEARCHES: dict[str, Callable[..., FrameSearch]] = {
     "affine": AffineSearch,
@@ -155,10 +157,11 @@ def fit_posterior(
     rounding decides where the search goes from there, and further starts help.
     """
     tracks = np.asarray(tracks)
-    missing = np.isnan(tracks[..., 0]) | np.isnan(tracks[..., 1])
-    seen = np.where(missing, 0.0, 1.0 if weights is None else weights)
+    seen = seen_points(tracks)
+    if weights is not None or not seen.all():
+        weights = np.where(seen, 1.0 if weights is None else weights, 0.0)
     return _best_fits(
-        _Tracks(tracks, seen, options),
+        _Tracks(tracks, weights, options),
         SEARCHES[camera](shapes, options=options),
         noise_variance,
         initial=initial,
@@ -237,22 +240,25 @@ class _Tracks(NamedTuple):
     """Frames that are given by their tracks."""
 
     tracks: NDArray  # (n_frames, n_points, 2)
-    weights: NDArray  # (n_frames, n_points)
+    weights: NDArray | None  # (n_frames, n_points), None where all are 1
     options: FrameOptions
 
     @property
     def n_points(self) -> float:
         """Number of points of a frame."""
-        return self.weights.shape[1]
+        return self.tracks.shape[1]
 
     @property
     def weight(self) -> NDArray:
         """Sum of the weights of each frame."""
+        if self.weights is None:
+            return np.full(len(self.tracks), float(self.n_points))
         return self.weights.sum(axis=1)
 
     def take(self, frames: NDArray) -> Self:
         """Return some of the frames."""
-        return self._replace(tracks=self.tracks[frames], weights=self.weights[frames])
+        weights = None if self.weights is None else self.weights[frames]
+        return self._replace(tracks=self.tracks[frames], weights=weights)
 
     def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
         """
@@ -261,11 +267,16 @@ class _Tracks(NamedTuple):
         Complete frames come first: they share one Gram matrix.
         """
         tracks, weights, options = self
-        complete = (weights == 1.0).all(axis=1)
+        complete = np.ones(len(tracks), dtype=bool)
+        if weights is not None:
+            complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
+        gram = shared_gram(shapes) if len(frames) else None
         for first in range(0, len(frames), options.complete_block):
             block = in_lanes(frames[first : first + options.complete_block])
-            yield block, frame_sums(frame_tracks(tracks[block]), shapes)
+            yield block, frame_sums(frame_tracks(tracks[block]), shapes, gram)
+        if weights is None:
+            return
         frames = np.flatnonzero(~complete)
         for first in range(0, len(frames), options.weighted_block):
             block = in_lanes(frames[first : first + options.weighted_block])
@@ -313,7 +324,10 @@ def _determined(
     frames: NDArray, products: FrameSums, shapes: NDArray
 ) -> tuple[NDArray, FrameSums]:
     """Return those of the frames (n,) that determine a camera, and their sums."""
-    usable = in_lanes(np.flatnonzero(determines_camera(products, shapes[0])))
+    determined = determines_camera(products, shapes[0])
+    if determined.all():
+        return frames, products
+    usable = in_lanes(np.flatnonzero(determined))
     return frames[usable], products.take(usable)
 
 
