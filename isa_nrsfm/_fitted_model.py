@@ -14,18 +14,38 @@ from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.layout import (
     Layout,
-    centred_tracks,
     table_to_tracks,
     tracks_to_table,
-    weighting_sizes,
 )
 from isa_nrsfm._tables.sources import Table
-from isa_nrsfm._tables.visibility import seen_points, usable_frames
+from isa_nrsfm._tables.visibility import CentredFrames, seen_points, usable_frames
 
 # Number of parts of the points that are held out in turn, and the fixed random seed of
 # the partition.
 N_FOLDS = 5
 FOLD_SEED = 0
+
+
+class ReadyFrames(NamedTuple):
+    """
+    Frames that are usable, centred and measured.
+
+    Attributes
+    ----------
+    usable : ndarray of bool, shape (n_frames,)
+        Which frames of a table they are.
+    centred : ndarray of shape (n_usable, n_points, 2)
+        Their centred tracks, NaN where a point is not seen.
+    translation : ndarray of shape (n_usable, 2)
+        What was subtracted.
+    sizes : ndarray of shape (n_usable,)
+        Their sizes.
+    """
+
+    usable: NDArray
+    centred: NDArray
+    translation: NDArray
+    sizes: NDArray
 
 
 class TableModel(NamedTuple):
@@ -55,11 +75,15 @@ class TableModel(NamedTuple):
     names: NDArray | None
     unit: float | None
 
-    def decompose(self, table: Table) -> FrameFit:
-        """Return cameras, positions and coefficients of the frames of a table."""
+    def decompose(self, table: Table, deviations: bool = True) -> FrameFit:
+        """
+        Return cameras, positions and coefficients of the frames of a table.
+
+        Without deviations the standard deviations of the coefficients are NaN.
+        """
         K = len(self.basis)
         shapes = ((2, 3), (2,), (K,), (K,))
-        fit = partial(_fit, model=self, dtype=table.dtype)
+        fit = partial(_fit, model=self, dtype=table.dtype, deviations=deviations)
         return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
 
     def posterior(self, table: Table) -> FramePosterior:
@@ -108,11 +132,25 @@ class TableModel(NamedTuple):
         noise, signal = np.sum(list(energies), axis=0)
         return float(noise / signal) if signal > 0 else float("nan")
 
-    def usable(self, rows: NDArray) -> tuple[NDArray, NDArray]:
-        """Return tracks (n, n_points, 2) of some rows, and which are usable (n,)."""
+    def tracks(self, rows: NDArray) -> NDArray:
+        """Return the tracks (n, n_points, 2) of some rows."""
         tracks = table_to_tracks(rows, self.layout)
-        tracks = clean_tracks(tracks, self.layout, self.names)
-        return tracks, usable_frames(tracks)
+        return clean_tracks(tracks, self.layout, self.names)
+
+    def ready(self, tracks: NDArray) -> ReadyFrames:
+        """Return the usable ones of tracks (n, n_points, 2), ready for the fit."""
+        frames = CentredFrames.of_tracks(tracks)
+        usable = frames.usable()
+        frames = frames.take(usable)
+        if self.robust:
+            centred, translation = robustly_centred(tracks[usable])
+        else:
+            centred, translation = frames.marked(), frames.translation
+        if self.unit is not None or not len(centred):
+            sizes = np.full(len(centred), self.unit, dtype=float)
+        else:
+            sizes = robust_sizes(centred) if self.robust else frames.sizes()
+        return ReadyFrames(usable, centred, translation, sizes)
 
     @property
     def robust(self) -> bool:
@@ -120,42 +158,31 @@ class TableModel(NamedTuple):
         frames = self.frames
         return isinstance(frames, PosteriorFrames) and frames.loss != "linear"
 
-    def centred(self, tracks: NDArray) -> tuple[NDArray, NDArray]:
-        """Return centred tracks (n, n_points, 2), and what was subtracted (n, 2)."""
-        return (robustly_centred if self.robust else centred_tracks)(tracks)
 
-    def sizes(self, centred: NDArray) -> NDArray:
-        """Return the sizes (n,) of frames, given as centred tracks (n, n_points, 2)."""
-        if self.unit is not None or not len(centred):
-            return np.full(len(centred), self.unit)
-        if self.robust:
-            return robust_sizes(centred)
-        return weighting_sizes(centred, scale_frames=True)
-
-
-def _fit(rows: NDArray, model: TableModel, dtype: Any) -> FrameFit:
+def _fit(
+    rows: NDArray, model: TableModel, dtype: Any, deviations: bool = False
+) -> FrameFit:
     """Return the fit of some rows (n, 2 * n_points); NaN for those not usable."""
-    tracks, usable = model.usable(rows)
-    frames = FrameFit.unknown(len(tracks), len(model.basis))
-    if usable.any():
-        centred, translation = model.centred(tracks[usable])
-        fit = model.frames.fit(centred, model.sizes(centred))
-        fit = fit._replace(translation=fit.translation + translation)
-        for whole, part in zip(frames, fit, strict=True):
-            whole[usable] = part
-    return frames.astype(dtype)
+    ready = model.ready(model.tracks(rows))
+    whole = FrameFit.unknown(len(rows), len(model.basis))
+    if not ready.usable.any():
+        return whole.astype(dtype)
+    fit = model.frames.fit(ready.centred, ready.sizes, deviations)
+    fit = fit._replace(translation=fit.translation + ready.translation)
+    if not ready.usable.all():
+        for all_frames, of_usable in zip(whole, fit, strict=True):
+            all_frames[ready.usable] = of_usable
+        fit = whole
+    return fit.astype(dtype)
 
 
 def _posterior(rows: NDArray, model: TableModel) -> FramePosterior:
     """Return the fit of rows (n, 2 * n_points) by themselves, before the gauge."""
     assert isinstance(model.frames, PosteriorFrames)
-    tracks, usable = model.usable(rows)
-    centred, _ = model.centred(tracks[usable])
-    sizes = model.sizes(centred)
-    found = model.frames.posterior(centred / sizes[:, None, None])
-    whole = FramePosterior.unknown(len(tracks), len(model.basis))
-    for all_frames, of_usable in zip(whole, found, strict=True):
-        all_frames[usable] = of_usable
+    ready = model.ready(model.tracks(rows))
+    found = model.frames.posterior(ready.centred / ready.sizes[:, None, None])
+    whole = FramePosterior.unknown(len(rows), len(model.basis))
+    whole.put(ready.usable, found)
     return whole
 
 
@@ -186,10 +213,11 @@ def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
 
 def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
     """Return the energies of `held_out_energies` for some rows (n, 2 * n_points)."""
-    tracks, usable = model.usable(rows)
-    tracks = tracks[usable]
-    sizes = model.sizes(model.centred(tracks)[0])
-    return held_out_energies(model.frames, model.mean_shape, model.basis, tracks, sizes)
+    tracks = model.tracks(rows)
+    ready = model.ready(tracks)
+    return held_out_energies(
+        model.frames, model.mean_shape, model.basis, tracks[ready.usable], ready.sizes
+    )
 
 
 def held_out_energies(
@@ -244,10 +272,10 @@ def held_out_energies(
         origin = np.zeros(3), np.zeros((len(basis), 3))  # of mean and basis shapes
         if complete is not None:
             others = complete.of_points(~held)
-            fit = others.fit(tracks[usable][:, ~held], sizes[usable])
+            fit = others.fit(tracks[usable][:, ~held], sizes[usable], False)
             origin = mean_shape[~held].mean(axis=0), basis[:, ~held].mean(axis=1)
         else:
-            fit = frames.fit(visible[usable], sizes[usable])
+            fit = frames.fit(visible[usable], sizes[usable], False)
         # Prediction of the held-out points, and its error
         at_origin = mean_shape[held] - origin[0], basis[:, held] - origin[1][:, None]
         shapes = compose(*at_origin, fit.alpha)

@@ -136,7 +136,8 @@ class TableTransformer(
             Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
             too little is seen.
         """
-        return self.decompose(X).alpha
+        table = self._opened(X)
+        return self._model.decompose(table, deviations=False).alpha
 
     def decompose(self, X: Any) -> Decomposition:
         """

@@ -135,7 +135,12 @@ class TestGram:
         gram, G = self.gram(weighted)
         c = np.random.default_rng(0).normal(size=(3, 6))
         T = np.einsum("klabi,li->kabi", G, c)
-        assert_allclose(gram.products(c), T + T.swapaxes(1, 2), atol=1e-12)
+        T += T.swapaxes(1, 2)
+        products = gram.products(c)
+        assert_allclose(unpack3(products), T, atol=1e-12)
+        M = np.random.default_rng(1).normal(size=(3, 2, 6))
+        expected = np.einsum("kabi,bri->kari", T[1:], M)
+        assert_allclose(gram.images(c, products, M), expected, atol=1e-12)
 
     def test_moments(self, weighted):
         gram, G = self.gram(weighted)
@@ -156,8 +161,8 @@ class TestGram:
         gram, _ = self.gram(weighted)
         c = np.random.default_rng(0).normal(size=(3, 6))
         first, second = pair_indices(3)
-        half = 0.5 * np.einsum("ki,kabi->abi", c, gram.products(c))
-        assert_allclose(unpack3(gram.moments(c[first] * c[second])), half, atol=1e-12)
+        half = 0.5 * np.einsum("ki,kpi->pi", c, gram.products(c))
+        assert_allclose(gram.moments(c[first] * c[second]), half, atol=1e-12)
 
 
 class TestWhitened:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.damped_newton import State, descend, newton_step
 from isa_nrsfm._frames.options import FRAME_OPTIONS, Damping, FrameOptions
 from isa_nrsfm._frames.point_sums import (
+    TWICE,
     FrameGram,
     FrameSums,
     SharedGram,
@@ -53,6 +54,8 @@ from isa_nrsfm._linalg.vectors import frames_first, in_lanes, of_frames
 # of s2, as a share of the energy of the frame. They keep the result finite for
 # degenerate shapes, and are too small to change it for others.
 RIDGE = 1e-13
+# Half the multiplicity of the entries of packed symmetric 3x3 matrices.
+HALVED = 0.5 * TWICE[:, None]
 
 
 class AffineSearch:
@@ -93,6 +96,7 @@ class AffineSearch:
         n_points: float,
         initial: NDArray,
         max_steps: int,
+        covariances: bool = True,
     ) -> FoundFrames:
         """
         Return the minima that frames reach from given coefficients.
@@ -109,6 +113,8 @@ class AffineSearch:
             Coefficients to start from.
         max_steps : int
             The most steps.
+        covariances : bool, default=True
+            Whether covariances are wanted.
 
         Returns
         -------
@@ -118,16 +124,15 @@ class AffineSearch:
         problem = affine_problem(products, variance, n_points, self._options)
         state = problem.evaluate(_first_step(problem, initial.T))
         alpha, converged = descend(problem, state, max_steps - 1)
-        eliminated = _eliminated(problem, with_one(alpha))
-        state = _state(problem, alpha, *eliminated)
+        _, _, half, camera = _eliminated(problem, with_one(alpha))
         prior = problem.ridge * np.einsum("ki,ki->i", alpha, alpha)
-        objective = np.maximum(products.energy + state.value, 0.0)
-        covariance = problem.ridge * _inverse_hessian(state, problem.damping.largest)
+        n = len(prior)
+        objective = np.maximum(products.energy - _explained(problem, alpha, half), 0.0)
         return FoundFrames(
-            _motion(eliminated[-1]),
+            _motion(camera),
             alpha.T,
-            frames_first(unpacked(covariance)),
-            np.full((len(products.energy), 3, 3), np.nan),
+            _covariance(problem, alpha) if covariances else np.empty((n, 0, 0)),
+            np.full((n, 3, 3), np.nan),
             objective,
             np.maximum(objective - prior, 0.0),
             converged,
@@ -193,7 +198,15 @@ class AffineProblem(NamedTuple):
 
     def evaluate(self, alpha: NDArray) -> State:
         """Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n)."""
-        return _state(self, alpha, *_eliminated(self, with_one(alpha)))
+        c = with_one(alpha)
+        T, R, half, camera = _eliminated(self, c)
+        held, slope = _held(self, c, T, camera)
+        # F_k^T, then R F_k^T for the Schur complement
+        F = self.gram.images(c, T, camera)
+        F -= self.cross[1:]
+        F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(self.ridge))
+        value = -_explained(self, alpha, half)
+        return State(alpha, value, slope, held, held - packed_gram(F))
 
     def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
         """
@@ -256,51 +269,50 @@ def _eliminated(
     """
     Eliminate the cameras for coefficients c (n_shapes, n).
 
-    Returned are ``B_k S^T + S B_k^T`` (n_shapes, 3, 3, n), R (3, 3, n) with ``R^T R =
-    A^-1``, ``R Y^T`` (3, 2, n) and the cameras ``M^T = A^-1 Y^T`` (3, 2, n).
+    Returned are ``B_k S^T + S B_k^T`` (n_shapes, 6, n), packed, R (3, 3, n) with ``R^T
+    R = A^-1``, ``R Y^T`` (3, 2, n) and the cameras ``M^T = A^-1 Y^T`` (3, 2, n).
     """
     T = problem.gram.products(c)
-    A = 0.5 * np.einsum("ki,kabi->abi", c, T)[ROWS, COLUMNS] + problem.precision
+    A = np.einsum("ki,kpi->pi", 0.5 * c, T)
+    A += problem.precision
     R = inverse_factor3(A)
     Y = np.einsum("ki,kari->ari", c, problem.cross)
     half = np.einsum("abi,bri->ari", R, Y)
     return T, R, half, np.einsum("bai,bri->ari", R, half)
 
 
-def _state(
-    problem: AffineProblem,
-    alpha: NDArray,
-    T: NDArray,
-    R: NDArray,
-    half: NDArray,
-    camera: NDArray,
-) -> State:
-    """
-    Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n).
-
-    The other arrays are those of `_eliminated`. See the docstring on top.
-    """
-    P, ridge = problem.cross, problem.ridge
-    # ||W||^2 - f = ||R Y^T||^2 - s2 |a|^2
+def _explained(problem: AffineProblem, alpha: NDArray, half: NDArray) -> NDArray:
+    """Return ``||W||^2 - f(a) = ||R Y^T||^2 - s2 |a|^2`` (n,), with half ``R Y^T``."""
     explained = np.einsum("ari,ari->i", half, half)
-    explained -= ridge * np.einsum("ki,ki->i", alpha, alpha)
+    explained -= problem.ridge * np.einsum("ki,ki->i", alpha, alpha)
+    return explained
 
+
+def _held(
+    problem: AffineProblem, c: NDArray, T: NDArray, camera: NDArray
+) -> tuple[NDArray, NDArray]:
+    """
+    Return ``H + s2 I`` (n_pairs, n), packed, and minus half the gradient (K, n).
+
+    T and the cameras are those of `_eliminated` for coefficients c (n_shapes, n).
+    """
     # H + s2 I, from M^T M
     images = np.einsum("cri,cri->ci", camera[ROWS, :], camera[COLUMNS, :])
-    held = problem.gram.energies(images)[len(alpha) + 1 :]
-    held[diagonal_of(held)] += ridge
-    # F_k^T, then R F_k^T for the Schur complement
-    F = np.einsum("kabi,bri->kari", T[1:], camera)
-    F -= P[1:]
-    slope = 0.5 * np.einsum("kari,ari->ki", P[1:] - F, camera) - ridge * alpha
-    F = np.einsum("abi,kbri->kari", R, F).reshape(len(alpha), 6, len(ridge))
-    return State(alpha, -explained, slope, held, held - packed_gram(F))
+    held = problem.gram.energies(images)[len(c) :]
+    held[diagonal_of(held)] += problem.ridge
+    # sum_l H_kl c_l = <B_k S^T + S B_k^T, M^T M> / 2
+    images *= HALVED
+    slope = np.einsum("kari,ari->ki", problem.cross[1:], camera)
+    slope -= np.einsum("kpi,pi->ki", T[1:], images)
+    slope -= problem.ridge * c[1:]
+    return held, slope
 
 
 def _first_step(problem: AffineProblem, alpha: NDArray) -> NDArray:
     """Return coefficients (K, n) after a step from alpha with the cameras held."""
-    state = problem.evaluate(np.ascontiguousarray(alpha))
-    return alpha + solve_positive(state.definite, state.slope)[0]
+    c = with_one(alpha)
+    T, _, _, camera = _eliminated(problem, c)
+    return alpha + solve_positive(*_held(problem, c, T, camera))[0]
 
 
 def _step_off_saddle(state: State, damping: NDArray) -> NDArray:
@@ -326,13 +338,14 @@ def _step_off_saddle(state: State, damping: NDArray) -> NDArray:
     return np.einsum("nab,nb->an", axes, along)
 
 
-def _inverse_hessian(state: State, most: float) -> NDArray:
+def _covariance(problem: AffineProblem, alpha: NDArray) -> NDArray:
     """
-    Return the inverse of the Schur complement, packed.
+    Return s2 times the inverse of the Schur complement at alpha (K, n): (n, K, K).
 
     It is positive definite at a minimum that the frame determines. Elsewhere a multiple
-    of ``H + s2 I`` is added that is large enough, and below the largest damping, most.
+    of ``H + s2 I`` is added that is large enough, and below the largest damping.
     """
+    state, most = problem.evaluate(alpha), problem.damping.largest
     inverse, _, positive = invert_positive(state.hessian)
     failing = in_lanes(np.flatnonzero(~positive))
     damping = 1.0
@@ -342,4 +355,5 @@ def _inverse_hessian(state: State, most: float) -> NDArray:
         inverse[..., failing], _, positive = invert_positive(matrix)
         failing = in_lanes(np.unique(failing[~positive]))
         damping *= 10.0
-    return inverse
+    inverse *= problem.ridge
+    return frames_first(unpacked(inverse))

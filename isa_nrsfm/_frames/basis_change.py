@@ -28,7 +28,7 @@ class FrameMap(NamedTuple):
         return cls(np.eye(n_components + 1), np.eye(3))
 
     def apply(
-        self, motion: NDArray, alpha: NDArray, covariance: NDArray
+        self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
         """
         Return cameras, coefficients and their standard deviations for the new shapes.
@@ -39,8 +39,8 @@ class FrameMap(NamedTuple):
             Cameras.
         alpha : ndarray of shape (n_frames, n_components)
             Coefficients.
-        covariance : ndarray of shape (n_frames, n_components, n_components)
-            Their covariances.
+        covariance : ndarray of shape (n_frames, n_components, n_components) or None
+            Their covariances; None where they are not known.
 
         Returns
         -------
@@ -49,14 +49,14 @@ class FrameMap(NamedTuple):
         alpha : ndarray of shape (n_frames, n_components)
             New coefficients.
         deviation : ndarray of shape (n_frames, n_components)
-            Their standard deviations, to first order.
+            Their standard deviations, to first order. NaN without covariances.
         """
         new, deviation, scale = self.coefficients(alpha, covariance)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
         return cameras, new, deviation
 
     def coefficients(
-        self, alpha: NDArray, covariance: NDArray
+        self, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
         """
         Return coefficients, their standard deviations and the scales of the cameras.
@@ -71,13 +71,15 @@ class FrameMap(NamedTuple):
         alpha : ndarray of shape (n_frames, n_components)
             New coefficients.
         deviation : ndarray of shape (n_frames, n_components)
-            Their standard deviations, to first order.
+            Their standard deviations, to first order. NaN without covariances.
         scale : ndarray of shape (n_frames,)
             Factors of the cameras.
         """
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
+        if covariance is None:
+            return new, np.full_like(new, np.nan), scale
         # d new / d alpha, times scale
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)

@@ -40,7 +40,6 @@ from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     inverse3,
     invert_positive,
-    pack3,
     pair_indices,
     unpack3,
     unpacked,
@@ -98,6 +97,7 @@ class CalibratedSearch:
         n_points: float,
         initial: NDArray,
         max_steps: int,
+        covariances: bool = True,
     ) -> FoundFrames:
         """
         Return the minima that frames reach from given coefficients.
@@ -115,6 +115,8 @@ class CalibratedSearch:
             of least squares for the shapes with these coefficients.
         max_steps : int
             The most steps.
+        covariances : bool, default=True
+            Whether covariances are wanted.
 
         Returns
         -------
@@ -126,7 +128,7 @@ class CalibratedSearch:
         M, converged = descend(problem, problem.evaluate(M), max_steps)
         M, better, reached = _better_reversed(problem, M, max_steps)
         converged[better] = reached[better]
-        return _found(problem, M, converged)
+        return _found(problem, M, converged, covariances)
 
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
@@ -280,7 +282,7 @@ def _first_cameras(problem: CalibratedProblem, alpha: NDArray) -> NDArray:
     seen = np.einsum("ki,kari->rai", c, products.cross)  # W S^T
     # Affine cameras of least squares, M = W S^T (S S^T)^-1
     T = products.gram.products(c)
-    inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, pack3(T)))
+    inverse = inverse3(0.5 * np.einsum("ki,kpi->pi", c, T))
     affine = frames_first(np.einsum("rbi,bai->rai", seen, inverse))
     starts = [nearest_calibrated(affine), _completed(affine)]
     if not problem.cameras.scaled:
@@ -354,7 +356,7 @@ def _coupling(
 ) -> NDArray:
     """Return ``<D_c, F_k>`` (p, K, n)."""
     products = problem.products
-    T = products.gram.products(posterior.c)[1:]
+    T = unpack3(products.gram.products(posterior.c)[1:])
     F = np.einsum("rbi,kbai->krai", M, T)
     F -= products.cross[1:].swapaxes(1, 2)
     D = problem.cameras.tangents(M)
@@ -419,10 +421,33 @@ def _state(
     return State(M, value, -gradient, definite, hessian)
 
 
-def _found(problem: CalibratedProblem, M: NDArray, converged: NDArray) -> FoundFrames:
+def _found(
+    problem: CalibratedProblem, M: NDArray, converged: NDArray, covariances: bool
+) -> FoundFrames:
     """Return the minima of a search from their cameras (2, 3, n)."""
-    noise = problem.noise
+    noise, n = problem.noise, M.shape[-1]
     posterior = _posterior(problem, M)
+    spreads = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
+    if covariances:
+        spreads = _covariances(problem, M, posterior)
+    return FoundFrames(
+        frames_first(M),
+        posterior.alpha.T,
+        *spreads,
+        posterior.objective,
+        np.maximum(posterior.residual(noise), 0.0),
+        converged,
+    )
+
+
+def _covariances(
+    problem: CalibratedProblem, M: NDArray, posterior: CoefficientPosterior
+) -> tuple[NDArray, NDArray]:
+    """Return the covariances of coefficients (n, K, K) and of rotations (n, 3, 3).
+
+    The cameras M (2, 3, n) are at a minimum.
+    """
+    noise = problem.noise
     state = _state(problem, M, posterior)
     # Covariance of the coefficients with the uncertainty of the camera, by the inverse
     # of the joint Hessian of both: s2 (Q + Q C^T Y^-1 C Q). C is the coupling, and Y
@@ -436,12 +461,4 @@ def _found(problem: CalibratedProblem, M: NDArray, converged: NDArray) -> FoundF
     inverse = unpacked(inverse)
     covariance = Q + np.einsum("kci,cdi,ldi->kli", through, inverse, through)
     covariance = unpacked(noise * covariance[pair_indices(len(Q))])  # symmetric
-    return FoundFrames(
-        frames_first(M),
-        posterior.alpha.T,
-        frames_first(covariance),
-        frames_first(noise * inverse[:3, :3]),
-        posterior.objective,
-        np.maximum(posterior.residual(noise), 0.0),
-        converged,
-    )
+    return frames_first(covariance), frames_first(noise * inverse[:3, :3])

@@ -103,7 +103,9 @@ class RigidFrames(NamedTuple):
             mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
         )
 
-    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+    def fit(
+        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+    ) -> FrameFit:
         """
         Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -113,6 +115,8 @@ class RigidFrames(NamedTuple):
             Tracks, in any place; NaN where a point is missing.
         sizes : ndarray of shape (n_frames,)
             Not used: the fit does not depend on the unit of a frame.
+        deviations : bool, default=True
+            Not used: there are none.
 
         Returns
         -------
@@ -253,7 +257,9 @@ class PosteriorFrames(NamedTuple):
         shapes = self.shapes[:, :, kept]
         return self._replace(shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
-    def fit(self, tracks: NDArray, sizes: NDArray) -> FrameFit:
+    def fit(
+        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+    ) -> FrameFit:
         """
         Return the most probable camera, position and coefficients.
 
@@ -263,6 +269,8 @@ class PosteriorFrames(NamedTuple):
             Tracks, in any place; NaN where a point is missing.
         sizes : ndarray of shape (n_frames,)
             Sizes of the frames.
+        deviations : bool, default=True
+            Whether standard deviations are wanted. They are NaN otherwise.
 
         Returns
         -------
@@ -270,7 +278,8 @@ class PosteriorFrames(NamedTuple):
             That of `fit_posterior`, in the gauge. With a robust loss the weights are
             those of the residuals of the fit.
         """
-        return self.shown(self.posterior(tracks / sizes[:, None, None]), sizes)
+        unit = tracks / sizes[:, None, None]
+        return self.shown(self.posterior(unit, covariances=deviations), sizes)
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> FrameFit:
         """
@@ -288,8 +297,11 @@ class PosteriorFrames(NamedTuple):
         FrameFit
             The same fit.
         """
+        covariance = posterior.covariance
         motion, alpha, deviation = self.gauge.apply(
-            posterior.motion, posterior.alpha, posterior.covariance
+            posterior.motion,
+            posterior.alpha,
+            covariance if covariance.shape[1] == len(self.shapes) - 1 else None,
         )
         translation = posterior.translation * sizes[:, None]
         return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
@@ -318,7 +330,10 @@ class PosteriorFrames(NamedTuple):
         )
 
     def posterior(
-        self, tracks: NDArray, options: FrameOptions = FRAME_OPTIONS
+        self,
+        tracks: NDArray,
+        options: FrameOptions = FRAME_OPTIONS,
+        covariances: bool = True,
     ) -> FramePosterior:
         """
         Return the fit of frames, before the gauge.
@@ -329,6 +344,8 @@ class PosteriorFrames(NamedTuple):
             Tracks of frames of size one.
         options : FrameOptions
             What steers the fit.
+        covariances : bool, default=True
+            Whether covariances are wanted.
 
         Returns
         -------
@@ -343,6 +360,7 @@ class PosteriorFrames(NamedTuple):
             shapes=self.shapes,
             noise_variance=self.noise_variance,
             camera=self.camera,
+            covariances=covariances,
             options=options,
         )
         if self.loss == "linear":

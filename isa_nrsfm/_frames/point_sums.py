@@ -13,6 +13,7 @@ arrays, so that each sum is one matrix product for all frames.
 """
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -64,12 +65,15 @@ class SharedGram:
     def __init__(self, pairs: NDArray) -> None:
         self.pairs = pairs
         index, multiplicity = _pair_index(len(pairs))
-        full = pairs[index]  # (n, n, 6)
         self._n_shapes = len(index)
         self._moments = multiplicity * pairs.T
         self._energies = pairs * TWICE
-        doubled = 2.0 * full.transpose(0, 2, 1)[:, UNPACKED]  # (n, 3, 3, n)
-        self._products = doubled.reshape(-1, self._n_shapes)
+        # Rows (k, ab) and columns l
+        full = 2.0 * pairs[index].transpose(0, 2, 1)  # (n, 6, n)
+        self._products = full.reshape(-1, self._n_shapes)
+        # Rows (k, a) and columns (l, b), for all shapes k but the mean
+        square = full[1:, UNPACKED].transpose(0, 1, 3, 2)  # (n - 1, 3, n, 3)
+        self._images = square.reshape(3 * len(square), 3 * len(full))
 
     def products(self, c: NDArray) -> NDArray:
         """
@@ -82,10 +86,32 @@ class SharedGram:
 
         Returns
         -------
-        ndarray of shape (n_shapes, 3, 3, n_frames)
-            ``B_k S_i^T + S_i B_k^T`` with ``S_i = sum_l c_il B_l``.
+        ndarray of shape (n_shapes, 6, n_frames)
+            ``B_k S_i^T + S_i B_k^T`` with ``S_i = sum_l c_il B_l``, packed.
         """
-        return (self._products @ c).reshape(-1, 3, 3, c.shape[-1])
+        return (self._products @ c).reshape(-1, 6, c.shape[-1])
+
+    def images(self, c: NDArray, products: NDArray, M: NDArray) -> NDArray:
+        """
+        Return the products with the basis shapes, seen by cameras.
+
+        Parameters
+        ----------
+        c : ndarray of shape (n_shapes, n_frames)
+            Coefficients of all shapes.
+        products : ndarray of shape (n_shapes, 6, n_frames)
+            `products` of c.
+        M : ndarray of shape (3, 2, n_frames)
+            Cameras, transposed.
+
+        Returns
+        -------
+        ndarray of shape (n_shapes - 1, 3, 2, n_frames)
+            ``(B_k S_i^T + S_i B_k^T) M_i^T``.
+        """
+        # One product of matrices: (B_k S^T + S B_k^T) M^T is linear in c (x) M.
+        seen = (c[:, None, None] * M).reshape(3 * self._n_shapes, -1)
+        return (self._images @ seen).reshape(self._n_shapes - 1, *M.shape)
 
     def moments(self, C: NDArray) -> NDArray:
         """
@@ -140,10 +166,18 @@ class FrameGram:
         self.pairs = pairs
         self._index, self._multiplicity = _pair_index(len(pairs))
 
+    @cached_property
+    def _full(self) -> NDArray:
+        """The matrices for all k and l (n_shapes, n_shapes, 6, n_frames)."""
+        return np.take(self.pairs, self._index, axis=0)
+
     def products(self, c: NDArray) -> NDArray:
-        """Return ``sum_l c_l (G_kl + G_kl^T)``."""
-        half = np.einsum("klai,li->kai", self.pairs[self._index], c)
-        return (2.0 * half)[:, UNPACKED]
+        """Return ``sum_l c_l (G_kl + G_kl^T)``, packed."""
+        return np.einsum("klai,li->kai", self._full, 2.0 * c)
+
+    def images(self, c: NDArray, products: NDArray, M: NDArray) -> NDArray:
+        """Return the products with the basis shapes, seen by cameras."""
+        return np.einsum("kabi,bri->kari", unpack3(products[1:]), M)
 
     def moments(self, C: NDArray) -> NDArray:
         """Return ``sum_kl C_kl G_kl``."""

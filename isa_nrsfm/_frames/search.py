@@ -19,10 +19,10 @@ class FoundFrames(NamedTuple):
         Coefficients.
     covariance : ndarray of shape (n_frames, n_components, n_components)
         Posterior covariance of the coefficients. It contains the uncertainty of the
-        camera.
+        camera. Of shape (n_frames, 0, 0) where covariances are not wanted.
     turn_covariance : ndarray of shape (n_frames, 3, 3)
         Posterior covariance of the rotation vectors w of ``M exp(hat(w))``, in radians
-        squared. NaN for affine cameras.
+        squared. NaN for affine cameras, and where covariances are not wanted.
     objective : ndarray of shape (n_frames,)
         ``||W - M S||^2 + s2 |a|^2``.
     residual : ndarray of shape (n_frames,)
@@ -69,12 +69,13 @@ class FrameSearch(Protocol):
         n_points: float,
         initial: NDArray,
         max_steps: int,
+        covariances: bool = True,
     ) -> FoundFrames:
         """
         Return the minima that frames reach from given coefficients.
 
         The noise variances are (n_frames,), the coefficients initial (n_frames,
-        n_components).
+        n_components). Covariances may be left out.
         """
 
     def rough_cameras(

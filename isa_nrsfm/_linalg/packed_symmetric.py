@@ -193,7 +193,8 @@ def unpacked(packed: NDArray) -> NDArray:
 def diagonal_of(packed: NDArray) -> NDArray:
     """Return the indices (k,) of the diagonal in packed matrices (n_pairs, ...)."""
     k = _size(packed)
-    return np.cumsum([0, *range(k, 1, -1)])[:k]
+    rows = np.arange(k)
+    return rows * (2 * k + 1 - rows) // 2
 
 
 def packed_gram(rows: NDArray) -> NDArray:
@@ -229,22 +230,14 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
-    k, n = b.shape
-    # Gaussian elimination, with the right side as the last entry of each row.
-    rows = [np.vstack(parts) for parts in zip(packed_rows(A), b, strict=True)]
-    diagonal = [row[0].copy() for row in rows]
-    positive = np.ones(n, dtype=bool)
-    room = np.empty((k, n))
-    for i, row in enumerate(rows):
-        scaled = row[1:] * _inverse_pivot(row[0], diagonal[i], positive)
-        for j in range(i + 1, k):
-            part = np.multiply(scaled[j - i - 1 :], row[j - i], out=room[: k + 1 - j])
-            rows[j] -= part
-        row[1:] = scaled
-    # Back substitution.
-    x = np.empty((k, n))
+    k = len(b)
+    rows, inverses, positive = _eliminated(A, b)
+    # Back substitution, column by column.
+    x = rows[:, k].copy()
     for i in range(k - 1, -1, -1):
-        x[i] = rows[i][-1] - np.einsum("jn,jn->n", rows[i][1:-1], x[i + 1 :])
+        x[i] *= inverses[i]
+        if i:
+            x[:i] -= rows[:i, i] * x[i]
     return x, positive
 
 
@@ -267,9 +260,74 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     positive : ndarray of bool, shape (n,)
         Whether all pivots are positive, that is, A is positive definite.
     """
-    work = A.copy()
-    log_determinant, positive = sweep(work)
-    return np.negative(work, out=work), log_determinant, positive
+    rows, inverses, positive = _eliminated(A)
+    k, n = inverses.shape
+    # With where=... NumPy rounds in another way beside those that are left out.
+    logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
+    # Back substitution for all right sides: ``A^-1 = D^-1 L^-T + (I - L) A^-1``, of
+    # which the first term is on and below the diagonal.
+    full = np.empty((k, k, n))
+    for i in range(k - 1, -1, -1):
+        full[i, i] = inverses[i]
+        if i < k - 1:
+            after = full[i, i + 1 :]
+            row = rows[i, i + 1 :] * -inverses[i]
+            np.einsum("mn,mjn->jn", row, full[i + 1 :, i + 1 :], out=after)
+            full[i + 1 :, i] = after
+            full[i, i] += np.einsum("mn,mn->n", row, after)
+    return full[pair_indices(k)], -logarithms.sum(axis=0), positive
+
+
+def _eliminated(
+    A: NDArray, b: NDArray | None = None
+) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return the factors of ``A = L^T D L``, with L unit upper triangular.
+
+    The matrices A are packed (n_pairs, n), the right sides b (k, n), if there are any.
+    Returned are D L (k, k, n), of which only the diagonal and what is above it counts,
+    or (k, k + 1, n) with ``L^-T b`` as the last column, the inverses of D (k, n), and
+    where all pivots are positive (n,). The inverse of one that is not is zero: its row
+    and its column do not count.
+    """
+    k, n = _size(A), A.shape[1]
+    smallest = SMALLEST_PIVOT * A[diagonal_of(A)]
+    rows, inverses = np.empty((k, k if b is None else k + 1, n)), np.empty((k, n))
+    # Nearly always all pivots are positive, and one look at the end is enough.
+    with np.errstate(all="ignore"):
+        _eliminate(A, b, rows, inverses)
+    pivots = rows.reshape(k * rows.shape[1], n)[:: rows.shape[1] + 1][:k]
+    positive = (pivots > smallest).all(axis=0)
+    if not positive.all():
+        _eliminate(A, b, rows, inverses, smallest)
+    return rows, inverses, positive
+
+
+def _eliminate(
+    A: NDArray,
+    b: NDArray | None,
+    rows: NDArray,
+    inverses: NDArray,
+    smallest: NDArray | None = None,
+) -> None:
+    """Set rows and inverses of `_eliminated`.
+
+    With the smallest pivots (k, n) those that are not above them are left out.
+    """
+    k = len(rows)
+    for i, row in enumerate(packed_rows(A)):
+        rest = rows[i, i:]
+        rest[: k - i] = row
+        if b is not None:
+            rest[k - i] = b[i]
+        if i:
+            # The sum over all rows before at once: one pass over the numbers.
+            rest -= np.einsum("jn,jcn->cn", rows[:i, i] * inverses[:i], rows[:i, i:])
+        if smallest is None:
+            np.divide(1.0, rest[0], out=inverses[i])
+        else:
+            kept = rest[0] > smallest[i]
+            inverses[i] = kept / np.where(kept, rest[0], 1.0)
 
 
 def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:

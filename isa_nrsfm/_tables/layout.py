@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._tables.visibility import (
-    centred_over_seen,
-    points_coincide,
+    CentredFrames,
     refuse_one_place,
     seen_points,
     zero_where_unseen,
@@ -96,13 +95,9 @@ def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
     ValueError
         If all seen points of a frame are equal, up to rounding.
     """
-    centred, translation, seen = centred_over_seen(tracks)
-    square = np.einsum("ijc,ijc->i", centred, centred)
-    coincide = points_coincide(square, translation, seen.sum(axis=1), tracks.dtype)
-    refuse_one_place(coincide, np.asarray(~seen.all(axis=1)))
-    if not seen.all():
-        centred[~seen] = np.nan
-    return centred, translation
+    frames = CentredFrames.of_tracks(tracks)
+    refuse_one_place(frames.in_one_place(), frames.n_seen < tracks.shape[1])
+    return frames.marked(), frames.translation
 
 
 def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:

@@ -46,6 +46,73 @@ class FrameReport(NamedTuple):
         return type(self)(*(part[frames] for part in self))
 
 
+class CentredFrames(NamedTuple):
+    """
+    Frames centred over the points that they show.
+
+    Attributes
+    ----------
+    centred : ndarray of shape (n_frames, n_points, 2)
+        Centred tracks in double precision, zero where a point is not seen.
+    translation : ndarray of shape (n_frames, 2)
+        Centroids of the seen points, NaN for frames without any.
+    seen : ndarray of bool, shape (n_frames, n_points)
+        Which points are seen.
+    n_seen : ndarray of int, shape (n_frames,)
+        How many they are.
+    square : ndarray of shape (n_frames,)
+        Sum of the squares of the centred coordinates.
+    dtype : dtype
+        Type of the numbers before centring.
+    """
+
+    centred: NDArray
+    translation: NDArray
+    seen: NDArray
+    n_seen: NDArray
+    square: NDArray
+    dtype: np.dtype
+
+    @classmethod
+    def of_tracks(cls, tracks: NDArray) -> Self:
+        """Centre tracks (n_frames, n_points, 2), NaN where a point is not seen."""
+        centred, translation, seen = centred_over_seen(tracks)
+        square = np.einsum("ijc,ijc->i", centred, centred)
+        return cls(
+            centred, translation, seen, seen.sum(axis=1), square, np.dtype(tracks.dtype)
+        )
+
+    def in_one_place(self) -> NDArray:
+        """Tell in which frames all seen points are equal, up to rounding."""
+        return points_coincide(self.square, self.translation, self.n_seen, self.dtype)
+
+    def on_line(self) -> NDArray:
+        """Tell which frames miss points and show the others on a line."""
+        return _collinear(self.centred, self.translation, self.seen, self.dtype)
+
+    def usable(self) -> NDArray:
+        """Tell which frames show enough, as `usable_frames`."""
+        enough = self.n_seen >= FEWEST_POINTS
+        return enough & ~self.in_one_place() & ~self.on_line()
+
+    def marked(self) -> NDArray:
+        """Return the centred tracks with NaN where a point is not seen, in place."""
+        if not self.seen.all():
+            self.centred[~self.seen] = np.nan
+        return self.centred
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames, all of them without a copy."""
+        if frames.all():
+            return self
+        parts = (part[frames] for part in self[:-1])
+        return type(self)(*parts, self.dtype)
+
+    def sizes(self) -> NDArray:
+        """Return the root mean squares of the seen coordinates (n_frames,)."""
+        return np.sqrt(self.square / (2 * self.n_seen))
+
+
 def seen_points(tracks: NDArray) -> NDArray:
     """
     Tell which points are seen.
@@ -80,17 +147,15 @@ def report_frames(tracks: NDArray) -> FrameReport:
     FrameReport
         The report.
     """
-    centred, translation, seen = centred_over_seen(tracks)
-    square = np.einsum("ijc,ijc->i", centred, centred)
-    n_seen = seen.sum(axis=1)
-    filled = zero_where_unseen(tracks, seen)
+    frames = CentredFrames.of_tracks(tracks)
+    filled = zero_where_unseen(tracks, frames.seen)
     return FrameReport(
-        translation,
-        square,
+        frames.translation,
+        frames.square,
         np.maximum(filled.max(axis=(1, 2)), -filled.min(axis=(1, 2))),
-        n_seen,
-        points_coincide(square, translation, n_seen, tracks.dtype),
-        _collinear(centred, translation, seen, tracks.dtype),
+        frames.n_seen,
+        frames.in_one_place(),
+        frames.on_line(),
     )
 
 
@@ -112,9 +177,7 @@ def usable_frames(tracks: NDArray) -> NDArray:
         it is rather that they lie on a line of the object, which leaves the camera
         free to turn around it.
     """
-    report = report_frames(tracks)
-    enough = report.n_seen >= FEWEST_POINTS
-    return enough & ~report.in_one_place & ~report.on_line
+    return CentredFrames.of_tracks(tracks).usable()
 
 
 def check_frames(report: FrameReport, n_points: int) -> None:
