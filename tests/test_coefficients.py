@@ -10,7 +10,7 @@ from scenes import random_rotation
 
 from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
-from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
+from isa_nrsfm._frames.point_sums import ShapeProducts, frame_sums, frame_tracks
 from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first
 
@@ -24,7 +24,9 @@ class Scene(NamedTuple):
     weights: NDArray | None
 
     def posterior(self, noise=NOISE, **options):
-        products = frame_sums(frame_tracks(self.tracks, self.weights), self.shapes)
+        products = frame_sums(
+            frame_tracks(self.tracks, self.weights), ShapeProducts(self.shapes)
+        )
         return coefficient_posterior(products, self.M, noise, **options)
 
 

@@ -10,7 +10,12 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.affine_newton import affine_problem
 from isa_nrsfm._frames.damped_newton import descend, newton_step
 from isa_nrsfm._frames.options import FRAME_OPTIONS
-from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks, whitened
+from isa_nrsfm._frames.point_sums import (
+    ShapeProducts,
+    frame_sums,
+    frame_tracks,
+    whitened,
+)
 from isa_nrsfm._frames.posterior import fit_posterior, spread_starts
 from isa_nrsfm._linalg.packed_symmetric import unpacked
 
@@ -66,7 +71,7 @@ def assert_same_fits(got, expected, atol=1e-9):
 def problem_of(tracks, shapes, variance, weights=None):
     """Return the objectives of the search, in the coordinates of white shapes."""
     white, _ = whitened(shapes)
-    products = frame_sums(frame_tracks(tracks, weights), white)
+    products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(white))
     variance = np.full(len(tracks), variance)
     return affine_problem(products, variance, shapes.shape[2])
 

@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._frames.point_sums import (
     FrameGram,
+    ShapeProducts,
     SharedGram,
     determines_camera,
     frame_sums,
@@ -42,7 +43,7 @@ def plain_gram(shapes, weights):
 class TestProducts:
     def test_by_definition(self):
         tracks, shapes, weights = random_problem(0)
-        products = frame_sums(frame_tracks(tracks, weights), shapes)
+        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
         first, second = pair_indices(3)
         for i, w in enumerate(weights):
             mean = w @ tracks[i] / w.sum()
@@ -59,8 +60,10 @@ class TestProducts:
 
     def test_complete_frames_share_a_gram_matrix(self):
         tracks, shapes, weights = random_problem(0)
-        shared = frame_sums(frame_tracks(tracks), shapes)
-        own = frame_sums(frame_tracks(tracks, np.ones_like(weights)), shapes)
+        shared = frame_sums(frame_tracks(tracks), ShapeProducts(shapes))
+        own = frame_sums(
+            frame_tracks(tracks, np.ones_like(weights)), ShapeProducts(shapes)
+        )
         assert isinstance(shared.gram, SharedGram)
         assert isinstance(own.gram, FrameGram)
         pairs = np.broadcast_to(shared.gram.pairs[..., None], own.gram.pairs.shape)
@@ -72,16 +75,16 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         hidden = np.where(weights[..., None] == 0, np.nan, tracks)
         hidden[0, 0, 0], weights[0, 0] = np.inf, 0.0
-        got = frame_sums(frame_tracks(hidden, weights), shapes)
+        got = frame_sums(frame_tracks(hidden, weights), ShapeProducts(shapes))
         tracks[0, 0] = 5.0
-        expected = frame_sums(frame_tracks(tracks, weights), shapes)
+        expected = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
         assert_array_equal(got.cross, expected.cross)
         assert_array_equal(got.energy, expected.energy)
 
     def test_frame_without_points(self):
         tracks, shapes, weights = random_problem(0)
         tracks[1], weights[1] = np.nan, 0.0
-        products = frame_sums(frame_tracks(tracks, weights), shapes)
+        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
         for each in (products.cross, products.centroid, products.gram.pairs):
             assert_array_equal(each[..., 1], 0)
             assert np.isfinite(each).all()
@@ -89,9 +92,9 @@ class TestProducts:
     def test_position_of_the_tracks(self):
         tracks, shapes, weights = random_problem(0)
         for w in (None, weights):
-            here = frame_sums(frame_tracks(tracks, w), shapes)
+            here = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes))
             moved = tracks + np.array([1e3, -1e4])
-            there = frame_sums(frame_tracks(moved, w), shapes)
+            there = frame_sums(frame_tracks(moved, w), ShapeProducts(shapes))
             assert_allclose(there.cross, here.cross, atol=1e-10)
             assert_allclose(there.energy, here.energy, rtol=1e-10)
 
@@ -101,9 +104,9 @@ class TestProducts:
             columns = None if w is None else np.asfortranarray(w)
             got = frame_sums(
                 frame_tracks(np.asfortranarray(tracks), columns),
-                np.asfortranarray(shapes),
+                ShapeProducts(np.asfortranarray(shapes)),
             )
-            expected = frame_sums(frame_tracks(tracks, w), shapes)
+            expected = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes))
             assert_array_equal(got.cross, expected.cross)
             assert_array_equal(got.gram.pairs, expected.gram.pairs)
 
@@ -112,9 +115,9 @@ class TestProducts:
         tracks, shapes, weights = random_problem(0)
         some = np.array([4, 1, 1])
         w = weights if weighted else None
-        taken = frame_sums(frame_tracks(tracks, w), shapes).take(some)
+        taken = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes)).take(some)
         w = weights[some] if weighted else None
-        expected = frame_sums(frame_tracks(tracks[some], w), shapes)
+        expected = frame_sums(frame_tracks(tracks[some], w), ShapeProducts(shapes))
         for got, want in zip(taken, expected, strict=True):
             if isinstance(got, np.ndarray):
                 assert_allclose(got, want, rtol=1e-13, atol=1e-14)
@@ -129,7 +132,7 @@ class TestGram:
             weights = np.ones_like(weights)
         given = frame_tracks(tracks, weights if weighted else None)
         plain = np.stack([plain_gram(shapes, w) for w in weights], axis=-1)
-        return frame_sums(given, shapes).gram, plain
+        return frame_sums(given, ShapeProducts(shapes)).gram, plain
 
     def test_products(self, weighted):
         gram, G = self.gram(weighted)
@@ -200,7 +203,7 @@ class TestDeterminesCamera:
     def answer(self, shapes, weights):
         white, _ = whitened(shapes)
         tracks = np.zeros((*weights.shape, 2))
-        products = frame_sums(frame_tracks(tracks, weights), white)
+        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(white))
         return determines_camera(products, white[0])
 
     def test_number_of_points(self):

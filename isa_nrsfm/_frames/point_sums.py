@@ -348,18 +348,39 @@ def _share(weight: NDArray) -> NDArray:
     return np.divide(1.0, weight, where=weight > 0, out=np.zeros_like(weight))
 
 
-def shared_gram(shapes: NDArray) -> SharedGram:
-    """Return the Gram matrix of shapes (n_shapes, 3, n_points) with centred rows."""
-    n_shapes, _, n_points = shapes.shape
-    rows = shapes.reshape(-1, n_points)
-    blocks = (rows @ rows.T).reshape(n_shapes, 3, n_shapes, 3).transpose(0, 2, 1, 3)
-    pairs = blocks[pair_indices(n_shapes)]
-    return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
+class ShapeProducts:
+    """
+    Products of shapes that all frames share, each computed when it is first needed.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_shapes, 3, n_points)
+        Mean shape and basis shapes, rows centred.
+    """
+
+    def __init__(self, shapes: NDArray):
+        self.shapes = np.ascontiguousarray(shapes, dtype=np.float64)
+
+    @property
+    def rows(self) -> NDArray:
+        """The shapes as rows (3 n_shapes, n_points)."""
+        return self.shapes.reshape(-1, self.shapes.shape[-1])
+
+    @cached_property
+    def gram(self) -> SharedGram:
+        """The Gram matrix of the shapes."""
+        n_shapes = len(self.shapes)
+        blocks = (self.rows @ self.rows.T).reshape(n_shapes, 3, n_shapes, 3)
+        pairs = blocks.transpose(0, 2, 1, 3)[pair_indices(n_shapes)]
+        return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
+
+    @cached_property
+    def pairs(self) -> NDArray:
+        """The products ``b_kj b_lj^T`` of each point, (6 n_pairs, n_points)."""
+        return _pair_products(self.shapes).reshape(-1, self.shapes.shape[-1])
 
 
-def frame_sums(
-    tracks: FrameTracks, shapes: NDArray, gram: SharedGram | None = None
-) -> FrameSums:
+def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
     """
     Return the sums over the points of frames.
 
@@ -367,10 +388,8 @@ def frame_sums(
     ----------
     tracks : FrameTracks
         The frames.
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes, rows centred.
-    gram : SharedGram, optional
-        Gram matrix of the shapes, if it has been computed already.
+    shapes : ShapeProducts
+        Mean shape and basis shapes.
 
     Returns
     -------
@@ -378,16 +397,14 @@ def frame_sums(
         With a `SharedGram` where all weights are 1, a `FrameGram` otherwise.
     """
     weighted, W, centroid, weight, energy = tracks
-    n_shapes, _, n_points = shapes.shape
-    rows = np.ascontiguousarray(shapes, dtype=np.float64).reshape(-1, n_points)
+    n_shapes, _, n_points = shapes.shapes.shape
+    rows = shapes.rows
     cross = (rows @ weighted.reshape(n_points, -1)).reshape(n_shapes, 3, 2, -1)
     if W is None:
         means = np.zeros((n_shapes, 3, len(weight)))
-        shared = shared_gram(shapes) if gram is None else gram
-        return FrameSums(cross, shared, means, centroid, weight, energy)
+        return FrameSums(cross, shapes.gram, means, centroid, weight, energy)
     means = ((rows @ W) * _share(weight)).reshape(n_shapes, 3, -1)
-    products = _pair_products(rows.reshape(shapes.shape))
-    pairs = (products.reshape(-1, n_points) @ W).reshape(-1, 6, len(weight))
+    pairs = (shapes.pairs @ W).reshape(-1, 6, len(weight))
     # G = sum_j w b b^T - weight mean mean^T. As the rows are centred over all points
     # the second term is small: no cancellation.
     pairs -= _pair_products(means * np.sqrt(weight))

@@ -18,10 +18,10 @@ from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import (
     FrameSums,
     FrameTracks,
+    ShapeProducts,
     determines_camera,
     frame_sums,
     frame_tracks,
-    shared_gram,
 )
 from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
@@ -271,17 +271,17 @@ class _Tracks(NamedTuple):
         if weights is not None:
             complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
-        gram = shared_gram(shapes) if len(frames) else None
+        shared = ShapeProducts(shapes)
         for first in range(0, len(frames), options.complete_block):
             block = in_lanes(frames[first : first + options.complete_block])
-            yield block, frame_sums(frame_tracks(tracks[block]), shapes, gram)
+            yield block, frame_sums(frame_tracks(tracks[block]), shared)
         if weights is None:
             return
         frames = np.flatnonzero(~complete)
         for first in range(0, len(frames), options.weighted_block):
             block = in_lanes(frames[first : first + options.weighted_block])
             part = frame_tracks(tracks[block], weights[block])
-            yield _determined(block, frame_sums(part, shapes), shapes)
+            yield _determined(block, frame_sums(part, shared), shapes)
 
 
 class _Prepared(NamedTuple):
@@ -311,10 +311,11 @@ class _Prepared(NamedTuple):
         complete = self.frames.weights is None
         options = self.options
         length = options.complete_block if complete else options.weighted_block
+        shared = ShapeProducts(shapes)
         for first in range(0, len(self.weight), length):
             last = min(first + length, len(self.weight))
             block = in_lanes(np.arange(first, last))
-            products = frame_sums(self.frames.take(block), shapes)
+            products = frame_sums(self.frames.take(block), shared)
             yield (
                 (block, products) if complete else _determined(block, products, shapes)
             )

@@ -35,10 +35,9 @@ from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FrameTracks,
-    SharedGram,
+    ShapeProducts,
     frame_sums,
     frame_tracks,
-    shared_gram,
 )
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
@@ -226,8 +225,7 @@ class MarginalLikelihood:
         """Return the function of a block and its cameras that computes the terms."""
         return partial(
             _block_terms,
-            shapes=shapes,
-            gram=shared_gram(shapes),
+            shapes=ShapeProducts(shapes),
             noise=noise,
             penalty=self.penalty,
             tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
@@ -276,8 +274,7 @@ def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]
 def _block_terms(
     block: FrameTracks,
     motion: NDArray,
-    shapes: NDArray,
-    gram: SharedGram,
+    shapes: ShapeProducts,
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
@@ -285,7 +282,7 @@ def _block_terms(
     """Return the terms of a block, summed over pieces whose matrices fit the cache."""
     M = frames_last(motion)
     parts = [
-        _frame_terms(piece, shapes, gram, M[:, :, frames], noise, penalty, tiny_noise)
+        _frame_terms(piece, shapes, M[:, :, frames], noise, penalty, tiny_noise)
         for frames, piece in block.pieces(BLOCK_FRAMES)
     ]
     if len(parts) == 1:
@@ -306,8 +303,7 @@ def _block_terms(
 
 def _frame_terms(
     block: FrameTracks,
-    shapes: NDArray,
-    gram: SharedGram,
+    shapes: ShapeProducts,
     M: NDArray,
     noise: float,
     penalty: NDArray | float,
@@ -320,8 +316,8 @@ def _frame_terms(
     ``2 / s2 curvature B`` of the gradient by the shapes. The curvature by the shapes is
     packed: (n_pairs, 6, n_points or 1).
     """
-    n_shapes, _, n_points = shapes.shape
-    products = frame_sums(block, shapes, gram)
+    n_shapes, _, n_points = shapes.shapes.shape
+    products = frame_sums(block, shapes)
     posterior = coefficient_posterior(products, M, noise, refined=tiny_noise)
     c, alpha = posterior.c, posterior.alpha
     value = np.sum(posterior.objective / noise + posterior.log_determinant)
@@ -352,7 +348,7 @@ def _frame_terms(
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
     return LikelihoodTerms(
         float(value),
-        (-2 / noise) * shape_gradient.reshape(shapes.shape),
+        (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape),
         frames_first((2 / noise) * G),
         -(residual + spread) / noise,
         shape_curvature,
