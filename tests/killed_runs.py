@@ -1,4 +1,4 @@
-"""Kill forks of this process at each operation on a file, and look at the folder."""
+"""Kill forks of this process at operations on files, and look at the folder."""
 
 import contextlib
 import io
@@ -16,7 +16,7 @@ import pandas as pd
 from disk_faults import disk_faults, leftovers, readable
 from fit_runs import fit, whole_run, write_landmarks
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.io import write_table
 
 
@@ -30,28 +30,28 @@ def in_a_fork(act):
     os._exit(0)
 
 
-def every_kill(folder, prepare, act, check):
-    """Kill an act at each operation on files of a folder; return how often."""
+def every_kill(folder, prepare, act, check, stride=1):
+    """Kill an act at every so many-th operation on files; return how often."""
 
     def killed(at):
         with disk_faults(folder, "killed", at) as faults:
             act()
         assert not faults.struck
 
-    for at in itertools.count(1):
+    for n_killed, at in enumerate(itertools.count(1, stride)):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         prepare()
         before = readable(folder)
         if in_a_fork(lambda at=at: killed(at)) != signal.SIGKILL:
-            return at - 1
+            return n_killed
         check(before, readable(folder))
-        if at % 5 == 0:  # the next run removes what is left
+        if n_killed % 5 == 0:  # the next run removes what is left
             assert in_a_fork(act) == 0
             assert leftovers(folder) == [], at
 
 
-def kill_fits(folder, *options):
+def kill_fits(folder, stride, *options):
     """Kill runs of seed 2 into a folder with one of seed 1."""
     landmarks, old = folder.with_name("t.csv"), folder.with_name("old")
     write_landmarks(landmarks)
@@ -68,7 +68,11 @@ def kill_fits(folder, *options):
 
     seeds = []
     n_killed = every_kill(
-        folder, lambda: shutil.copytree(old, folder, dirs_exist_ok=True), act, check
+        folder,
+        lambda: shutil.copytree(old, folder, dirs_exist_ok=True),
+        act,
+        check,
+        stride,
     )
     assert set(seeds) == {1, 2}
     return n_killed
@@ -97,21 +101,22 @@ def kill_kept(folder):
     def act():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            AffineNRSfM(1, random_state=0, max_iter=3, keep_frames=folder).fit(X)
+            quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+            AffineNRSfM(1, keep_frames=folder, **quick).fit(X)
 
     def check(before, after):
         assert before.items() <= after.items()
         assert len(after) in (len(before), len(before) + 4)
 
-    return every_kill(folder, act, act, check)
+    return every_kill(folder, act, act, check, stride=3)
 
 
 if __name__ == "__main__":
     matplotlib.use("Agg")
     place, what = Path(sys.argv[1], "out"), sys.argv[2]
     kills = {
-        "fit": lambda: kill_fits(place, "--no-figures"),
-        "fit with figures": lambda: kill_fits(place),
+        "fit": lambda: kill_fits(place, 7, "--no-figures"),
+        "fit with figures": lambda: kill_fits(place, 16),
         "write_table": lambda: kill_writes(place),
         "kept": lambda: kill_kept(place),
     }

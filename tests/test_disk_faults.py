@@ -108,12 +108,14 @@ WRITERS = {
 }
 
 
-def every_fault(folder, strike, prepare, act):
+def every_fault(folder, strike, prepare, act, stride=1):
     """Let each operation of an act fail in turn, until there is none more.
 
-    Yield what was raised, what the folder held before, and the operations.
+    With a stride it is each so many-th, and others of them for the next strike. Yield
+    what was raised, what the folder held before, and the operations.
     """
-    for at in itertools.count(1):
+    first = 1 + list(STRIKES).index(strike) % stride
+    for at in itertools.count(first, stride):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         prepare()
@@ -126,7 +128,7 @@ def every_fault(folder, strike, prepare, act):
                 raised = error
         if not faults.struck:
             assert raised is None
-            assert at > 1
+            assert at > first
             return
         yield raised, before, faults.operations
 
@@ -221,7 +223,8 @@ def small_table():
 class TestKeepFrames:
     @staticmethod
     def estimator(folder, **params):
-        return AffineNRSfM(1, random_state=0, keep_frames=folder, **params)
+        quick = {"refinement": None, "random_state": 0}
+        return AffineNRSfM(1, keep_frames=folder, **quick, **params)
 
     def test_a_full_disk_is_no_fit(self, tmp_path, table):
         folder = tmp_path / "kept"
@@ -248,7 +251,11 @@ class TestKeepFrames:
         first = self.estimator(folder)
         second = self.estimator(folder)
         for raised, before, operations in every_fault(
-            folder, strike, lambda: first.fit(table), lambda: second.fit(table[:30])
+            folder,
+            strike,
+            lambda: first.fit(table),
+            lambda: second.fit(table[:30]),
+            stride=2,
         ):
             assert leftovers(folder) == [], operations
             after = readable(folder)
@@ -348,14 +355,16 @@ def without_links():
 class TestFit:
     """Runs of seed 2 into a folder that has one of seed 1, or nothing."""
 
-    def check(self, capsys, landmarks, folder, strike, prepare, *options):
+    def check(self, capsys, landmarks, folder, strike, prepare, stride, *options):
         codes = []
 
         def run():
             codes.append(fit(landmarks, folder, 2, *options))
 
         found = set()
-        for raised, before, operations in every_fault(folder, strike, prepare, run):
+        for raised, before, operations in every_fault(
+            folder, strike, prepare, run, stride
+        ):
             err = capsys.readouterr().err
             assert raised is None
             assert leftovers(folder) == [], operations[-3:]
@@ -383,6 +392,7 @@ class TestFit:
             folder,
             strike,
             lambda: copied(old_run, folder),
+            4,
             "--no-figures",
         )
         code = 130 if "interrupted" in strike else 1
@@ -399,6 +409,7 @@ class TestFit:
                 folder,
                 "disk broken",
                 lambda: copied(old_run, folder),
+                4,
                 "--no-figures",
             )
         assert found == {(1, 1), (0, 2)}
@@ -406,7 +417,7 @@ class TestFit:
     @pytest.mark.slow
     def test_with_figures_into_an_empty_folder(self, capsys, landmarks, tmp_path):
         folder = tmp_path / "out"
-        found = self.check(capsys, landmarks, folder, "disk full", lambda: None)
+        found = self.check(capsys, landmarks, folder, "disk full", lambda: None, 10)
         assert (1, None) in found
         assert found <= {(1, None), (0, 2)}
 
@@ -546,7 +557,7 @@ class TestRunsThatAreMixed:
 @pytest.mark.subprocess
 @pytest.mark.parametrize("what", ["fit", "fit with figures", "write_table", "kept"])
 def test_processes_that_are_killed(tmp_path, what):
-    # Forks of one process, which has no threads, are killed at each operation.
+    # Forks of one process, which has no threads, are killed at operations on files.
     done = subprocess.run(
         [sys.executable, HERE / "killed_runs.py", tmp_path, what],
         capture_output=True,
