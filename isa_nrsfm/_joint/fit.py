@@ -244,7 +244,7 @@ def fit_jointly(
     # Further directions, then the points that are seen, and robust weights
     if ready.wide:
         result, problem = in_all_points(result, problem, completed, refined)
-    if ready.wide and ready.seen is not None:
+    if ready.seen is not None:
         shapes = problem.frames.points(result.state.shapes)
         problem = problem.with_frames(ready.seen)
         result = refined(problem, result.state._replace(shapes=shapes))
@@ -317,7 +317,7 @@ class _Ready(NamedTuple):
 
     problems: list[JointProblem]  # of larger and larger samples, and of all frames
     wide: bool  # whether they are of completed frames, given by directions
-    seen: JointFrames | None  # by their points; None where directions tell all
+    seen: JointFrames | None  # if they do not tell all, frames by seen points
     left_out: NDArray | None  # (n_frames, n_points), outliers; robust losses only
 
 
@@ -342,14 +342,13 @@ def _ready(
         none = np.zeros((n_frames, n_points), dtype=bool)
         left_out = none if outliers is None else outliers
     # Many points: completed frames, given by directions, before those that are seen
-    wide = has_many_points(n_points, n_shapes, options.many_points)
-    seen, directions = None, leading_directions(factors)
-    if not (wide and complete and left_out is None):
-        seen = _seen_frames(rows, complete, left_out)
-    if wide or seen is None:
-        frames = JointFrames.from_directions(completed, directions)
+    wide, seen = has_many_points(n_points, n_shapes, options.many_points), None
+    if wide:
+        frames = JointFrames.from_directions(completed, leading_directions(factors))
+        if not complete or left_out is not None:
+            seen = _seen_frames(rows, complete, left_out)
     else:
-        frames = seen
+        frames = _seen_frames(rows, complete, left_out)
     small = n_frames <= options.few_frames
     steps = steps._replace(effort=options.small if small else options.large)
     problem = JointProblem(frames, steps, 0.0, options)
