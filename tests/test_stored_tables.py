@@ -118,18 +118,17 @@ class TestFit:
             )
 
     @pytest.mark.parametrize("loss", slow_after(1, ["huber", "cauchy"]))
-    @pytest.mark.parametrize("limits", [Limits(), SAMPLED], ids=["few", "sampled"])
-    def test_robust_losses(self, tmp_path, loss, limits):
+    @pytest.mark.parametrize("limits", slow_after(1, [SAMPLED, Limits()]))
+    @pytest.mark.parametrize("megabytes", slow_after(1, [0.1, 0.02, 1000]))
+    def test_robust_losses(self, tmp_path, loss, limits, megabytes):
         X = table(0.1)
         rng = np.random.default_rng(1)
         wrong = np.repeat(rng.random((150, 20)) < 0.05, 2, axis=1)
         X = np.where(wrong, X + X[np.isfinite(X)].std() * rng.normal(size=X.shape), X)
         X[40, :2] = 1e6  # a point that is no part of its frame
         expected = estimator(limits, loss=loss).fit(X)
-        stored = memmap(X, tmp_path)
-        for megabytes in MEMORIES:
-            got = estimator(limits, loss=loss, working_memory=megabytes).fit(stored)
-            assert_same_model(got, expected)
+        got = estimator(limits, loss=loss, working_memory=megabytes)
+        assert_same_model(got.fit(memmap(X, tmp_path)), expected)
         # The outliers do not spoil it.
         clean = estimator(limits).fit(table(0.1))
         seen = np.isfinite(X) & ~wrong
@@ -147,7 +146,8 @@ class TestFit:
         got = estimator(KRYLOV, working_memory=1).fit(memmap(X, tmp_path))
         assert_same_model(got, expected)
 
-    @pytest.mark.parametrize("loss", slow_after(1, ["linear", "huber"]))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("loss", ["linear", "huber"])
     def test_of_many_points_of_which_some_are_missing(self, tmp_path, loss):
         # Completed frames along directions first: the end is that of the seen points.
         X, joint = table(0.1, n_points=300), Limits().joint
