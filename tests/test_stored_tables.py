@@ -150,13 +150,13 @@ class TestFit:
     @pytest.mark.parametrize("loss", ["linear", "huber"])
     def test_of_many_points_of_which_some_are_missing(self, tmp_path, loss):
         # Completed frames along directions first: the end is that of the seen points.
-        X, joint = table(0.1, n_points=300), Limits().joint
+        X, joint = table(0.1, n_points=210), Limits().joint
         few = joint._replace(many_points=joint.many_points._replace(least_points=999))
         at_once = estimator(Limits()._replace(joint=few), loss=loss, tol=1e-4).fit(X)
         model = estimator(loss=loss, tol=1e-4).fit(X)
         assert_allclose(model.basis_, at_once.basis_, rtol=0, atol=1e-4)
         assert_allclose(model.alpha_, at_once.alpha_, rtol=0, atol=1e-3)
-        got = estimator(loss=loss, tol=1e-4, working_memory=0.2)
+        got = estimator(loss=loss, tol=1e-4, working_memory=1)
         assert_same_model(got.fit(memmap(X, tmp_path)), model)
 
     @pytest.mark.parametrize("kind", slow_after(1, ["npy", "parquet"]))
