@@ -115,8 +115,8 @@ def test_docstrings_are_complete(name):
     item = public_objects().get(name)
     if hasattr(item, "_fields"):
         # The fields of a named tuple may be documented as attributes.
-        sections = item.__doc__.partition("Attributes\n")[2]
-        if all(f"    {field} : " in sections for field in item._fields):
+        sections = inspect.getdoc(item).partition("\nAttributes\n")[2]
+        if all(f"\n{field} : " in sections for field in item._fields):
             errors = [e for e in errors if e[0] != "PR01"]
     assert errors == []
 

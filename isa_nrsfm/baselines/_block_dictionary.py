@@ -248,7 +248,8 @@ def _reweighted_ridge(
             continue
         size = max(sparsity, int(KEPT * size))
         kept = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :size], axis=1)
-        chosen, weights = (np.take_along_axis(a, kept, 1) for a in (chosen, weights))
+        chosen = np.take_along_axis(chosen, kept, axis=1)
+        weights = np.take_along_axis(weights, kept, axis=1)
         right = np.take_along_axis(right, kept[..., None, None], 1)
     # At the end of the reweighting the norm of a block is ridge over that of its
     # product with the residual, which is less than one: a smaller one is vanishing.
