@@ -5,6 +5,9 @@ matrix. Complete frames with many points are given by their products with direct
 first these are the directions of the factorisation. One step of expectation
 maximisation in all points then gives shapes that may leave their span. The directions
 that it needs are added, and the fit goes on, until such a step gains nothing.
+
+Frames with missing points are filled in for that. The result is a start for steps with
+the points that are seen.
 """
 
 from collections.abc import Callable
