@@ -16,6 +16,7 @@ from isa_nrsfm._joint import problem as problem_module, reweighting
 from isa_nrsfm._joint.fit import (
     JointFit,
     Spectrum,
+    Start,
     count_components,
     fit_jointly,
 )
@@ -197,6 +198,42 @@ class TestFit:
         assert np.ptp(ends) < 0.05 * len(tracks)
         for result in results:
             assert affine_shape_error(truth, frames_of(result, tracks)[1]) < 0.02
+
+
+class TestGivenStarts:
+    """The fit from shapes of a similar table, instead of a search for starts."""
+
+    def steps_and_fit(self, tracks, *starts):
+        steps = []
+        found = fitted(tracks, starts=starts, on_step=lambda: steps.append(1))
+        return len(steps), found
+
+    def test_the_better_one_is_taken_whatever_the_order(self):
+        tracks, _ = random_table(seed=1)
+        known = fitted(random_table(seed=1, deviation=0.06)[0])
+        good = Start(known.shapes, known.noise_variance)
+        # A basis shape of zero stays zero: from there the fit cannot catch up.
+        rng = np.random.default_rng(0)
+        shapes = known.shapes + known.shapes.std() * rng.normal(size=(3, 3, 40))
+        shapes -= shapes.mean(axis=2, keepdims=True)
+        poor = Start(shapes * np.array([1, 1, 0])[:, None, None], 0.01)
+        n_good, alone = self.steps_and_fit(tracks, good)
+        n_poor, _ = self.steps_and_fit(tracks, poor)
+        for starts in [(good, poor), (poor, good)]:
+            _, found = self.steps_and_fit(tracks, *starts)
+            assert_allclose(found.history[-1], alone.history[-1], rtol=1e-4)
+        # After some steps it is dropped.
+        n_both, _ = self.steps_and_fit(tracks, good, poor)
+        assert n_both - n_good <= JOINT_OPTIONS.starts.catching_up < n_poor
+
+    def test_calibrated_cameras_go_before_affine_ones(self):
+        tracks, _ = random_table(seed=1)
+        known = fitted(tracks)
+        start = Start(known.shapes, known.noise_variance)
+        _, plainly = self.steps_and_fit(tracks, start)
+        _, first = self.steps_and_fit(tracks, start._replace(calibrated_first=True))
+        assert_allclose(first.history[-1], plainly.history[-1], rtol=1e-4)
+        assert first.history[0] > plainly.history[0]
 
 
 class TestSpectrum:

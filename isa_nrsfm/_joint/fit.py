@@ -419,20 +419,39 @@ def _continued_fit(
     """
     Return the fit from the best of given starts, NaN, and that start.
 
-    The third number would be the `camera_noise_ratio`, which needs both camera models.
+    The first start is fitted. Each other one goes on only if it can catch up: it may
+    not lack more, after some steps, than the second half of them gained. The second
+    number would be the `camera_noise_ratio`, which needs both camera models.
     """
-    cameras, calibrated = CAMERAS[camera], CAMERAS["weak_perspective"]
-    fit = _calibrated_fit if cameras.calibrated else _refined
-    fits = []
+    cameras = CAMERAS[camera]
+    n_steps = min(problem.options.starts.catching_up, problem.steps.max_iter)
+    fitted = _calibrated_fit if cameras.calibrated else _refined
+    fits: list[tuple[JointResult, float, JointState]] = []
     for start in starts:
-        shapes = problem.frames.coordinates(start.shapes)
-        state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
-        if start.calibrated_first and not cameras.calibrated:
-            state = problem.aligned(state, "weak_perspective")
-            state = problem.refined(state, calibrated).state
-        state = problem.aligned(state, camera)
-        fits.append((fit(problem, state, cameras), np.nan, state))
+        state = given = _aligned_start(problem, start, camera)
+        if fits:
+            tried = _refined(problem, state, cameras, max_iter=n_steps)
+            history = tried.history
+            gained = history[len(history) // 2] - history[-1]
+            least = min(result.history[-1] for result, *_ in fits)
+            if history[-1] - least > gained:
+                continue
+            state = tried.state
+        fits.append((fitted(problem, state, cameras), np.nan, given))
     return min(fits, key=lambda found: found[0].history[-1])
+
+
+def _aligned_start(problem: JointProblem, start: Start, camera: str) -> JointState:
+    """Return a given start with cameras, preceded by calibrated ones if it says so."""
+    shapes = problem.frames.coordinates(start.shapes)
+    state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
+    if start.calibrated_first and not CAMERAS[camera].calibrated:
+        # As many steps as starts of the search make
+        max_iter = min(problem.options.starts.freed_steps, problem.steps.max_iter)
+        calibrated = "weak_perspective"
+        state = problem.aligned(state, calibrated)
+        state = problem.refined(state, CAMERAS[calibrated], max_iter=max_iter).state
+    return problem.aligned(state, camera)
 
 
 def _least(results: Iterable[JointResult]) -> JointResult:

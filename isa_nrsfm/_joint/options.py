@@ -125,6 +125,10 @@ class StartOptions(NamedTuple):
         frame.
     first_noise : float
         Share of what the mean shape leaves that counts as noise at the start.
+    catching_up : int
+        Steps after which a further start, of those that are given, is judged by
+        whether it can still become the best. With half as many the better one is often
+        dropped (``python -m benchmarks.choice``).
     """
 
     widths: tuple[int, ...] = (6, 9, 12, 18, 24, 36)
@@ -133,6 +137,7 @@ class StartOptions(NamedTuple):
     freed_steps: int = 30
     compared_tol: float = 0.5
     first_noise: float = 0.1
+    catching_up: int = 10
 
 
 class Effort(NamedTuple):

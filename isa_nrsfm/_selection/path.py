@@ -312,8 +312,10 @@ def _fitted(
             if before is not None:
                 starts.append(extended(before.frames, part.scaled, n_components))
             if every is not None:
-                known = every.frames
-                starts.append(Start(known.shapes, known.noise_variance, True))
+                known = Start(every.frames.shapes, every.frames.noise_variance)
+                if before is None and checked.options.camera == "affine":
+                    starts.append(known)
+                starts.append(known._replace(calibrated_first=True))
             fit = fit_ready_table(
                 part.scaled, n_components, checked.options, NoProgress(), starts
             )
