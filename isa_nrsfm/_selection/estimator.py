@@ -125,9 +125,9 @@ class AffineNRSfMCV(
     one before, from its shapes and the leading directions of what they leave. The fit
     of a part of the frames starts from that of all frames, and from the one before of
     the same part. The lower objective decides, on that part alone, and the steps go on
-    until it has converged: frames that are held out can offer a start, and have no
-    other influence on the score. ``python -m benchmarks.choice`` compares errors and
-    choices with those of a plain search.
+    until it has converged; a start that falls behind is dropped before. Frames that are
+    held out can offer a start, and have no other influence on the score. ``python -m
+    benchmarks.choice`` compares errors and choices with those of a plain search.
 
     Without the joint refinement no fit can start from another one, and the search is a
     plain one.
