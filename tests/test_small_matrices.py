@@ -311,4 +311,4 @@ class TestOrderOfTheFrames:
 
 def test_packing_of_3x3_matrices():
     entries = np.random.default_rng(0).normal(size=(4, 6, 5))
-    assert_array_equal(unpack3(entries)[ROWS, COLUMNS], entries)
+    assert_array_equal(unpack3(entries)[:, ROWS, COLUMNS], entries)
