@@ -6,11 +6,14 @@ taken pair by pair, reference and candidate in turn, so that it holds on a machi
 speed drifts.
 """
 
+import copy
+import gc
 import os
 import resource
 import subprocess
 import sys
 import time
+import tracemalloc
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +33,7 @@ from isa_nrsfm._tables.layout import (
     weighting_sizes,
 )
 from isa_nrsfm._transformer import frames_of
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model, write_table
 
 # Random starts against which the fit of a frame is held, and how far they are spread,
@@ -39,6 +42,9 @@ N_STARTS = 20
 SPREAD = 1.5
 # A start finds something better if it lowers the objective by this share.
 BETTER = 1e-6
+# Section frames: new frames, how many are taken one by one to time one, frames of a
+# stream, and the least number of pairs.
+N_FRAMES, SINGLE, STREAM, FRAME_PAIRS = 8000, 100, 10_000, 10
 
 
 def seconds(function, repeats=1):
@@ -137,6 +143,70 @@ def seconds_of_a_frame(model, X):
     """Return the median seconds of transform for single frames."""
     rows = (X[i : i + 1] for i in range(100))
     return np.median([seconds(partial(model.transform, row)) for row in rows])
+
+
+def each(function, rows):
+    """Call a function of each row."""
+    for row in rows:
+        function(row)
+
+
+def heap_after_stream(model, X, n_frames):
+    """Return the growth and the peak, in bytes, of the heap over single frames."""
+
+    def stream(n_frames):
+        for i in range(n_frames):
+            model.transform(X[i % len(X)][None])
+        gc.collect()
+
+    tracemalloc.start()
+    stream(100)  # whatever is made once
+    before, _ = tracemalloc.get_traced_memory()
+    tracemalloc.reset_peak()
+    stream(n_frames)
+    after, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return after - before, peak - before
+
+
+def frames(options):
+    """New frames, many and one by one, relative to a thin SVD; memory of a stream.
+
+    The frames have 68 points, and the model 9 basis shapes. The SVD is that of all
+    complete frames. Milliseconds of single frames are those of all of them. Two jobs
+    are held against one.
+    """
+    n_pairs = max(options.pairs, FRAME_PAIRS)
+    truth = make_nonrigid_tracks(
+        N_FRAMES, 68, n_components=9, noise=0.02, random_state=0
+    )
+    X = truth.data
+    tables = {"complete": X, "20 % missing": with_holes(X, 0.2)}
+    model = AffineNRSfM(9, random_state=0).fit(X[:3000])
+    two = copy.copy(model).set_params(n_jobs=2)
+    svd = partial(np.linalg.svd, measured(X, True), full_matrices=False)
+
+    def line(title, candidate, reference, unit):
+        least, median, most, own, other = paired_ratio(candidate, reference, n_pairs)
+        print(
+            f"{title:26}{least:8.2f}{median:8.2f}{most:8.2f}"
+            f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {unit}",
+            flush=True,
+        )
+
+    heading(f"{N_FRAMES:<26}", "ms", "ms of")
+    for title, table in tables.items():
+        transform = partial(model.transform, table)
+        line(title, transform, svd, "SVD")
+        line(f"{title}, 2 jobs", partial(two.transform, table), transform, "1 job")
+    for title, table in tables.items():
+        rows = [table[i : i + 1] for i in range(SINGLE)]
+        singles = partial(each, model.transform, rows)
+        line(f"{SINGLE} single, {title}", singles, svd, "SVD")
+    growth, peak = heap_after_stream(model, tables["20 % missing"], STREAM)
+    print(
+        f"stream of {STREAM} frames: {growth} bytes kept, {peak / 1e3:.0f} kB at most"
+    )
 
 
 def new_frames(options):
@@ -265,6 +335,7 @@ def start(options):
 
 SECTIONS = {
     "start": start,
+    "frames": frames,
     "fits": fits,
     "new_frames": new_frames,
     "optima": optima,

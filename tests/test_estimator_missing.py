@@ -1,5 +1,7 @@
 """AffineNRSfM on tables with missing points and outliers, noise and deviations."""
 
+import gc
+import tracemalloc
 from functools import cache
 
 import numpy as np
@@ -307,6 +309,23 @@ def test_rows_do_not_depend_on_each_other(variant):
         for one, whole, reverse in zip(alone, together, backwards, strict=True):
             assert_allclose(one[0], whole[i], rtol=1e-8, atol=1e-9)
             assert_allclose(one[0], reverse[-1 - i], rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_stream_of_frames_keeps_its_memory(model):
+    def stream(n_frames):
+        for i in range(n_frames):
+            model.transform(HOLED.data[i % 50][None])
+        gc.collect()
+
+    tracemalloc.start()
+    stream(200)  # Python and NumPy fill caches of their own
+    before, _ = tracemalloc.get_traced_memory()
+    stream(200)
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # Fewer bytes a frame than the header of an array
+    assert after - before < 100 * 200
 
 
 def with_unknown_rows():

@@ -204,6 +204,22 @@ class TestOptimum:
 
 
 class TestInvariance:
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_fits_are_the_same_without_covariances(self, camera):
+        tracks, shapes, _ = random_scene(0)
+        tracks[10:] = with_gaps(tracks[10:], 0)
+        starts = np.ones((2, len(shapes) - 1))
+        expected = fit_posterior(
+            tracks, shapes, NOISE**2, camera=camera, starts=starts
+        )._asdict()
+        got = fit_posterior(
+            tracks, shapes, NOISE**2, camera=camera, starts=starts, covariances=False
+        )._asdict()
+        assert got.pop("covariance").shape == (len(tracks), 0, 0)
+        assert np.isnan(got.pop("turn_covariance")).all()
+        for name, value in got.items():
+            assert_array_equal(value, expected[name])
+
     def test_frames_are_separate(self):
         tracks, shapes, _ = random_scene(0)
         tracks[10:] = with_gaps(tracks[10:], 0)

@@ -314,6 +314,18 @@ class FramesMissing(Frames):
         self.rows = with_holes(self.X, MISSING)
 
 
+class SingleFrames(Frames):
+    """`transform` of frames one by one, as of a live stream."""
+
+    def run(self):
+        for row in self.rows[:100]:
+            self.model.transform(row[None])
+
+
+class SingleFramesMissing(SingleFrames, FramesMissing):
+    pass
+
+
 class Score(Stage):
     def run(self):
         return self.model.score(self.X)

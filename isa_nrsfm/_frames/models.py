@@ -103,9 +103,7 @@ class RigidFrames(NamedTuple):
             mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
         )
 
-    def fit(
-        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
-    ) -> FrameFit:
+    def fit(self, tracks: NDArray, sizes: NDArray, deviations: bool = True) -> FrameFit:
         """
         Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -257,9 +255,7 @@ class PosteriorFrames(NamedTuple):
         shapes = self.shapes[:, :, kept]
         return self._replace(shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
-    def fit(
-        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
-    ) -> FrameFit:
+    def fit(self, tracks: NDArray, sizes: NDArray, deviations: bool = True) -> FrameFit:
         """
         Return the most probable camera, position and coefficients.
 

@@ -138,7 +138,7 @@ def fit_posterior(
         Coefficients to start from besides these, `spread_starts` for instance, for
         frames whose first fit is much worse than the noise explains.
     covariances : bool, default=True
-        Whether covariances are wanted. They cost a fifth of the time.
+        Whether covariances are wanted. The rest of the fit is the same without them.
     options : FrameOptions
         What steers the search.
 
@@ -394,7 +394,8 @@ def _fit(
     covariances: bool,
 ) -> FramePosterior:
     """Return the minima that frames reach from coefficients initial (n_frames, K)."""
-    fits = FramePosterior.unknown(*initial.shape, covariances)
+    n_frames, n_components = initial.shape
+    fits = FramePosterior.unknown(n_frames, n_components, covariances)
     for block, products in frames.blocks(search.shapes):
         found = search.fit(
             products,

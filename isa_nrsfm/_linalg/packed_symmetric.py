@@ -29,12 +29,6 @@ def unpack3(packed: NDArray) -> NDArray:
     return packed[..., UNPACKED, :]
 
 
-def pack3(full: NDArray) -> NDArray:
-    """Return symmetric matrices (..., 3, 3, n) packed, (..., 6, n)."""
-    pairs = zip(ROWS, COLUMNS, strict=True)
-    return np.stack([full[..., a, b, :] for a, b in pairs], axis=-2)
-
-
 def inverse_factor3(packed: NDArray) -> NDArray:
     """
     Return the inverse of the Cholesky factor of symmetric 3x3 matrices.

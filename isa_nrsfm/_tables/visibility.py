@@ -105,8 +105,13 @@ class CentredFrames(NamedTuple):
         """Return some of the frames, all of them without a copy."""
         if frames.all():
             return self
-        parts = (part[frames] for part in self[:-1])
-        return type(self)(*parts, self.dtype)
+        return self._replace(
+            centred=self.centred[frames],
+            translation=self.translation[frames],
+            seen=self.seen[frames],
+            n_seen=self.n_seen[frames],
+            square=self.square[frames],
+        )
 
     def sizes(self) -> NDArray:
         """Return the root mean squares of the seen coordinates (n_frames,)."""
