@@ -1,6 +1,7 @@
 """AffineNRSfM: attributes, the model's formula, methods, input and parameters."""
 
 import copy
+import inspect
 import pickle
 import warnings
 from functools import cache
@@ -221,9 +222,8 @@ def test_attributes_have_the_documented_shapes_and_types(dtype, refinement):
 
 def test_every_attribute_is_documented(model):
     fitted = {name for name in vars(model) if name.endswith("_")}
-    documented = {
-        name for name in dir(model) if f"\n    {name} : " in type(model).__doc__
-    }
+    text = inspect.getdoc(type(model))
+    documented = {name for name in dir(model) if f"\n{name} : " in text}
     assert fitted <= documented
     documented = {name for name in documented if name.endswith("_")}
     assert documented - fitted == set()

@@ -1,6 +1,7 @@
 """Models saved to files and loaded again."""
 
 import functools
+import inspect
 import io
 import json
 import pickle
@@ -656,8 +657,8 @@ def test_attributes_that_older_files_never_had_are_refused(path):
 def test_the_attributes_of_files_are_those_that_are_documented():
     documented = [
         line.split(" : ")[0].strip()
-        for line in AffineNRSfM.__doc__.partition("Attributes\n")[2].splitlines()
-        if line.startswith("    ") and line[4:5].isalpha() and "_ : " in line
+        for line in inspect.getdoc(AffineNRSfM).partition("Attributes\n")[2].split("\n")
+        if line[:1].isalpha() and "_ : " in line
     ]
     # Two follow from the model of a table.
     assert set(documented) == {*ATTRIBUTES, "camera_", "frames_scaled_"}
