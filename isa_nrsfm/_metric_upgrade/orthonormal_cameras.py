@@ -109,7 +109,7 @@ def orthonormal_cameras(
     >>> import numpy as np
     >>> from scipy.spatial.transform import Rotation
     >>> from isa_nrsfm.calibration import orthonormal_cameras
-    >>> cameras = Rotation.random(20, rng=0).as_matrix()[:, :2]
+    >>> cameras = Rotation.random(20, np.random.default_rng(0)).as_matrix()[:, :2]
     >>> shape = np.random.default_rng(0).normal(size=(3, 9))
     >>> U, S, _ = np.linalg.svd(cameras.reshape(-1, 3) @ shape, full_matrices=False)
     >>> found = orthonormal_cameras(U[:, :3])
