@@ -19,7 +19,7 @@ from numpy.testing import assert_array_equal
 from scipy.io import loadmat
 from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._compat.whole_files import ASIDE, whole_file
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -223,7 +223,7 @@ def small_table():
 class TestKeepFrames:
     @staticmethod
     def estimator(folder, **params):
-        quick = {"refinement": None, "random_state": 0}
+        quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
         return AffineNRSfM(1, keep_frames=folder, **quick, **params)
 
     def test_a_full_disk_is_no_fit(self, tmp_path, table):
