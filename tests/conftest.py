@@ -7,6 +7,7 @@ os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before scipy is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
+import signal
 from collections import Counter
 from pathlib import Path
 
@@ -66,6 +67,18 @@ def data_path():
 def load_data(data_path):
     """Return a function from the name of a data set to its arrays."""
     return lambda name: np.load(data_path(f"{name}.npz"), allow_pickle=False)
+
+
+@pytest.fixture
+def interruptible():
+    """Let programs that a test starts be interrupted, also where pytest itself is not.
+
+    Shells start what runs in the background without interrupts, and programs inherit
+    that.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture

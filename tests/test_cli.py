@@ -857,6 +857,7 @@ def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch,
 
 
 @pytest.mark.subprocess
+@pytest.mark.usefixtures("interruptible")
 def test_signal_of_the_keyboard_stops_the_program(table, tmp_path):
     folder = tmp_path / "results"
     started = subprocess.Popen(

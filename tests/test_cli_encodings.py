@@ -99,6 +99,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.subprocess
 @pytest.mark.parametrize(
     "module",

@@ -614,8 +614,9 @@ def test_options_of_other_formats_are_refused(tmp_path):
         (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",?,", 1), "'x_2'.*'\\?'"),
         (lambda text: text.replace(f",{TRACKS[4, 2, 0]},", ",inf,", 1), "infinite"),
         (lambda text: text.replace("0.98", "0.9\xe9"), "'confidence'.*in row 0"),
+        (lambda text: text.replace("0.98", "0\x00.98", 1), "line 2 has a null"),
     ],
-    ids=["truncated", "long", "twice", "unpaired", "empty", "text", "inf", "letter"],
+    ids="truncated long twice unpaired empty text inf letter null".split(),
 )
 def test_damaged_tables_are_refused(damage, message, tmp_path):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)

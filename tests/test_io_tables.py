@@ -79,6 +79,7 @@ def test_unnamed_index_column_is_kept(write):
         ("x0, x0\n1,2\n", "more than one column called 'x0'"),
         ("x0;y0\n1;2\n", "separated by semicolons; commas are needed"),
         ("x0\ty0\n1\t2\n", "separated by tabs"),
+        ("x0,y0\n1\x002,3\n", "line 2 has a null character"),
     ],
 )
 def test_files_that_are_no_tables_are_refused(write, text, message):

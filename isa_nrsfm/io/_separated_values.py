@@ -61,6 +61,20 @@ def header_rows(path: Path, n_rows: int) -> list[list[str]]:
         return []
 
 
+def refuse_nulls(path: Path) -> None:
+    """
+    Raise if a text file holds a null character, at which some readers end a cell.
+
+    Files in UTF-16 without a mark hold many.
+    """
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if b"\0" in line:
+                raise ValueError(
+                    f"its text is not in UTF-8: line {number} has a null character"
+                )
+
+
 def read_columns(
     path: Path,
     *,
@@ -97,10 +111,11 @@ def read_columns(
     Raises
     ------
     ValueError
-        If there is no row, if lines are not of the same length, or if a cell that
-        should be a number is none.
+        If there is no row, if lines are not of the same length, if a cell that should
+        be a number is none, or if there is a null character.
     """
     pd = import_optional("pandas", extra="io")
+    refuse_nulls(path)
     if names is None:
         names = [name.strip() for name in header_names(path)]
     if len(set(names)) < len(names):

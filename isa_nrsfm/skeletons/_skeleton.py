@@ -119,7 +119,8 @@ class Skeleton:
 
     @property
     def left_right(self) -> NDArray[np.intp]:
-        """Return the pairs (n_pairs, 2) that `canonical_pose` takes as `left_right`.
+        """
+        Return the pairs (n_pairs, 2) that `canonical_pose` takes as `left_right`.
 
         The point on the right side comes first: it is on the left for somebody who is
         looked at.
