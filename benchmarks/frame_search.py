@@ -12,6 +12,7 @@ that is left there. "ms" is the CPU time.
 """
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -157,10 +158,14 @@ def robust(options):
         far = rng.random(tracks.shape[:2]) < 0.05
         spoiled = tracks + far[..., None] * rng.normal(size=tracks.shape)
         print(f"{title:28}{'huber':>10}{'cauchy':>10}{'ms':>8}")
-        models = [frames._replace(loss=loss) for loss in ("huber", "cauchy")]
-        expected = [model.posterior(spoiled, many).alpha for model in models]
+        losses = ("huber", "cauchy")
+        models = [replace(frames, loss=loss, options=many) for loss in losses]
+        expected = [model.posterior(spoiled).alpha for model in models]
         for name, changed in variants(only=OF_ROBUST):
-            fits = [timed(model.posterior, spoiled, changed) for model in models]
+            fits = [
+                timed(replace(model, options=changed).posterior, spoiled)
+                for model in models
+            ]
             errors = [
                 np.abs(fit.alpha - alpha).max()
                 for (fit, _), alpha in zip(fits, expected, strict=True)
@@ -172,7 +177,7 @@ def robust(options):
 def reversed_minima(frames, block):
     """Return cameras at minima that reversed cameras reach, and the sums for them."""
     search = CalibratedSearch(frames.shapes, True)
-    sums = frame_sums(block, search.shapes)
+    sums = frame_sums(block, search.shared)
     variance = np.full(len(block.weight), frames.noise_variance)
     problem = calibrated_problem(sums, variance, CAMERAS[frames.camera])
     best = fit_prepared(

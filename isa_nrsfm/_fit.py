@@ -13,6 +13,7 @@ refinement. All others use the frames of the sample.
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -489,7 +490,7 @@ def _refined_jointly(
         float(table.sizes[0]) if options.camera == "orthographic" else None,
         options.limits.gauge,
     )
-    frames = frames._replace(gauge=gauge.frames)
+    frames = replace(frames, gauge=gauge.frames)
     shown = FrameFit.from_blocks(posteriors.map(frames.shown, table.sizes))
     cameras = shown.motion / table.sizes[:, None, None]
     return Refined(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch, calibrated_problem
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.point_sums import ShapeProducts, frame_sums, frame_tracks
+from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.posterior import approximate_cameras, fit_posterior
 from isa_nrsfm._linalg.packed_symmetric import unpacked
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
@@ -113,9 +113,7 @@ def problem_of(scene, camera, noise):
     search = CalibratedSearch(scene.shapes, cameras.scaled)
     seen = np.isfinite(scene.tracks[..., 0])
     weights = None if seen.all() else 1.0 * seen
-    products = frame_sums(
-        frame_tracks(scene.tracks, weights), ShapeProducts(search.shapes)
-    )
+    products = frame_sums(frame_tracks(scene.tracks, weights), search.shared)
     problem = calibrated_problem(products, np.full(len(scene.tracks), noise), cameras)
     axes = search.cameras(np.eye(3)[None])[0].T
     return problem, frames_last(scene.motion @ axes)
@@ -566,7 +564,7 @@ class TestReversal:
 
     def search(self, scene, camera, noise, motion):
         search = CalibratedSearch(scene.shapes, CAMERAS[camera].scaled)
-        products = frame_sums(frame_tracks(scene.tracks), ShapeProducts(search.shapes))
+        products = frame_sums(frame_tracks(scene.tracks), search.shared)
         return search.reversed_cameras(products, noise, motion)
 
     @BOTH

@@ -1,5 +1,7 @@
 """Camera and coefficients of single frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -241,7 +243,7 @@ class TestMirrored:
     @pytest.mark.parametrize("camera", ["affine", "weak_perspective", "orthographic"])
     def test_posterior_frames_have_mirrored_cameras(self, camera):
         model, tracks = posterior_frames(0)
-        model = model._replace(camera=camera)
+        model = replace(model, camera=camera)
         one, other = (
             each.fit(tracks, np.ones(12)) for each in (model, model.mirrored())
         )
@@ -278,6 +280,11 @@ def posterior_frames(seed, loss="linear", gauge=None):
     return PosteriorFrames(shapes, NOISE**2, starts, loss, gauge), tracks
 
 
+def with_options(frames, **changed):
+    """Return the model with some other options of its fit."""
+    return replace(frames, options=FRAME_OPTIONS._replace(**changed))
+
+
 def mixing_gauge():
     """Return a map to other shapes: B_0 with B_k, B_k with B_0, and an affinity."""
     rng = np.random.default_rng(5)
@@ -305,7 +312,7 @@ class TestPosteriorFrames:
     @pytest.mark.parametrize("missing", [0.0, 0.3])
     def test_calibrated_cameras(self, camera, missing):
         frames, tracks = posterior_frames(0)
-        frames, tracks = frames._replace(camera=camera), hide(tracks, missing)
+        frames, tracks = replace(frames, camera=camera), hide(tracks, missing)
         sizes = np.linspace(0.5, 200.0, len(tracks))
         fitted = frames.fit(tracks * sizes[:, None, None], sizes)
         expected = fit_posterior(
@@ -328,7 +335,7 @@ class TestPosteriorFrames:
         new = np.einsum("kl,kjc->ljc", inverse, np.stack([mean_shape, *basis]))
         new = new @ gauge.space.T
         one, other = (
-            frames._replace(gauge=each).fit(tracks, np.ones(len(tracks)))
+            replace(frames, gauge=each).fit(tracks, np.ones(len(tracks)))
             for each in (frames.gauge, gauge)
         )
         images = project(
@@ -344,7 +351,7 @@ class TestPosteriorFrames:
         frames, tracks = posterior_frames(0)
         gauge = mixing_gauge()
         posterior = frames.posterior(tracks)
-        shown = frames._replace(gauge=gauge).shown(posterior, np.ones(len(tracks)))
+        shown = replace(frames, gauge=gauge).shown(posterior, np.ones(len(tracks)))
 
         def mapped(alpha):
             one = np.column_stack([np.ones(len(alpha)), alpha]) @ gauge.mixing.T
@@ -380,14 +387,13 @@ class TestPosteriorFrames:
 
     def test_options_of_a_robust_loss(self):
         frames, tracks = posterior_frames(0, "cauchy")
-        first = frames.posterior(tracks, FRAME_OPTIONS._replace(reweightings=0))
-        linear = frames._replace(loss="linear").posterior(tracks)
+        first = with_options(frames, reweightings=0).posterior(tracks)
+        linear = replace(frames, loss="linear").posterior(tracks)
         assert_allclose(first.alpha, linear.alpha, atol=1e-9)
-        exact = frames.posterior(tracks, FRAME_OPTIONS._replace(settled=1e-12)).alpha
+        exact = with_options(frames, settled=1e-12).posterior(tracks).alpha
         errors = [
             np.abs(
-                frames.posterior(tracks, FRAME_OPTIONS._replace(settled=s)).alpha
-                - exact
+                with_options(frames, settled=s).posterior(tracks).alpha - exact
             ).max()
             for s in (0.1, 1e-3, 1e-6)
         ]
@@ -402,7 +408,7 @@ class TestPosteriorFrames:
         deviation = np.sqrt(np.einsum("ikk->ik", expected.covariance))
         tracks[:, point] += size
         drawn = frames.posterior(tracks).alpha - expected.alpha
-        robust = frames._replace(loss=loss).posterior(tracks).alpha - expected.alpha
+        robust = replace(frames, loss=loss).posterior(tracks).alpha - expected.alpha
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
@@ -421,7 +427,7 @@ class TestPosteriorFrames:
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
     def test_weights_of_a_wrong_model_leave_a_camera(self, loss, noise):
         frames, _ = posterior_frames(0, loss)
-        frames = frames._replace(noise_variance=noise)
+        frames = replace(frames, noise_variance=noise)
         n_points = frames.shapes.shape[2]
         tracks = np.random.default_rng(0).normal(size=(200, n_points, 2))
         for part in frames.posterior(tracks)[:4]:
@@ -438,7 +444,7 @@ class TestPosteriorFrames:
         seen = np.arange(len(mean_shape)) < 9
         tracks = np.where(seen[:, None], mean_shape[:, :2], np.nan)[None]
         assert distant_points(tracks)[0, 6:9].all()
-        fitted = frames._replace(shapes=shapes).posterior(tracks)
+        fitted = replace(frames, shapes=shapes).posterior(tracks)
         images = project(mean_shape[None], fitted.motion, fitted.translation)
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 

@@ -32,6 +32,7 @@ from isa_nrsfm._frames.point_sums import (
     TWICE,
     FrameGram,
     FrameSums,
+    ShapeProducts,
     SharedGram,
     whitened,
     with_one,
@@ -71,15 +72,18 @@ class AffineSearch:
 
     Attributes
     ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
+    shared : ShapeProducts
         The shapes in the space of `whitened`, where the search takes place.
+    options : FrameOptions
+        What steers the search.
     first_steps : int
         As of `FrameOptions`.
     """
 
     def __init__(self, shapes: NDArray, options: FrameOptions = FRAME_OPTIONS):
-        self._options, self.first_steps = options, options.first_steps
-        self.shapes, self._space = whitened(np.ascontiguousarray(shapes))
+        self.options, self.first_steps = options, options.first_steps
+        white, self._space = whitened(np.ascontiguousarray(shapes))
+        self.shared = ShapeProducts(white)
 
     def cameras(self, motion: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
@@ -104,7 +108,7 @@ class AffineSearch:
         Parameters
         ----------
         products : FrameSums
-            Sums of the frames for `shapes`.
+            Sums of the frames for the shapes in `shared`.
         variance : ndarray of shape (n_frames,)
             Noise variances.
         n_points : float
@@ -121,7 +125,7 @@ class AffineSearch:
         FoundFrames
             The minima.
         """
-        problem = affine_problem(products, variance, n_points, self._options)
+        problem = affine_problem(products, variance, n_points, self.options)
         state = problem.evaluate(_first_step(problem, initial.T))
         alpha, converged = descend(problem, state, max_steps - 1)
         _, _, half, camera = _eliminated(problem, with_one(alpha))
@@ -142,8 +146,8 @@ class AffineSearch:
         self, products: FrameSums, variance: NDArray, n_points: float
     ) -> NDArray:
         """Return cameras (n_frames, 2, 3) by two steps from coefficients of zero."""
-        problem = affine_problem(products, variance, n_points, self._options)
-        zero = np.zeros((len(self.shapes) - 1, len(variance)))
+        problem = affine_problem(products, variance, n_points, self.options)
+        zero = np.zeros((self.shared.n_components, len(variance)))
         alpha = _first_step(problem, zero)
         step, _ = problem.step(problem.evaluate(alpha), np.zeros(len(variance)))
         return _motion(_eliminated(problem, with_one(alpha + step))[-1])

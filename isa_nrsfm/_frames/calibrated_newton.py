@@ -35,7 +35,7 @@ from isa_nrsfm._frames.coefficients import (
 )
 from isa_nrsfm._frames.damped_newton import State, descend, newton_step
 from isa_nrsfm._frames.options import FRAME_OPTIONS, Damping, FrameOptions
-from isa_nrsfm._frames.point_sums import FLAT, FrameSums, with_one
+from isa_nrsfm._frames.point_sums import FLAT, FrameSums, ShapeProducts, with_one
 from isa_nrsfm._frames.search import FoundFrames
 from isa_nrsfm._linalg.packed_symmetric import (
     inverse3,
@@ -66,8 +66,10 @@ class CalibratedSearch:
 
     Attributes
     ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
+    shared : ShapeProducts
         The shapes, turned to the principal axes of the mean shape.
+    options : FrameOptions
+        What steers the search.
     first_steps : int
         The largest number of steps there is: no second round is needed.
     """
@@ -75,12 +77,13 @@ class CalibratedSearch:
     def __init__(
         self, shapes: NDArray, scaled: bool, options: FrameOptions = FRAME_OPTIONS
     ):
-        self._options, self.first_steps = options, options.max_steps
+        self.options, self.first_steps = options, options.max_steps
         self._models = CalibratedCameras(scaled, options.largest_turn)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         self._axes = axes
-        self.shapes = np.ascontiguousarray(axes.T @ shapes)
-        self.shapes[0, size <= FLAT * size[0]] = 0.0
+        turned = np.ascontiguousarray(axes.T @ shapes)
+        turned[0, size <= FLAT * size[0]] = 0.0
+        self.shared = ShapeProducts(turned)
 
     def cameras(self, motion: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
@@ -105,7 +108,7 @@ class CalibratedSearch:
         Parameters
         ----------
         products : FrameSums
-            Sums of the frames for `shapes`.
+            Sums of the frames for the shapes in `shared`.
         variance : ndarray of shape (n_frames,)
             Noise variances.
         n_points : float
@@ -139,7 +142,7 @@ class CalibratedSearch:
         Parameters
         ----------
         products : FrameSums
-            Sums of the frames for `shapes`.
+            Sums of the frames for the shapes in `shared`.
         noise : float
             Noise variance.
         motion : ndarray of shape (n_frames, 2, 3)
@@ -155,7 +158,7 @@ class CalibratedSearch:
         M = frames_last(motion @ self._axes)
         problem = self._problem(products, np.full(len(motion), noise))
         # The cameras may not be at their minimum yet. Compare minima with minima.
-        n_steps = self._options.reversed_steps
+        n_steps = self.options.reversed_steps
         M, _ = descend(problem, problem.evaluate(M), n_steps)
         M, better, _ = _better_reversed(problem, M, n_steps)
         motion = motion.copy()
@@ -167,14 +170,14 @@ class CalibratedSearch:
     ) -> NDArray:
         """Return cameras (n_frames, 2, 3) by a few steps from coefficients of zero."""
         problem = self._problem(products, variance)
-        zero = np.zeros((len(self.shapes) - 1, len(variance)))
+        zero = np.zeros((self.shared.n_components, len(variance)))
         M = _first_cameras(problem, zero)
-        M, _ = descend(problem, problem.evaluate(M), self._options.rough_steps)
+        M, _ = descend(problem, problem.evaluate(M), self.options.rough_steps)
         return frames_first(M)
 
     def _problem(self, products: FrameSums, variance: NDArray) -> "CalibratedProblem":
         """Return the objectives of frames."""
-        return calibrated_problem(products, variance, self._models, self._options)
+        return calibrated_problem(products, variance, self._models, self.options)
 
 
 class CalibratedProblem(NamedTuple):

@@ -141,11 +141,13 @@ def descend(
             last = problem.moved(state.position, np.where(small, step, 0.0))
             found[..., running[leaving]] = last[..., leaving]
             converged[running[leaving]] = small[leaving]
+            if leaving.all():
+                return found, converged
             left = in_lanes(np.flatnonzero(~leaving))
             running, limit = running[left], limit[left]
             damping, step = damping[left], of_frames(step, left)
             problem, state = problem.take(left), state.take(left)
-        if not n_left or not len(running):
+        if not n_left:
             break
         # Trial step, refused where the objective rises. Less damping after a good step,
         # more after a refused one.

@@ -7,7 +7,8 @@ joint refinement, takes the most probable camera and coefficients together.
 """
 
 from collections.abc import Iterable
-from functools import partial
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +19,14 @@ from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.posterior import FramePosterior, fit_posterior, fit_prepared
+from isa_nrsfm._frames.posterior import (
+    SEARCHES,
+    FramePosterior,
+    fit_prepared,
+    fit_tracks,
+)
 from isa_nrsfm._frames.projection import distances
+from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.layout import measurement_matrix
@@ -202,7 +209,8 @@ class RigidFrames(NamedTuple):
         return motion, translation[None], alpha[None]
 
 
-class PosteriorFrames(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PosteriorFrames:
     """
     The joint refinement's model of a frame: its posterior, camera and coefficients.
 
@@ -221,6 +229,8 @@ class PosteriorFrames(NamedTuple):
         Takes cameras and coefficients to those of the public shapes.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
         Model of the cameras. Orthographic ones have the scale one.
+    options : FrameOptions
+        What steers the fit.
     """
 
     shapes: NDArray
@@ -229,11 +239,21 @@ class PosteriorFrames(NamedTuple):
     loss: str
     gauge: FrameMap
     camera: str = "affine"
+    options: FrameOptions = FRAME_OPTIONS
+
+    @cached_property
+    def _search(self) -> FrameSearch:
+        """The search for frames. What it knows of the shapes serves all tables."""
+        return SEARCHES[self.camera](self.shapes, options=self.options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes, without what is computed from them."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def mirrored(self) -> "PosteriorFrames":
         """Return the model whose public shapes are mirrored in depth."""
         space = MIRROR[:, None] * self.gauge.space
-        return self._replace(gauge=self.gauge._replace(space=space))
+        return replace(self, gauge=self.gauge._replace(space=space))
 
     def of_points(self, kept: NDArray) -> "PosteriorFrames":
         """
@@ -253,7 +273,7 @@ class PosteriorFrames(NamedTuple):
             The model. Its positions are images of the centroid of these points.
         """
         shapes = self.shapes[:, :, kept]
-        return self._replace(shapes=shapes - shapes.mean(axis=2, keepdims=True))
+        return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
     def fit(self, tracks: NDArray, sizes: NDArray, deviations: bool = True) -> FrameFit:
         """
@@ -323,14 +343,10 @@ class PosteriorFrames(NamedTuple):
             self.noise_variance,
             camera=self.camera,
             starts=self.starts,
+            options=self.options,
         )
 
-    def posterior(
-        self,
-        tracks: NDArray,
-        options: FrameOptions = FRAME_OPTIONS,
-        covariances: bool = True,
-    ) -> FramePosterior:
+    def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
         """
         Return the fit of frames, before the gauge.
 
@@ -338,8 +354,6 @@ class PosteriorFrames(NamedTuple):
         ----------
         tracks : ndarray of shape (n_frames, n_points, 2)
             Tracks of frames of size one.
-        options : FrameOptions
-            What steers the fit.
         covariances : bool, default=True
             Whether covariances are wanted.
 
@@ -352,12 +366,10 @@ class PosteriorFrames(NamedTuple):
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
         fitted = partial(
-            fit_posterior,
-            shapes=self.shapes,
+            fit_tracks,
+            search=self._search,
             noise_variance=self.noise_variance,
-            camera=self.camera,
             covariances=covariances,
-            options=options,
         )
         if self.loss == "linear":
             return fitted(tracks, starts=self.starts)
@@ -373,12 +385,13 @@ class PosteriorFrames(NamedTuple):
         deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
-        for _ in range(options.reweightings):
+        for _ in range(self.options.reweightings):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             distance = np.where(seen[changing], distance, np.inf)
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
-            unsettled = np.abs(new - weights[changing]).max(axis=1) > options.settled
+            change = np.abs(new - weights[changing]).max(axis=1)
+            unsettled = change > self.options.settled
             weights[changing] = new
             changing = in_lanes(np.unique(changing[unsettled]))
             if not len(changing):

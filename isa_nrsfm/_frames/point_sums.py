@@ -362,6 +362,11 @@ class ShapeProducts:
         self.shapes = np.ascontiguousarray(shapes, dtype=np.float64)
 
     @property
+    def n_components(self) -> int:
+        """Number of the shapes without the mean shape."""
+        return len(self.shapes) - 1
+
+    @property
     def rows(self) -> NDArray:
         """The shapes as rows (3 n_shapes, n_points)."""
         return self.shapes.reshape(-1, self.shapes.shape[-1])

@@ -156,13 +156,50 @@ def fit_posterior(
     mean shape is flat, coefficients of zero can be a saddle point of the objective:
     rounding decides where the search goes from there, and further starts help.
     """
+    return fit_tracks(
+        tracks,
+        SEARCHES[camera](shapes, options=options),
+        noise_variance,
+        weights=weights,
+        initial=initial,
+        starts=starts,
+        covariances=covariances,
+    )
+
+
+def fit_tracks(
+    tracks: NDArray,
+    search: FrameSearch,
+    noise_variance: NDArray | float,
+    *,
+    weights: NDArray | None = None,
+    initial: NDArray | None = None,
+    starts: NDArray | None = None,
+    covariances: bool = True,
+) -> FramePosterior:
+    """
+    Return the fits of `fit_posterior` by a search that is there already.
+
+    Parameters
+    ----------
+    tracks, noise_variance, weights, initial, starts, covariances
+        As of `fit_posterior`.
+    search : FrameSearch
+        The search for the shapes, one of `SEARCHES`. What it computes of the shapes
+        serves all tables.
+
+    Returns
+    -------
+    FramePosterior
+        The best fit of each frame.
+    """
     tracks = np.asarray(tracks)
     seen = seen_points(tracks)
     if weights is not None or not seen.all():
         weights = np.where(seen, 1.0 if weights is None else weights, 0.0)
     return _best_fits(
-        _Tracks(tracks, weights, options),
-        SEARCHES[camera](shapes, options=options),
+        _Tracks(tracks, weights, search.options),
+        search,
         noise_variance,
         initial=initial,
         starts=starts,
@@ -230,7 +267,7 @@ def approximate_cameras(
     prepared = _Prepared(frames, options)
     search = SEARCHES[camera](shapes, options=options)
     motion = np.empty((len(frames.weight), 2, 3))
-    for block, products in prepared.blocks(search.shapes):
+    for block, products in prepared.blocks(search.shared):
         variance = np.full(len(block), noise_variance)
         motion[block] = search.rough_cameras(products, variance, prepared.n_points)
     return search.cameras(motion)
@@ -260,7 +297,7 @@ class _Tracks(NamedTuple):
         weights = None if self.weights is None else self.weights[frames]
         return self._replace(tracks=self.tracks[frames], weights=weights)
 
-    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
+    def blocks(self, shared: ShapeProducts) -> Iterator[tuple[NDArray, FrameSums]]:
         """
         Yield the numbers of frames that determine a camera, and their sums.
 
@@ -271,7 +308,6 @@ class _Tracks(NamedTuple):
         if weights is not None:
             complete = (weights == 1.0).all(axis=1)
         frames = np.flatnonzero(complete)
-        shared = ShapeProducts(shapes)
         for first in range(0, len(frames), options.complete_block):
             block = in_lanes(frames[first : first + options.complete_block])
             yield block, frame_sums(frame_tracks(tracks[block]), shared)
@@ -281,7 +317,7 @@ class _Tracks(NamedTuple):
         for first in range(0, len(frames), options.weighted_block):
             block = in_lanes(frames[first : first + options.weighted_block])
             part = frame_tracks(tracks[block], weights[block])
-            yield _determined(block, frame_sums(part, shared), shapes)
+            yield _determined(block, frame_sums(part, shared), shared)
 
 
 class _Prepared(NamedTuple):
@@ -306,26 +342,25 @@ class _Prepared(NamedTuple):
         """Return some of the frames."""
         return self._replace(frames=self.frames.take(frames))
 
-    def blocks(self, shapes: NDArray) -> Iterator[tuple[NDArray, FrameSums]]:
+    def blocks(self, shared: ShapeProducts) -> Iterator[tuple[NDArray, FrameSums]]:
         """Yield the numbers of frames that determine a camera, and their sums."""
         complete = self.frames.weights is None
         options = self.options
         length = options.complete_block if complete else options.weighted_block
-        shared = ShapeProducts(shapes)
         for first in range(0, len(self.weight), length):
             last = min(first + length, len(self.weight))
             block = in_lanes(np.arange(first, last))
             products = frame_sums(self.frames.take(block), shared)
             yield (
-                (block, products) if complete else _determined(block, products, shapes)
+                (block, products) if complete else _determined(block, products, shared)
             )
 
 
 def _determined(
-    frames: NDArray, products: FrameSums, shapes: NDArray
+    frames: NDArray, products: FrameSums, shared: ShapeProducts
 ) -> tuple[NDArray, FrameSums]:
     """Return those of the frames (n,) that determine a camera, and their sums."""
-    determined = determines_camera(products, shapes[0])
+    determined = determines_camera(products, shared.shapes[0])
     if determined.all():
         return frames, products
     usable = in_lanes(np.flatnonzero(determined))
@@ -346,7 +381,7 @@ def _best_fits(
 
     The arrays initial and starts are (n_frames, K) and (n_starts, K).
     """
-    weight, n_components = frames.weight, len(search.shapes) - 1
+    weight, n_components = frames.weight, search.shared.n_components
     options = frames.options
     n_frames = len(weight)
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
@@ -397,7 +432,7 @@ def _fit(
     """Return the minima that frames reach from coefficients initial (n_frames, K)."""
     n_frames, n_components = initial.shape
     fits = FramePosterior.unknown(n_frames, n_components, covariances)
-    for block, products in frames.blocks(search.shapes):
+    for block, products in frames.blocks(search.shared):
         found = search.fit(
             products,
             variance[block],

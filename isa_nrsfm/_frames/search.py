@@ -4,7 +4,8 @@ from typing import NamedTuple, Protocol
 
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameSums
+from isa_nrsfm._frames.options import FrameOptions
+from isa_nrsfm._frames.point_sums import FrameSums, ShapeProducts
 
 
 class FoundFrames(NamedTuple):
@@ -46,14 +47,18 @@ class FrameSearch(Protocol):
 
     Attributes
     ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        The shapes in the coordinates of the search.
+    shared : ShapeProducts
+        The shapes (n_components + 1, 3, n_points) in the coordinates of the search,
+        and their products.
+    options : FrameOptions
+        What steers the search.
     first_steps : int
         Largest number of steps of a first round, block by block. Frames that have not
         converged then are collected from all blocks for a second round.
     """
 
-    shapes: NDArray
+    shared: ShapeProducts
+    options: FrameOptions
     first_steps: int
 
     def cameras(self, motion: NDArray) -> NDArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
-from isa_nrsfm._frames.point_sums import FrameTracks, ShapeProducts, frame_sums
+from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import approximate_cameras
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
@@ -196,9 +196,8 @@ def _reversed_back(
 ) -> tuple[NDArray, NDArray]:
     """Return the better cameras (n_frames, 2, 3), and which ones were reversed."""
     search = CalibratedSearch(shapes, scaled)
-    shared = ShapeProducts(search.shapes)
     found = [
-        search.reversed_cameras(frame_sums(piece, shared), noise, motion[frames])
+        search.reversed_cameras(frame_sums(piece, search.shared), noise, motion[frames])
         for frames, piece in block.pieces(BLOCK_FRAMES)
     ]
     cameras, better = map(np.concatenate, zip(*found, strict=True))

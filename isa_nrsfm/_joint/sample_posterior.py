@@ -1,5 +1,6 @@
 """The fit of each frame of the table, block by block, after the joint fit."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -34,7 +35,7 @@ def posterior_blocks(
     if model.loss != "linear":
         return rows.derive(partial(_row_posterior, model=model))
     shapes = frames.coordinates(model.shapes)
-    return frames.blocks.derive(model._replace(shapes=shapes).prepared_posterior)
+    return frames.blocks.derive(replace(model, shapes=shapes).prepared_posterior)
 
 
 def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
