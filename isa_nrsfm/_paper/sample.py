@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._paper.options import SAMPLE_OPTIONS, SampleOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import spread
@@ -93,6 +94,5 @@ def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
     """
     axes, size, _ = np.linalg.svd(shape.T, full_matrices=False)
     axes = axes[:, size > OF_RANKS * size[0]]
-    flat = rows.reshape(len(rows), -1)
     seen = (rows.reshape(-1, rows.shape[-1]) @ axes).reshape(len(rows), -1)
-    return np.maximum(np.vecdot(flat, flat) - np.vecdot(seen, seen), 0.0)
+    return np.maximum(energies(rows) - energies(seen), 0.0)
