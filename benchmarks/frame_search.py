@@ -28,7 +28,6 @@ from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._frames.posterior import (
     approximate_cameras,
     fit_posterior,
-    fit_prepared,
 )
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
@@ -180,9 +179,7 @@ def reversed_minima(frames, block):
     sums = frame_sums(block, search.shared)
     variance = np.full(len(block.weight), frames.noise_variance)
     problem = calibrated_problem(sums, variance, CAMERAS[frames.camera])
-    best = fit_prepared(
-        block, frames.shapes, frames.noise_variance, camera=frames.camera
-    )
+    best = frames.prepared_posterior(block)
     axes = search.cameras(np.eye(3)[None])[0].T
     M = frames_last(best.motion @ axes @ MIRROR)
     M, _ = descend(problem, problem.evaluate(M), FRAME_OPTIONS.max_steps)

@@ -46,6 +46,11 @@ def half_mask(tracks, share, seed):
     return seen
 
 
+def unit_rows(centred, sizes):
+    """Return tracks as frames (n_frames, 2, n_points) of size one."""
+    return (centred / sizes[:, None, None]).transpose(0, 2, 1)
+
+
 def completed(tracks, n_components, **params):
     """Return tracks in place of those with missing points."""
     centred, translation = centred_tracks(tracks)
@@ -143,7 +148,7 @@ def log_likelihood(B, noise, centred, seen, sizes):
 
 def test_missing_points_are_conditional_expectations(small):
     centred, seen, sizes = small
-    frames, _ = _by_pattern(centred, seen, sizes)
+    frames, _ = _by_pattern(unit_rows(centred, sizes))
     filled = completed(centred, 1)  # rank 6 of 9 points
     model = _fit(frames, 6, COMPLETION_OPTIONS)
     far = 1e7  # variance of the translation, which may be anything
@@ -156,8 +161,8 @@ def test_missing_points_are_conditional_expectations(small):
 
 
 def test_the_fit_is_a_stationary_point_of_the_likelihood(small):
-    centred, seen, sizes = small
-    frames, _ = _by_pattern(centred, seen, sizes)
+    centred, _, sizes = small
+    frames, _ = _by_pattern(unit_rows(centred, sizes))
     far = COMPLETION_OPTIONS._replace(tol=1e-13, max_iter=5000)
     model = _fit(frames, 3, far)
     best = log_likelihood(*model, *small)
@@ -177,8 +182,8 @@ def test_the_fit_is_a_stationary_point_of_the_likelihood(small):
 
 
 def test_a_step_with_fixed_noise_raises_the_likelihood(small):
-    centred, seen, sizes = small
-    frames, _ = _by_pattern(centred, seen, sizes)
+    centred, _, sizes = small
+    frames, _ = _by_pattern(unit_rows(centred, sizes))
     B = np.random.default_rng(0).normal(size=(4, 9))
     for _ in range(20):
         before = log_likelihood(B, 0.01, *small)
@@ -188,7 +193,7 @@ def test_a_step_with_fixed_noise_raises_the_likelihood(small):
 
 def test_the_residual_of_a_step_is_that_of_least_squares_with_a_ridge(small):
     centred, seen, sizes = small
-    frames, order = _by_pattern(centred, seen, sizes)
+    frames, order = _by_pattern(unit_rows(centred, sizes))
     B = np.random.default_rng(0).normal(size=(3, 9))
     _, residual, mean_square = _em_step(
         CompletionModel(B, 0.1), frames, COMPLETION_OPTIONS

@@ -338,12 +338,7 @@ class PosteriorFrames:
             The fit, that of `posterior`.
         """
         return fit_prepared(
-            block,
-            self.shapes,
-            self.noise_variance,
-            camera=self.camera,
-            starts=self.starts,
-            options=self.options,
+            block, self._search, self.noise_variance, starts=self.starts
         )
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:

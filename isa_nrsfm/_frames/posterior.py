@@ -209,24 +209,22 @@ def fit_tracks(
 
 def fit_prepared(
     frames: FrameTracks,
-    shapes: NDArray,
+    search: FrameSearch,
     noise_variance: NDArray | float,
     *,
-    camera: str = "affine",
     initial: NDArray | None = None,
     starts: NDArray | None = None,
-    options: FrameOptions = FRAME_OPTIONS,
 ) -> FramePosterior:
     """
-    Return the fits of `fit_posterior` for frames that are ready for products.
+    Return the fits of `fit_tracks` for frames that are ready for products.
 
     Parameters
     ----------
     frames : FrameTracks
         The frames, by their points or by their products with directions.
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes, by points (centred) or directions as the frames.
-    noise_variance, camera, initial, starts, options
+    search : FrameSearch
+        The search for the shapes, by points (centred) or directions as the frames.
+    noise_variance, initial, starts
         As of `fit_posterior`.
 
     Returns
@@ -235,8 +233,8 @@ def fit_prepared(
         The best fit of each frame.
     """
     return _best_fits(
-        _Prepared(frames, options),
-        SEARCHES[camera](shapes, options=options),
+        _Prepared(frames, search.options),
+        search,
         noise_variance,
         initial=initial,
         starts=starts,
@@ -256,7 +254,9 @@ def approximate_cameras(
 
     Parameters
     ----------
-    frames, shapes, noise_variance, camera, options
+    shapes, noise_variance, camera, options
+        As of `fit_posterior`.
+    frames : FrameTracks
         As of `fit_prepared`; all frames determine a camera.
 
     Returns

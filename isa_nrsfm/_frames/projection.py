@@ -1,6 +1,7 @@
 """Images of shapes, and how far they are from what frames show."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,13 +56,14 @@ def _energies(
     images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
     images += position[:, :, None]
     np.subtract(rows, images, out=images)
-    return _energy(images), _energy(rows - np.nanmean(rows, axis=2, keepdims=True))
-
-
-def _energy(rows: NDArray) -> float:
-    """Return the sum of the squares of all numbers that are not NaN."""
-    energy = float(energies(rows).sum())
-    return float(np.nansum(rows**2)) if np.isnan(energy) else energy
+    n_seen: Any = rows.shape[2]
+    if np.isnan(rows.sum()):
+        missing = np.isnan(rows)
+        n_seen = rows.shape[2] - missing.sum(axis=2)
+        rows, images = np.where(missing, 0.0, (rows, images))
+    total = rows.sum(axis=2, dtype=np.float64)
+    signal = energies(rows).sum() - (total * total / n_seen).sum()
+    return float(energies(images).sum()), float(signal)
 
 
 def distances(

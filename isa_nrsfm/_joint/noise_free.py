@@ -43,7 +43,7 @@ from scipy.linalg import solve_triangular
 
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.posterior import fit_posterior, fit_prepared
+from isa_nrsfm._frames.posterior import SEARCHES, fit_posterior, fit_prepared
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.options import JOINT_OPTIONS, NoiseFreeOptions
@@ -521,7 +521,7 @@ def _fitted(
     """Return cameras (n, 2, 3) and coefficients of a block; initial (n, K)."""
     W, seen = _tracks_of(block, counted)
     if seen is None:
-        fit = fit_prepared(block, shapes, 0.0, camera=camera, initial=initial)
+        fit = fit_prepared(block, SEARCHES[camera](shapes), 0.0, initial=initial)
     else:
         tracks = W.swapaxes(1, 2)
         fit = fit_posterior(

@@ -96,8 +96,8 @@ def block_triplets(
     """
     n_rows, n_columns = shape
     if min(shape) > max(options.dense, 4 * k):
-        V = _leading_subspace(blocks, n_columns, k, options)
         energy = sum(blocks.map(_energy))
+        V = _leading_subspace(blocks, n_columns, k, energy, options)
         projected = _triangle(blocks, k, options.stacked, V)
         _, S, rotation = np.linalg.svd(projected, full_matrices=False)
         rest = max(float(energy - S @ S), 0.0)
@@ -150,7 +150,7 @@ def _block_triangle(block: NDArray, V: NDArray | None) -> NDArray:
 
 
 def _leading_subspace(
-    blocks: FrameBlocks, n_columns: int, k: int, options: SvdOptions
+    blocks: FrameBlocks, n_columns: int, k: int, energy: float, options: SvdOptions
 ) -> NDArray:
     """
     Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
@@ -169,7 +169,6 @@ def _leading_subspace(
     sample = _matrix(blocks.take(np.sort(some))).astype(np.float64)
     last = np.linalg.qr(sample.T @ np.linalg.svd(sample @ sample.T)[0][:, :width])[0]
     basis, products = last, np.zeros((n_columns, 0))
-    energy = sum(blocks.map(_energy))
     found, gains = 0.0, []
     for _ in range(options.most_passes):
         # One pass over the matrix. Ritz values and vectors of W^T W in the basis.

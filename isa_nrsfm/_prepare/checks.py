@@ -77,7 +77,9 @@ class PointReport(NamedTuple):
     def from_seen(cls, seen: NDArray) -> Self:
         """Return the report from the mask of seen points (n_frames, n_points)."""
         n_frames = seen.sum(axis=0)
-        if seen.all(axis=1).any():
+        # Nearly always all points are in frames that share one with the fullest frame.
+        fullest = seen[np.argsort(seen.sum(axis=1))[-1:]]
+        if seen[(seen & fullest).any(axis=1)].any(axis=0).all():
             return cls(n_frames, np.zeros(len(n_frames), dtype=np.intp))
         shown = csr_array(seen)
         # Nodes are the points, then the frames. A frame is linked to what it shows.

@@ -24,7 +24,6 @@ from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
 from isa_nrsfm._prepare.options import COMPLETION_OPTIONS, CompletionOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames, spread
-from isa_nrsfm._tables.visibility import seen_points
 
 RIGID_RANK = 3
 
@@ -140,11 +139,19 @@ def complete_tracks(
     Completion
         Complete tracks. Tracks without missing points are returned as they are.
     """
-    seen = seen_points(centred)
-    if seen.all():
+    if not np.isnan(centred).any():
         return Completion(centred, np.zeros((len(centred), 2)))
-    model = completion_model(centred, sizes, n_components, options)
-    return filled_in(centred, sizes, model, options)
+    rows = _unit_rows(centred, sizes)
+    filled, shift = filled_in(
+        rows, completion_model(rows, n_components, options), options
+    )
+    scale = sizes[:, None, None]
+    return Completion(scale * filled.transpose(0, 2, 1), sizes[:, None] * shift)
+
+
+def _unit_rows(centred: NDArray, sizes: NDArray) -> NDArray:
+    """Return tracks (n_frames, n_points, 2) as frames (n_frames, 2, n_points)."""
+    return np.ascontiguousarray((centred / sizes[:, None, None]).transpose(0, 2, 1))
 
 
 def complete_rows(
@@ -178,8 +185,7 @@ def complete_rows(
     most = options.model_frames * options.model_points // n_points
     most = np.clip(most, options.fewest_shown, options.model_frames)
     frames = representative_frames(rows, n_points, int(most), options.fewest_shown)
-    tracks = rows.take(frames).transpose(0, 2, 1)
-    model = completion_model(tracks, np.ones(len(tracks)), n_components, options)
+    model = completion_model(rows.take(frames), n_components, options)
     return rows.derive(partial(_filled_rows, model=model, options=options))
 
 
@@ -187,32 +193,31 @@ def _filled_rows(
     rows: NDArray, model: CompletionModel, options: CompletionOptions
 ) -> NDArray:
     """Return frames (n_frames, 2, n_points) with their missing points filled in."""
-    tracks = rows.transpose(0, 2, 1)
-    centred = filled_in(tracks, np.ones(len(tracks)), model, options).centred
-    return np.ascontiguousarray(centred.transpose(0, 2, 1))
+    return filled_in(rows, model, options)[0]
 
 
 def completion_model(
-    centred: NDArray,
-    sizes: NDArray,
+    rows: NDArray,
     n_components: int,
     options: CompletionOptions = COMPLETION_OPTIONS,
 ) -> CompletionModel:
     """
-    Return the low-rank model that `complete_tracks` fills missing points in with.
+    Return the low-rank model that missing points are filled in with.
 
     Parameters
     ----------
-    centred, sizes, n_components, options
-        As there.
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Frames of size one, centred over the seen points, NaN where not seen.
+    n_components, options
+        As of `complete_rows`.
 
     Returns
     -------
     CompletionModel
         The model.
     """
-    rank = _possible_rank(3 * n_components + 3, centred.shape[1])
-    frames, _ = _by_pattern(centred, seen_points(centred), sizes)
+    rank = _possible_rank(3 * n_components + 3, rows.shape[2])
+    frames, _ = _by_pattern(rows)
     points = _model_points(frames, options.model_points)
     if points is None:
         return _fit(frames, rank, options)
@@ -223,41 +228,37 @@ def completion_model(
 
 
 def filled_in(
-    centred: NDArray,
-    sizes: NDArray,
+    rows: NDArray,
     model: CompletionModel,
     options: CompletionOptions = COMPLETION_OPTIONS,
-) -> Completion:
+) -> tuple[NDArray, NDArray]:
     """
-    Return tracks with the posterior means of a low-rank model as missing points.
+    Return frames with the posterior means of a low-rank model as missing points.
 
     Parameters
     ----------
-    centred : ndarray of shape (n_frames, n_points, 2)
-        Tracks, centred over the seen points of each frame, NaN where not seen.
-    sizes : ndarray of shape (n_frames,)
-        What each frame is divided by.
+    rows : ndarray of shape (n_frames, 2, n_points)
+        Frames of size one, centred over the seen points, NaN where not seen.
     model : CompletionModel
-        The model of frames of size one.
+        The model.
     options : CompletionOptions
         The size of blocks.
 
     Returns
     -------
-    Completion
-        Complete tracks.
+    filled : ndarray of shape (n_frames, 2, n_points)
+        The frames, centred over all points.
+    shift : ndarray of shape (n_frames, 2)
+        The centroids of all points that were subtracted.
     """
-    seen = seen_points(centred)
-    frames, order = _by_pattern(centred, seen, sizes)
-    fitted = np.empty_like(frames.rows)
-    for block, posterior, _ in _posteriors(frames, model, options.block_numbers):
-        fitted[block] = posterior.z @ model.B + posterior.t
-    expected = np.empty(centred.shape)
-    expected[order] = fitted.transpose(0, 2, 1)
-    expected *= sizes[:, None, None]
-    tracks = np.where(seen[..., None], centred, expected)
-    shift = tracks.mean(axis=1)
-    return Completion(tracks - shift[:, None], shift)
+    frames, order = _by_pattern(rows)
+    filled = np.empty(rows.shape)
+    for block, posterior, seen in _posteriors(frames, model, options.block_numbers):
+        expected = posterior.z @ model.B + posterior.t
+        filled[order[block]] = np.where(seen[:, None] > 0, frames.rows[block], expected)
+    shift = filled.mean(axis=2)
+    filled -= shift[:, :, None]
+    return filled, shift
 
 
 def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
@@ -277,8 +278,7 @@ def rigid_noise(centred: NDArray, sizes: NDArray) -> float:
         Noise variance of one coordinate in the model of rank 3, relative to the
         squared sizes.
     """
-    seen = seen_points(centred)
-    frames, _ = _by_pattern(centred, seen, sizes)
+    frames, _ = _by_pattern(_unit_rows(centred, sizes))
     points = _model_points(frames, COMPLETION_OPTIONS.model_points)
     if points is not None:
         frames, _, _ = frames.of_points(points)
@@ -294,21 +294,19 @@ def _possible_rank(rank: int, n_points: int) -> int:
     return max(1, min(rank, n_points - 2))
 
 
-def _by_pattern(
-    centred: NDArray, seen: NDArray, sizes: NDArray
-) -> tuple[_Frames, NDArray]:
+def _by_pattern(rows: NDArray) -> tuple[_Frames, NDArray]:
     """Return frames sorted by pattern, and the order (n_frames,) that sorts them.
 
-    Tracks are (n_frames, n_points, 2), `seen` (n_frames, n_points), sizes (n_frames,).
+    Rows are (n_frames, 2, n_points), NaN where not seen.
     """
+    seen = ~np.isnan(rows).any(axis=1)
     _, first, pattern = np.unique(
         np.packbits(seen, axis=1), axis=0, return_index=True, return_inverse=True
     )
     pattern = pattern.reshape(-1)
     order = np.argsort(pattern, kind="stable")
-    scaled = np.where(seen[..., None], centred, 0.0) / sizes[:, None, None]
-    rows = np.ascontiguousarray(scaled[order].transpose(0, 2, 1))
-    return _Frames(rows, pattern[order], seen[first].astype(np.float64)), order
+    filled = np.where(seen[:, None], rows, 0.0)
+    return _Frames(filled[order], pattern[order], seen[first].astype(float)), order
 
 
 def _model_points(frames: _Frames, most: int) -> NDArray | None:

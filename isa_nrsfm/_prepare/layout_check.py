@@ -14,7 +14,7 @@ from isa_nrsfm._tables.layout import (
     table_to_tracks,
     weighting_sizes,
 )
-from isa_nrsfm._tables.visibility import FEWEST_POINTS, seen_points
+from isa_nrsfm._tables.visibility import FEWEST_POINTS, CentredFrames, seen_points
 
 
 def layout_sample(
@@ -65,7 +65,7 @@ def warn_if_other_layout(
     both = _without_rarely_seen(both)
     if min(min(tracks.shape[:2]) for tracks in both) < options.fewest_to_tell:
         return
-    centred = [tracks - np.nanmean(tracks, axis=1, keepdims=True) for tracks in both]
+    centred = [CentredFrames.of_tracks(tracks).marked() for tracks in both]
     # The size of a frame is the smaller of the two, that of the right layout.
     sizes = np.min([weighting_sizes(c, scale_frames) for c in centred], axis=0)
     sizes = np.where(sizes > 0, sizes, 1.0)

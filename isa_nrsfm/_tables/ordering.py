@@ -34,8 +34,9 @@ def _first_half(rows: NDArray) -> NDArray:
     """
     flat = rows.reshape(len(rows), -1)
     if np.isnan(flat.sum()):
-        flat = np.nan_to_num(flat)
-    energy, half = energies(flat), energies(flat[:, : flat.shape[1] // 2])
+        flat = np.where(np.isnan(flat), 0.0, flat)
+    half, rest = (energies(part) for part in np.array_split(flat, 2, axis=1))
+    energy = half + rest
     return np.divide(half, energy, where=energy > 0, out=np.zeros_like(energy))
 
 

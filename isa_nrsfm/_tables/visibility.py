@@ -155,11 +155,14 @@ def report_frames(tracks: NDArray) -> FrameReport:
         The report.
     """
     frames = CentredFrames.of_tracks(tracks)
-    filled = zero_where_unseen(tracks, frames.seen)
+    highest, lowest = (
+        reduce(tracks, axis=(1, 2), initial=0.0)
+        for reduce in (np.fmax.reduce, np.fmin.reduce)
+    )
     return FrameReport(
         frames.translation,
         frames.square,
-        np.maximum(filled.max(axis=(1, 2)), -filled.min(axis=(1, 2))),
+        np.maximum(highest, -lowest),
         frames.n_seen,
         frames.in_one_place(),
         frames.on_line(),
@@ -269,11 +272,17 @@ def centred_over_seen(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     seen = seen_points(tracks)
     n_seen = seen.sum(axis=1)[:, None]
-    filled = zero_where_unseen(tracks, seen)
+    # Points as complex numbers x + iy: loops over two coordinates would be slow.
+    points = tracks.view(np.complex128)[..., 0]
+    if not seen.all():
+        points = np.where(seen, points, 0.0)
+    total = points.sum(axis=1).view(np.float64).reshape(-1, 2)
     translation = np.full((len(tracks), 2), np.nan)
-    total = np.einsum("ijc->ic", filled)
     np.divide(total, n_seen, where=n_seen > 0, out=translation)
-    return zero_where_unseen(tracks - translation[:, None], seen), translation, seen
+    centred = points - translation.view(np.complex128)
+    if not seen.all():
+        centred[~seen] = 0.0
+    return centred.view(np.float64).reshape(tracks.shape), translation, seen
 
 
 def points_coincide(
