@@ -96,7 +96,7 @@ class FrameOptions(NamedTuple):
     reweightings: int = 50
     settled: float = 1e-4
     complete_block: int = 2048
-    weighted_block: int = 512
+    weighted_block: int = 1024
 
 
 FRAME_OPTIONS = FrameOptions()
