@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import reliabilities
@@ -175,6 +176,7 @@ def fit_table(
     return fit_ready_table(table, n_components, options, progress)
 
 
+@one_blas_thread
 def fit_ready_table(
     table: ScaledTable,
     n_components: int,
@@ -273,6 +275,7 @@ def fit_ready_table(
     return fit
 
 
+@one_blas_thread
 def _count_components(source: Table, options: FitOptions) -> int:
     """Return the number of basis shapes that a table supports."""
     with warnings.catch_warnings():
@@ -305,6 +308,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
     return found
 
 
+@one_blas_thread
 def ready_table(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
     """
     Return a table checked, centred and scaled.

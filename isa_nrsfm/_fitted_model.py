@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import FramePosterior
 from isa_nrsfm._frames.projection import compose, project
@@ -75,6 +76,7 @@ class TableModel(NamedTuple):
     names: NDArray | None
     unit: float | None
 
+    @one_blas_thread
     def decompose(self, table: Table, deviations: bool = True) -> FrameFit:
         """
         Return cameras, positions and coefficients of the frames of a table.
@@ -86,6 +88,7 @@ class TableModel(NamedTuple):
         fit = partial(_fit, model=self, dtype=table.dtype, deviations=deviations)
         return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
 
+    @one_blas_thread
     def posterior(self, table: Table) -> FramePosterior:
         """
         Return the fit of each frame by itself, of size one and before the gauge.
@@ -96,6 +99,7 @@ class TableModel(NamedTuple):
         found = table.blocks.map(partial(_posterior, model=self))
         return FramePosterior(*map(np.concatenate, zip(*found, strict=True)))
 
+    @one_blas_thread
     def reconstruct(
         self, table: Table, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
@@ -121,11 +125,13 @@ class TableModel(NamedTuple):
         )
         return table.blocks.collect(shape, (self.mean_shape.shape,), table.dtype)[0]
 
+    @one_blas_thread
     def reproject(self, table: Table) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
         image = partial(_images, model=self, dtype=table.dtype)
         return table.blocks.collect(image, ((table.n_columns,),), table.dtype)[0]
 
+    @one_blas_thread
     def held_out_error(self, table: Table) -> float:
         """Return the inverse SNR of points held out of the fit of their frame."""
         energies = table.blocks.map(partial(_held_out, model=self))

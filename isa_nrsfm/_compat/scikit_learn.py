@@ -5,10 +5,7 @@ own. A version that lacks this code gets the fallbacks of `plain_checks`.
 """
 
 from collections.abc import Callable
-from functools import cache, wraps
 from typing import Any, TypeVar
-
-from threadpoolctl import ThreadpoolController
 
 from isa_nrsfm._compat.plain_checks import check_values
 
@@ -61,7 +58,6 @@ __all__ = [
     "fit_context",
     "is_pandas_na",
     "number_of_rows",
-    "one_blas_thread",
     "taken_rows",
 ]
 
@@ -141,32 +137,3 @@ def check_parameters(estimator: Any) -> None:
         name = type(estimator).__name__
         constraints = estimator._parameter_constraints
         check_values(constraints, estimator.get_params(deep=False), name)
-
-
-@cache
-def _thread_pools() -> ThreadpoolController:
-    """Return the loaded libraries with threads. The search is slow, so it is cached."""
-    return ThreadpoolController()
-
-
-def one_blas_thread(function: Function) -> Function:
-    """
-    Decorate a function to run with one BLAS thread.
-
-    Parameters
-    ----------
-    function : callable
-        A function whose matrices are so small that threads would wait for each other.
-
-    Returns
-    -------
-    callable
-        The function, with BLAS limited to one thread while it runs.
-    """
-
-    @wraps(function)
-    def limited(*args: Any, **kwargs: Any) -> Any:
-        with _thread_pools().limit(limits=1, user_api="blas"):
-            return function(*args, **kwargs)
-
-    return limited  # type: ignore[return-value]

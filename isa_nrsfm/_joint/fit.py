@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames, WeightedRows
 from isa_nrsfm._joint.many_points import (
@@ -158,7 +157,6 @@ class JointFit(NamedTuple):
 
 
 # The matrix products are small: more BLAS threads would only wait for each other.
-@one_blas_thread
 def fit_jointly(
     rows: FrameBlocks,
     completed: FrameBlocks,
@@ -272,7 +270,6 @@ def fit_jointly(
     )
 
 
-@one_blas_thread
 def count_components(
     rows: FrameBlocks,
     completed: FrameBlocks,

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
 
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._tables.ordering import spread
@@ -89,7 +88,6 @@ MIXING_OPTIONS = MixingOptions()
 
 
 # Threads cost more than they give on matrices of this size.
-@one_blas_thread
 def shared_mixing(
     signals: NDArray,
     *,
