@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 from sklearn.utils.extmath import randomized_svd
+from threadpoolctl import threadpool_limits
 
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
@@ -34,7 +35,8 @@ from isa_nrsfm._tables.layout import (
     weighting_sizes,
 )
 from isa_nrsfm._transformer import frames_of
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.baselines import BlockMatrixNRSfM
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import save_model, write_table
 
 # Random starts against which the fit of a frame is held, and how far they are spread,
@@ -375,6 +377,39 @@ def start(options):
             )
 
 
+def threads(options):
+    """Two BLAS threads beside another program, relative to one."""
+    X = make_nonrigid_tracks(2000, 68, 6, noise=0.02, random_state=0).data
+    body = make_body_tracks(400, random_state=0).data
+    model = AffineNRSfM(6, random_state=0).fit(X)
+
+    def with_threads(number, function):
+        with threadpool_limits(number, user_api="blas"):
+            function()
+
+    heading("", "two, ms", "one, ms")
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as busy:
+        try:
+            for title, function in (
+                ("fit", lambda: model.fit(X)),
+                ("fit, 20 % missing", lambda: model.fit(with_holes(X, 0.2))),
+                ("transform", lambda: model.transform(X)),
+                ("BlockMatrixNRSfM", lambda: BlockMatrixNRSfM(4).fit(body)),
+            ):
+                least, median, most, two, one = paired_ratio(
+                    partial(with_threads, 2, function),
+                    partial(with_threads, 1, function),
+                    options.pairs,
+                )
+                print(
+                    f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
+                    f"{1e3 * two:10.1f}{1e3 * one:9.1f}",
+                    flush=True,
+                )
+        finally:
+            busy.kill()
+
+
 SECTIONS = {
     "start": start,
     "frames": frames,
@@ -383,6 +418,7 @@ SECTIONS = {
     "new_frames": new_frames,
     "optima": optima,
     "fastisa": fastisa_iteration,
+    "threads": threads,
 }
 
 if __name__ == "__main__":

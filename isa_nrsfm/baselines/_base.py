@@ -18,6 +18,7 @@ from sklearn.base import (
 )
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
@@ -115,6 +116,7 @@ class ShapeSequenceNRSfM(
         """
 
     @fit_context(nested=False)
+    @one_blas_thread
     def fit(self, X: Any, y: Any = None) -> Self:
         """
         Factorise a table.
@@ -208,6 +210,7 @@ class ShapeSequenceNRSfM(
         """
         return self.decompose(X).alpha
 
+    @one_blas_thread
     def decompose(self, X: Any) -> Decomposition:
         """
         Return camera and coefficients of each frame of a table.
