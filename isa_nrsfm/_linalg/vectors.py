@@ -3,37 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-# OpenBLAS shares the inner product of more than 10 000 numbers among its threads. Where
-# other programs run on the same cores, that takes a thousand times as long: a thread
-# waits until the system lets the other one run.
-LONGEST = 8192
-
-
-def inner_products(a: NDArray, b: NDArray) -> NDArray:
-    """
-    Return the inner products of rows, by one thread.
-
-    Parameters
-    ----------
-    a, b : ndarray of shape (..., n)
-        Rows.
-
-    Returns
-    -------
-    ndarray of shape (...)
-        Sums over the last axis of ``a * b``.
-    """
-    product = np.vecdot(a[..., :LONGEST], b[..., :LONGEST])
-    for start in range(LONGEST, a.shape[-1], LONGEST):
-        part = slice(start, start + LONGEST)
-        product += np.vecdot(a[..., part], b[..., part])
-    return product
-
 
 def energies(rows: NDArray) -> NDArray[np.float64]:
     """Return the sums of the squares of arrays (n_frames, ...), in double precision."""
     flat = rows.reshape(len(rows), -1).astype(np.float64, copy=False)
-    return inner_products(flat, flat)
+    return np.vecdot(flat, flat)
 
 
 # Where the number of frames is no multiple of this, sums are rounded in another way for

@@ -5,8 +5,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.vectors import inner_products
-
 # Least number of points that a frame must show. Each point gives two equations; an
 # affine camera with its translation has eight unknowns. Coefficients need no further
 # points: their prior determines what the points do not.
@@ -309,11 +307,10 @@ def _collinear(
     x, y = centred[..., 0], centred[..., 1]
     # The principal axis by its angle. Eigenvalues of the 2x2 second moment would square
     # the distances from it, and lose half of their digits.
-    difference = inner_products(x, x) - inner_products(y, y)
-    angle = 0.5 * np.arctan2(2.0 * inner_products(x, y), difference)
+    angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
     across = np.cos(angle)[:, None] * y - np.sin(angle)[:, None] * x
     extent = np.linalg.norm(translation, axis=1) + np.abs(centred).max(axis=(1, 2))
     rounding = EQUAL * np.finfo(dtype).eps * extent
-    thin = inner_products(across, across) <= n_seen * rounding**2
+    thin = np.vecdot(across, across) <= n_seen * rounding**2
     on_line[on_line] = thin & (n_seen > 0)
     return on_line

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.vectors import inner_products
 from isa_nrsfm.isa._density import SubspaceDensity
 
 # A start cycles if its smallest change has not fallen for this many steps. Its step
@@ -125,8 +124,7 @@ def fixed_point_step(
     Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
     square = Y * Y
     g, dg = density.derivatives(square.sum(axis=2))
-    curvature = g.sum(axis=-1)[..., None]
-    curvature = curvature + 2.0 * inner_products(square, dg[:, :, None])
+    curvature = g.sum(axis=-1)[..., None] + 2.0 * np.vecdot(square, dg[:, :, None])
     Y *= g[:, :, None]
     step = Y.reshape(n_batch, n_signals, n_samples) @ Z.T
     step -= curvature.reshape(n_batch, n_signals, 1) * W
