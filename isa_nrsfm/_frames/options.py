@@ -95,7 +95,7 @@ class FrameOptions(NamedTuple):
     calibrated: Damping = Damping(first=0.1, raised=8.0, eased=0.1, least=0.01)
     reweightings: int = 50
     settled: float = 1e-4
-    complete_block: int = 4096
+    complete_block: int = 2048
     weighted_block: int = 1024
 
 

@@ -15,11 +15,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-# The most frames that a thread works on at a time to collect arrays: after short calls
-# of NumPy it waits for Python's lock. `AffineNRSfM.transform` by two threads takes 1.0
-# to 1.2 of the time of one with 2048 frames, 0.9 with 4096.
-THREAD_FRAMES = 4096
-
 
 class FrameBlocks(ABC):
     """
@@ -238,25 +233,6 @@ class MemoryBlocks(FrameBlocks):
             return
         with ThreadPoolExecutor(self.n_threads) as pool:
             yield from pool.map(run, numbers)
-
-    def collect(
-        self,
-        function: Callable[..., Any],
-        shapes: tuple[tuple[int, ...], ...],
-        dtype: Any,
-    ) -> tuple[Any, ...]:
-        """Return the arrays that a function makes of the blocks, each for all frames.
-
-        The blocks must be arrays: threads work on several of them at a time.
-        """
-        if min(self.n_threads, len(self.blocks)) < 2:
-            return super().collect(function, shapes, dtype)
-
-        def of_joined(parts: list[NDArray]) -> Any:
-            return function(np.concatenate(parts))
-
-        larger = self.regrouped(list, THREAD_FRAMES)
-        return FrameBlocks.collect(larger, of_joined, shapes, dtype)
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return the blocks that a function makes of these."""
