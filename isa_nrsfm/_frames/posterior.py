@@ -198,7 +198,7 @@ def fit_tracks(
     if weights is not None or not seen.all():
         weights = np.where(seen, 1.0 if weights is None else weights, 0.0)
     return _best_fits(
-        _Tracks(tracks, weights, search.options),
+        _Tracks(tracks, weights),
         search,
         noise_variance,
         initial=initial,
@@ -233,7 +233,7 @@ def fit_prepared(
         The best fit of each frame.
     """
     return _best_fits(
-        _Prepared(frames, search.options),
+        _Prepared(frames),
         search,
         noise_variance,
         initial=initial,
@@ -264,10 +264,10 @@ def approximate_cameras(
     ndarray of shape (n_frames, 2, 3)
         Cameras.
     """
-    prepared = _Prepared(frames, options)
+    prepared = _Prepared(frames)
     search = SEARCHES[camera](shapes, options=options)
     motion = np.empty((len(frames.weight), 2, 3))
-    for block, products in prepared.blocks(search.shared):
+    for block, products in prepared.blocks(search):
         variance = np.full(len(block), noise_variance)
         motion[block] = search.rough_cameras(products, variance, prepared.n_points)
     return search.cameras(motion)
@@ -278,7 +278,6 @@ class _Tracks(NamedTuple):
 
     tracks: NDArray  # (n_frames, n_points, 2)
     weights: NDArray | None  # (n_frames, n_points), None where all are 1
-    options: FrameOptions
 
     @property
     def n_points(self) -> float:
@@ -297,13 +296,14 @@ class _Tracks(NamedTuple):
         weights = None if self.weights is None else self.weights[frames]
         return self._replace(tracks=self.tracks[frames], weights=weights)
 
-    def blocks(self, shared: ShapeProducts) -> Iterator[tuple[NDArray, FrameSums]]:
+    def blocks(self, search: FrameSearch) -> Iterator[tuple[NDArray, FrameSums]]:
         """
         Yield the numbers of frames that determine a camera, and their sums.
 
         Complete frames come first: they share one Gram matrix.
         """
-        tracks, weights, options = self
+        tracks, weights = self
+        options, shared = search.options, search.shared
         complete = np.ones(len(tracks), dtype=bool)
         if weights is not None:
             complete = (weights == 1.0).all(axis=1)
@@ -324,7 +324,6 @@ class _Prepared(NamedTuple):
     """Frames that are ready for products."""
 
     frames: FrameTracks
-    options: FrameOptions
 
     @property
     def n_points(self) -> float:
@@ -342,10 +341,10 @@ class _Prepared(NamedTuple):
         """Return some of the frames."""
         return self._replace(frames=self.frames.take(frames))
 
-    def blocks(self, shared: ShapeProducts) -> Iterator[tuple[NDArray, FrameSums]]:
+    def blocks(self, search: FrameSearch) -> Iterator[tuple[NDArray, FrameSums]]:
         """Yield the numbers of frames that determine a camera, and their sums."""
         complete = self.frames.weights is None
-        options = self.options
+        options, shared = search.options, search.shared
         length = options.complete_block if complete else options.weighted_block
         for first in range(0, len(self.weight), length):
             last = min(first + length, len(self.weight))
@@ -382,7 +381,7 @@ def _best_fits(
     The arrays initial and starts are (n_frames, K) and (n_starts, K).
     """
     weight, n_components = frames.weight, search.shared.n_components
-    options = frames.options
+    options = search.options
     n_frames = len(weight)
     variance = np.broadcast_to(np.asarray(noise_variance, dtype=float), (n_frames,))
     first = np.zeros((n_frames, n_components)) if initial is None else initial
@@ -432,7 +431,7 @@ def _fit(
     """Return the minima that frames reach from coefficients initial (n_frames, K)."""
     n_frames, n_components = initial.shape
     fits = FramePosterior.unknown(n_frames, n_components, covariances)
-    for block, products in frames.blocks(search.shared):
+    for block, products in frames.blocks(search):
         found = search.fit(
             products,
             variance[block],

@@ -156,7 +156,6 @@ class JointFit(NamedTuple):
     frames: JointFrames
 
 
-# The matrix products are small: more BLAS threads would only wait for each other.
 def fit_jointly(
     rows: FrameBlocks,
     completed: FrameBlocks,

@@ -2,15 +2,16 @@
 
 import csv
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from isa_nrsfm._compat.optional import import_optional
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Line = TypeVar("Line", str, bytes)
 # As C and C++ programs on Windows write a number that is none.
 _NOT_NUMBERS = ["nan(ind)", "-nan(ind)"]
 # The longest header of a known format (py-feat with a mesh) has 40 000 characters.
@@ -61,18 +62,18 @@ def header_rows(path: Path, n_rows: int) -> list[list[str]]:
         return []
 
 
-def refuse_nulls(path: Path) -> None:
+def without_nulls(lines: Iterable[Line], null: Line) -> Iterator[Line]:
     """
-    Raise if a text file holds a null character, at which some readers end a cell.
+    Yield lines, and raise at a null character, at which some readers end a cell.
 
     Files in UTF-16 without a mark hold many.
     """
-    with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
-            if b"\0" in line:
-                raise ValueError(
-                    f"its text is not in UTF-8: line {number} has a null character"
-                )
+    for number, line in enumerate(lines, start=1):
+        if null in line:
+            raise ValueError(
+                f"its text is not in UTF-8: line {number} has a null character"
+            )
+        yield line
 
 
 def read_columns(
@@ -115,7 +116,6 @@ def read_columns(
         be a number is none, or if there is a null character.
     """
     pd = import_optional("pandas", extra="io")
-    refuse_nulls(path)
     if names is None:
         names = [name.strip() for name in header_names(path)]
     if len(set(names)) < len(names):
@@ -146,13 +146,13 @@ def read_columns(
 
 def _check_widths(path: Path, n_header: int, n_columns: int) -> None:
     """
-    Raise if a line does not have as many values as there are columns.
+    Raise if a line does not have as many values as there are columns, or has nulls.
 
     pandas fills short lines up and cuts long ones where only some columns are read.
     """
     n_rows = 0
     with path.open("rb") as file:
-        for number, line in enumerate(file, start=1):
+        for number, line in enumerate(without_nulls(file, b"\0"), start=1):
             if number <= n_header or not line.strip():
                 continue
             n_rows += 1

@@ -12,7 +12,7 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.landmark_columns import find_landmark_columns, parse_coordinate
-from isa_nrsfm.io._separated_values import refuse_nulls
+from isa_nrsfm.io._separated_values import without_nulls
 
 if TYPE_CHECKING:
     import os
@@ -213,9 +213,9 @@ def table_suffix(path: "str | os.PathLike[str]") -> str:
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
     pd = import_optional("pandas", extra="io")
-    refuse_nulls(path)
     with path.open(encoding="utf-8-sig", newline="") as file:
-        header = _check_lines(csv.reader(file, delimiter=separator))
+        lines = csv.reader(without_nulls(file, "\0"), delimiter=separator)
+        header = _check_lines(lines)
     frame = pd.read_csv(
         path,
         sep=separator,
