@@ -498,9 +498,10 @@ def judged(
     without them is returned (released). Deformation below the floor has vanished from
     the result, so that the released fit is tried from the start of the fit as well.
 
-    A model that is not right has too few basis shapes. If its noise is at the floor all
-    the same, cameras or depths explain the deformation that is missing. With calibrated
-    cameras it is fitted again, with a floor as high as that deformation.
+    A model that is not right has too few basis shapes, and cameras or depths explain
+    the deformation that is missing. Calibrated cameras are fitted again, with a floor
+    of the noise as high as that deformation. Orthographic ones, which have no scales
+    that could explain any of it, only if their noise is at the lower floor.
     """
     options, least_noise = problem.options.judgement, problem.options.least_noise
     n_seen, energy = problem.totals
@@ -514,7 +515,8 @@ def judged(
             if released.state.noise < right_noise:
                 return released, problem.options.search.noise_floor, True
     # Not right: with a floor as high as the missing deformation
-    if at_floor and cameras.calibrated and spectrum.noise > 0:
+    follows = cameras.scaled or at_floor
+    if cameras.calibrated and follows and spectrum.noise > 0:
         missing = options.cut_off * spectrum.missing
         least_noise = np.clip(missing, least_noise, options.most_noise)
         result = _calibrated_fit(problem, result.state, cameras, least_noise)

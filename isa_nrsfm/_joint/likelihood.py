@@ -9,7 +9,8 @@ minus twice the log likelihood of all frames is, up to a constant ::
 
 with N the number of coordinates that were seen. The objective is that plus ``penalty
 * sum_i tr H_i``, minus twice the log prior of the basis shapes: it penalises what they
-move in the images. So the objective is minus twice a log posterior.
+move in the images. Calibrated cameras add the prior of the extents of the shapes
+(`extents`). So the objective is minus twice a log posterior.
 
 Positions are eliminated by least squares: tracks and shapes are centred over the seen
 points of each frame. Without weights all frames see all points, and the shapes that are
@@ -39,6 +40,7 @@ from isa_nrsfm._frames.point_sums import (
     frame_sums,
     frame_tracks,
 )
+from isa_nrsfm._joint.extents import extent_penalty
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
@@ -129,6 +131,8 @@ class MarginalLikelihood:
         diagonal entry of each basis shape.
     known : tuple of float, optional
         What `totals` returns for these blocks, if it has been computed already.
+    extent_weight : float, default=0.0
+        Weight of the prior of the extents, for each coordinate.
 
     Attributes
     ----------
@@ -145,8 +149,9 @@ class MarginalLikelihood:
         frames: FrameBlocks,
         penalty: NDArray | float,
         known: tuple[float, float] | None = None,
+        extent_weight: float = 0.0,
     ):
-        self.frames = frames
+        self.frames, self.extent_weight = frames, extent_weight
         self.n_frames = frames.n_frames
         self.penalty = penalty
         self.n_seen, self.square = totals(frames) if known is None else known
@@ -188,9 +193,19 @@ class MarginalLikelihood:
         # What is common to all frames: 2 / s2 curvature B, N log s2 and its derivative.
         rows = shapes.reshape(3 * n_shapes, -1).T[:, :, None]
         pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
+        shape_gradient = shape_gradient + (2 / noise) * pulled
+        value += self.n_seen * np.log(noise)
+        if self.extent_weight:
+            weight = self.extent_weight * self.n_seen
+            # With one curvature for all points the shapes are centred already.
+            penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
+            value, shape_gradient = (
+                value + weight * penalty,
+                shape_gradient + weight * slope,
+            )
         return LikelihoodTerms(
-            float(value + self.n_seen * np.log(noise)),
-            shape_gradient + (2 / noise) * pulled,
+            float(value),
+            shape_gradient,
             motion_gradient,
             float(noise_gradient + self.n_seen),
             curvature,

@@ -11,6 +11,7 @@ from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import approximate_cameras
+from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
 from isa_nrsfm._joint.options import JOINT_OPTIONS, Effort, JointOptions
@@ -173,8 +174,13 @@ class JointProblem:
             The refinement.
         """
         steps = self.steps._replace(**changed)
+        likelihood = self.likelihood
+        if cameras.name != "affine":
+            likelihood = MarginalLikelihood(
+                self.frames.blocks, self.penalty, self.totals, EXTENT_WEIGHT
+            )
         return refine_joint(
-            self.likelihood,
+            likelihood,
             state,
             cameras,
             least_noise=(

@@ -292,26 +292,36 @@ def best_starts(
         _trial(part, rows, motion, few, given)
         for given in (shapes, lifted_shapes(rows[few], motion[few], n_components))
     ]
-    # Mixtures of more and more columns, until the objective rises
+    # Mixtures of more and more columns, until the objective rises. For small tables
+    # all of them, without and with scales: few steps do not show which is the best.
+    compared = effort.n_finalists > 1
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
-    frame_scales = scales if cameras.scaled else None
-    for mixed in mixed_cameras(rows, frame_scales, few, options):
-        given = lifted_shapes(rows[few], mixed[few], n_components)
-        trials.append(_trial(part, rows, mixed, few, given))
-        if len(trials) > 3 and trials[-1].value > trials[-2].value:
-            break
+    families = [scales] if cameras.scaled else [None]
+    if compared and cameras.scaled:
+        families.append(None)
+    for given_scales in families:
+        values: list[float] = []
+        for mixed in mixed_cameras(rows, given_scales, few, options):
+            given = lifted_shapes(rows[few], mixed[few], n_components)
+            trials.append(_trial(part, rows, mixed, few, given))
+            values.append(trials[-1].value)
+            if not compared and len(values) > 1 and values[-1] > values[-2]:
+                break
     # The best ones, with their cameras freed
     trials.sort(key=lambda trial: trial.value)
-    finalists = trials[: effort.n_finalists]
-    starts = [_freed(part, trial, few, cameras) for trial in finalists]
-    return [with_prior(problem, state) for state in starts]
+    freed = [
+        _freed(part, trial, few, cameras)
+        for trial in (trials if compared else trials[:1])
+    ]
+    freed.sort(key=lambda trial: trial.value)
+    return [with_prior(problem, each.state) for each in freed[: effort.n_finalists]]
 
 
 class _Trial(NamedTuple):
-    """A start after the first steps with its cameras held."""
+    """A start after some steps."""
 
     value: float  # of the objective
-    state: JointState  # of the compared frames
+    state: JointState  # of the compared frames; of all frames once cameras are freed
     motion: NDArray  # of all frames (n_frames, 2, 3)
 
 
@@ -331,13 +341,14 @@ def _trial(
 
 def _freed(
     part: JointProblem, trial: _Trial, few: NDArray, cameras: CameraModel
-) -> JointState:
-    """Return a start after some steps of shapes and cameras of the compared frames."""
+) -> _Trial:
+    """Make some steps of the shapes and the cameras of the compared frames few."""
     freed_steps = part.options.starts.freed_steps
     result = part.refined(trial.state, cameras, max_iter=freed_steps)
     motion = trial.motion.copy()
     motion[few] = result.state.motion
-    return result.state._replace(motion=motion)
+    state = result.state._replace(motion=motion)
+    return _Trial(result.history[-1], state, motion)
 
 
 def _first_state(

@@ -1,0 +1,45 @@
+"""Prior of the extents of the shapes, for calibrated cameras.
+
+Images of an object that hardly turns determine its depth only to second order. Depths
+that are c times as large, turned by angles that are c times smaller, have nearly the
+same images (bas-relief ambiguity: Belhumeur, Kriegman, Yuille, 1999). Whatever the model
+leaves of the images then decides on the depth. With the second moments ``G = sum_k B_k
+B_k^T`` of all shapes the objective contains ::
+
+    N weight (tr G / (3 det(G)^(1/3)) - 1),
+
+the ratio of the arithmetic to the geometric mean of the squared extents, for N
+coordinates. It is zero for shapes that extend alike in all directions, and grows with
+the number of coordinates as the misfit does: ``N log s2`` has to fall by as much.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+# An extent that is r times as large as both others has to lower the noise variance by
+# a factor: by 4 % for r = 5, by 12 % for 10. Frontal
+# photos of faces become needles without it. With 0.015 and 0.02
+# faces that turn by 6 degrees and more have the same errors as without it.
+EXTENT_WEIGHT = 0.02
+# Added to the squared extents, as a share of their mean: flat objects stay flat.
+FLAT = 1e-4
+
+
+def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:
+    """Compute the penalty of shapes (n_shapes, 3, n) and its gradient, for N weight 1.
+
+    Shapes that are not centred are centred first.
+    """
+    B = shapes if centred else shapes - shapes.mean(axis=2, keepdims=True)
+    G = np.einsum("kaj,kbj->ab", B, B)
+    mean = np.trace(G) / 3
+    if not mean > 0:
+        return 0.0, np.zeros_like(B)
+    square, axes = np.linalg.eigh(G)
+    square = np.maximum(square, 0.0) / mean + FLAT
+    ratio = (1.0 + FLAT) / np.cbrt(np.prod(square))
+    # Derivative of the logarithm of the ratio by G, times the mean extent
+    slope = -((axes / square) @ axes.T) / 3
+    slope += (np.sum((square - FLAT) / square) / 9) * np.eye(3)
+    gradient = np.tensordot(slope, B, axes=(1, 1)).swapaxes(0, 1)
+    return ratio - 1.0, (2.0 * ratio / mean) * gradient
