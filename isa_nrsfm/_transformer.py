@@ -21,6 +21,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,
@@ -31,6 +32,7 @@ from isa_nrsfm._tables.sources import (
     is_stored,
     unmasked,
 )
+from isa_nrsfm.skeletons import find_skeleton
 
 
 class Decomposition(NamedTuple):
@@ -465,15 +467,21 @@ class TableTransformer(
         table = self._opened(X)
         return -self._model.held_out_error(table)
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, X: Any = None) -> Diagnostics:
         """
         Return how well the fitted table determines shapes and coefficients.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points), default=None
+            The fitted table. With it outliers are looked for.
 
         Returns
         -------
         Diagnostics
             Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames, weak_deviations, camera_noise_ratio and camera_meaning.
+            effective_frames, weak_deviations, camera_noise_ratio, camera_meaning,
+            pose_share, outlier_share and outliers.
 
         Raises
         ------
@@ -485,7 +493,9 @@ class TableTransformer(
         -----
         UserWarning
             If the table does not support so many basis shapes, or hardly determines
-            the part of them that cameras absorb.
+            the part of them that cameras absorb. If X has outliers and the loss is
+            linear. If a handful of frames decide a coefficient. If the pose predicts a
+            coefficient and the points are those of a layout with a contour.
         """
         check_is_fitted(self)
         if not hasattr(self, "noise_variance_"):
@@ -496,6 +506,7 @@ class TableTransformer(
         check_frames_kept(self, "diagnostics")
         fitted = np.isfinite(self._frame_sizes)
         motion = np.asarray(self.motion_)[fitted]
+        image = self.mean_shape_ @ self.reference_motion_.T
         return diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
@@ -504,6 +515,9 @@ class TableTransformer(
             self.noise_variance_ / self._unit**2,
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
+            None if X is None else self._model.distances(self._opened(X)),
+            find_skeleton(len(image), names_of_points(self), shape=image),
+            self._model.frames.loss,
         )
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
