@@ -1,6 +1,6 @@
 """How far a table determines what was fitted to it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,7 +112,6 @@ def diagnose(
     reliability: NDArray,
     camera_noise_ratio: float,
     distance: NDArray | None = None,
-    layout: Skeleton | None = None,
     loss: str = "linear",
 ) -> Diagnostics:
     """
@@ -136,8 +135,6 @@ def diagnose(
         As of `Diagnostics`.
     distance : ndarray of shape (n_rows, n_points), default=None
         Lengths of the residuals of frames of size one, NaN where a point is missing.
-    layout : Skeleton, default=None
-        The layout of the points, if it is known.
     loss : {"linear", "huber", "cauchy"}, default="linear"
         The loss of the fit.
 
@@ -150,8 +147,7 @@ def diagnose(
     -----
     UserWarning
         If the table does not support so many basis shapes, or not the weak directions,
-        if it has outliers, if a few frames decide a coefficient, or if the pose
-        predicts one and the layout has a contour.
+        unless outliers may be the reason.
     """
     rows = motion.reshape(-1, 3)
     deformation = np.einsum(
@@ -175,6 +171,8 @@ def diagnose(
         pose_share(motion, alpha),
         *gross_residuals(distance),
     )
+    if loss == "linear" and found.outlier_share > MOST_GROSS:
+        return found
     unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
     if unsupported:
         warn_caller(
@@ -189,11 +187,6 @@ def diagnose(
             f"{found.weak_deviations[-1]:.2g} of the mean shape; take more frames or "
             "fewer basis shapes",
         )
-    if loss == "linear" and found.outlier_share > MOST_GROSS:
-        warn_caller(_outlier_advice(found))
-    _warn_of_few_frames(found.effective_frames, len(alpha))
-    if layout is not None and layout.contour:
-        _warn_of_pose(found.pose_share, layout)
     return found
 
 
@@ -266,50 +259,68 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
     return len(found) / np.count_nonzero(shown), found[order]
 
 
-def _outlier_advice(found: Diagnostics) -> str:
-    """Return the message of a table with outliers."""
+def outlier_advice(found: Diagnostics, rows: Sequence, names: Sequence[str]) -> str:
+    """
+    Return the message of a table with outliers.
+
+    Parameters
+    ----------
+    found : Diagnostics
+        The figures, with outliers.
+    rows : sequence of length n_rows
+        Names of the rows of the table.
+    names : sequence of str
+        Names of its points.
+
+    Returns
+    -------
+    str
+        The message; empty if there are too few outliers to matter.
+    """
+    if not found.outlier_share > MOST_GROSS:
+        return ""
     frames = np.unique(found.outliers[:, 0])
     points, counts = np.unique(found.outliers[:, 1], return_counts=True)
     most = points[np.argsort(-counts, kind="stable")]
     return (
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
-        f"{GROSS:g} standard deviations off and bend the shapes; frames "
-        f"{listed(frames)}; points {listed(most)}, the most frequent first; take "
-        'loss="cauchy" (--loss cauchy), or correct these points'
+        f"{GROSS:g} standard deviations off, in the rows "
+        f"{listed(rows[i] for i in frames)}, most often the points "
+        f"{listed(names[j] for j in most)}"
     )
 
 
-def _warn_of_few_frames(effective: NDArray, n_frames: int) -> None:
-    """Warn of coefficients that a handful of frames decide."""
+def warn_of_few_frames(effective: NDArray, n_frames: int) -> None:
+    """Warn of coefficients with few effective frames (n_components,)."""
     fewest = min(FEWEST_FRAMES, FEWEST_SHARE * n_frames)
     few = np.flatnonzero((effective > 0) & (effective < fewest))
     if len(few):
-        shown = [f"alpha_{k + 1} ({effective[k]:.1f})" for k in few]
+        shown = listed(f"alpha_{k + 1} ({effective[k]:.1f})" for k in few)
         warn_caller(
-            f"a handful of the {n_frames} frames decide {listed(shown)}, in effective "
-            "frames: these may be errors of the landmarks; look at the frames with the "
-            "largest coefficients, or take fewer basis shapes"
+            f"a handful of the {n_frames} frames decide {shown}, in effective frames: "
+            "look at the frames with the largest coefficients, which may have wrong "
+            "landmarks, or take fewer basis shapes"
         )
 
 
-def _warn_of_pose(share: NDArray, layout: Skeleton) -> None:
-    """Warn of coefficients that the pose predicts because a contour slides."""
+def warn_of_pose(share: NDArray, layout: Skeleton | None) -> None:
+    """Warn of coefficients whose share of pose (n_components,) a contour explains."""
     large = np.flatnonzero(share > MOST_POSE)
-    if len(large):
-        shown = [f"{100 * share[k]:.0f} % of alpha_{k + 1}" for k in large]
+    if layout is not None and layout.contour and len(large):
+        shown = listed(f"{100 * share[k]:.0f} % of alpha_{k + 1}" for k in large)
         warn_caller(
-            f"the pose predicts {listed(shown)}: {len(layout.contour)} points of "
-            f"{layout.name} follow the visible outline, which slides over the surface "
-            "as the head turns; fit the others alone (--points inner; in Python the "
-            f"columns get_skeleton({layout.name!r}).inner_columns)"
+            f"the pose predicts {shown}: {len(layout.contour)} points of {layout.name} "
+            "follow the visible outline, which slides over the surface as the head "
+            "turns; fit the others alone (--points inner; in Python the columns "
+            f"get_skeleton({layout.name!r}).inner_columns)"
         )
 
 
-def listed(items: Sequence[Any]) -> str:
-    """Return the first items of a list."""
-    shown = ", ".join(map(str, items[:MOST_LISTED]))
-    return shown + ", ..." * (len(items) > MOST_LISTED)
+def listed(items: Iterable[Any]) -> str:
+    """Return the first items of a list as a text."""
+    texts = [str(item) for item in items]
+    return ", ".join(texts[:MOST_LISTED]) + ", ..." * (len(texts) > MOST_LISTED)
 
 
 def camera_meaning(ratio: float) -> str:

@@ -13,7 +13,14 @@ from sklearn.base import (
 from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._diagnostics import Diagnostics, diagnose
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._diagnostics import (
+    Diagnostics,
+    diagnose,
+    outlier_advice,
+    warn_of_few_frames,
+    warn_of_pose,
+)
 from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
@@ -493,9 +500,10 @@ class TableTransformer(
         -----
         UserWarning
             If the table does not support so many basis shapes, or hardly determines
-            the part of them that cameras absorb. If X has outliers and the loss is
-            linear. If a handful of frames decide a coefficient. If the pose predicts a
-            coefficient and the points are those of a layout with a contour.
+            the part of them that cameras absorb. If a handful of frames decide a
+            coefficient. If the pose predicts a coefficient and the points are those of
+            a layout with a contour. If X has outliers and the loss is linear; these
+            may be the reason for all others, which are not given then.
         """
         check_is_fitted(self)
         if not hasattr(self, "noise_variance_"):
@@ -506,8 +514,8 @@ class TableTransformer(
         check_frames_kept(self, "diagnostics")
         fitted = np.isfinite(self._frame_sizes)
         motion = np.asarray(self.motion_)[fitted]
-        image = self.mean_shape_ @ self.reference_motion_.T
-        return diagnose(
+        names, loss = names_of_points(self), frames_of(self).loss
+        found = diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
             motion / self._frame_sizes[fitted, None, None],
@@ -516,9 +524,20 @@ class TableTransformer(
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
             None if X is None else self._model.distances(self._opened(X)),
-            find_skeleton(len(image), names_of_points(self), shape=image),
-            self._model.frames.loss,
+            loss,
         )
+        rows = X.index if hasattr(X, "iloc") else range(len(fitted))
+        if loss == "linear" and (advice := outlier_advice(found, rows, names)):
+            warn_caller(
+                f'{advice}: they bend the shapes; take loss="cauchy" (--loss cauchy), '
+                "or correct them"
+            )
+            return found
+        warn_of_few_frames(found.effective_frames, len(motion))
+        image = self.mean_shape_ @ self.reference_motion_.T
+        layout = find_skeleton(len(names), names, shape=image)
+        warn_of_pose(found.pose_share, layout)
+        return found
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
         """
