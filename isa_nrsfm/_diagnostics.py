@@ -291,24 +291,50 @@ def outlier_advice(found: Diagnostics, rows: Sequence, names: Sequence[str]) -> 
     )
 
 
-def warn_of_few_frames(effective: NDArray, n_frames: int) -> None:
-    """Warn of coefficients with few effective frames (n_components,)."""
+def warn_of_coefficients(
+    found: Diagnostics, alpha: NDArray, rows: Sequence, layout: Skeleton | None
+) -> None:
+    """
+    Warn of coefficients that a handful of frames decide, or the pose of a contour.
+
+    Parameters
+    ----------
+    found : Diagnostics
+        The figures.
+    alpha : ndarray of shape (n_rows, n_components)
+        Coefficients, NaN for rows that were not fitted.
+    rows : sequence of length n_rows
+        Names of the rows.
+    layout : Skeleton or None
+        Layout of the points, if it is known.
+
+    Warns
+    -----
+    UserWarning
+        If there are such coefficients.
+    """
+    n_frames = np.count_nonzero(np.isfinite(alpha[:, 0]))
+    effective = found.effective_frames
     fewest = min(FEWEST_FRAMES, FEWEST_SHARE * n_frames)
-    few = np.flatnonzero((effective > 0) & (effective < fewest))
-    if len(few):
-        shown = listed(f"alpha_{k + 1} ({effective[k]:.1f})" for k in few)
-        warn_caller(
-            f"a handful of the {n_frames} frames decide {shown}, in effective frames: "
-            "look at the frames with the largest coefficients, which may have wrong "
-            "landmarks, or take fewer basis shapes"
+    few = (effective > 0) & (effective < fewest)
+    if few.any():
+        largest = {
+            k: rows[np.nanargmax(np.abs(alpha[:, k]))] for k in np.flatnonzero(few)
+        }
+        shown = listed(
+            f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row {row})"
+            for k, row in largest.items()
         )
-
-
-def warn_of_pose(share: NDArray, layout: Skeleton | None) -> None:
-    """Warn of coefficients whose share of pose (n_components,) a contour explains."""
-    large = np.flatnonzero(share > MOST_POSE)
+        warn_caller(
+            f"a handful of the {n_frames} frames decide {shown}: look for wrong "
+            "landmarks in the frames with the largest coefficients, or take fewer "
+            "basis shapes"
+        )
+    large = np.flatnonzero(~few & (found.pose_share > MOST_POSE))
     if layout is not None and layout.contour and len(large):
-        shown = listed(f"{100 * share[k]:.0f} % of alpha_{k + 1}" for k in large)
+        shown = listed(
+            f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large
+        )
         warn_caller(
             f"the pose predicts {shown}: {len(layout.contour)} points of {layout.name} "
             "follow the visible outline, which slides over the surface as the head "

@@ -18,8 +18,7 @@ from isa_nrsfm._diagnostics import (
     Diagnostics,
     diagnose,
     outlier_advice,
-    warn_of_few_frames,
-    warn_of_pose,
+    warn_of_coefficients,
 )
 from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
@@ -514,12 +513,13 @@ class TableTransformer(
         check_frames_kept(self, "diagnostics")
         fitted = np.isfinite(self._frame_sizes)
         motion = np.asarray(self.motion_)[fitted]
+        alpha = np.asarray(self.alpha_, dtype=np.float64)
         names, loss = names_of_points(self), frames_of(self).loss
         found = diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
             motion / self._frame_sizes[fitted, None, None],
-            np.asarray(self.alpha_, dtype=np.float64)[fitted],
+            alpha[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
@@ -533,10 +533,9 @@ class TableTransformer(
                 "or correct them"
             )
             return found
-        warn_of_few_frames(found.effective_frames, len(motion))
         image = self.mean_shape_ @ self.reference_motion_.T
         layout = find_skeleton(len(names), names, shape=image)
-        warn_of_pose(found.pose_share, layout)
+        warn_of_coefficients(found, alpha, rows, layout)
         return found
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
