@@ -259,7 +259,7 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
     return len(found) / np.count_nonzero(shown), found[order]
 
 
-def outlier_advice(found: Diagnostics, rows: Sequence, names: Sequence[str]) -> str:
+def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     """
     Return the message of a table with outliers.
 
@@ -292,7 +292,7 @@ def outlier_advice(found: Diagnostics, rows: Sequence, names: Sequence[str]) -> 
 
 
 def warn_of_coefficients(
-    found: Diagnostics, alpha: NDArray, rows: Sequence, layout: Skeleton | None
+    found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
 ) -> None:
     """
     Warn of coefficients that a handful of frames decide, or the pose of a contour.

@@ -261,6 +261,35 @@ def test_what_the_table_hardly_determines_is_said(run, table, tmp_path, monkeypa
     assert "the table says little" in report["warnings"]
 
 
+def test_outliers_and_pose_are_reported(run, tmp_path):
+    scene = make_face_tracks(80, n_components=1, noise=0.01, random_state=0)
+    table = pd.DataFrame(scene.data, columns=scene.feature_names)
+    for row in range(8, 16):
+        table.loc[row, f"x_{4 * row}"] += 300.0
+    table["name"] = np.where(np.arange(80) < 5, "skip", "keep")
+    table.to_csv(tmp_path / "faces.csv", index=False)
+    fit = ["fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", "-k", 1]
+    code, out, err = run(*fit, "--skip-rows", "name=skip")
+    assert code == 0
+    said = "the table has outliers: 8 points (0.16 %) in 8 frames"
+    text = " ".join(out.split())
+    assert said in text
+    assert "in the rows 8, 9, 10, 11, 12, ..., most often the points 32, 36," in text
+    assert f"warning: {said}" in err
+    assert "--loss cauchy" in err
+    assert re.search(
+        r"alpha_1 .* \d+ %\n +pose: variance that yaw, pitch and roll", out
+    )
+    model = json.loads((tmp_path / "report.json").read_text())["model"]
+    largest = {(each["row"], each["point"]) for each in model["outliers"]["largest"]}
+    assert largest == {(row, str(4 * row)) for row in range(8, 16)}
+    assert model["alpha"][0]["pose_share"] < 0.3
+    assert model["alpha"][0]["effective_frames"] > 1
+    code, out, err = run(*fit, "--loss", "cauchy")
+    assert code == 0
+    assert "outliers" not in err
+
+
 def test_rows_with_missing_points_are_fitted(run, faces, tmp_path):
     faces = faces.copy()
     faces.loc[3, ["x_5", "y_5"]] = 0.0
@@ -807,7 +836,11 @@ def test_table_as_it_is_distributed(run, data_path, tmp_path):
         "fit", table, "--skip-rows", "name=^ir", "--zeros-missing", "-k", "2",
         "--n-init", "1", "--no-figures", "-o", tmp_path,
     )  # fmt: skip
-    assert (code, err) == (0, "")
+    assert code == 0
+    # Faces of this table are turned, and their jaw is the visible outline.
+    (warned,) = err.splitlines()
+    assert "the pose predicts" in warned
+    assert "15 points of xm2vts-68 follow the visible outline" in warned
     assert "3755 left out: name matches '^ir'" in out
     assert "3755 used" in out
     assert "2544 points (0.996 %) are missing in 840 of these rows" in out

@@ -234,7 +234,7 @@ def test_points_by_their_names(run, bodies, tmp_path):
 @pytest.mark.parametrize(
     ("given", "points", "message"),
     [
-        ("table", "inner", "got 17 points in no known layout: name the points"),
+        ("table", "inner", "17 points are in no known layout: name the points"),
         ("table", "3-17", "there are no points '3-17'; the 17 points are 0, 1"),
         ("faces", "nose", "there are no points 'nose'"),
         ("faces", "9-3", "there are no points '9-3'"),

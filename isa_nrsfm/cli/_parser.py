@@ -29,7 +29,7 @@ _MOST_CHOICES = 100
 
 _OVERVIEW = """\
 Factorise a table of 2D landmarks (one row a frame) into a mean 3D shape, basis shapes
-and, for every frame, coefficients that do not depend on the viewpoint."""
+and, for every frame, coefficients that are freed of the viewpoint."""
 
 _EXAMPLES = """\
 examples:

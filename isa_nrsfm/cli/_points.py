@@ -54,15 +54,11 @@ def kept_points(text: str, names: Sequence[str], layout: Skeleton | None) -> lis
     if text == INNER:
         if layout is None or not layout.contour:
             known = ", ".join(s.name for s in SKELETONS.values() if s.contour)
+            found = "in no known layout" if layout is None else f"of {layout.name}"
             raise ValueError(
                 "--points inner leaves out the visible outline of a face, but the "
-                f"{len(names)} points are "
-                + (
-                    "in no known layout"
-                    if layout is None
-                    else f"those of {layout.name}"
-                )
-                + f": name the points to keep, or give --skeleton ({known})"
+                f"{len(names)} points are {found}: name the points to keep, or give "
+                f"--skeleton ({known})"
             )
         return [int(j) for j in layout.inner]
     numbers = {name: j for j, name in enumerate(names)}

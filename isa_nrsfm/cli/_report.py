@@ -224,7 +224,8 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
         f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f} {pose_cell(row):>6}"
         for row in model["alpha"]
     ]
-    alpha.append("pose: variance that yaw, pitch and roll predict, cross-validated")
+    if any(map(pose_cell, model["alpha"])):
+        alpha.append("pose: variance that yaw, pitch and roll predict, cross-validated")
     choice = {}
     if "choice" in report:
         choice["Choice"] = _choice_lines(report["choice"])

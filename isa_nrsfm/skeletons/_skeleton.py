@@ -157,13 +157,13 @@ class Skeleton:
         """Return the columns of the inner points in a table x0, y0, x1, y1, ...."""
         return np.add.outer(2 * self.inner, [0, 1]).ravel()
 
-    def subset(self, points: Sequence[int]) -> "Skeleton":
+    def subset(self, points: Iterable[int]) -> "Skeleton":
         """
         Return the layout of some of the points.
 
         Parameters
         ----------
-        points : sequence of int
+        points : iterable of int
             The points to keep, in their new order.
 
         Returns
@@ -182,27 +182,25 @@ class Skeleton:
         new = {int(j): k for k, j in enumerate(points)}
         names = self.point_names
 
-        def kept(tuples: Iterable[tuple[int, ...]]) -> tuple[tuple[int, ...], ...]:
-            return tuple(
-                tuple(new[j] for j in each) for each in tuples if {*each} <= new.keys()
-            )
+        def pairs(old: Iterable[tuple[int, int]]) -> Pairs:
+            return tuple((new[a], new[b]) for a, b in old if {a, b} <= new.keys())
 
         parts = []
         for curve in self.curves:
             groups = groupby(curve, new.__contains__)
-            parts += [tuple(part) for inside, part in groups if inside]
-        sides = kept(zip(self.left, self.right, strict=True))
+            parts += [tuple(new[j] for j in part) for inside, part in groups if inside]
+        sides = pairs(zip(self.left, self.right, strict=True))
         return replace(
             self,
             name=f"{len(new)} points of {self.name}",
             n_points=len(new),
-            curves=kept(part for part in parts if len(part) > 1),
+            curves=tuple(part for part in parts if len(part) > 1),
             point_names=None if names is None else tuple(names[j] for j in new),
             left=tuple(left for left, _ in sides),
             right=tuple(right for _, right in sides),
-            up=kept(self.up),
-            front=kept(self.front),
-            across=kept(self.across),
+            up=pairs(self.up),
+            front=pairs(self.front),
+            across=pairs(self.across),
             contour=tuple(new[j] for j in self.contour if j in new),
         )
 
