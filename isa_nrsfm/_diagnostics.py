@@ -1,11 +1,16 @@
 """How far a table determines what was fitted to it."""
 
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
+from isa_nrsfm.skeletons import Skeleton
 
 # The information matrix of the weak directions is computed from this many frames.
 INFORMATIVE_FRAMES = 400
@@ -23,6 +28,22 @@ LARGEST_DEVIATION = 0.1
 # image. Motion capture with too few basis shapes has 1.1 to 4
 # (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
+# Gross residuals are so many robust standard deviations long. More than the second
+# share of the points are outliers. Without outliers at most 0.02 % of the points are so
+# far off: generated faces, bodies and hands, captured motion, photos of faces, K = 3
+# and 9. With one wrong point in a thousand, at half the size of a face, 0.06 to 0.13 %.
+GROSS, MOST_GROSS = 8.0, 5e-4
+# Effective frames of a coefficient that only a handful of frames decide: fewer than the
+# number, and than that share of the frames. Least of any coefficient without outliers:
+# 20 of 307 to 320 of 1000 frames (same tables). With outliers 1 to 20.
+FEWEST_FRAMES, FEWEST_SHARE = 10.0, 0.1
+# A larger share of a coefficient is called pose. Real faces of 68 points, K = 8, have
+# up to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
+MOST_POSE = 0.3
+# A regression on nine numbers needs more frames than that.
+FEWEST_FOR_POSE = 20
+# Frames, points or coefficients that a message names, at most.
+MOST_LISTED = 5
 
 
 class Diagnostics(NamedTuple):
@@ -59,6 +80,15 @@ class Diagnostics(NamedTuple):
         with affine ones; NaN for models that were saved before it was measured.
     camera_meaning : str
         What that ratio says of the cameras, in a sentence.
+    pose_share : ndarray of shape (n_components,)
+        Share of the variance of each coefficient that the pose predicts: R^2 of the
+        frames, each left out of a linear regression on the rotation. Not above zero if
+        the pose says nothing. NaN with fewer than 20 frames.
+    outlier_share : float
+        Share of the points of a table with gross residuals, more than 8 robust standard
+        deviations. NaN without a table.
+    outliers : ndarray of shape (n_outliers, 2)
+        Row and point of each gross residual, the largest first.
     """
 
     camera_singular_values: NDArray
@@ -68,6 +98,9 @@ class Diagnostics(NamedTuple):
     weak_deviations: NDArray
     camera_noise_ratio: float
     camera_meaning: str
+    pose_share: NDArray
+    outlier_share: float
+    outliers: NDArray
 
 
 def diagnose(
@@ -78,6 +111,8 @@ def diagnose(
     noise_variance: float,
     reliability: NDArray,
     camera_noise_ratio: float,
+    distance: NDArray | None = None,
+    loss: str = "linear",
 ) -> Diagnostics:
     """
     Return how far a table determines a fit, and warn where it does not.
@@ -98,6 +133,10 @@ def diagnose(
         As of `reliabilities`.
     camera_noise_ratio : float
         As of `Diagnostics`.
+    distance : ndarray of shape (n_rows, n_points), default=None
+        Lengths of the residuals of frames of size one, NaN where a point is missing.
+    loss : {"linear", "huber", "cauchy"}, default="linear"
+        The loss of the fit.
 
     Returns
     -------
@@ -107,7 +146,8 @@ def diagnose(
     Warns
     -----
     UserWarning
-        If the table does not support so many basis shapes, or not the weak directions.
+        If the table does not support so many basis shapes, or not the weak directions,
+        unless outliers may be the reason.
     """
     rows = motion.reshape(-1, 3)
     deformation = np.einsum(
@@ -128,7 +168,11 @@ def diagnose(
         np.sqrt(noise_variance / known),
         camera_noise_ratio,
         camera_meaning(camera_noise_ratio),
+        pose_share(motion, alpha),
+        *gross_residuals(distance),
     )
+    if loss == "linear" and found.outlier_share > MOST_GROSS:
+        return found
     unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
     if unsupported:
         warn_caller(
@@ -144,6 +188,165 @@ def diagnose(
             "fewer basis shapes",
         )
     return found
+
+
+def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
+    """
+    Compute the share of the variance of coefficients that the pose predicts.
+
+    Parameters
+    ----------
+    motion : ndarray of shape (n_frames, 2, 3)
+        Cameras. Of affine ones the nearest rotations in this space count.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+
+    Returns
+    -------
+    ndarray of shape (n_components,)
+        Leave-one-out R^2 of a linear regression on the nine entries of the rotations.
+        These span yaw, pitch, roll, their squares and products, to second order, and
+        do not depend on a reference pose. NaN for coefficients that are zero, or with
+        fewer than 20 frames.
+    """
+    if len(alpha) < FEWEST_FOR_POSE:
+        return np.full(alpha.shape[1], np.nan)
+    rows = polar(motion).rows
+    third = np.cross(rows[:, 0], rows[:, 1])
+    predictors = np.hstack([rows.reshape(-1, 6), third])
+    axes, sizes, _ = np.linalg.svd(predictors - predictors.mean(0), full_matrices=False)
+    axes = axes[:, sizes > OF_RANKS * np.sqrt(len(alpha))]
+    centred = alpha - alpha.mean(axis=0)
+    # With hat matrix H, the residual of a frame that was left out is r_i / (1 - H_ii).
+    kept = np.maximum(1 - 1 / len(alpha) - np.sum(axes**2, axis=1), OF_RANKS)
+    left_out = (centred - axes @ (axes.T @ centred)) / kept[:, None]
+    energy = np.sum(centred**2, axis=0)
+    ratio = np.full(len(energy), np.nan)
+    np.divide(np.sum(left_out**2, axis=0), energy, where=energy > 0, out=ratio)
+    return 1 - ratio
+
+
+def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
+    """
+    Find the points whose residuals are far longer than those of others.
+
+    Parameters
+    ----------
+    distance : ndarray of shape (n_rows, n_points) or None
+        Lengths of residuals, NaN where a point is missing.
+
+    Returns
+    -------
+    share : float
+        Share of the points with gross residuals, NaN without residuals.
+    outliers : ndarray of shape (n_outliers, 2)
+        Row and point of each, the largest first. The scale of a residual is the median
+        of all of them. It is larger for points and frames whose own median is larger:
+        such points and frames are badly explained as a whole.
+    """
+    none = np.empty((0, 2), dtype=np.intp)
+    if distance is None or not (shown := np.isfinite(distance)).any():
+        return np.nan, none
+    median = float(np.median(distance[shown]))
+    if not median > 0:
+        return 0.0, none
+    filled = np.ma.masked_invalid(distance)
+    of_rows = np.maximum(1.0, np.ma.median(filled, axis=1).filled(0) / median)
+    of_points = np.maximum(1.0, np.ma.median(filled, axis=0).filled(0) / median)
+    relative = np.where(shown, distance, 0.0) / of_rows[:, None] / of_points
+    found = np.argwhere(relative > GROSS * median / MEDIAN_DISTANCE)
+    order = np.argsort(-relative[tuple(found.T)], kind="stable")
+    return len(found) / np.count_nonzero(shown), found[order]
+
+
+def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
+    """
+    Return the message of a table with outliers.
+
+    Parameters
+    ----------
+    found : Diagnostics
+        The figures, with outliers.
+    rows : sequence of length n_rows
+        Names of the rows of the table.
+    names : sequence of str
+        Names of its points.
+
+    Returns
+    -------
+    str
+        The message; empty if there are too few outliers to matter.
+    """
+    if not found.outlier_share > MOST_GROSS:
+        return ""
+    frames = np.unique(found.outliers[:, 0])
+    points, counts = np.unique(found.outliers[:, 1], return_counts=True)
+    most = points[np.argsort(-counts, kind="stable")]
+    return (
+        f"the table has outliers: {len(found.outliers)} points "
+        f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
+        f"{GROSS:g} standard deviations off, in the rows "
+        f"{listed(rows[i] for i in frames)}, most often the points "
+        f"{listed(names[j] for j in most)}"
+    )
+
+
+def warn_of_coefficients(
+    found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
+) -> None:
+    """
+    Warn of coefficients that a handful of frames decide, or the pose of a contour.
+
+    Parameters
+    ----------
+    found : Diagnostics
+        The figures.
+    alpha : ndarray of shape (n_rows, n_components)
+        Coefficients, NaN for rows that were not fitted.
+    rows : sequence of length n_rows
+        Names of the rows.
+    layout : Skeleton or None
+        Layout of the points, if it is known.
+
+    Warns
+    -----
+    UserWarning
+        If there are such coefficients.
+    """
+    n_frames = np.count_nonzero(np.isfinite(alpha[:, 0]))
+    effective = found.effective_frames
+    fewest = min(FEWEST_FRAMES, FEWEST_SHARE * n_frames)
+    few = (effective > 0) & (effective < fewest)
+    if few.any():
+        largest = {
+            k: rows[np.nanargmax(np.abs(alpha[:, k]))] for k in np.flatnonzero(few)
+        }
+        shown = listed(
+            f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row {row})"
+            for k, row in largest.items()
+        )
+        warn_caller(
+            f"a handful of the {n_frames} frames decide {shown}: look for wrong "
+            "landmarks in the frames with the largest coefficients, or take fewer "
+            "basis shapes"
+        )
+    large = np.flatnonzero(~few & (found.pose_share > MOST_POSE))
+    if layout is not None and layout.contour and len(large):
+        shown = listed(
+            f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large
+        )
+        warn_caller(
+            f"the pose predicts {shown}: {len(layout.contour)} points of {layout.name} "
+            "follow the visible outline, which slides over the surface as the head "
+            "turns; fit the others alone (--points inner; in Python the columns "
+            f"get_skeleton({layout.name!r}).inner_columns)"
+        )
+
+
+def listed(items: Iterable[Any]) -> str:
+    """Return the first items of a list as a text."""
+    texts = [str(item) for item in items]
+    return ", ".join(texts[:MOST_LISTED]) + ", ..." * (len(texts) > MOST_LISTED)
 
 
 def camera_meaning(ratio: float) -> str:

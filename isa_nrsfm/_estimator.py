@@ -47,9 +47,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     Affine non-rigid structure from motion by independent subspace analysis.
 
     Factorises a table of 2D landmarks, one frame a row, into a mean 3D shape, basis
-    shapes, and for each frame a camera and coefficients that do not depend on the
-    viewpoint. No calibration, training data or order of the frames is needed. Row i,
-    reshaped to (n_points, 2), is modelled as::
+    shapes, and for each frame a camera and coefficients, which are free of the
+    viewpoint where points are fixed on the surface. No calibration, training data or
+    order of the frames is needed. Row i, reshaped to (n_points, 2), is modelled as::
 
         (mean_shape_ + tensordot(alpha_[i], basis_, 1)) @ motion_[i].T + translation_[i]
 

@@ -132,6 +132,15 @@ class TableModel(NamedTuple):
         return table.blocks.collect(image, ((table.n_columns,),), table.dtype)[0]
 
     @one_blas_thread
+    def distances(self, table: Table) -> NDArray:
+        """Return the lengths of residuals (n_frames, n_points) of frames of size one.
+
+        NaN where a point is missing, and for frames that are not usable.
+        """
+        found = partial(_distances, model=self)
+        return np.concatenate(list(table.blocks.map(found)))
+
+    @one_blas_thread
     def held_out_error(self, table: Table) -> float:
         """Return the inverse SNR of points held out of the fit of their frame."""
         energies = table.blocks.map(partial(_held_out, model=self))
@@ -215,6 +224,17 @@ def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
     motion, translation, alpha, _ = _fit(rows, model, dtype)
     shapes = compose(model.mean_shape, model.basis, alpha)
     return (tracks_to_table(project(shapes, motion, translation), model.layout),)
+
+
+def _distances(rows: NDArray, model: TableModel) -> NDArray:
+    """Return the lengths of the residuals (n, n_points) of some rows."""
+    ready = model.ready(model.tracks(rows))
+    fit = model.frames.fit(ready.centred, ready.sizes, False)
+    shapes = compose(model.mean_shape, model.basis, fit.alpha)
+    off = ready.centred - project(shapes, fit.motion, fit.translation)
+    lengths = np.full((len(rows), off.shape[1]), np.nan)
+    lengths[ready.usable] = np.linalg.norm(off, axis=2) / ready.sizes[:, None]
+    return lengths
 
 
 def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:

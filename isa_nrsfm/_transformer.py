@@ -13,7 +13,13 @@ from sklearn.base import (
 from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._diagnostics import Diagnostics, diagnose
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._diagnostics import (
+    Diagnostics,
+    diagnose,
+    outlier_advice,
+    warn_of_coefficients,
+)
 from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
@@ -21,6 +27,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,
@@ -31,6 +38,7 @@ from isa_nrsfm._tables.sources import (
     is_stored,
     unmasked,
 )
+from isa_nrsfm.skeletons import find_skeleton
 
 
 class Decomposition(NamedTuple):
@@ -465,15 +473,21 @@ class TableTransformer(
         table = self._opened(X)
         return -self._model.held_out_error(table)
 
-    def diagnostics(self) -> Diagnostics:
+    def diagnostics(self, X: Any = None) -> Diagnostics:
         """
         Return how well the fitted table determines shapes and coefficients.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_frames, 2 * n_points), default=None
+            The fitted table. With it outliers are looked for.
 
         Returns
         -------
         Diagnostics
             Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames, weak_deviations, camera_noise_ratio and camera_meaning.
+            effective_frames, weak_deviations, camera_noise_ratio, camera_meaning,
+            pose_share, outlier_share and outliers.
 
         Raises
         ------
@@ -485,7 +499,10 @@ class TableTransformer(
         -----
         UserWarning
             If the table does not support so many basis shapes, or hardly determines
-            the part of them that cameras absorb.
+            the part of them that cameras absorb. If a handful of frames decide a
+            coefficient. If the pose predicts a coefficient and the points are those of
+            a layout with a contour. If X has outliers and the loss is linear; these
+            may be the reason for all others, which are not given then.
         """
         check_is_fitted(self)
         if not hasattr(self, "noise_variance_"):
@@ -496,15 +513,30 @@ class TableTransformer(
         check_frames_kept(self, "diagnostics")
         fitted = np.isfinite(self._frame_sizes)
         motion = np.asarray(self.motion_)[fitted]
-        return diagnose(
+        alpha = np.asarray(self.alpha_, dtype=np.float64)
+        names, loss = names_of_points(self), frames_of(self).loss
+        found = diagnose(
             self.mean_shape_.astype(np.float64),
             self.basis_.astype(np.float64),
             motion / self._frame_sizes[fitted, None, None],
-            np.asarray(self.alpha_, dtype=np.float64)[fitted],
+            alpha[fitted],
             self.noise_variance_ / self._unit**2,
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
+            None if X is None else self._model.distances(self._opened(X)),
+            loss,
         )
+        rows = X.index if hasattr(X, "iloc") else range(len(fitted))
+        if loss == "linear" and (advice := outlier_advice(found, rows, names)):
+            warn_caller(
+                f'{advice}: they bend the shapes; take loss="cauchy" (--loss cauchy), '
+                "or correct them"
+            )
+            return found
+        image = self.mean_shape_ @ self.reference_motion_.T
+        layout = find_skeleton(len(names), names, shape=image)
+        warn_of_coefficients(found, alpha, rows, layout)
+        return found
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
         """

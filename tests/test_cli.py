@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import re
 import runpy
 import signal
 import subprocess
@@ -246,8 +247,11 @@ def test_auto_is_for_the_joint_refinement(fails, table, tmp_path):
 
 
 def test_what_the_table_hardly_determines_is_said(run, table, tmp_path, monkeypatch):
-    def diagnostics(self):
+    diagnose = AffineNRSfM.diagnostics
+
+    def diagnostics(self, X):
         warnings.warn("the table says little", stacklevel=2)
+        return diagnose(self, X)
 
     monkeypatch.setattr(AffineNRSfM, "diagnostics", diagnostics)
     code, _, err = run("fit", table, "-o", tmp_path, "--no-figures")
@@ -255,6 +259,37 @@ def test_what_the_table_hardly_determines_is_said(run, table, tmp_path, monkeypa
     assert "warning: the table says little" in err
     report = json.loads((tmp_path / "report.json").read_text())
     assert "the table says little" in report["warnings"]
+
+
+def test_outliers_and_pose_are_reported(run, tmp_path):
+    scene = make_face_tracks(80, n_components=1, noise=0.01, random_state=0)
+    table = pd.DataFrame(scene.data, columns=scene.feature_names)
+    for row in range(8, 16):
+        table.loc[row, f"x_{4 * row}"] += 300.0
+    table["name"] = np.where(np.arange(80) < 5, "skip", "keep")
+    table.to_csv(tmp_path / "faces.csv", index=False)
+    fit = ["fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", "-k", 1]
+    code, out, err = run(*fit, "--skip-rows", "name=skip")
+    assert code == 0
+    (said,) = re.findall("warning: (the table has outliers: .*): they bend", err)
+    assert said in " ".join(out.split())
+    assert "--loss cauchy" in err
+    assert re.search(
+        r"alpha_1 .* \d+ %\n +pose: variance that yaw, pitch and roll", out
+    )
+    model = json.loads((tmp_path / "report.json").read_text())["model"]
+    # The basis shape bends to some of the eight. Rows are those of the table.
+    largest = [
+        (each["row"], int(each["point"])) for each in model["outliers"]["largest"]
+    ]
+    assert 4 <= len(largest) == model["outliers"]["n_points"]
+    assert {row for row, _ in largest} < {*range(8, 16)}
+    assert all(point == 4 * row for row, point in largest[:4])
+    assert model["alpha"][0]["pose_share"] < 0.3
+    assert model["alpha"][0]["effective_frames"] > 1
+    code, out, err = run(*fit, "--loss", "cauchy")
+    assert code == 0
+    assert "outliers" not in err
 
 
 def test_rows_with_missing_points_are_fitted(run, faces, tmp_path):
@@ -444,12 +479,16 @@ def test_points_at_zero_are_pointed_out(run, faces, tmp_path):
         "fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", *QUICK
     )
     assert code == 0
-    assert err == (
-        "isa-nrsfm: warning: 2 points in 2 rows are at exactly (0, 0); if that marks "
-        "missing points, use --zeros-missing\n"
+    zeros, few = (
+        line.removeprefix("isa-nrsfm: warning: ") for line in err.strip().split("\n")
     )
+    assert zeros == (
+        "2 points in 2 rows are at exactly (0, 0); if that marks missing points, use "
+        "--zeros-missing"
+    )
+    assert re.search(r"a handful of the 60 frames decide alpha_1 \(.* row [39]\)", few)
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["warnings"] == [err.removeprefix("isa-nrsfm: warning: ").strip()]
+    assert report["warnings"] == [zeros, few]
 
 
 def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path):
@@ -799,7 +838,11 @@ def test_table_as_it_is_distributed(run, data_path, tmp_path):
         "fit", table, "--skip-rows", "name=^ir", "--zeros-missing", "-k", "2",
         "--n-init", "1", "--no-figures", "-o", tmp_path,
     )  # fmt: skip
-    assert (code, err) == (0, "")
+    assert code == 0
+    # Faces of this table are turned, and their jaw is the visible outline.
+    (warned,) = err.splitlines()
+    assert "the pose predicts" in warned
+    assert "15 points of xm2vts-68 follow the visible outline" in warned
     assert "3755 left out: name matches '^ir'" in out
     assert "3755 used" in out
     assert "2544 points (0.996 %) are missing in 840 of these rows" in out

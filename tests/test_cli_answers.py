@@ -10,6 +10,7 @@ pytest.importorskip("matplotlib")
 
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
 from isa_nrsfm.cli import main  # noqa: E402
+from isa_nrsfm.cli._answer_text import answer_lines  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
 from isa_nrsfm.io import load_model  # noqa: E402
 
@@ -74,6 +75,28 @@ def test_labels_are_answered_as_in_python(run):
     assert age["cross_validated"] > 0.8 > age["cross_validated_pca"]
 
 
+def test_means_of_classes_are_said_in_words(run):
+    folder, table = run
+    model = load_model(folder / "model.skops")
+    report = report_of(folder)
+    mood, age = report["labels"]
+    standard = (model.alpha_ - model.alpha_.mean(axis=0)) / model.alpha_.std(axis=0)
+    for name in ("up", "down"):
+        expected = standard[table["mood"] == name].mean(axis=0)
+        np.testing.assert_allclose(mood["class_means"][name], expected, atol=1e-9)
+    assert "class_means" not in age
+    k = int(np.argmax(mood["values"]))
+    means = {name: f"{mean[k]:+.1f}" for name, mean in mood["class_means"].items()}
+    first, second = sorted(means, key=lambda name: -abs(mood["class_means"][name][k]))
+    line = f"alpha_{k + 1}: {first} {means[first]}, {second} {means[second]}"
+    assert mood["p_values"][k] < 0.05
+    assert line in answer_lines(report)["Labels"]
+    assert line in (folder / "report.html").read_text(encoding="utf-8")
+    # Coefficients that have nothing to do with the label have no line.
+    report["labels"][0]["p_values"][k] = 0.2
+    assert line not in answer_lines(report)["Labels"]
+
+
 def test_groups_and_coefficients_within_them(run):
     folder, table = run
     model, alpha = load_model(folder / "model.skops"), pd.read_csv(folder / "alpha.csv")
@@ -101,7 +124,7 @@ def test_time_smooths(run):
 def test_figures_are_listed_and_drawn(run):
     folder, _ = run
     files = report_of(folder)["files"]
-    for name in ("label_1.png", "label_2.png", "time.png"):
+    for name in ("label_1.png", "label_1_shapes.png", "label_2.png", "time.png"):
         assert name in files
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
 

@@ -61,7 +61,7 @@ def test_it_needs_nothing_else(run):
     source, report = run
     page = Page(source)
     figures = [name for name in report["files"] if name.endswith(".png")]
-    assert len(page.images) == len(figures) == 4
+    assert len(page.images) == len(figures) == 5
     for image in page.images:
         assert image["src"].startswith("data:image/png;base64,")
         assert image["alt"]

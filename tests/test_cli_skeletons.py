@@ -9,7 +9,8 @@ import pytest
 from exported_files import Read, content_of
 
 from isa_nrsfm.cli import main
-from isa_nrsfm.datasets import make_body_tracks, make_hand_tracks
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.io import load_model
 from isa_nrsfm.skeletons import get_skeleton
 
 QUICK = [*"--n-components 1 --refinement none --isa fast --n-init 2".split()]
@@ -167,3 +168,81 @@ def test_the_demo_takes_edges(run, tmp_path):
     assert code == 0
     assert "--edges none" in report
     assert edges_of(tmp_path / "viewer.html") == (set(), [])
+
+
+@pytest.fixture(scope="module")
+def faces(tmp_path_factory):
+    scene = make_face_tracks(60, n_components=1, noise=0.01, random_state=0)
+    return write(scene, tmp_path_factory.mktemp("faces") / "faces.csv")
+
+
+@pytest.mark.parametrize("options", [[], ["--skeleton", "ibug-68"]])
+def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, options):
+    inner = ["--points", "inner", *options, "--no-figures"]
+    code, report, _ = run("fit", faces, "-o", tmp_path, *inner, *QUICK)
+    assert code == 0
+    assert "60 frames of 51 points" in report
+    assert "coordinates not used: --points inner (17)" in report
+    assert "points recognised as ibug-51" in report
+    assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("ibug-51")
+    names = load_model(tmp_path / "model.skops").feature_names_in_
+    assert names.tolist()[:2] == ["x_17", "y_17"]
+    alpha = pd.read_csv(tmp_path / "alpha.csv")
+    assert alpha.columns.tolist() == ["row", "alpha_1"]
+    # The table with all points has these points.
+    for columns in ([], ["--columns", "x_#,y_#"]):
+        page = ["--viewer", tmp_path / "v.html"]
+        code, report, _ = run(
+            "transform", tmp_path / "model.skops", faces, "-o", tmp_path / "a.csv",
+            *columns, *page,
+        )  # fmt: skip
+        assert code == 0
+        found = pd.read_csv(tmp_path / "a.csv")["alpha_1"]
+        np.testing.assert_allclose(found, alpha["alpha_1"], atol=1e-9)
+        assert edges_of(tmp_path / "v.html")[0] == pairs_of("ibug-51")
+
+
+@pytest.mark.parametrize(
+    ("points", "kept"),
+    [
+        ("without:0-16", range(17, 68)),
+        ("17-67", range(17, 68)),
+        ("36-47, 30,48-67,30", [30, *range(36, 68)]),
+    ],
+)
+def test_points_are_named(run, faces, tmp_path, points, kept):
+    fit = ["fit", faces, "-o", tmp_path, "--no-figures", "--points", points, *QUICK]
+    assert run(*fit)[0] == 0
+    names = load_model(tmp_path / "model.skops").feature_names_in_
+    assert names[::2].tolist() == [f"x_{j}" for j in kept]
+    expected = get_skeleton("ibug-68").subset(kept).edges.tolist()
+    found, _ = edges_of(tmp_path / "viewer.html")
+    assert found == {tuple(edge) for edge in expected}
+
+
+def test_points_by_their_names(run, bodies, tmp_path):
+    names = get_skeleton("coco-17").point_names
+    columns = [f"{name}_{axis}" for name in names for axis in "xy"]
+    path = write(bodies, tmp_path / "bodies.csv", columns)
+    options = ["--points", "without:left_eye-right_ear,0", "--no-figures", *QUICK]
+    code, report, _ = run("fit", path, "-o", tmp_path, *options)
+    assert code == 0
+    assert "12 points in the columns left_shoulder_x" in report
+    assert "points recognised as 12 points of coco-17" in report
+
+
+@pytest.mark.parametrize(
+    ("given", "points", "message"),
+    [
+        ("table", "inner", "17 points are in no known layout: name the points"),
+        ("table", "3-17", "there are no points '3-17'; the 17 points are 0, 1"),
+        ("faces", "nose", "there are no points 'nose'"),
+        ("faces", "9-3", "there are no points '9-3'"),
+        ("faces", "0-3", "needs at least 7 points, X has 4"),
+    ],
+)
+def test_points_that_are_none(run, request, given, tmp_path, points, message):
+    options = ["-o", tmp_path / "o", "--points", points, *QUICK]
+    code, _, error = run("fit", request.getfixturevalue(given), *options)
+    assert code == 1
+    assert message in error

@@ -1,15 +1,23 @@
 """What a fit says of itself: reliabilities and information, by their definitions."""
 
+import warnings
 from copy import deepcopy
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import eigvals
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._diagnostics import reliabilities, weak_information
+from isa_nrsfm._diagnostics import (
+    gross_residuals,
+    pose_share,
+    reliabilities,
+    weak_information,
+)
 from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.skeletons import get_skeleton
 
 
 def random_coefficients(seed, n_frames=50, n_components=3):
@@ -119,3 +127,132 @@ class TestFigures:
         mirrored = deepcopy(model).mirror().mode_covariance_
         assert np.abs(np.diff([expected, model.mode_covariance_], axis=0)).max() > 0
         assert_allclose(mirrored, expected, rtol=0, atol=1e-15)
+
+
+def with_outliers(faces, share, seed=0):
+    """Return a table of faces with wrong points, and which points are wrong."""
+    rng = np.random.default_rng(seed)
+    tracks = faces.tracks.copy()
+    wrong = rng.random(tracks.shape[:2]) < share
+    size = tracks.std(axis=1).mean()
+    tracks[wrong] += size * rng.normal(size=(np.count_nonzero(wrong), 2))
+    return tracks.reshape(len(tracks), -1), wrong
+
+
+class TestPoseShare:
+    def test_is_that_of_frames_left_out(self):
+        rng = np.random.default_rng(0)
+        R = Rotation.from_rotvec(0.4 * rng.normal(size=(40, 3))).as_matrix()
+        scales = rng.uniform(0.5, 2.0, size=(40, 1, 1))
+        alpha = rng.normal(size=(40, 2))
+        alpha[:, 0] += 1 + 5 * R[:, 0, 2]
+        predictors = np.hstack([np.ones((40, 1)), R.reshape(40, 9)])
+        error = np.empty_like(alpha)
+        for i in range(40):
+            others = np.arange(40) != i
+            fit = np.linalg.lstsq(predictors[others], alpha[others])[0]
+            error[i] = alpha[i] - predictors[i] @ fit
+        energy = np.sum((alpha - alpha.mean(axis=0)) ** 2, axis=0)
+        expected = 1 - np.sum(error**2, axis=0) / energy
+        found = pose_share(scales * R[:, :2], alpha)
+        assert_allclose(found, expected, rtol=1e-9)
+        assert found[0] > 0.5 > found[1]
+        turned = R[:, :2] @ Rotation.from_rotvec([1.0, 2.0, 3.0]).as_matrix()
+        assert_allclose(pose_share(turned, alpha), expected, rtol=1e-9)
+
+    @pytest.mark.parametrize("n_frames", [2, 19])
+    def test_of_few_frames_is_not_known(self, n_frames):
+        rng = np.random.default_rng(0)
+        motion = rng.normal(size=(n_frames, 2, 3))
+        assert np.isnan(pose_share(motion, rng.normal(size=(n_frames, 2)))).all()
+
+    def test_of_equal_cameras_and_of_coefficients_that_are_zero(self):
+        alpha = np.random.default_rng(0).normal(size=(30, 2))
+        alpha[:, 1] = 0.0
+        share = pose_share(np.tile(np.eye(2, 3), (30, 1, 1)), alpha)
+        assert -0.1 < share[0] <= 0
+        assert np.isnan(share[1])
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_a_contour_that_slides_is_named(self, camera):
+        faces = make_face_tracks(
+            300, n_components=2, camera="weak_perspective", noise=0.01, random_state=0
+        )
+        model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
+        assert np.abs(model.diagnostics().pose_share).max() < 0.1  # no warning
+        # The jaw follows the visible outline: it slides along itself by the yaw.
+        tracks, jaw = faces.tracks.copy(), np.arange(1, 16)
+        yaw = faces.motion[:, 0, 2] / np.linalg.norm(faces.motion[:, 0], axis=1)
+        along = tracks[:, jaw + 1] - tracks[:, jaw - 1]
+        tracks[:, jaw] += yaw[:, None, None] * along
+        table = tracks.reshape(300, -1)
+        model = AffineNRSfM(3, camera=camera, random_state=0).fit(table)
+        with pytest.warns(UserWarning, match="17 points of ibug-68 .*--points inner"):
+            assert model.diagnostics().pose_share.max() > 0.3
+        inner = table[:, get_skeleton("ibug-68").inner_columns]
+        model = AffineNRSfM(2, camera=camera, random_state=0).fit(inner)
+        assert np.abs(model.diagnostics().pose_share).max() < 0.1
+
+
+class TestOutliers:
+    def test_are_found_beside_badly_explained_points_and_frames(self):
+        rng = np.random.default_rng(0)
+        lengths = np.linalg.norm(rng.normal(size=(50, 20, 2)), axis=2)
+        lengths[7] *= 10
+        lengths[:, 3] *= 10
+        lengths[2, 5], lengths[4, 4], lengths[9, 9] = 20.0, 30.0, np.nan
+        share, found = gross_residuals(lengths)
+        assert found.tolist() == [[4, 4], [2, 5]]
+        assert share == 2 / 999
+        share, found = gross_residuals(np.zeros((3, 4)))
+        assert share == 0
+        assert found.shape == (0, 2)
+
+    def test_are_named_and_stand_for_what_they_cause(self):
+        faces = make_face_tracks(100, n_components=2, noise=0.01, random_state=0)
+        table, wrong = with_outliers(faces, 0.05)
+        model = AffineNRSfM(2, random_state=0).fit(table)
+        with pytest.warns(UserWarning, match="outliers") as warned:
+            found = model.diagnostics(table)
+        (message,) = (str(each.message) for each in warned)
+        assert message.startswith(f"the table has outliers: {len(found.outliers)} ")
+        assert 'loss="cauchy" (--loss cauchy)' in message
+        assert wrong[tuple(found.outliers.T)].mean() > 0.98
+        assert 0.03 < found.outlier_share < wrong.mean()
+        robust = AffineNRSfM(2, loss="cauchy", random_state=0).fit(table)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "the table has outliers")
+            warnings.filterwarnings("ignore", "a handful")
+            found = robust.diagnostics(table)
+        assert 0.04 < found.outlier_share < 1.05 * wrong.mean()
+
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    def test_tables_without_have_none(self, camera):
+        faces = make_face_tracks(100, noise=0.02, random_state=0)
+        model = AffineNRSfM(3, camera=camera, random_state=0).fit(faces.data)
+        found = model.diagnostics(faces.data)
+        assert found.outlier_share == 0
+        assert np.isnan(model.diagnostics().outlier_share)
+
+    def test_rows_and_points_have_their_names(self):
+        pandas = pytest.importorskip("pandas")
+        faces = make_face_tracks(100, n_components=2, noise=0.01, random_state=0)
+        table = pandas.DataFrame(faces.data, columns=faces.feature_names)
+        table.index = [f"image{i}" for i in range(100)]
+        for point in range(5, 30, 2):
+            table.loc[f"image{point + 2}", f"x_{point}"] += 400.0
+            table.loc[f"image{90 - point}", "x_5"] += 400.0
+        model = AffineNRSfM(2, random_state=0).fit(table)
+        with pytest.warns(UserWarning, match=r"rows image9, .* points 7,"):
+            model.diagnostics(table)
+
+
+def test_a_handful_of_frames_that_decide_a_coefficient_are_said():
+    faces = make_face_tracks(200, n_components=1, noise=0.01, random_state=0)
+    tracks = faces.tracks.copy()
+    tracks[:4, 48:68, 1] *= 1.3  # all lips of four frames
+    model = AffineNRSfM(2, random_state=0).fit(tracks.reshape(200, -1))
+    message = r"a handful of the 200 frames decide alpha_. \(.* most row [0-3]\)"
+    with pytest.warns(UserWarning, match=message):
+        effective = model.diagnostics().effective_frames
+    assert effective.min() < 10 < effective.max()

@@ -24,7 +24,7 @@ SIZES = {
     **{"ibug-68": 68, "ibug-51": 51, "xm2vts-68": 68, "muct-76": 76, "wflw-98": 98},
     **{"mediapipe-face-468": 468, "mediapipe-face-478": 478, "hand-21": 21},
     **{"coco-17": 17, "h36m-17": 17, "body-25": 25, "mediapipe-pose-33": 33},
-    "coco-wholebody-133": 133,
+    **{"coco-wholebody-133": 133, "xm2vts-53": 53, "muct-61": 61, "wflw-65": 65},
 }
 # The mirror image of a ring of the irises is not documented.
 RINGS = {*range(469, 473), *range(474, 478)}
@@ -70,7 +70,10 @@ def test_each_has_a_source_and_joins_its_points(name):
     known = {
         "xm2vts-68": {31, 36, 46, 47, 66, 67},
         "muct-76": {31, 36, 46, 47, 66, 67},
+        "xm2vts-53": {16, 21, 31, 32, 51, 52},
+        "muct-61": {16, 21, 31, 32, 51, 52},
         "wflw-98": {96, 97},
+        "wflw-65": {63, 64},
     }
     if not name.startswith("mediapipe-face"):
         assert alone == known.get(name, set())
@@ -342,3 +345,68 @@ def test_bad_questions():
 
 def test_names_of_the_command_line_are_those_of_the_registry():
     assert tuple(SKELETONS) == SKELETON_NAMES
+
+
+WITH_CONTOUR = {
+    **{"ibug-68": "ibug-51", "xm2vts-68": "xm2vts-53", "muct-76": "muct-61"},
+    "wflw-98": "wflw-65",
+}
+
+
+@ALL
+def test_the_contour_is_the_jaw(name):
+    skeleton = SKELETONS[name]
+    if name in WITH_CONTOUR:
+        assert skeleton.contour == skeleton.curves[0]
+    elif name == "coco-wholebody-133":
+        # The points of the face begin at 23.
+        assert skeleton.contour == tuple(j + 23 for j in range(17))
+    else:
+        assert skeleton.contour == ()
+
+
+@pytest.mark.parametrize(("name", "rest"), WITH_CONTOUR.items())
+def test_inner_points_are_a_layout(name, rest):
+    whole, inner = get_skeleton(name), get_skeleton(rest)
+    assert whole.subset(whole.inner).curves == inner.curves
+    assert inner.edges.tolist() == [
+        [whole.inner.tolist().index(j) for j in edge]
+        for edge in whole.edges.tolist()
+        if not {*edge} & {*whole.contour}
+    ]
+    table = np.arange(2 * whole.n_points)[None]
+    columns = table[:, whole.inner_columns].reshape(-1, 2)
+    assert columns[:, 0].tolist() == (2 * whole.inner).tolist()
+    assert columns[:, 1].tolist() == (2 * whole.inner + 1).tolist()
+
+
+def test_inner_points_stand_upright_as_all_do():
+    face, inner = get_skeleton("ibug-68"), get_skeleton("ibug-51")
+    shape = make_face_tracks(n_frames=20, random_state=0).mean_shape
+    turned = Rotation.random(random_state=0).apply(shape)
+    whole = Rotation.from_matrix(canonical_pose(turned, scheme=face).rotation)
+    part = canonical_pose(turned[face.inner], scheme=inner).rotation
+    between = whole * Rotation.from_matrix(part).inv()
+    assert np.rad2deg(between.magnitude()) < 15
+
+
+def test_parts_of_curves_and_sides_are_kept():
+    skeleton = Skeleton(
+        **{"name": "made", "kind": "other", "n_points": 7, "source": "a test, 2024"},
+        curves=((0, 1, 2, 3, 4), (5, 6)),
+        point_names=tuple("abcdefg"),
+        left=(0, 5),
+        right=(1, 6),
+        up=((0, 4), (2, 3)),
+        contour=(2, 4),
+    )
+    part = skeleton.subset([6, 0, 1, 3, 4])
+    assert part.curves == ((1, 2), (3, 4))
+    assert part.point_names == tuple("gabde")
+    assert (part.left, part.right) == ((1,), (2,))
+    assert part.up == ((1, 4),)
+    assert part.contour == (4,)
+    names = list("gfedcba")
+    assert skeleton.reordered(names).contour == (4, 2)
+    with pytest.raises(ValueError, match="0 to 6; got 7"):
+        dataclasses.replace(skeleton, contour=(7,))

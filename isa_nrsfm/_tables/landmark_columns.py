@@ -14,7 +14,7 @@ sets, ``thumb_#_x`` and ``*_x``.
 import re
 from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_patterns import (
@@ -281,6 +281,17 @@ def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
     if len(set(points)) == len(x_columns):
         return points
     return tuple(x_columns)
+
+
+def names_of_points(model: Any) -> tuple[str, ...]:
+    """Return the names of a model's points, or their numbers."""
+    n_points = len(model.mean_shape_)
+    columns = getattr(model, "feature_names_in_", None)
+    if columns is None:
+        return tuple(map(str, range(n_points)))
+    names = [str(name).strip() for name in columns]
+    x_columns = names[:n_points] if model.layout == "planar" else names[::2]
+    return point_names(x_columns)
 
 
 def _axis(letter: str) -> int:

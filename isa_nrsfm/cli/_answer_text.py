@@ -7,6 +7,9 @@ import numpy as np
 
 from isa_nrsfm.cli._outputs import component_names
 
+# Coefficients of which the means of classes are listed, and how many classes.
+SIGNIFICANT, MOST_CLASSES = 0.05, 4
+
 
 class Block(NamedTuple):
     """
@@ -81,7 +84,26 @@ def _label_block(label: dict[str, Any]) -> Block:
             names, label["values"], label["p_values"], strict=True
         )
     ]
-    return Block(title, ["", what, "p"], rows, [_told(label)])
+    return Block(title, ["", what, "p"], rows, [*_class_lines(label), _told(label)])
+
+
+def _class_lines(label: dict[str, Any]) -> list[str]:
+    """Say at which end of its coefficients each class is."""
+    classes = label.get("class_means", {})
+    names = component_names(len(label["values"]))
+    lines = []
+    for k, (name, p) in enumerate(zip(names, label["p_values"], strict=True)):
+        if p < SIGNIFICANT and classes:
+            means = {each: mean[k] for each, mean in classes.items()}
+            order = sorted(means, key=lambda each: -abs(means[each]))[:MOST_CLASSES]
+            shown = ", ".join(f"{each} {means[each]:+.1f}" for each in order)
+            lines.append(f"{name}: {shown}" + ", ..." * (len(means) > MOST_CLASSES))
+    if lines:
+        head = (
+            "mean of each class where p < 0.05, in standard deviations; + is the + end"
+        )
+        lines.insert(0, f"{head} of the basis shape")
+    return lines
 
 
 def _told(label: dict[str, Any]) -> str:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 
 TIME_FIGURE = "time.png"
+# Classes whose mean shapes are drawn on a page, at most.
+MOST_SHAPES = 12
 
 
 class Label(NamedTuple):
@@ -324,12 +326,27 @@ def _label_report(
         counts = np.unique(label.values, return_counts=True)
         report["classes"] = {str(c): int(n) for c, n in zip(*counts, strict=True)}
         report["largest_class"] = counts[1].max() / len(label.values)
+        report["class_means"] = dict(
+            zip(report["classes"], _class_means(label, alpha), strict=True)
+        )
     try:
         report["cross_validated"] = predictability(alpha[known], **options).mean()
         report["cross_validated_pca"] = predictability(aligned[known], **options).mean()
     except ValueError as error:  # too few frames of a class, or groups, for two folds
         report["not_cross_validated"] = str(error)
     return report
+
+
+def _class_means(label: Label, alpha: NDArray) -> NDArray:
+    """Return the mean coefficients of each class (n_classes, K), in deviations.
+
+    They are relative to the mean over all frames. alpha is (n_frames, K).
+    """
+    deviation = alpha.std(axis=0)
+    standard = np.zeros_like(alpha)
+    np.divide(alpha - alpha.mean(axis=0), deviation, where=deviation > 0, out=standard)
+    of_class = label.values == np.unique(label.values)[:, None]
+    return of_class @ standard[label.known] / of_class.sum(axis=1, keepdims=True)
 
 
 def _group_report(asked: Answers, alpha: NDArray) -> dict[str, Any]:
@@ -352,6 +369,12 @@ def answer_figures(asked: Answers) -> dict[str, str]:
         _label_figure(number): f"coefficients by {label.name}"
         for number, label in enumerate(asked.labels)
     }
+    figures |= {
+        _shapes_figure(number): f"mean shape of each {label.name}, beside that of all "
+        "frames in grey"
+        for number, label in enumerate(asked.labels)
+        if _has_shapes(label)
+    }
     if asked.times is not None:
         figures[TIME_FIGURE] = "coefficients in time, with one standard deviation"
     return figures
@@ -362,8 +385,23 @@ def _label_figure(number: int) -> str:
     return f"label_{number + 1}.png"
 
 
+def _shapes_figure(number: int) -> str:
+    """Return the name of the figure of the mean shapes of a label."""
+    return f"label_{number + 1}_shapes.png"
+
+
+def _has_shapes(label: Label) -> bool:
+    """Tell whether a label has few enough classes for a figure of their shapes."""
+    few = len(np.unique(label.values)) <= MOST_SHAPES
+    return label.kind == "classes" and few
+
+
 def draw_answers(
-    folder: Path, asked: Answers, answers: Answered, estimator: AffineNRSfM
+    folder: Path,
+    asked: Answers,
+    answers: Answered,
+    estimator: AffineNRSfM,
+    edges: Any = "auto",
 ) -> None:
     """Draw the coefficients by label, and in time: smoothed where they are."""
     from isa_nrsfm.plotting import CoefficientsDisplay
@@ -378,6 +416,9 @@ def draw_answers(
         )
         figure = display.plot(kind=label.kind).figure_
         write_figure(folder / _label_figure(number), figure)
+        if _has_shapes(label):
+            figure = _draw_shapes(label, estimator, edges)
+            write_figure(folder / _shapes_figure(number), figure)
     if asked.times is not None:
         alpha, deviation = estimator.alpha_, getattr(estimator, "alpha_std_", None)
         if answers.smooth is not None:
@@ -390,3 +431,33 @@ def draw_answers(
             component_names=names,
         )
         write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)
+
+
+def _draw_shapes(label: Label, estimator: AffineNRSfM, edges: Any) -> Any:
+    """Draw the mean shape of each class over that of all frames."""
+    from isa_nrsfm.plotting import BasisShapeDisplay
+    from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
+    from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
+
+    whole = BasisShapeDisplay.from_estimator(estimator, edges=edges)
+    import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
+    means = _class_means(label, estimator.alpha_)
+    shapes = whole.mean_shape + np.tensordot(means, whole.basis, 1)
+    everything = np.concatenate([whole.mean_shape[None], shapes])
+    (limits,), _ = block_limits([everything])
+    axes = new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
+    classes, counts = np.unique(label.values, return_counts=True)
+    for shape, pair, name, count in zip(shapes, axes, classes, counts, strict=True):
+        for drawn, colour in ((whole.mean_shape, "0.8"), (shape, MEAN_COLOUR)):
+            BasisShapeDisplay(
+                mean_shape=drawn,
+                basis=np.zeros((0, *drawn.shape)),
+                edges=whole.skeleton,
+                origin=whole.origin,
+            ).plot(pair, point_kw={"color": colour})
+        for axis, (x, y) in zip(pair, VIEWS, strict=True):
+            axis.set(xlim=limits[x], ylim=limits[y])
+            axis.yaxis.set_inverted(whole.origin == "upper")
+        title = wrap_title(f"{name} ({count} frames)", pair)
+        pair[0].set_title(title, loc="left", fontsize="small")
+    return axes[0, 0].figure

@@ -139,7 +139,7 @@ def fit_table(
             )
             if not args.no_figures:
                 write_figures(new, estimator, X, args.random_state, edges, search)
-                draw_answers(new, asked, answers, estimator)
+                draw_answers(new, asked, answers, estimator, edges)
             model = model_report(estimator, X, frames, edges)
             clock["write"] = time.perf_counter()
             seconds = np.diff([*clock.values()]).round(3)
@@ -189,8 +189,6 @@ def _fitted(
     else:
         with _progress(estimator):
             estimator.fit(X)
-    if estimator.refinement == "joint":
-        estimator.diagnostics()  # for its warnings
     clock["fit"] = time.perf_counter()
     return estimator, search
 

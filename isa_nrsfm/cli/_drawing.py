@@ -42,7 +42,9 @@ def chosen_edges(
             return links
         sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return np.unique(np.sort(sides, axis=1), axis=0)
-    if args.skeleton is not None:
+    # With --points the option is of all points, and the layout of the rest is stored.
+    some_points = stored is not None and getattr(args, "points", None) is not None
+    if args.skeleton is not None and not some_points:
         if Path(args.skeleton).suffix.lower() in CONFIGURATIONS:
             return read_skeleton(args.skeleton, names)
         skeleton = get_skeleton(args.skeleton)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.cli._drawing import chosen_edges
 from isa_nrsfm.cli._drawing_options import drawing_files
 from isa_nrsfm.cli._export_options import SUFFIXES
@@ -20,7 +21,6 @@ from isa_nrsfm.export import (
     write_viewer,
 )
 from isa_nrsfm.io import load_model
-from isa_nrsfm.plotting._edges import names_of_points
 from isa_nrsfm.skeletons import Skeleton
 
 # The options that each content has.

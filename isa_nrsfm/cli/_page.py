@@ -11,7 +11,7 @@ from typing import Any
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._answer_text import answer_tables
 from isa_nrsfm.cli._parser import PROGRAM
-from isa_nrsfm.cli._report import fit_sections, fit_title
+from isa_nrsfm.cli._report import fit_sections, fit_title, pose_cell
 
 REPORT_PAGE = "report.html"
 
@@ -87,11 +87,13 @@ def _coefficients(model: dict[str, Any]) -> list[str]:
             row["name"],
             f"{100 * row['energy_share']:.1f} %",
             *(f"{row[key]:z.2f}" for key in ("mean", "std", "min", "max")),
+            pose_cell(row),
         ]
         for row in model["alpha"]
     ]
-    head = ["", "energy", "mean", "std", "min", "max"]
-    return ["<h2>Coefficients</h2>", table(head, rows)]
+    head = ["", "energy", "mean", "std", "min", "max", "pose"]
+    meaning = "Pose: variance that yaw, pitch and roll predict, cross-validated."
+    return ["<h2>Coefficients</h2>", table(head, rows), _paragraph(meaning, "quiet")]
 
 
 def answer_sections(report: dict[str, Any]) -> list[str]:

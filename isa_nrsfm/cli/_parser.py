@@ -29,7 +29,7 @@ _MOST_CHOICES = 100
 
 _OVERVIEW = """\
 Factorise a table of 2D landmarks (one row a frame) into a mean 3D shape, basis shapes
-and, for every frame, coefficients that do not depend on the viewpoint."""
+and, for every frame, coefficients that are freed of the viewpoint."""
 
 _EXAMPLES = """\
 examples:
@@ -55,7 +55,7 @@ examples:
   isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
       --n-components 9 --output muct
   isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
-  isa-nrsfm fit 300W/01_Indoor --n-components 5 --output results
+  isa-nrsfm fit 300W/01_Indoor --points inner --n-components 5 --output results
 
 Cells of missing points are empty. Rows that show too few points for a fit are counted
 and get empty coefficients. Files of an earlier run in the output folder are
@@ -97,7 +97,7 @@ def build_parser() -> argparse.ArgumentParser:
             "Fit basis shapes and coefficients to a table of landmarks.", _FIT_EXAMPLES
         ),
     )
-    _add_table_options(fit)
+    _add_points_option(_add_table_options(fit))
     output = _add_folder_options(fit, required=True)
     _add_std_option(output)
     add_drawing_options(output, _path)
@@ -166,7 +166,7 @@ def _manners(description: str, epilog: str) -> dict[str, Any]:
 
 def _add_table_options(
     parser: argparse.ArgumentParser, *, required: bool = True
-) -> None:
+) -> argparse._ActionsContainer:
     """Add the options that say what a table's rows and columns mean."""
     group = parser.add_argument_group("table")
     group.add_argument(
@@ -221,6 +221,18 @@ def _add_table_options(
         type=_image_size,
         help="size of the images in pixels, such as 1920x1080, for the coordinates of "
         "MediaPipe, which are shares of it",
+    )
+    return group
+
+
+def _add_points_option(group: argparse._ActionsContainer) -> None:
+    """Add the option that keeps some of the points."""
+    group.add_argument(
+        "--points",
+        metavar="POINTS",
+        help="fit some of the points: inner leaves out the visible outline of a face, "
+        "which slides over the surface as the head turns; otherwise names, numbers and "
+        "ranges such as nose,36-47, or without:0-16 for those to leave out",
     )
 
 

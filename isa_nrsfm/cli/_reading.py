@@ -1,6 +1,8 @@
 """Read the table that a command is given, and take its landmark columns."""
 
+import warnings
 from argparse import Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +16,11 @@ from isa_nrsfm._tables.landmark_columns import (
     parse_coordinate,
     point_names,
 )
+from isa_nrsfm.cli._drawing_options import CONFIGURATIONS
 from isa_nrsfm.cli._frames import Frames, choose_frames
+from isa_nrsfm.cli._points import kept_points, layout_of_table, part_of_layout
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
+from isa_nrsfm.skeletons import read_skeleton
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,10 +37,42 @@ def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames
     table, chosen, failed, skeleton = _read(args)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
+        if chosen is not None and skeleton is not None:
+            places = [chosen.x.index(name) for name in columns.x]
+            if sorted(places) != list(range(len(chosen.x))):
+                skeleton = part_of_layout(skeleton, places)
     else:
         columns = chosen or find_landmark_columns(table.columns)
+        if args.points is not None:
+            return _some_points(args, table, columns, failed, skeleton)
     frames = taken_frames(args, table, columns, failed)
     return frames._replace(skeleton=skeleton)
+
+
+def _some_points(
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    failed: NDArray[np.bool_] | None,
+    skeleton: "Skeleton | None",
+) -> Frames:
+    """Take the frames with the points of --points; skeleton is that of all points."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the points that are kept warn again
+        whole = taken_frames(args, table, columns, failed)
+    tracks = whole.points[whole.usable].to_numpy().reshape(-1, len(columns.points), 2)
+    if args.skeleton is not None and Path(args.skeleton).suffix in CONFIGURATIONS:
+        skeleton = read_skeleton(args.skeleton, columns.points)
+    layout = layout_of_table(args.skeleton or skeleton, columns.points, tracks)
+    kept = kept_points(args.points, columns.points, layout)
+    names, x, y = (
+        tuple(each[j] for j in kept) for each in (columns.points, columns.x, columns.y)
+    )
+    some = columns._replace(points=names, x=x, y=y)
+    out = [name for name in columns.interleaved if name not in {*x, *y}]
+    frames = taken_frames(args, table.drop(columns=out), some, failed)
+    not_used = frames.not_used | {f"--points {args.points}": len(out) // 2}
+    return frames._replace(skeleton=part_of_layout(layout, kept), not_used=not_used)
 
 
 def taken_frames(
@@ -139,7 +176,9 @@ def _columns_of_model(
     absent = [name for point in zip(x, y, strict=True) for name in point]
     absent = [name for name in absent if name not in present]
     surplus = [name for name in coordinates if name not in wanted]
-    if absent or (surplus and chosen is not None):
+    # Points after those of the model are of another layout. Others were left out of it.
+    first = [str(name).strip() for name in candidates[: len(wanted)]]
+    if absent or (surplus and chosen is not None and wanted == {*first}):
         differences = [
             f"{len(names)} columns are only in the {where} ({_shortened(names)})"
             for names, where in ((absent, "model"), (surplus, "table"))

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, Decomposition, __version__
-from isa_nrsfm._diagnostics import camera_meaning
+from isa_nrsfm._diagnostics import Diagnostics, camera_meaning, outlier_advice
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.cli._answer_text import answer_lines
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
@@ -99,6 +100,8 @@ def model_report(
     floor = frames.seen.all() and estimator.loss == "linear"
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     layout = layout_of(estimator, edges)
+    K = len(names)
+    found = estimator.diagnostics(X) if estimator.refinement == "joint" else None
     return {
         "n_components": len(estimator.basis_),
         **quality_report(estimator, X, fitted_frames(estimator)),
@@ -110,6 +113,7 @@ def model_report(
         "camera_noise_ratio": ratio,
         "camera_meaning": None if ratio is None else camera_meaning(ratio),
         "skeleton": None if layout is None else layout.name,
+        "outliers": None if found is None else _outliers(found, estimator, X),
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),
         "alpha": [
@@ -120,11 +124,34 @@ def model_report(
                 "std": alpha.std(),
                 "min": alpha.min(),
                 "max": alpha.max(),
+                "effective_frames": frames_of,
+                "pose_share": pose,
             }
-            for name, share, alpha in zip(
-                names, estimator.energy_share_, estimator.alpha_.T, strict=True
+            for name, share, alpha, frames_of, pose in zip(
+                names,
+                estimator.energy_share_,
+                estimator.alpha_.T,
+                [None] * K if found is None else found.effective_frames,
+                [None] * K if found is None else found.pose_share,
+                strict=True,
             )
         ],
+    }
+
+
+def _outliers(found: Diagnostics, estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
+    """Describe the gross residuals of a table, by its rows and names of points."""
+    names = names_of_points(estimator)
+    rows, points = found.outliers.T
+    return {
+        "share": found.outlier_share,
+        "n_points": len(rows),
+        "n_frames": len(np.unique(rows)),
+        "largest": [
+            {"row": X.index[i], "point": names[j]}
+            for i, j in zip(rows[:_MOST_ROWS], points[:_MOST_ROWS], strict=True)
+        ],
+        "message": outlier_advice(found, X.index, names),
     }
 
 
@@ -185,15 +212,20 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
             else f"{noise:.3g} in the units of the table"
         )
         fit.append(f"noise {unit}, standard deviation of a coordinate")
+    if model["outliers"] is not None and model["outliers"]["message"]:
+        fit += textwrap.wrap(model["outliers"]["message"], _TEXT_WIDTH)
     fit.append(f"{report['seconds']['fit']:.1f} seconds")
     if model["skeleton"] is not None:
         fit.append(f"points recognised as {model['skeleton']}")
-    alpha = [f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"]
+    head = f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"
+    alpha = [f"{head} {'pose':>6}"]
     alpha += [
         f"{row['name']:10} {100 * row['energy_share']:6.1f} % {row['mean']:z7.2f} "
-        f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f}"
+        f"{row['std']:6.2f} {row['min']:7.2f} {row['max']:7.2f} {pose_cell(row):>6}"
         for row in model["alpha"]
     ]
+    if any(map(pose_cell, model["alpha"])):
+        alpha.append("pose: variance that yaw, pitch and roll predict, cross-validated")
     choice = {}
     if "choice" in report:
         choice["Choice"] = _choice_lines(report["choice"])
@@ -207,6 +239,12 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
         "Alpha": alpha,
         **answer_lines(report),
     }
+
+
+def pose_cell(row: dict[str, Any]) -> str:
+    """Return the share of a coefficient that the pose predicts, in percent."""
+    share = row["pose_share"]
+    return "" if share is None or math.isnan(share) else f"{100 * max(share, 0):.0f} %"
 
 
 def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:

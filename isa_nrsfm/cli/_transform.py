@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from isa_nrsfm import Decomposition
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.cli._drawing import chosen_edges
 from isa_nrsfm.cli._drawing_options import drawing_files, drawing_options
 from isa_nrsfm.cli._outputs import (
@@ -25,7 +26,6 @@ from isa_nrsfm.cli._report import (
 from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.io import load_model, write_table
 from isa_nrsfm.io._tables import table_suffix
-from isa_nrsfm.plotting._edges import names_of_points
 
 
 def run_transform(args: Namespace) -> str:

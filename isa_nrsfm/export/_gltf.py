@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.export._drawing import (
     Drawing,
     Links,
@@ -26,7 +27,7 @@ from isa_nrsfm.export._upright import (
     upright_space,
 )
 from isa_nrsfm.plotting._axes import is_dense
-from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin, names_of_points
+from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._upright import (
     Camera,
@@ -13,7 +14,7 @@ from isa_nrsfm.export._upright import (
     upright_frames,
     upright_space,
 )
-from isa_nrsfm.plotting._edges import Origin, names_of_points
+from isa_nrsfm.plotting._edges import Origin
 
 # The outer corners of the eyes in the order of iBUG.
 EYE_CORNERS = (36, 45)

@@ -24,13 +24,13 @@ from isa_nrsfm._metric_upgrade.deforming import (
 )
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._transformer import check_frames_kept
 from isa_nrsfm.plotting._edges import (
     UPSIDE_DOWN,
     Origin,
     choose_layout,
     choose_origin,
-    names_of_points,
     upright_turn,
 )
 from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.plotting._axes import (
     LEFT_COLOUR,
     MEAN_COLOUR,
@@ -31,7 +32,6 @@ from isa_nrsfm.plotting._edges import (
     choose_layout,
     choose_origin,
     choose_skeleton,
-    names_of_points,
     upright_turn,
 )
 from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page

@@ -5,7 +5,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._tables.landmark_columns import point_names
 from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.skeletons import SKELETONS, Skeleton, find_skeleton
 
@@ -134,14 +133,3 @@ def upright_turn(
         return np.eye(3)
     over = UPSIDE_DOWN if origin == "lower" else np.eye(3)
     return over @ canonical_pose(shape @ over, scheme=layout).rotation @ over
-
-
-def names_of_points(model: Any) -> tuple[str, ...]:
-    """Return the names of a model's points, or their numbers."""
-    n_points = len(model.mean_shape_)
-    columns = getattr(model, "feature_names_in_", None)
-    if columns is None:
-        return tuple(map(str, range(n_points)))
-    names = [str(name).strip() for name in columns]
-    x_columns = names[:n_points] if model.layout == "planar" else names[::2]
-    return point_names(x_columns)

@@ -19,7 +19,8 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
-from isa_nrsfm.plotting._edges import choose_layout, names_of_points
+from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm.plotting._edges import choose_layout
 from isa_nrsfm.skeletons import Skeleton
 
 

@@ -250,6 +250,7 @@ WHOLE_BODY_133 = replace(
         *range(_RIGHT_HAND, 133),
     ),
     front=(*COCO_17.front, (19, 17), (22, 20)),
+    contour=tuple(j + _FACE for j in IBUG_68.contour),
 )
 
 BODIES = (HAND_21, COCO_17, H36M_17, BODY_25, POSE_33, WHOLE_BODY_133)

@@ -7,7 +7,7 @@ of the person's right eye, which an image shows on its left.
 from dataclasses import replace
 from itertools import chain
 
-from isa_nrsfm.skeletons._skeleton import Skeleton, run, shifted
+from isa_nrsfm.skeletons._skeleton import Pairs, Skeleton, run
 
 IBUG_68 = Skeleton(
     name="ibug-68",
@@ -44,19 +44,18 @@ IBUG_68 = Skeleton(
     ),
     up=((8, 27),),
     front=((0, 30), (16, 30)),
+    contour=run(0, 16),
 )
 
-# The same without the jaw.
-_JAW = 17
-IBUG_51 = replace(
-    IBUG_68,
-    name="ibug-51",
-    n_points=51,
-    curves=shifted(IBUG_68.curves[1:], -_JAW),
-    right=tuple(j - _JAW for j in IBUG_68.right if j >= _JAW),
-    left=tuple(j - _JAW for j in IBUG_68.left if j >= _JAW),
-    up=((57 - _JAW, 27 - _JAW),),
-    front=((36 - _JAW, 30 - _JAW), (45 - _JAW, 30 - _JAW)),
+
+def _without_contour(face: Skeleton, name: str, up: Pairs, front: Pairs) -> Skeleton:
+    """Return a face without its contour; pairs of points are those of the whole."""
+    inner = replace(face, up=up, front=front).subset(face.inner)
+    return replace(inner, name=name)
+
+
+IBUG_51 = _without_contour(
+    IBUG_68, "ibug-51", up=((57, 27),), front=((36, 30), (45, 30))
 )
 
 # Points 31 and 36 are the pupils, 46, 47 and 67 nostrils and tip of the nose, 66 the
@@ -99,7 +98,14 @@ XM2VTS_68 = Skeleton(
     ),
     up=((7, 37), (7, 45)),
     front=((0, 67), (14, 67)),
+    contour=run(0, 14),
 )
+# The lower lip and the outer corners of the eyes in place of the jaw.
+_XM2VTS_INNER: dict[str, Pairs] = {
+    "up": ((57, 37), (57, 45)),
+    "front": ((27, 67), (32, 67)),
+}
+XM2VTS_53 = _without_contour(XM2VTS_68, "xm2vts-53", **_XM2VTS_INNER)
 
 # Eight points more, between those of the eyelids.
 _MUCT_EYES = (
@@ -119,6 +125,7 @@ MUCT_76 = replace(
     right=(*XM2VTS_68.right, *range(68, 72)),
     left=(*XM2VTS_68.left, *range(72, 76)),
 )
+MUCT_61 = _without_contour(MUCT_76, "muct-61", **_XM2VTS_INNER)
 
 WFLW_98 = Skeleton(
     name="wflw-98",
@@ -156,6 +163,10 @@ WFLW_98 = Skeleton(
     ),
     up=((16, 51),),
     front=((0, 54), (32, 54)),
+    contour=run(0, 32),
+)
+WFLW_65 = _without_contour(
+    WFLW_98, "wflw-65", up=((85, 51),), front=((60, 54), (72, 54))
 )
 
 # The contours of the mesh: those of the right side, and in the same order the left.
@@ -233,4 +244,7 @@ MESH_478 = replace(
     left=(*MESH_468.left, 473),
 )
 
-FACES = (IBUG_68, IBUG_51, XM2VTS_68, MUCT_76, WFLW_98, MESH_468, MESH_478)
+FACES = (
+    *(IBUG_68, IBUG_51, XM2VTS_68, XM2VTS_53, MUCT_76, MUCT_61, WFLW_98, WFLW_65),
+    *(MESH_468, MESH_478),
+)

@@ -20,8 +20,8 @@ SKELETONS: Mapping[str, Skeleton] = MappingProxyType(
 # The layouts in which the readers of `isa_nrsfm.io` find points without names.
 LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "openface": ("ibug-68",),
-        "pyfeat": ("ibug-68", "mediapipe-face-478"),
+        "openface": ("ibug-68", "ibug-51"),
+        "pyfeat": ("ibug-68", "ibug-51", "mediapipe-face-478"),
         "mediapipe": (
             "mediapipe-face-468",
             "mediapipe-face-478",
@@ -29,7 +29,7 @@ LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "mediapipe-pose-33",
         ),
         "pts": ("ibug-68", "ibug-51"),
-        "wflw": ("wflw-98",),
+        "wflw": ("wflw-98", "wflw-65"),
         "coco": ("coco-17", "coco-wholebody-133"),
     }
 )

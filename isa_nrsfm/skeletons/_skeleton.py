@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, pairwise
+from itertools import chain, groupby, pairwise
 from typing import Literal
 
 import numpy as np
@@ -48,6 +48,10 @@ class Skeleton:
     across : tuple of pairs of int, default=()
         Pairs of a right and a left point that tell the axis across, where not all of
         `right` and `left` are to be taken, as those of arms and legs.
+    contour : tuple of int, default=()
+        Points that annotators place on the visible outline, such as the jaw of a face.
+        They slide over the surface as the head turns: the pose changes their place on
+        the face, and with it the coefficients.
 
     Raises
     ------
@@ -83,6 +87,7 @@ class Skeleton:
     up: Pairs = ()
     front: Pairs = ()
     across: Pairs = ()
+    contour: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that the parts fit together."""
@@ -92,6 +97,7 @@ class Skeleton:
             raise ValueError("a curve needs at least two points")
         pairs = chain(self.up, self.front, self.across)
         named = [*chain(*self.curves, *pairs), *self.left, *self.right]
+        named += self.contour
         strange = [j for j in named if not 0 <= j < self.n_points]
         if strange:
             raise ValueError(
@@ -141,6 +147,63 @@ class Skeleton:
         """Return the side of each edge; one from side to side is in the middle."""
         return sides_of_edges(self.sides, self.edges)
 
+    @property
+    def inner(self) -> NDArray[np.intp]:
+        """Return the points that are not on the contour."""
+        return np.setdiff1d(np.arange(self.n_points), self.contour)
+
+    @property
+    def inner_columns(self) -> NDArray[np.intp]:
+        """Return the columns of the inner points in a table x0, y0, x1, y1, ...."""
+        return np.add.outer(2 * self.inner, [0, 1]).ravel()
+
+    def subset(self, points: Iterable[int]) -> "Skeleton":
+        """
+        Return the layout of some of the points.
+
+        Parameters
+        ----------
+        points : iterable of int
+            The points to keep, in their new order.
+
+        Returns
+        -------
+        Skeleton
+            The layout, with the parts of the curves, the sides and the pairs of points
+            that are left. Points whose mirror image is left out are on no side.
+
+        Examples
+        --------
+        >>> from isa_nrsfm.skeletons import get_skeleton
+        >>> face = get_skeleton("wflw-98")
+        >>> face.subset(face.inner).n_points
+        65
+        """
+        new = {int(j): k for k, j in enumerate(points)}
+        names = self.point_names
+
+        def pairs(old: Iterable[tuple[int, int]]) -> Pairs:
+            return tuple((new[a], new[b]) for a, b in old if {a, b} <= new.keys())
+
+        parts = []
+        for curve in self.curves:
+            groups = groupby(curve, new.__contains__)
+            parts += [tuple(new[j] for j in part) for inside, part in groups if inside]
+        sides = pairs(zip(self.left, self.right, strict=True))
+        return replace(
+            self,
+            name=f"{len(new)} points of {self.name}",
+            n_points=len(new),
+            curves=tuple(part for part in parts if len(part) > 1),
+            point_names=None if names is None else tuple(names[j] for j in new),
+            left=tuple(left for left, _ in sides),
+            right=tuple(right for _, right in sides),
+            up=pairs(self.up),
+            front=pairs(self.front),
+            across=pairs(self.across),
+            contour=tuple(new[j] for j in self.contour if j in new),
+        )
+
     def reordered(self, names: Sequence[str]) -> "Skeleton":
         """
         Return the same layout with its points in another order.
@@ -180,6 +243,7 @@ class Skeleton:
             up=moved_pairs(self.up),
             front=moved_pairs(self.front),
             across=moved_pairs(self.across),
+            contour=moved(self.contour),
         )
 
 

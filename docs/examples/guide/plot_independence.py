@@ -40,7 +40,8 @@ BasisShapeDisplay.from_estimator(model, component_names=names, n_columns=3)
 # shapes, from the front and from the side. Affine cameras leave one affinity of space
 # open; for figures the cameras are taken for photos from afar, which chooses it.
 #
-# The coefficients do not depend on the viewpoint. Each is the strength of an
+# The points of these faces are fixed on the surface, so that the coefficients do not
+# depend on the viewpoint. Each is the strength of an
 # expression:
 
 _, axes = plt.subplots(2, 3, figsize=(9, 5), layout="constrained")

@@ -61,7 +61,8 @@ for i in (order[-1], order[0]):
 # Outliers
 # --------
 #
-# Detectors sometimes put points far off. Squares of such errors lead a fit astray;
+# Detectors sometimes put points far off. ``model.diagnostics(X)`` and the report name
+# rows and points that are. Squares of such errors lead a fit astray;
 # ``loss="huber"`` and ``loss="cauchy"`` count points less the farther they are from the
 # model, the second hardly at all. Here 2 % of the points are anywhere within the face.
 
