@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sklearn import get_config
 from sklearn.base import (
     BaseEstimator,
-    ClassNamePrefixFeaturesOutMixin,
     MetaEstimatorMixin,
     TransformerMixin,
     clone,
@@ -40,7 +39,7 @@ from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._selection.choice import SELECTIONS, results_of, selected
 from isa_nrsfm._selection.path import Row, Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._transformer import Decomposition
+from isa_nrsfm._transformer import CoefficientNamesMixin, Decomposition
 
 # Blocks of rows that are held out in turn by default. More cost more, and hardly change
 # the choice: neighbours are alike, and large blocks keep them together.
@@ -48,7 +47,7 @@ N_BLOCKS = 3
 
 
 class AffineNRSfMCV(
-    ClassNamePrefixFeaturesOutMixin,
+    CoefficientNamesMixin,
     TransformerMixin,
     MetaEstimatorMixin,
     BaseEstimator,
