@@ -23,7 +23,8 @@ from isa_nrsfm.analysis import (
 )
 from isa_nrsfm.analysis._labels import kind_of
 from isa_nrsfm.cli._frames import Frames, column_named
-from isa_nrsfm.cli._outputs import component_names, write_figure
+from isa_nrsfm.cli._outputs import component_names, figure_named, write_figure
+from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -254,6 +255,7 @@ def answered(
         relative = WithinGroups().fit_transform(alpha, groups=asked.groups)
         columns |= dict(zip([f"{n}_within" for n in names], relative.T, strict=True))
     if asked.times is not None and estimator.refinement == "joint":
+        show_stage("smoothing")
         smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
         report["time"] = {
             "column": asked.time,
@@ -376,8 +378,8 @@ def draw_answers(
             label=label.name,
             component_names=names,
         )
-        figure = display.plot(kind=label.kind).figure_
-        write_figure(folder / _label_figure(number), figure)
+        with figure_named(name := _label_figure(number)):
+            write_figure(folder / name, display.plot(kind=label.kind).figure_)
     if asked.times is not None:
         alpha, deviation = estimator.alpha_, getattr(estimator, "alpha_std_", None)
         if answers.smooth is not None:
@@ -389,4 +391,5 @@ def draw_answers(
             groups=asked.groups,
             component_names=names,
         )
-        write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)
+        with figure_named(TIME_FIGURE):
+            write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)

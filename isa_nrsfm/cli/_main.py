@@ -3,12 +3,14 @@
 import contextlib
 import os
 import sys
+import time
 import warnings
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from typing import TextIO
 
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
+from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 FINE, BAD_INPUT, BROKEN_PIPE = 0, 1, 141
 
@@ -16,9 +18,11 @@ FINE, BAD_INPUT, BROKEN_PIPE = 0, 1, 141
 def run(argv: Sequence[str] | None = None) -> int:
     """Run the command line as of `isa_nrsfm.cli.main`, but for interruptions."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    args = build_parser().parse_args(arguments, Namespace(arguments=arguments))
+    started = Namespace(arguments=arguments, since=time.perf_counter())
+    args = build_parser().parse_args(arguments, started)
     try:
-        with _warnings_as_lines() as warned:
+        with _warnings_as_lines() as warned, shown_progress(PROGRAM, args.since):
+            show_stage(args.command)
             report = _run(args, warned)
         _show(report)
     except BrokenPipeError:

@@ -185,7 +185,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
             else f"{noise:.3g} in the units of the table"
         )
         fit.append(f"noise {unit}, standard deviation of a coordinate")
-    fit.append(f"{report['seconds']['fit']:.1f} seconds")
+    fit.append(_seconds(report["seconds"]))
     if model["skeleton"] is not None:
         fit.append(f"points recognised as {model['skeleton']}")
     alpha = [f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"]
@@ -207,6 +207,12 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
         "Alpha": alpha,
         **answer_lines(report),
     }
+
+
+def _seconds(of_stages: dict[str, float]) -> str:
+    """Say how long a run took, and its fit."""
+    fit = of_stages["fit"] + of_stages.get("choose", 0.0)
+    return f"{sum(of_stages.values()):.1f} seconds, {fit:.1f} of them for the fit"
 
 
 def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
