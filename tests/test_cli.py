@@ -820,6 +820,24 @@ def test_warnings_are_shown_once_and_in_one_line(run, table, tmp_path, monkeypat
     assert (code, err) == (0, "isa-nrsfm: warning: a long warning\n")
 
 
+def test_messages_name_options(run, fails, table, tmp_path, monkeypatch):
+    message = fails("fit", table, "-o", tmp_path, "-k", "40", "--no-figures")
+    assert "--n-components 40 needs at least 124 points" in message
+    assert "the largest possible --n-components is 21" in message
+
+    fit = AffineNRSfM.fit
+
+    def warn_and_fit(self, X, y=None):
+        said = "got camera='affine'; n_components=2 of a/camera=1.csv, layout='planar'"
+        warnings.warn(said, UserWarning, stacklevel=1)
+        return fit(self, X, y)
+
+    monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
+    _, _, err = run("fit", table, "-o", tmp_path, "--no-figures", *QUICK)
+    said = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='planar'"
+    assert err == f"isa-nrsfm: warning: {said}\n"
+
+
 @pytest.mark.slow
 def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -179,12 +179,12 @@ def check_names(names: NDArray | None, layout: Layout) -> None:
             "the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
         )
     shown = ", ".join(map(str, names[:4]))
-    order = said
-    if said == "other":
-        order = (
-            "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
-            "them interleaved"
-        )
+    order = (
+        "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
+        "them interleaved"
+        if said == "other"
+        else said
+    )
     raise ValueError(
         f"layout={layout!r} contradicts the column names ({shown}, ...), "
         f"whose order is {order}"

@@ -86,5 +86,25 @@ def selected(scores: NDArray, select: str) -> int:
             f"select={select!r} needs the standard error over at least two splits; cv "
             "has one"
         )
-    error = scores[best].std(ddof=1) / np.sqrt(n_splits)
+    error = standard_errors(scores)[best]
     return int(np.argmax(mean >= mean[best] - error))
+
+
+def standard_errors(scores: NDArray) -> NDArray:
+    """
+    Return the standard errors of mean scores over splits.
+
+    Parameters
+    ----------
+    scores : ndarray of shape (..., n_splits)
+        Scores.
+
+    Returns
+    -------
+    ndarray of shape (...)
+        Standard errors; NaN with one split.
+    """
+    n_splits = scores.shape[-1]
+    if n_splits < 2:
+        return np.full(scores.shape[:-1], np.nan)
+    return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))

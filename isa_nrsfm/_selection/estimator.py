@@ -36,7 +36,12 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._selection.choice import SELECTIONS, results_of, selected
+from isa_nrsfm._selection.choice import (
+    SELECTIONS,
+    results_of,
+    selected,
+    standard_errors,
+)
 from isa_nrsfm._selection.path import Row, Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm._transformer import CoefficientNamesMixin, Decomposition
@@ -576,12 +581,15 @@ def line(row: Row, held_out: bool) -> str:
     Returns
     -------
     str
-        The number of basis shapes, mean and deviation of the score, and the seconds.
+        The number of basis shapes, mean and standard error of the score, and the
+        seconds.
     """
-    mean, deviation = row.scores.mean(), row.scores.std()
-    score = f"score {mean:.4g} +- {deviation:.2g}"
+    mean, error = row.scores.mean(), standard_errors(row.scores)
+    score = f"score {mean:.4g}, standard error {error:.2g}"
     if held_out:
-        score = f"held-out error {-100 * mean:#.3g} +- {100 * deviation:#.2g} %"
+        score = (
+            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
+        )
     seconds = row.path_seconds + row.fit_seconds.sum() + row.score_seconds.sum()
     return f"n_components={row.n_components}: {score}, {seconds:.1f} s"
 

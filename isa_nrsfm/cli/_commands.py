@@ -114,6 +114,7 @@ def fit_table(
     about = {REPORT_PAGE: "this report with its figures, for any browser"}
     results = about | MODEL | TABLES | ARRAYS | PAGE
     edges = chosen_edges(args, frames.columns.points, frames.skeleton)
+    drawn: dict[str, Any] = {"edges": edges, "origin": args.origin or "auto"}
     inputs = [args.table, *drawing_files(args)]
     if table is not None:
         results, inputs = results | {Path(args.table).name: "the table"}, inputs[1:]
@@ -137,7 +138,7 @@ def fit_table(
                 std=args.std,
                 labels=first_classes(asked, X),
                 times=asked.times,
-                edges=edges,
+                **drawn,
             )
             model = model_report(estimator, X, frames, edges)
             report = {
@@ -162,10 +163,10 @@ def fit_table(
                     f"another run has written to {folder} meanwhile; its files are "
                     "there, and no figures of this one"
                 )
-            write_figures(new, estimator, X, args.random_state, edges, search)
+            write_figures(new, estimator, X, args.random_state, search, **drawn)
             draw_answers(new, asked, answers, estimator)
-            drawn = {name: figures[name] for name in figures if (new / name).exists()}
-            report = _written(new, report, results | drawn, clock, "figures")
+            there = {name: figures[name] for name in figures if (new / name).exists()}
+            report = _written(new, report, results | there, clock, "figures")
     return report
 
 
@@ -178,8 +179,8 @@ def _written(
 ) -> dict[str, Any]:
     """Write a report, with the seconds up to now, and return it."""
     clock[stage] = time.perf_counter()
-    seconds = np.diff([*clock.values()]).round(3)
-    seconds = dict(zip([*clock][1:], seconds, strict=True))
+    of_stages = np.diff([*clock.values()]).round(3)
+    seconds = dict(zip([*clock][1:], of_stages, strict=True))
     report = report | {"seconds": seconds, "files": files}
     write_report_page(folder, report)
     return write_report(folder, report)

@@ -63,8 +63,9 @@ def old_figures(folder: Path, new: Iterable[str]) -> list[str]:
     """
     listed = files_of_report(folder)
     old = sorted(name for name in listed if name.endswith(".png"))
-    others = {*FIGURES} - {*old, *new}
-    others = sorted(name for name in others if (folder / name).exists())
+    others = sorted(
+        name for name in {*FIGURES} - {*old, *new} if (folder / name).exists()
+    )
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
     return old
@@ -121,6 +122,7 @@ def write_results(
     labels: "pd.Series | None" = None,
     times: Any = None,
     edges: Any = "auto",
+    origin: Any = "auto",
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
@@ -132,7 +134,7 @@ def write_results(
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
-    poses = told_poses(estimator, X, edges, NOT_TOLD)
+    poses = told_poses(estimator, X, NOT_TOLD, edges=edges, origin=origin)
     cameras = camera_table(estimator, fit, X).join(poses)
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)
@@ -144,6 +146,7 @@ def write_results(
         folder / "viewer.html",
         X=X,
         edges=edges,
+        origin=origin,
         labels=labels,
         times=times,
         camera="weak_perspective" if len(poses.columns) else None,
@@ -167,7 +170,7 @@ def camera_table(
 
 
 def told_poses(
-    estimator: AffineNRSfM, X: "pd.DataFrame", edges: Any, otherwise: str
+    estimator: AffineNRSfM, X: "pd.DataFrame", otherwise: str, **drawn: Any
 ) -> "pd.DataFrame":
     """Return yaw, pitch, roll, scale and deviations of frames as columns.
 
@@ -178,7 +181,7 @@ def told_poses(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            poses = export.frame_poses(estimator, X, edges=edges)
+            poses = export.frame_poses(estimator, X, **drawn)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{otherwise}: {error}")
         return pd.DataFrame(index=X.index)
@@ -186,15 +189,15 @@ def told_poses(
     return columns.dropna(axis="columns", how="all")
 
 
-def write_page(path: Path, estimator: AffineNRSfM, X: Any, edges: Any) -> None:
+def write_page(path: Path, estimator: AffineNRSfM, X: Any, **drawn: Any) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            export.write_viewer(estimator, path, X=X, edges=edges)
+            export.write_viewer(estimator, path, X=X, **drawn)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        export.write_viewer(estimator, path, X=X, edges=edges, camera=None)
+        export.write_viewer(estimator, path, X=X, camera=None, **drawn)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
@@ -225,8 +228,8 @@ def write_figures(
     estimator: AffineNRSfM,
     points: "pd.DataFrame",
     random_state: int,
-    edges: Any = "auto",
     search: "AffineNRSfMCV | None" = None,
+    **drawn: Any,
 ) -> None:
     """Draw the figures without a screen, that of the choice if there was a search."""
     import_optional("matplotlib", extra="plot").use("Agg")
@@ -238,10 +241,10 @@ def write_figures(
     )
 
     figures: list[Callable[[], Any]] = [
-        lambda: BasisShapeDisplay.from_estimator(estimator, edges=edges),
+        lambda: BasisShapeDisplay.from_estimator(estimator, **drawn),
         lambda: ModeCovarianceDisplay.from_estimator(estimator),
         lambda: ReprojectionDisplay.from_estimator(
-            estimator, points, random_state=random_state, edges=edges
+            estimator, points, random_state=random_state, **drawn
         ),
         lambda: ComponentChoiceDisplay.from_estimator(search),
     ]

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import TextIO
 
 # Seconds between two lines: a twentieth of the time so far, within these limits. An
 # hour has about 90 lines.
@@ -64,7 +65,7 @@ def _seconds(since: float) -> float:
 class _LatestLine(io.TextIOBase):
     """A stream that keeps its latest line, and passes whole lines on to a terminal."""
 
-    def __init__(self, terminal: io.TextIOBase | None) -> None:
+    def __init__(self, terminal: TextIO | None) -> None:
         self.terminal = terminal
         self.line = self.begun = ""
 

@@ -257,14 +257,14 @@ def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
 
 def _choice_lines(choice: dict[str, Any]) -> list[str]:
     """Show the held-out error of each number of basis shapes."""
-    lines = ["  K   held-out error of frames that were not fitted, and its deviation"]
+    lines = ["  K   held-out error of frames that were not fitted, +- standard error"]
     lines += [
-        f"{k:3}   {100 * error:#.3g} +- {100 * deviation:#.2g} %"
+        f"{k:3}   {_digits(100 * error, 3)} +- {_digits(100 * standard_error, 2)} %"
         f"{', the least' * (k == choice['chosen'])}"
-        for k, error, deviation in zip(
+        for k, error, standard_error in zip(
             choice["n_components"],
             choice["held_out_error"],
-            choice["held_out_error_deviation"],
+            choice["held_out_error_standard_error"],
             strict=True,
         )
     ]
@@ -273,8 +273,13 @@ def _choice_lines(choice: dict[str, Any]) -> list[str]:
     if "next" in choice:
         following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
         numbers = "-".join(map(str, sorted({following[0], following[-1]})))
-        lines.append(f"to try K = {numbers}, too, would take about {seconds:#.2g} s")
+        lines.append(f"to try K = {numbers}, too, would take about {seconds:.0f} s")
     return lines
+
+
+def _digits(number: float, n_digits: int) -> str:
+    """Write a number with so many digits, zeros at the end included."""
+    return f"{number:#.{n_digits}g}".removesuffix(".")
 
 
 def _camera_lines(model: dict[str, Any]) -> list[str]:
