@@ -108,3 +108,30 @@ def standard_errors(scores: NDArray) -> NDArray:
     if n_splits < 2:
         return np.full(scores.shape[:-1], np.nan)
     return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))
+
+
+def line(row: Row, held_out: bool) -> str:
+    """
+    Return a row of a path as text.
+
+    Parameters
+    ----------
+    row : Row
+        The row.
+    held_out : bool
+        Whether the score is that of points that are held out, minus their error.
+
+    Returns
+    -------
+    str
+        The number of basis shapes, mean and standard error of the score, and the
+        seconds.
+    """
+    mean, error = row.scores.mean(), standard_errors(row.scores)
+    score = f"score {mean:.4g}, standard error {error:.2g}"
+    if held_out:
+        score = (
+            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
+        )
+    seconds = row.path_seconds + row.fit_seconds.sum() + row.score_seconds.sum()
+    return f"n_components={row.n_components}: {score}, {seconds:.1f} s"
