@@ -132,8 +132,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         tables, and of joblib workers for strategies that use them. The result does not
         depend on it.
     verbose : int, default=0
-        Above zero, print a line for each stage. With scikit-learn 1.9 and later the fit
-        tells its callbacks of stages and steps, too: ``set_callbacks(ProgressBar())``.
+        Above zero, print a line for each stage, above one also the current step. With
+        scikit-learn 1.9 and later the fit tells its callbacks of stages and steps, too:
+        ``set_callbacks(ProgressBar())``.
 
     Attributes
     ----------

@@ -86,9 +86,29 @@ class SmoothedCoefficients(NamedTuple):
     time_scales: NDArray
 
 
-class TableTransformer(
-    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
-):
+class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
+    """Names what `transform` returns."""
+
+    def get_feature_names_out(self, input_features: Any = None) -> NDArray:
+        """
+        Return the names of the coefficients.
+
+        Parameters
+        ----------
+        input_features : array-like of str, default=None
+            Checked against the names of the fitted columns, and not used.
+
+        Returns
+        -------
+        ndarray of str, shape (n_components,)
+            ``alpha_1``, ``alpha_2`` and so on, as in the files of the command line.
+        """
+        n_components = len(super().get_feature_names_out(input_features))
+        names = [f"alpha_{k + 1}" for k in range(n_components)]
+        return np.array(names, dtype=object)
+
+
+class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
     """
     The methods of `AffineNRSfM` that need a fit.
 

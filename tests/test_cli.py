@@ -5,11 +5,13 @@ import os
 import pty
 import re
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
 import time
 import warnings
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +21,14 @@ from layers import slow_after
 from sklearn.model_selection import cross_val_score
 
 from isa_nrsfm import AffineNRSfM, __version__
-from isa_nrsfm.cli import main
+from isa_nrsfm._compat.whole_files import files_together
+from isa_nrsfm.cli import _commands, main
 from isa_nrsfm.cli._demo import run_demo
 from isa_nrsfm.cli._parser import build_parser
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import inverse_snr
+from isa_nrsfm.plotting import ModeCovarianceDisplay
 
 N_FRAMES, N_COMPONENTS = 60, 2
 QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
@@ -89,6 +93,7 @@ def fails(run):
 
 def test_fit_writes_what_it_says(run, table, faces, tmp_path):
     folder = tmp_path / "new" / "results"
+    since = time.perf_counter()
     code, out, err = run("fit", table, "--output", folder, *QUICK)
     assert (code, err) == (0, "")
     assert {path.name for path in folder.iterdir()} == FIT_FILES | FIGURES
@@ -107,7 +112,11 @@ def test_fit_writes_what_it_says(run, table, faces, tmp_path):
     assert report["versions"]["isa_nrsfm"] == __version__
     assert report["warnings"] == []
     assert set(report["files"]) == (FIT_FILES | FIGURES) - {"report.json"}
-    assert set(report["seconds"]) == {"read", "fit", "write"}
+    seconds = report["seconds"]
+    assert set(seconds) == {"read", "fit", "write", "figures"}
+    whole = f"{sum(seconds.values()):.1f} seconds, {seconds['fit']:.1f} of them for the"
+    assert whole in out
+    assert sum(seconds.values()) == pytest.approx(time.perf_counter() - since, abs=0.5)
     assert report["table"]["n_missing_points"] == 0
     assert "missing" not in out
     assert "choice" not in report
@@ -468,7 +477,7 @@ def test_number_of_basis_shapes_is_chosen_by_held_out_points(
     assert "at least 94 points" in fails("fit", table, *folder, "-k", "1-30")
     few = ["--skip-rows", "code=[1-9].$"]  # ten rows, six or seven in a fit
     message = fails("fit", table, *folder, *few, "-k", "1-3")
-    assert "of cv fits 6 frames, enough for n_components=1 at most" in message
+    assert "of cv fits 6 frames, enough for --n-components 1 at most" in message
 
 
 def test_points_at_zero_are_pointed_out(run, faces, tmp_path):
@@ -719,6 +728,51 @@ def test_old_figures_are_pointed_out(run, table, tmp_path):
     assert (tmp_path / "basis_shapes.png").read_bytes() == PNG
 
 
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_figure_that_fails_costs_no_results(run, fitted, table, tmp_path, exists):
+    folder = tmp_path / "results"
+    if exists:
+        shutil.copytree(fitted, folder)
+        (folder / "mode_covariance.png").write_bytes(PNG)
+    seen = []
+
+    def fail(*_args, **_keywords):
+        seen.extend(sorted(path.name for path in folder.iterdir() if path.is_file()))
+        raise np.linalg.LinAlgError("no axes")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
+        code, out, err = run("fit", table, "-o", folder, *QUICK)
+    warning = "mode_covariance.png was not drawn: no axes"
+    assert (code, err) == (0, f"isa-nrsfm: warning: {warning}\n")
+    # All results were there, and only they, when figures began.
+    assert set(seen) == FIT_FILES
+    left = FIT_FILES | FIGURES - {"mode_covariance.png"}
+    assert {path.name for path in folder.iterdir()} == left
+    assert "mode_covariance" not in out
+    report = json.loads((folder / "report.json").read_text())
+    assert set(report["files"]) == set(report["sha256"]) == left - {"report.json"}
+    assert report["warnings"] == [warning]
+    assert warning in (folder / "report.html").read_text()
+
+
+def test_figures_are_not_written_to_another_run(fails, fitted, table, tmp_path):
+    def write_another_run(*_args, **_keywords):
+        shutil.copytree(fitted, tmp_path, dirs_exist_ok=True)
+        return draw(*_args, **_keywords)
+
+    draw = files_together
+    steps = iter([draw, write_another_run])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            _commands, "files_together", lambda *a, **kw: next(steps)(*a, **kw)
+        )
+        message = fails("fit", table, "-o", tmp_path, *QUICK, "--random-state", "3")
+    assert "another run has written to" in message
+    for name in FIT_FILES:
+        assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
+
+
 def test_missing_libraries_are_named_before_the_fit(
     fails, table, tmp_path, monkeypatch
 ):
@@ -805,11 +859,30 @@ def test_warnings_are_shown_once_and_in_one_line(run, table, tmp_path, monkeypat
     assert (code, err) == (0, "isa-nrsfm: warning: a long warning\n")
 
 
+def test_messages_name_options(run, fails, table, tmp_path, monkeypatch):
+    message = fails("fit", table, "-o", tmp_path, "-k", "40", "--no-figures")
+    assert "--n-components 40 needs at least 124 points" in message
+    assert "the largest possible --n-components is 21" in message
+
+    fit = AffineNRSfM.fit
+
+    def warn_and_fit(self, X, y=None):
+        said = "got camera='affine'; n_components=2 of a/camera=1.csv, layout='planar'"
+        warnings.warn(said, UserWarning, stacklevel=1)
+        return fit(self, X, y)
+
+    monkeypatch.setattr(AffineNRSfM, "fit", warn_and_fit)
+    _, _, err = run("fit", table, "-o", tmp_path, "--no-figures", *QUICK)
+    said = "got --camera affine; --n-components 2 of a/camera=1.csv, layout='planar'"
+    assert err == f"isa-nrsfm: warning: {said}\n"
+
+
 @pytest.mark.slow
 def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # All numbers that the demo tries would take long.
-    args, warned = build_parser().parse_args(["demo", "--no-figures"]), []
+    started = Namespace(since=time.perf_counter())
+    args, warned = build_parser().parse_args(["demo", "--no-figures"], started), []
     out = run_demo(args, warned, tried="3-4")
     assert warned == []
     folder = tmp_path / "isa-nrsfm-demo"
@@ -916,4 +989,6 @@ def test_signal_of_the_keyboard_stops_the_program(table, tmp_path):
     time.sleep(0.5)
     started.send_signal(signal.SIGINT)
     out, err = started.communicate(timeout=60)
-    assert (started.returncode, out, err) == (130, "", "isa-nrsfm: interrupted\n")
+    assert (started.returncode, out) == (130, "")
+    assert err.endswith("isa-nrsfm: interrupted\n")
+    assert "Traceback" not in err

@@ -144,6 +144,25 @@ def test_a_later_run_without_questions_takes_the_figures_away(run, tmp_path, cap
 
 
 @pytest.mark.parametrize(
+    ("scales", "said"),
+    [
+        (
+            [np.inf, np.inf, 8.24],
+            "fades within 8.24; in 2 of 3 directions of change it",
+        ),
+        ([8.24, 3.0], "a change of the shape fades within 8.24, 3"),
+        ([np.inf], "time: in 1 of 1 directions of change it lasts"),
+        ([], "the frames show no dynamics"),
+    ],
+)
+def test_times_are_said_in_words(scales, said):
+    time = {"column": "time", "time_scales": scales, "changed_by": 0.1}
+    (title, *_) = answer_lines({"time": time})["Time"]
+    assert said in title
+    assert "never" not in title
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--label", "smile"], "--label: the table has no column 'smile'; its columns"),

@@ -7,7 +7,9 @@ from numpy.testing import assert_allclose
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._choice import choice_report, choose_n_components, extrapolated
+from isa_nrsfm.cli._report import _choice_lines
 from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.plotting import ComponentChoiceDisplay
 
 X = pd.DataFrame(make_nonrigid_tracks(48, 20, 2, noise=0.01, random_state=0).data)
 
@@ -28,7 +30,14 @@ def test_the_report_has_what_the_search_found(estimator, capsys):
     parts = report["held_out_error_of_parts"]
     assert parts.shape == (3, 3)
     assert_allclose(report["held_out_error"], parts.mean(axis=1))
-    assert_allclose(report["held_out_error_deviation"], parts.std(axis=1))
+    error = report["held_out_error_standard_error"]
+    assert_allclose(error, parts.std(axis=1, ddof=1) / np.sqrt(3))
+    # As in the figure.
+    figure = ComponentChoiceDisplay.from_estimator(search)
+    (bars,) = figure.errorbar_.lines[2]
+    ends = np.array([bar[:, 1] for bar in bars.get_segments()])
+    assert_allclose(np.diff(ends)[:, 0], 200 * error)
+    assert all(", standard error " in line for line in told.err.splitlines())
     best = 1 + int(np.argmin(parts.mean(axis=1)))
     assert report["chosen"] == search.n_components_ == best
     assert (report["seconds"] > 0).all()
@@ -45,6 +54,20 @@ def test_what_comes_next_is_what_the_table_allows(estimator):
     few = X.iloc[:, :28]
     search = choose_n_components(estimator, few, [3])
     assert "next" not in choice_report(search, few)  # 14 points allow three
+
+
+def test_numbers_of_the_choice_have_no_point_at_the_end():
+    choice = {
+        "n_components": [1, 2],
+        "held_out_error": [1.23, 0.05],
+        "held_out_error_standard_error": [0.12, 0.003],
+        "chosen": 2,
+        "next": {"n_components": [3], "seconds": 10.0},
+    }
+    lines = _choice_lines(choice)
+    assert lines[0].endswith("+- standard error")
+    assert lines[1:3] == ["  1   123 +- 12 %", "  2   5.00 +- 0.30 %, the least"]
+    assert lines[-1] == "to try K = 3, too, would take about 10 s"
 
 
 def test_seconds_go_on_along_a_line():

@@ -74,7 +74,8 @@ def test_it_says_what_the_report_says(run):
     text = "".join(Page(source).texts)
     assert "1 basis shape fitted to 40 frames of 12 points" in text
     held_out = 100 * report["model"]["held_out_error"]
-    assert f"an error of {held_out:.3g} %" in text
+    assert f"from the other points of their frame are off by {held_out:.3g} %" in text
+    assert "not seen" not in text
     for warning in report["warnings"]:
         assert warning[1:] in text
     assert "isa-nrsfm fit" in text

@@ -9,7 +9,13 @@ import pytest
 from exported_files import Read, content_of
 
 from isa_nrsfm.cli import main
-from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.datasets import (
+    make_body_tracks,
+    make_face_tracks,
+    make_hand_tracks,
+    make_nonrigid_tracks,
+)
+from isa_nrsfm.export import frame_poses
 from isa_nrsfm.io import load_model
 from isa_nrsfm.skeletons import get_skeleton
 
@@ -132,7 +138,30 @@ def test_transform_writes_a_page_of_the_new_frames(run, table, folder, tmp_path)
     assert len(content_of(page)["rows"]) == 120
     code, _, error = run(*transform)
     assert code == 1
-    assert "--edges and --skeleton are for --viewer" in error
+    assert "--edges, --skeleton and --origin are for --viewer" in error
+
+
+def test_where_y_is_zero_is_said(run, tmp_path):
+    # Points without a known layout, which nothing else says to be upside down.
+    scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
+    path = write(scene, tmp_path / "points.csv")
+    fitted, new = tmp_path / "fit", tmp_path / "new.html"
+    lower = ["--origin", "lower"]
+    options = ["--camera", "weak_perspective", "-k", "1", "--no-figures"]
+    assert run("fit", path, "-o", fitted, *options, *lower)[0] == 0
+    model = fitted / "model.skops"
+    exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}
+    for name, page in exported.items():
+        run("export", model, path, "-o", page, "--origin", name)
+    run("transform", model, path, "-o", tmp_path / "a.csv", "--viewer", new, *lower)
+    shapes = content_of(fitted / "viewer.html")["shapes"]
+    assert shapes == content_of(exported["lower"])["shapes"]
+    assert shapes == content_of(new)["shapes"]
+    assert shapes != content_of(exported["upper"])["shapes"]
+    cameras, estimator = pd.read_csv(fitted / "cameras.csv"), load_model(model)
+    poses = {name: frame_poses(estimator, origin=name) for name in exported}
+    np.testing.assert_allclose(cameras["yaw"], poses["lower"].yaw, atol=1e-6)
+    assert not np.allclose(cameras["yaw"], poses["upper"].yaw, atol=1)
 
 
 @pytest.mark.parametrize(
@@ -163,10 +192,10 @@ def test_options_that_mean_nothing(run, table, tmp_path, options, capsys):
 
 @pytest.mark.slow
 def test_the_demo_takes_edges(run, tmp_path):
-    options = ["-o", tmp_path, "--no-figures", "--edges", "none"]
+    options = ["-o", tmp_path, "--no-figures", "--edges", "none", "--origin", "lower"]
     code, report, _ = run("demo", *options)
     assert code == 0
-    assert "--edges none" in report
+    assert "--edges none --origin lower" in report
     assert edges_of(tmp_path / "viewer.html") == (set(), [])
 
 

@@ -103,7 +103,7 @@ def test_the_readme_runs():
 def test_getting_started_runs():
     names = run("docs/getting_started.md")
     table = pd.read_csv("alpha.csv")
-    assert list(table)[:2] == ["person", "affinenrsfm0"]
+    assert list(table)[:2] == ["person", "alpha_1"]
     seen = names["points"].to_numpy()[0].reshape(-1, 2)
     np.testing.assert_allclose(names["row"], seen, atol=10)
     assert Path("shapes.png").stat().st_size

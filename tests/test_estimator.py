@@ -21,10 +21,11 @@ from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm._prepare.robust import robust_sizes
+from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.io import landmark_table, load_model, save_model
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
@@ -738,6 +739,26 @@ def test_cameras_that_are_not_finite_numbers_are_refused(model, argument, broken
         model.inverse_transform(model.alpha_, **{argument: value})
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+@pytest.mark.parametrize("others", [["likelihood"], ["frame", "person"]])
+def test_columns_that_are_no_points_are_refused(library, others):
+    table = pd.DataFrame(TABLE, columns=FACES.feature_names)
+    if others == ["likelihood"]:
+        for j in range(68):
+            table.insert(3 * j + 2, f"likelihood_{j}", 0.9)
+    else:
+        table = pd.concat([pd.DataFrame(1.0, table.index, others), table], axis=1)
+    given = table
+    if library == "polars":
+        given = pl.DataFrame(dict(table.items()))
+    planar, search = estimator(layout="planar"), AffineNRSfMCV([1, 2])
+    for model in (estimator(), planar, search, PseudoInverseNRSfM()):
+        with pytest.raises(ValueError, match=r"not the x or y of a point, .*landmark"):
+            model.fit(given)
+    points = landmark_table(table).points
+    assert_array_equal(estimator().fit(points).alpha_, estimator().fit(TABLE).alpha_)
+
+
 def test_names_that_contradict_the_layout_are_refused():
     interleaved = pd.DataFrame(TABLE, columns=FACES.feature_names)
     order = list(interleaved)[0::2] + list(interleaved)[1::2]
@@ -1092,7 +1113,7 @@ def test_pipeline_ends_in_a_classifier():
     pipeline.fit(TABLE, labels)
     assert pipeline.score(TABLE, labels) > 0.8
     assert pipeline[:-1].get_feature_names_out().tolist() == [
-        f"affinenrsfm{k}" for k in range(4)
+        f"alpha_{k}" for k in range(1, 5)
     ]
 
 
@@ -1175,7 +1196,7 @@ def test_output_in_dataframes(library, frame):
     model = estimator().set_output(transform=library)
     for alpha in (model.fit_transform(table), model.transform(table)):
         assert isinstance(alpha, frame.DataFrame)
-        assert list(alpha.columns) == ["affinenrsfm0", "affinenrsfm1", "affinenrsfm2"]
+        assert list(alpha.columns) == ["alpha_1", "alpha_2", "alpha_3"]
         assert_allclose(alpha.to_numpy(), model.alpha_, atol=1e-10)
     assert isinstance(model.alpha_, np.ndarray)
     # What is not the coefficients stays an array.
@@ -1185,7 +1206,7 @@ def test_output_in_dataframes(library, frame):
 
 
 def test_names_of_the_output(model):
-    names = ["affinenrsfm0", "affinenrsfm1", "affinenrsfm2"]
+    names = ["alpha_1", "alpha_2", "alpha_3"]
     assert model.get_feature_names_out().tolist() == names
 
 
@@ -1293,7 +1314,7 @@ def test_the_number_of_components_is_found(camera):
     truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)
     model = AffineNRSfM("auto", camera=camera, random_state=0).fit(truth.data)
     assert len(model.basis_) == 2
-    assert model.get_feature_names_out().tolist() == ["affinenrsfm0", "affinenrsfm1"]
+    assert model.get_feature_names_out().tolist() == ["alpha_1", "alpha_2"]
     given = AffineNRSfM(2, camera=camera, random_state=0).fit(truth.data)
     assert_array_equal(model.alpha_, given.alpha_)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
@@ -203,3 +204,25 @@ class TestContract:
         model.fit(table)
         with pytest.warns(UserWarning, match="hardly determine the metric"):
             model.reconstruct(table, camera="weak_perspective")
+
+    @pytest.mark.parametrize("seed", [11, 17])
+    def test_noisy_cameras_that_hardly_turn(self, seed):
+        # The deeper space is, the better it fits the noise of such cameras.
+        rng = np.random.default_rng(seed)
+        angles = rng.uniform(-3, 3, (60, 3))
+        cameras = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()[:, :2]
+        cameras = cameras + rng.normal(0, 0.02, cameras.shape)
+        alpha = rng.normal(size=(60, 3))
+        with pytest.warns(UserWarning, match="hardly determine the metric"):
+            metric = deformation_metric(cameras, alpha)
+        # The cameras themselves see the depth with 0.04 of the other directions.
+        assert np.linalg.cond(metric.Q) < 1e5 / 0.04
+        mean, basis = rng.normal(size=(9, 3)), rng.normal(size=(3, 9, 3))
+        frames = euclidean_frames(metric, cameras, alpha, mean, basis)
+        assert np.isfinite(frames.shapes).all()
+
+    def test_refuses_cameras_that_see_two_directions(self, faces, model):
+        flat = clone(model).fit(faces.data)
+        flat.motion_[:, :, 2] = 0
+        with pytest.raises(ValueError, match=r"three directions of space; .* see 2"):
+            flat.reconstruct(faces.data, camera="weak_perspective")

@@ -45,19 +45,45 @@ def test_curves_have_bands_and_stop_at_gaps_and_groups():
     display = CoefficientsDisplay(
         alpha=ALPHA, alpha_std=0.1 + 0 * ALPHA, time=time, groups=groups
     ).plot()
-    curves = [line for line in display.axes_[0].lines if len(line.get_xdata()) == 10]
-    assert len(curves) == 3
-    assert_array_equal(curves[1].get_xdata(), time[10:20])
-    assert_array_equal(curves[1].get_ydata(), ALPHA[10:20, 0])
-    assert len(display.axes_[0].collections) == 3
+    line = display.axes_[0].lines[0]
+    drawn = np.isfinite(line.get_ydata())
+    assert_array_equal(np.flatnonzero(~drawn), [10, 21])
+    assert_array_equal(line.get_xdata()[drawn], time)
+    assert_array_equal(line.get_ydata()[drawn], ALPHA[:, 0])
+    (band,) = display.axes_[0].collections
+    assert len(band.get_paths()) == 3
+    assert_allclose(band.get_paths()[1].get_extents().intervalx, [20, 29])
     low, high = (
         display.axes_[0]
         .collections[0]
         .get_datalim(display.axes_[0].transData)
         .intervaly
     )
-    assert low == pytest.approx(ALPHA[:10, 0].min() - 0.1)
-    assert high == pytest.approx(ALPHA[:10, 0].max() + 0.1)
+    assert low == pytest.approx(ALPHA[:, 0].min() - 0.1)
+    assert high == pytest.approx(ALPHA[:, 0].max() + 0.1)
+
+
+def test_of_many_groups_the_largest_are_drawn_in_one_line():
+    groups = np.r_[np.repeat(np.arange(50), 3), np.arange(50, 1000)]
+    alpha = np.zeros((len(groups), 2))
+    alpha[:150] = 1.0
+    display = CoefficientsDisplay(alpha=alpha, alpha_std=alpha, groups=groups).plot()
+    (line, _), title = display.axes_[0].lines, display.axes_[0].get_title("left")
+    assert title == "the 50 of 1000 groups with the most frames"
+    assert_array_equal(np.unique(line.get_ydata()), [1.0, np.nan])
+    assert np.sum(line.get_ydata() == 1) == 150
+    names = np.char.mod("%03d", groups)
+    display = CoefficientsDisplay(alpha=alpha, y=names).plot(kind="classes")
+    assert display.axes_[0].get_title("left").startswith("the 50 of 1000 classes")
+    labels = [text.get_text() for text in display.axes_[1].get_xticklabels()]
+    assert labels == [f"{number:03d}" for number in range(50)]
+
+
+def test_single_frames_of_groups_are_dots():
+    display = CoefficientsDisplay(alpha=ALPHA[:3], groups=[0, 0, 1]).plot()
+    dots = display.axes_[0].lines[1]
+    assert dots.get_marker() == "."
+    assert_array_equal(dots.get_ydata(), ALPHA[2:3, 0])
 
 
 def test_from_estimator():

@@ -108,8 +108,7 @@ def test_methods_are_those_of_the_best_estimator(fitted):
     assert_array_equal(fitted.decompose(rows).motion, best.decompose(rows).motion)
     assert fitted.score(rows) == best.score(rows)
     assert fitted.n_features_in_ == X.shape[1]
-    names = ["affinenrsfmcv0", "affinenrsfmcv1"]
-    assert_array_equal(fitted.get_feature_names_out(), names)
+    assert_array_equal(fitted.get_feature_names_out(), ["alpha_1", "alpha_2"])
 
 
 def test_nothing_is_there_before_the_fit():

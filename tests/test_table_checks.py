@@ -201,7 +201,7 @@ class TestNames:
             (
                 "interleaved",
                 ["y0", "x0", "y1", "x1", "y2", "x2"],
-                "neither interleaved nor planar",
+                "neither interleaved nor planar; .*landmark_table.*",
             ),
         ],
     )
@@ -213,6 +213,23 @@ class TestNames:
             rf"whose order is {order}$",
         ):
             check_names(np.array(names), layout)
+
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    @pytest.mark.parametrize(
+        ("names", "n_others", "first"),
+        [
+            ("x_0 y_0 likelihood_0 x_1 y_1 likelihood_1", 2, "likelihood_0"),
+            ("frame person x_0 y_0 x_1 y_1", 2, "frame"),
+            ("nose_x nose_y nose_z chin_x chin_y chin_z", 2, "nose_z"),
+        ],
+    )
+    def test_columns_beside_those_of_points(self, names, n_others, first, layout):
+        with pytest.raises(
+            ValueError,
+            match=rf"^{n_others} of the 6 columns are not the x or y of a point, .*; "
+            rf"the first is '{first}'\. .*isa_nrsfm\.io\.landmark_table",
+        ):
+            check_names(np.array(names.split()), layout)
 
 
 @pytest.fixture(scope="module")

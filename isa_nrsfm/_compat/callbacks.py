@@ -50,6 +50,7 @@ class FitProgress:
 
     For callbacks the fit is a task, its stages are subtasks, and the steps of a stage
     are subtasks of that. With `verbose`, a line is printed at the end of each stage.
+    Above one, the stage and step that begin are printed, to be overwritten by the next.
 
     Parameters
     ----------
@@ -91,6 +92,8 @@ class FitProgress:
     def step(self) -> None:
         """Tell that a step of the stage begins, and that the one before has ended."""
         self._end_step()
+        self.n_steps += 1
+        self._print_begun(f", step {self.n_steps}")
         self.last_step = self.stage.subcontext(task_name="step")
         self.last_step.call_on_fit_task_begin(**self.about)
 
@@ -101,10 +104,22 @@ class FitProgress:
     def _begin(self) -> None:
         """Tell that the next stage begins."""
         n_steps = None if self.left[0] == self.stepwise else 0
+        self.n_steps = 0
+        self._print_begun("")
         self.since = time.perf_counter()
         self.last_step = None
         self.stage = self.fit.subcontext(task_name=self.left[0], max_subtasks=n_steps)
         self.stage.call_on_fit_task_begin(**self.about)
+
+    def _print_begun(self, step: str) -> None:
+        """Print the stage and step that begin, on a line that is overwritten."""
+        estimator = self.about["estimator"]
+        if estimator.verbose > 1:
+            print(
+                f"[{type(estimator).__name__}] {self.left[0]}{step}",
+                end="\r",
+                flush=True,
+            )
 
     def _end_step(self) -> None:
         """Tell that the step has ended, if there is one."""

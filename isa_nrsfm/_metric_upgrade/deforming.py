@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import polar
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._metric_upgrade.minimisation import exponential, refine_fit
-from isa_nrsfm._metric_upgrade.quadric import symmetric_power
 from isa_nrsfm._metric_upgrade.residuals import (
     MetricFit,
     fit_at,
@@ -157,8 +157,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
     # The symmetric Q is fit.Q times a rotation, which turns the strains, too.
-    Q = symmetric_power(fit.Q @ fit.Q.T, 0.5)
-    turn = np.linalg.solve(Q, fit.Q)
+    turn, Q = polar(fit.Q, side="left")
     strain = turn @ fit.strain @ turn.T
     Q = scaled(Q, cameras)
     warn_if_degenerate(fit.condition_number)

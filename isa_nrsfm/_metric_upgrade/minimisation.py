@@ -12,7 +12,7 @@ methods.
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.rounding import OF_PRODUCTS
+from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS
 from isa_nrsfm._metric_upgrade.quadric import mean_gram, symmetric_power, unit_cameras
 from isa_nrsfm._metric_upgrade.residuals import (
     Block,
@@ -149,6 +149,7 @@ def refine_fit(
     value = fit.cost + ridge * float(np.sum(numbers**2))
     damping = FIRST_DAMPING
     second_order = np.zeros_like(fit.curvature)
+    gram = sum(np.einsum("pan,pbn->ab", M, M) for M, _ in blocks)
     for _ in range(max_steps):
         # Damped step, shortened to LONGEST_STEP.
         curvature = fit.curvature + second_order + np.diag(ridges)
@@ -163,7 +164,8 @@ def refine_fit(
         new = fit_at(blocks, new_Q, np.tensordot(changed, basis, 1), camera)
         new_value = new.cost + ridge * float(np.sum(changed**2))
         # Accept the step, or drop the estimated part of the Hessian, or damp more.
-        if new_value <= value * (1 + OF_PRODUCTS):
+        better = new_value <= value * (1 + OF_PRODUCTS)
+        if better and _shows_depth(gram, new_Q):
             second_order = _updated_second_order(second_order, step, fit, new, ridges)
             value, numbers, fit = new_value, changed, new
             damping *= EASED
@@ -205,6 +207,15 @@ def _updated_second_order(
         if np.linalg.eigvalsh(whole)[0] > 0
         else np.zeros_like(second_order)
     )
+
+
+def _shows_depth(gram: NDArray, Q: NDArray) -> bool:
+    """Return whether cameras of a Gram matrix see three directions in a metric.
+
+    Noisy cameras that hardly turn fit the better, the deeper space becomes.
+    """
+    values = np.linalg.eigvalsh(Q.T @ gram @ Q)
+    return bool(values[0] > OF_RANKS * values[-1])
 
 
 def exponential(matrices: NDArray) -> NDArray:

@@ -4,6 +4,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.polar import polar
@@ -12,7 +13,6 @@ from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,
     metric_quadric,
-    symmetric_power,
     unit_cameras,
 )
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS, CameraModel, MetricFit
@@ -163,7 +163,7 @@ def metric_upgrade(
     if camera not in CAMERA_MODELS:
         raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
-    Q = scaled(symmetric_power(fit.Q @ fit.Q.T, 0.5), cameras[usable])
+    Q = scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
     rotations = np.full((len(cameras), 3, 3), np.nan)
     scales = np.full(len(cameras), np.nan)
     rotations[usable], stretches = nearest_rotations(cameras[usable] @ Q)
@@ -271,7 +271,7 @@ def best_metric(motion: NDArray) -> NDArray:
         fit = fit_metric(cameras[usable], "weak_perspective")
     except ValueError:
         return np.eye(3)
-    return scaled(symmetric_power(fit.Q @ fit.Q.T, 0.5), cameras[usable])
+    return scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
 
 
 def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
@@ -301,5 +301,5 @@ def warn_if_degenerate(condition_number: float) -> None:
             f"the cameras hardly determine the metric of space: its condition number "
             f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
             "may have wrong depth and angles. Take frames that are seen from more "
-            "sides, or more frames, or affine shapes (camera=None)",
+            "sides, or more frames, or affine shapes",
         )

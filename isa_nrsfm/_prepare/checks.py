@@ -9,9 +9,8 @@ from scipy.sparse import bmat, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.landmark_columns import names_layout
+from isa_nrsfm._tables.landmark_columns import names_layout, parse_coordinate
 from isa_nrsfm._tables.layout import (
-    LAYOUTS,
     Layout,
     table_to_tracks,
 )
@@ -168,15 +167,34 @@ def clean_tracks(
 
 
 def check_names(names: NDArray | None, layout: Layout) -> None:
-    """Refuse column names that say another layout than the one given."""
-    said = None if names is None else names_layout(list(names))
-    if said not in (None, layout):
-        shown = ", ".join(map(str, names[:4]))  # type: ignore[index]
-        order = said if said in LAYOUTS else "neither interleaved nor planar"
+    """Refuse column names of another layout than the given one, or of other things."""
+    said = None if names is None else names_layout(names)
+    if names is None or said in (None, layout):
+        return
+    others = [str(name) for name in names if not _is_x_or_y(name)]
+    if others:
         raise ValueError(
-            f"layout={layout!r} contradicts the column names ({shown}, ...), "
-            f"whose order is {order}"
+            f"{len(others)} of the {len(names)} columns are not the x or y of a point, "
+            f"as the names of the others are; the first is {others[0]!r}. Give only "
+            "the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
         )
+    shown = ", ".join(map(str, names[:4]))
+    order = (
+        "neither interleaved nor planar; isa_nrsfm.io.landmark_table(X).points has "
+        "them interleaved"
+        if said == "other"
+        else said
+    )
+    raise ValueError(
+        f"layout={layout!r} contradicts the column names ({shown}, ...), "
+        f"whose order is {order}"
+    )
+
+
+def _is_x_or_y(name: str) -> bool:
+    """Return whether a column is named as the x or y of a point."""
+    coordinate = parse_coordinate(name)
+    return coordinate is not None and coordinate.axis < 2
 
 
 def largest_n_components(n_points: int) -> int:

@@ -86,5 +86,52 @@ def selected(scores: NDArray, select: str) -> int:
             f"select={select!r} needs the standard error over at least two splits; cv "
             "has one"
         )
-    error = scores[best].std(ddof=1) / np.sqrt(n_splits)
+    error = standard_errors(scores)[best]
     return int(np.argmax(mean >= mean[best] - error))
+
+
+def standard_errors(scores: NDArray) -> NDArray:
+    """
+    Return the standard errors of mean scores over splits.
+
+    Parameters
+    ----------
+    scores : ndarray of shape (..., n_splits)
+        Scores.
+
+    Returns
+    -------
+    ndarray of shape (...)
+        Standard errors; NaN with one split.
+    """
+    n_splits = scores.shape[-1]
+    if n_splits < 2:
+        return np.full(scores.shape[:-1], np.nan)
+    return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))
+
+
+def line(row: Row, held_out: bool) -> str:
+    """
+    Return a row of a path as text.
+
+    Parameters
+    ----------
+    row : Row
+        The row.
+    held_out : bool
+        Whether the score is that of points that are held out, minus their error.
+
+    Returns
+    -------
+    str
+        The number of basis shapes, mean and standard error of the score, and the
+        seconds.
+    """
+    mean, error = row.scores.mean(), standard_errors(row.scores)
+    score = f"score {mean:.4g}, standard error {error:.2g}"
+    if held_out:
+        score = (
+            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
+        )
+    seconds = row.path_seconds + row.fit_seconds.sum() + row.score_seconds.sum()
+    return f"n_components={row.n_components}: {score}, {seconds:.1f} s"

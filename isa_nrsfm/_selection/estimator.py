@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from sklearn import get_config
 from sklearn.base import (
     BaseEstimator,
-    ClassNamePrefixFeaturesOutMixin,
     MetaEstimatorMixin,
     TransformerMixin,
     clone,
@@ -37,10 +36,10 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._selection.choice import SELECTIONS, results_of, selected
+from isa_nrsfm._selection.choice import SELECTIONS, line, results_of, selected
 from isa_nrsfm._selection.path import Row, Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._transformer import Decomposition
+from isa_nrsfm._transformer import CoefficientNamesMixin, Decomposition
 
 # Blocks of rows that are held out in turn by default. More cost more, and hardly change
 # the choice: neighbours are alike, and large blocks keep them together.
@@ -48,7 +47,7 @@ N_BLOCKS = 3
 
 
 class AffineNRSfMCV(
-    ClassNamePrefixFeaturesOutMixin,
+    CoefficientNamesMixin,
     TransformerMixin,
     MetaEstimatorMixin,
     BaseEstimator,
@@ -561,30 +560,6 @@ def held_out_score(
     part = taken_rows(X, split.test)
     wanted = None if y is None else taken_rows(y, split.test)
     return float(scorer(model, part, wanted, **own))
-
-
-def line(row: Row, held_out: bool) -> str:
-    """
-    Return a row of a path as text.
-
-    Parameters
-    ----------
-    row : Row
-        The row.
-    held_out : bool
-        Whether the score is that of points that are held out, minus their error.
-
-    Returns
-    -------
-    str
-        The number of basis shapes, mean and deviation of the score, and the seconds.
-    """
-    mean, deviation = row.scores.mean(), row.scores.std()
-    score = f"score {mean:.4g} +- {deviation:.2g}"
-    if held_out:
-        score = f"held-out error {-100 * mean:#.3g} +- {100 * deviation:#.2g} %"
-    seconds = row.path_seconds + row.fit_seconds.sum() + row.score_seconds.sum()
-    return f"n_components={row.n_components}: {score}, {seconds:.1f} s"
 
 
 def warn_of_unconverged(rows: list[Row]) -> None:

@@ -234,8 +234,9 @@ def names_layout(
     {"interleaved", "planar", "other"} or None
         "interleaved" for x0, y0, x1, y1, ..., "planar" for x0, x1, ..., y0, y1, ...,
         "other" for landmark columns in another order, incomplete ones, and ones with a
-        third coordinate. None where the names say nothing, because some are
-        not those of landmark coordinates or because there is only one axis.
+        third coordinate or other columns beside them. None where no names are those of
+        landmark coordinates, or of only one axis. None, too, where the other columns
+        are pairs that differ in the letters x and y alone, such as lx1, ly1.
 
     Examples
     --------
@@ -246,14 +247,17 @@ def names_layout(
     'planar'
     >>> names_layout(["x1", "y2", "y1", "x2"])
     'other'
+    >>> names_layout(["frame", "person", "x1", "y1"])
+    'other'
     >>> names_layout(["x1", "x2", "x3", "x4"]) is None
     True
     """
-    coordinates = []
+    coordinates, rest = [], []
     for name in names:
         coordinate = parse_coordinate(name)
         if coordinate is None:
-            return None
+            rest.append(str(name).lower().replace("x", "y"))
+            continue
         (x, y, _), key = coordinate.memberships[0]
         # What x and y of a point share: the key, and the pattern without its axis
         # letter (at the first place where the patterns of x and y differ).
@@ -263,6 +267,8 @@ def names_layout(
     points = [point for _, point in coordinates]
     if 0 not in axes or 1 not in axes:
         return None
+    if rest:
+        return None if rest[0::2] == rest[1::2] else "other"
     n_points = len(set(points))
     if axes == [0, 1] * n_points and points[0::2] == points[1::2]:
         return "interleaved"

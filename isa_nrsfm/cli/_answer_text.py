@@ -141,13 +141,17 @@ def _time_block(time: dict[str, Any]) -> Block:
     if not len(scales):
         title = "the frames show no dynamics; coefficients are not smoothed"
         return Block(f"{time['column']}: {title}", [], [], [])
-    listed = ", ".join(
-        f"{each:.3g}" if np.isfinite(each) else "never" for each in scales[:4]
-    )
-    more = ", ..." if len(scales) > 4 else ""
+    lasting, fading = int(np.isinf(scales).sum()), scales[np.isfinite(scales)]
+    said = []
+    if len(fading):
+        listed = ", ".join(f"{each:.3g}" for each in fading[:4])
+        more = ", ..." if len(fading) > 4 else ""
+        said.append(f"a change of the shape fades within {listed}{more}")
+    if lasting:
+        said.append(f"in {lasting} of {len(scales)} directions of change it lasts")
     changed = f"smoothed coefficients differ by {time['changed_by']:.2f}, "
     return Block(
-        f"{time['column']}: times until a shape is forgotten: {listed}{more}",
+        f"{time['column']}: {'; '.join(said)}",
         [],
         [],
         [f"{changed}root mean square"],

@@ -23,7 +23,8 @@ from isa_nrsfm.analysis import (
 )
 from isa_nrsfm.analysis._labels import kind_of
 from isa_nrsfm.cli._frames import Frames, column_named
-from isa_nrsfm.cli._outputs import component_names, write_figure
+from isa_nrsfm.cli._outputs import component_names, figure_named, write_figure
+from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -256,6 +257,7 @@ def answered(
         relative = WithinGroups().fit_transform(alpha, groups=asked.groups)
         columns |= dict(zip([f"{n}_within" for n in names], relative.T, strict=True))
     if asked.times is not None and estimator.refinement == "joint":
+        show_stage("smoothing")
         smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
         report["time"] = {
             "column": asked.time,
@@ -401,7 +403,7 @@ def draw_answers(
     asked: Answers,
     answers: Answered,
     estimator: AffineNRSfM,
-    edges: Any = "auto",
+    **drawn: Any,
 ) -> None:
     """Draw the coefficients by label, and in time: smoothed where they are."""
     from isa_nrsfm.plotting import CoefficientsDisplay
@@ -414,11 +416,11 @@ def draw_answers(
             label=label.name,
             component_names=names,
         )
-        figure = display.plot(kind=label.kind).figure_
-        write_figure(folder / _label_figure(number), figure)
+        with figure_named(name := _label_figure(number)):
+            write_figure(folder / name, display.plot(kind=label.kind).figure_)
         if _has_shapes(label):
-            figure = _draw_shapes(label, estimator, edges)
-            write_figure(folder / _shapes_figure(number), figure)
+            with figure_named(name := _shapes_figure(number)):
+                write_figure(folder / name, _draw_shapes(label, estimator, drawn))
     if asked.times is not None:
         alpha, deviation = estimator.alpha_, getattr(estimator, "alpha_std_", None)
         if answers.smooth is not None:
@@ -430,16 +432,17 @@ def draw_answers(
             groups=asked.groups,
             component_names=names,
         )
-        write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)
+        with figure_named(TIME_FIGURE):
+            write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)
 
 
-def _draw_shapes(label: Label, estimator: AffineNRSfM, edges: Any) -> Any:
+def _draw_shapes(label: Label, estimator: AffineNRSfM, drawn: dict[str, Any]) -> Any:
     """Draw the mean shape of each class over that of all frames."""
     from isa_nrsfm.plotting import BasisShapeDisplay
     from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
     from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
 
-    whole = BasisShapeDisplay.from_estimator(estimator, edges=edges)
+    whole = BasisShapeDisplay.from_estimator(estimator, **drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     means = _class_means(label, estimator.alpha_)
     shapes = whole.mean_shape + np.tensordot(means, whole.basis, 1)

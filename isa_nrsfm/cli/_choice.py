@@ -11,6 +11,7 @@ from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
+from isa_nrsfm._selection.choice import standard_errors
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -83,20 +84,19 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
     -------
     dict
         The numbers tried; for each its held-out error in each part (minus
-        `AffineNRSfM.score` of frames that were not fitted), their mean and standard
-        deviation, and its seconds; the number that was chosen; and, where that is the
-        largest, which numbers come next and about how many seconds they take.
+        `AffineNRSfM.score` of frames that were not fitted), their mean and its
+        standard error, and its seconds; the number that was chosen; and, where that is
+        the largest, which numbers come next and about how many seconds they take.
     """
     results, parts = search.cv_results_, range(search.n_splits_)
     seconds = seconds_of_rows(results, search.n_splits_)
     tried = results["param_n_components"]
+    of_parts = np.transpose([-results[f"split{part}_test_score"] for part in parts])
     report = {
         "n_components": tried.tolist(),
         "held_out_error": -results["mean_test_score"],
-        "held_out_error_deviation": results["std_test_score"],
-        "held_out_error_of_parts": np.transpose(
-            [-results[f"split{part}_test_score"] for part in parts]
-        ),
+        "held_out_error_standard_error": standard_errors(of_parts),
+        "held_out_error_of_parts": of_parts,
         "seconds": seconds,
         "chosen": search.n_components_,
     }

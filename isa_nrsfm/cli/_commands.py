@@ -1,10 +1,8 @@
 """The command fit, from options to the text of its report."""
 
-import contextlib
-import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +40,7 @@ from isa_nrsfm.cli._outputs import (
 )
 from isa_nrsfm.cli._page import REPORT_PAGE, write_report_page
 from isa_nrsfm.cli._parser import AUTO
+from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import read_frames, taken_frames
 from isa_nrsfm.cli._report import (
     fit_text,
@@ -49,7 +48,7 @@ from isa_nrsfm.cli._report import (
     table_report,
     versions,
 )
-from isa_nrsfm.cli._runs import REPORT
+from isa_nrsfm.cli._runs import REPORT, is_of_run
 from isa_nrsfm.io import write_table
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def fit_table(
             f"{args.refinement}"
         )
     folder = Path(args.output)
-    clock = {"": time.perf_counter()}
+    clock = {"": args.since}
     if table is None:
         frames = read_frames(args)
     else:
@@ -113,17 +112,21 @@ def fit_table(
         choice = CHOICE_FIGURE if several else {}
         figures = FIGURES | choice | answer_figures(asked)
     about = {REPORT_PAGE: "this report with its figures, for any browser"}
-    files = about | MODEL | TABLES | ARRAYS | PAGE | figures
+    results = about | MODEL | TABLES | ARRAYS | PAGE
     edges = chosen_edges(args, frames.columns.points, frames.skeleton)
+    drawn: dict[str, Any] = {"edges": edges, "origin": args.origin or "auto"}
     inputs = [args.table, *drawing_files(args)]
     if table is not None:
-        files, inputs = files | {Path(args.table).name: "the table"}, inputs[1:]
+        results, inputs = results | {Path(args.table).name: "the table"}, inputs[1:]
     with folder_for_writing(folder):
-        check_outputs((folder / name for name in (*files, REPORT)), inputs)
-        removed = old_figures(folder, files)
+        files = (*results, *figures, REPORT)
+        check_outputs((folder / name for name in files), inputs)
+        removed = {*old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
         estimator, search = _fitted(args, X, asked.groups, clock)
+        show_stage("answers")
         answers = answered(asked, estimator, X, args.random_state)
+        show_stage("tables")
         with files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
@@ -135,14 +138,9 @@ def fit_table(
                 std=args.std,
                 labels=first_classes(asked, X),
                 times=asked.times,
-                edges=edges,
+                **drawn,
             )
-            if not args.no_figures:
-                write_figures(new, estimator, X, args.random_state, edges, search)
-                draw_answers(new, asked, answers, estimator, edges)
             model = model_report(estimator, X, frames, edges)
-            clock["write"] = time.perf_counter()
-            seconds = np.diff([*clock.values()]).round(3)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
@@ -152,14 +150,40 @@ def fit_table(
                 "model": model,
                 **answers.report,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
-                "seconds": dict(zip([*clock][1:], seconds, strict=True)),
                 "warnings": warned,
                 "versions": versions(),
-                "files": files,
             }
-            write_report_page(new, report)
-            write_report(new, report)
+            report = _written(new, report, results, clock, "write")
+        if not figures:
+            return report
+        # A figure that fails, or takes long, costs no results: they are in place.
+        with files_together(folder) as new:
+            if not is_of_run(folder, report):
+                raise ValueError(
+                    f"another run has written to {folder} meanwhile; its files are "
+                    "there, and no figures of this one"
+                )
+            write_figures(new, estimator, X, args.random_state, search, **drawn)
+            draw_answers(new, asked, answers, estimator, **drawn)
+            there = {name: figures[name] for name in figures if (new / name).exists()}
+            report = _written(new, report, results | there, clock, "figures")
     return report
+
+
+def _written(
+    folder: Path,
+    report: dict[str, Any],
+    files: dict[str, str],
+    clock: dict[str, float],
+    stage: str,
+) -> dict[str, Any]:
+    """Write a report, with the seconds up to now, and return it."""
+    clock[stage] = time.perf_counter()
+    of_stages = np.diff([*clock.values()]).round(3)
+    seconds = dict(zip([*clock][1:], of_stages, strict=True))
+    report = report | {"seconds": seconds, "files": files}
+    write_report_page(folder, report)
+    return write_report(folder, report)
 
 
 def _fitted(
@@ -183,12 +207,14 @@ def _fitted(
     )
     search = None
     if len(args.n_components) > 1:
+        show_stage("choice of the number of basis shapes")
         search = choose_n_components(estimator, X, args.n_components, groups)
         estimator = search.best_estimator_
         clock["choose"] = time.perf_counter() - search.refit_time_
     else:
-        with _progress(estimator):
-            estimator.fit(X)
+        # For `shown_progress`; the model that is written does not have it.
+        estimator.set_params(verbose=2).fit(X)
+        estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
     return estimator, search
 
@@ -199,18 +225,6 @@ def _strategy(args: Namespace) -> Any:
         return None if args.isa == "pooled" else FastISA()
     kind = PooledFastICA if args.isa == "pooled" else FastISA
     return kind(n_init=args.n_init)
-
-
-@contextlib.contextmanager
-def _progress(estimator: AffineNRSfM) -> Iterator[None]:
-    """Show the progress of a fit on the terminal, if there is one."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    estimator.set_params(verbose=1)
-    with contextlib.redirect_stdout(sys.stderr):
-        yield
-    estimator.set_params(verbose=0)
 
 
 def _reasons(frames: Frames) -> str:

@@ -49,7 +49,9 @@ def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
         *drawing_options(args),
     ]
     report = fit_table(
-        build_parser().parse_args(options, Namespace(arguments=options)),
+        build_parser().parse_args(
+            options, Namespace(arguments=options, since=args.since)
+        ),
         warned,
         table=table,
         truth=lambda estimator, X: _compare(faces, estimator, X),

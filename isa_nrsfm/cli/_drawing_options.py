@@ -1,4 +1,4 @@
-"""The options that say what joins the points. No library is imported here."""
+"""The options that say how points are drawn. No library is imported here."""
 
 import argparse
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from pathlib import Path
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
 
 NONE = "none"
+_NAMES = ("edges", "skeleton", "origin")
 CONFIGURATIONS = (".yaml", ".yml")
 
 
@@ -16,7 +17,7 @@ def add_drawing_options(
     where: str = "in viewer and figures",
     default: str = "those of a layout that is known",
 ) -> None:
-    """Add the options --edges and --skeleton, of which one may be given."""
+    """Add the options --edges or --skeleton, and --origin."""
     options = group.add_mutually_exclusive_group()
     options.add_argument(
         "--edges",
@@ -34,11 +35,17 @@ def add_drawing_options(
         f"table nor names, number and order of the points tell it: "
         f"{', '.join(SKELETON_NAMES)}, or the config.yaml of DeepLabCut",
     )
+    group.add_argument(
+        "--origin",
+        choices=["auto", "upper", "lower"],
+        help="where y is zero: upper in images, whose y points down, lower where it "
+        "points up (default: auto, lower for faces that would be upside down)",
+    )
 
 
 def drawing_options(args: argparse.Namespace) -> list[str]:
     """Return the options that are given, as words of a command line."""
-    words = (("--edges", args.edges), ("--skeleton", args.skeleton))
+    words = [(f"--{name}", getattr(args, name)) for name in _NAMES]
     return [word for pair in words if pair[1] is not None for word in pair]
 
 

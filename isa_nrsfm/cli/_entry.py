@@ -10,8 +10,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    The report goes to the standard output, and everything else (errors, warnings and,
-    on a terminal, the progress) to the standard error. Characters that the encoding of
+    The report goes to the standard output, and everything else (errors, warnings and
+    the progress) to the standard error. Characters that the encoding of
     the standard output lacks are written with a backslash.
 
     Parameters

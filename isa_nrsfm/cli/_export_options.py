@@ -91,12 +91,6 @@ def add_export_options(
         "weak_perspective)",
     )
     group.add_argument(
-        "--origin",
-        choices=["auto", "upper", "lower"],
-        help="where y is zero: upper in images, whose y points down, lower where it "
-        "points up (default: auto, lower for faces that would be upside down)",
-    )
-    group.add_argument(
         "--mirrored",
         action="store_true",
         default=None,

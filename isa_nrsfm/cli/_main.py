@@ -2,23 +2,31 @@
 
 import contextlib
 import os
+import re
 import sys
+import time
 import warnings
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TextIO
 
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
+from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 FINE, BAD_INPUT, BROKEN_PIPE = 0, 1, 141
+# Parameters that messages name, as options of the same names.
+_PARAMETERS = ("n_components", "camera", "refinement", "independence", "loss")
 
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Run the command line as of `isa_nrsfm.cli.main`, but for interruptions."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    args = build_parser().parse_args(arguments, Namespace(arguments=arguments))
+    started = Namespace(arguments=arguments, since=time.perf_counter())
+    args = build_parser().parse_args(arguments, started)
     try:
-        with _warnings_as_lines() as warned:
+        with _warnings_as_lines(args) as warned, shown_progress(PROGRAM, args.since):
+            show_stage(args.command)
             report = _run(args, warned)
         _show(report)
     except BrokenPipeError:
@@ -27,7 +35,7 @@ def run(argv: Sequence[str] | None = None) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except (ValueError, OSError, ImportError) as error:
-        _say(f"error: {_message(error)}")
+        _say(f"error: {_message(error, args)}")
         return BAD_INPUT
     return FINE
 
@@ -53,7 +61,7 @@ def _run(args: Namespace, warned: list[str]) -> str:
 
 
 @contextlib.contextmanager
-def _warnings_as_lines() -> Iterator[list[str]]:
+def _warnings_as_lines(args: Namespace) -> Iterator[list[str]]:
     """Show each warning once, as a line; yield the list of those shown."""
     warned: list[str] = []
 
@@ -65,7 +73,7 @@ def _warnings_as_lines() -> Iterator[list[str]]:
         file: TextIO | None = None,
         line: str | None = None,
     ) -> None:
-        text = _one_line(str(message))
+        text = _with_options(str(message), args)
         if text not in warned:
             warned.append(text)
             _say(f"warning: {text}")
@@ -78,16 +86,23 @@ def _warnings_as_lines() -> Iterator[list[str]]:
         yield warned
 
 
-def _message(error: Exception) -> str:
+def _message(error: Exception, args: Namespace) -> str:
     """Return what an error says, in one line."""
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: {error.strerror}"
-    return _one_line(str(error)) or type(error).__name__
+    return _with_options(str(error), args) or type(error).__name__
 
 
-def _one_line(text: str) -> str:
-    """Join the lines of a text."""
-    return " ".join(text.split())
+def _with_options(text: str, args: Namespace) -> str:
+    """Join the lines of a message, and name options instead of parameters of Python."""
+    text = " ".join(text.split())
+    for name in filter(partial(hasattr, args), _PARAMETERS):
+        option = f"--{name.replace('_', '-')}"
+        value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
+        text = re.sub(rf"(?<![\w/\\-]){name}{value}", rf"{option} \g<value>", text)
+    if hasattr(args, "n_components"):
+        text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
+    return text
 
 
 def _show(report: str) -> None:

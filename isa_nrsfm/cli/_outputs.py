@@ -1,9 +1,10 @@
 """Write the results of a fit to a folder."""
 
+import contextlib
 import io
 import json
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm._compat.whole_files import refuse_replacing, write_whole
 from isa_nrsfm.cli._frames import Frames
+from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._runs import DIGESTS, REPORT, digests_of, files_of_report
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import save_model, write_table
@@ -55,18 +57,18 @@ def component_names(n_components: int) -> list[str]:
 
 
 def old_figures(folder: Path, new: Iterable[str]) -> list[str]:
-    """Return the names of figures of an earlier run that no new file replaces.
+    """Return the names of figures of an earlier run, which its report lists.
 
-    Of figures that no report lists, it is said that they are old.
+    Of others that no new file replaces it is said that they are old.
     """
     listed = files_of_report(folder)
-    figures = {*FIGURES, *(name for name in listed if name.endswith(".png"))}
-    figures -= {*new}
-    old = sorted(name for name in figures if (folder / name).exists())
-    others = [name for name in old if name not in listed]
+    old = sorted(name for name in listed if name.endswith(".png"))
+    others = sorted(
+        name for name in {*FIGURES} - {*old, *new} if (folder / name).exists()
+    )
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
-    return [name for name in old if name in listed]
+    return old
 
 
 def check_outputs(targets: Iterable[Path], inputs: Iterable[str]) -> None:
@@ -120,6 +122,7 @@ def write_results(
     labels: "pd.Series | None" = None,
     times: Any = None,
     edges: Any = "auto",
+    origin: Any = "auto",
 ) -> None:
     """Write model, coefficients with further columns, cameras, shapes and the viewer.
 
@@ -131,7 +134,7 @@ def write_results(
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
-    poses = told_poses(estimator, X, edges, NOT_TOLD)
+    poses = told_poses(estimator, X, NOT_TOLD, edges=edges, origin=origin)
     cameras = camera_table(estimator, fit, X).join(poses)
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)
@@ -143,6 +146,7 @@ def write_results(
         folder / "viewer.html",
         X=X,
         edges=edges,
+        origin=origin,
         labels=labels,
         times=times,
         camera="weak_perspective" if len(poses.columns) else None,
@@ -166,7 +170,7 @@ def camera_table(
 
 
 def told_poses(
-    estimator: AffineNRSfM, X: "pd.DataFrame", edges: Any, otherwise: str
+    estimator: AffineNRSfM, X: "pd.DataFrame", otherwise: str, **drawn: Any
 ) -> "pd.DataFrame":
     """Return yaw, pitch, roll, scale and deviations of frames as columns.
 
@@ -177,7 +181,7 @@ def told_poses(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            poses = export.frame_poses(estimator, X, edges=edges)
+            poses = export.frame_poses(estimator, X, **drawn)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{otherwise}: {error}")
         return pd.DataFrame(index=X.index)
@@ -185,15 +189,15 @@ def told_poses(
     return columns.dropna(axis="columns", how="all")
 
 
-def write_page(path: Path, estimator: AffineNRSfM, X: Any, edges: Any) -> None:
+def write_page(path: Path, estimator: AffineNRSfM, X: Any, **drawn: Any) -> None:
     """Write the viewer, with affine shapes where the cameras hardly tell others."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            export.write_viewer(estimator, path, X=X, edges=edges)
+            export.write_viewer(estimator, path, X=X, **drawn)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")
-        export.write_viewer(estimator, path, X=X, edges=edges, camera=None)
+        export.write_viewer(estimator, path, X=X, camera=None, **drawn)
 
 
 def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
@@ -224,8 +228,8 @@ def write_figures(
     estimator: AffineNRSfM,
     points: "pd.DataFrame",
     random_state: int,
-    edges: Any = "auto",
     search: "AffineNRSfMCV | None" = None,
+    **drawn: Any,
 ) -> None:
     """Draw the figures without a screen, that of the choice if there was a search."""
     import_optional("matplotlib", extra="plot").use("Agg")
@@ -236,19 +240,30 @@ def write_figures(
         ReprojectionDisplay,
     )
 
-    names = [*FIGURES]
-    figures = [
-        BasisShapeDisplay.from_estimator(estimator, edges=edges).figure_,
-        ModeCovarianceDisplay.from_estimator(estimator).figure_,
-        ReprojectionDisplay.from_estimator(
-            estimator, points, random_state=random_state, edges=edges
-        ).figure_,
+    figures: list[Callable[[], Any]] = [
+        lambda: BasisShapeDisplay.from_estimator(estimator, **drawn),
+        lambda: ModeCovarianceDisplay.from_estimator(estimator),
+        lambda: ReprojectionDisplay.from_estimator(
+            estimator, points, random_state=random_state, **drawn
+        ),
+        lambda: ComponentChoiceDisplay.from_estimator(search),
     ]
-    if search is not None:
-        names += CHOICE_FIGURE
-        figures.append(ComponentChoiceDisplay.from_estimator(search).figure_)
-    for name, figure in zip(names, figures, strict=True):
-        write_figure(folder / name, figure)
+    names = [*FIGURES, *(CHOICE_FIGURE if search is not None else ())]
+    for name, draw in zip(names, figures, strict=False):
+        with figure_named(name):
+            write_figure(folder / name, draw().figure_)
+
+
+@contextlib.contextmanager
+def figure_named(name: str) -> Iterator[None]:
+    """Warn if a figure cannot be drawn: results do not depend on it."""
+    show_stage(name)
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
 
 
 def write_figure(path: Path, figure: Any) -> None:
@@ -259,14 +274,17 @@ def write_figure(path: Path, figure: Any) -> None:
     write_whole(path, image.getvalue())
 
 
-def write_report(folder: Path, report: dict[str, Any]) -> None:
+def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
     """Write the report as JSON, in which NaN and infinities become null.
 
-    It gets the digests of the files that it lists, which are in the folder.
+    It gets the digests of those of its files that are in the folder, beside those that
+    it has. Return it.
     """
-    report = report | {DIGESTS: digests_of(folder, report["files"])}
+    digests = report.get(DIGESTS, {}) | digests_of(folder, report["files"])
+    report = report | {DIGESTS: digests}
     text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
     write_whole(folder / REPORT, f"{text}\n".encode())
+    return report
 
 
 def _plain(value: Any) -> Any:

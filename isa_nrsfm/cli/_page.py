@@ -44,10 +44,10 @@ def _advice(report: dict[str, Any]) -> list[str]:
     """Say in words how good the fit is, and what to do about what is not."""
     model = report["model"]
     lines = [
-        "Points that the fit has not seen are predicted with an error of "
-        f"{_percent(model['held_out_error'])} of the energy of their frame, points "
-        f"that it has seen with {_percent(model['inverse_snr'])}. Too many basis "
-        "shapes make the first much larger than the second."
+        "Points that are predicted from the other points of their frame are off by "
+        f"{_percent(model['held_out_error'])} of its energy, points that are fitted "
+        f"by {_percent(model['inverse_snr'])}. Too many basis shapes make the first "
+        "much larger than the second. Both are frames to which the shapes were fitted."
     ]
     if model["camera_meaning"]:
         lines.append(_sentence(model["camera_meaning"]))

@@ -59,7 +59,7 @@ examples:
 
 Cells of missing points are empty. Rows that show too few points for a fit are counted
 and get empty coefficients. Files of an earlier run in the output folder are
-replaced, all together at the end."""
+replaced, all together, before the figures are drawn."""
 
 _TRANSFORM_EXAMPLES = """\
 example:

@@ -214,7 +214,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str]]:
         fit.append(f"noise {unit}, standard deviation of a coordinate")
     if model["outliers"] is not None and model["outliers"]["message"]:
         fit += textwrap.wrap(model["outliers"]["message"], _TEXT_WIDTH)
-    fit.append(f"{report['seconds']['fit']:.1f} seconds")
+    fit.append(_seconds(report["seconds"]))
     if model["skeleton"] is not None:
         fit.append(f"points recognised as {model['skeleton']}")
     head = f"{'':10} {'energy':>8} {'mean':>7} {'std':>6} {'min':>7} {'max':>7}"
@@ -245,6 +245,12 @@ def pose_cell(row: dict[str, Any]) -> str:
     """Return the share of a coefficient that the pose predicts, in percent."""
     share = row["pose_share"]
     return "" if share is None or math.isnan(share) else f"{100 * max(share, 0):.0f} %"
+
+
+def _seconds(of_stages: dict[str, float]) -> str:
+    """Say how long a run took, and its fit."""
+    fit = of_stages["fit"] + of_stages.get("choose", 0.0)
+    return f"{sum(of_stages.values()):.1f} seconds, {fit:.1f} of them for the fit"
 
 
 def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
@@ -289,14 +295,14 @@ def table_lines(table: dict[str, Any], unusable: str = "left out") -> list[str]:
 
 def _choice_lines(choice: dict[str, Any]) -> list[str]:
     """Show the held-out error of each number of basis shapes."""
-    lines = ["  K   held-out error of frames that were not fitted, and its deviation"]
+    lines = ["  K   held-out error of frames that were not fitted, +- standard error"]
     lines += [
-        f"{k:3}   {100 * error:#.3g} +- {100 * deviation:#.2g} %"
+        f"{k:3}   {_digits(100 * error, 3)} +- {_digits(100 * standard_error, 2)} %"
         f"{', the least' * (k == choice['chosen'])}"
-        for k, error, deviation in zip(
+        for k, error, standard_error in zip(
             choice["n_components"],
             choice["held_out_error"],
-            choice["held_out_error_deviation"],
+            choice["held_out_error_standard_error"],
             strict=True,
         )
     ]
@@ -305,8 +311,13 @@ def _choice_lines(choice: dict[str, Any]) -> list[str]:
     if "next" in choice:
         following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
         numbers = "-".join(map(str, sorted({following[0], following[-1]})))
-        lines.append(f"to try K = {numbers}, too, would take about {seconds:#.2g} s")
+        lines.append(f"to try K = {numbers}, too, would take about {seconds:.0f} s")
     return lines
+
+
+def _digits(number: float, n_digits: int) -> str:
+    """Write a number with so many digits, zeros at the end included."""
+    return f"{number:#.{n_digits}g}".removesuffix(".")
 
 
 def _camera_lines(model: dict[str, Any]) -> list[str]:

@@ -31,6 +31,11 @@ def files_of_report(folder: Path) -> set[str]:
     return set(_entry(folder, "files"))
 
 
+def is_of_run(folder: Path, report: dict[str, Any]) -> bool:
+    """Return whether the files in a folder are those that a report has digests of."""
+    return digests_of(folder, report[DIGESTS]) == report[DIGESTS]
+
+
 def warn_of_mixed_runs(model: str) -> None:
     """Warn if files beside a model are not of the run that the report is of."""
     folder, name = Path(model).parent, Path(model).name

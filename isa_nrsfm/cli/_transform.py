@@ -43,7 +43,7 @@ def run_transform(args: Namespace) -> str:
     frames = read_frames(args, estimator)
     edges = chosen_edges(args, names_of_points(estimator), frames.skeleton)
     if args.viewer is None and drawing_options(args):
-        raise ValueError("--edges and --skeleton are for --viewer")
+        raise ValueError("--edges, --skeleton and --origin are for --viewer")
     outputs = [output, *([] if args.viewer is None else [Path(args.viewer)])]
     for source in (args.table, args.model, *drawing_files(args)):
         refuse_overwriting(source, outputs)
@@ -58,7 +58,8 @@ def run_transform(args: Namespace) -> str:
     results = alpha_table(fit, frames, std=args.std)
     write_table(beside_other_columns(results, frames.other), output)
     if args.viewer is not None:
-        write_page(outputs[1], estimator, X, edges)
+        drawn = {"edges": edges, "origin": args.origin or "auto"}
+        write_page(outputs[1], estimator, X, **drawn)
 
     table = table_report(args.table, args.format, frames)
     title = f"{n_components} coefficients of {n_frames} frames"

@@ -24,6 +24,9 @@ Kind = Literal["classes", "number", "time"]
 PANEL_HEIGHT, LABEL_HEIGHT = 1.3, 0.5
 # Curves stop where the time between frames is more than this many times the median.
 BREAK = 3.0
+# Groups or classes that are drawn: more of them cover each other, and a figure of eight
+# basis shapes and 1,000 classes takes 47 s.
+MOST_GROUPS = 50
 # Half the width of the band in which the frames of a class are scattered.
 JITTER = 0.18
 
@@ -43,11 +46,13 @@ class CoefficientsDisplay:
     alpha_std : array-like of shape (n_frames, n_components), default=None
         Their standard deviations.
     y : array-like of shape (n_frames,), default=None
-        A label for each frame: classes, or a number.
+        A label for each frame: classes, or a number. Of more than 50 classes those with
+        the most frames are drawn, and the title says so.
     time : array-like of shape (n_frames,), default=None
         Times of the frames. By default their numbers.
     groups : array-like of shape (n_frames,), default=None
-        Videos or people: a curve does not go from one to another.
+        Videos or people: a curve does not go from one to another. Of more than 50 those
+        with the most frames are drawn in time, and the title says so.
     label : str, default=None
         What `y` is, for the axis. By default "label".
     component_names : list of str of length n_components, default=None
@@ -141,7 +146,8 @@ class CoefficientsDisplay:
         time : array-like of shape (n_frames,), default=None
             Times of the frames. By default their numbers.
         groups : array-like of shape (n_frames,), default=None
-            Videos or people: a curve does not go from one to another.
+            Videos or people: a curve does not go from one to another. Of more than 50
+            those with the most frames are drawn.
         label : str, default=None
             What `y` is, for the axis. By default "label".
         component_names : list of str of length n_components, default=None
@@ -226,6 +232,12 @@ class CoefficientsDisplay:
             axes.set_ylabel(self.component_names[k])
             axes.axhline(0, color="0.85", linewidth=0.6, zorder=0)
             axes.spines[["top", "right"]].set_visible(False)
+        divided = {"classes": self.y, "number": None, "time": self.groups}[found]
+        n_groups = 0 if divided is None else len(np.unique(divided))
+        if n_groups > MOST_GROUPS:
+            what = "groups" if found == "time" else "classes"
+            title = f"the {MOST_GROUPS} of {n_groups} {what} with the most frames"
+            self.axes_[0].set_title(title, loc="left", fontsize="medium")
         time_label = "frame" if self.time is None else "time"
         self.axes_[-1].set_xlabel(time_label if found == "time" else self.label)
         return self
@@ -241,13 +253,13 @@ class CoefficientsDisplay:
     def _draw_classes(self, axes: Any, k: int) -> None:
         """Draw box plots and the frames of each class, scattered sideways."""
         assert self.y is not None
-        classes, numbers = np.unique(self.y, return_inverse=True)
-        known = np.isfinite(self.alpha[:, k])
+        classes, members = _rows_of_largest(self.y)
+        known = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
         rng = np.random.default_rng(0)  # where points lie sideways means nothing
-        sideways = numbers + JITTER * rng.uniform(-1, 1, len(numbers))
+        places = np.repeat(np.arange(len(classes)), [len(rows) for rows in known])
         axes.scatter(
-            sideways[known],
-            self.alpha[known, k],
+            places + JITTER * rng.uniform(-1, 1, len(places)),
+            self.alpha[np.concatenate(known), k],
             s=4,
             color=MINUS_COLOUR,
             alpha=0.4,
@@ -255,7 +267,7 @@ class CoefficientsDisplay:
             rasterized=True,
         )
         axes.boxplot(
-            [self.alpha[known & (numbers == c), k] for c in range(len(classes))],
+            [self.alpha[rows, k] for rows in known],
             positions=range(len(classes)),
             widths=0.6,
             showfliers=False,
@@ -283,32 +295,42 @@ class CoefficientsDisplay:
     def _draw_time(self, axes: Any, k: int) -> None:
         """Draw a curve, broken at gaps and groups, with a band of one deviation."""
         time: NDArray = np.arange(len(self.alpha)) if self.time is None else self.time
-        for rows in self._pieces(time):
-            axes.plot(
-                time[rows],
-                self.alpha[rows, k],
+        pieces = self._pieces(time)
+        rows = np.concatenate(pieces)
+        # One line with gaps: a line for each piece takes minutes for thousands.
+        gaps = np.cumsum([len(piece) for piece in pieces])[:-1]
+        times, alpha = np.insert(time[rows], gaps, time[rows][gaps - 1]), self.alpha
+        curve = np.insert(alpha[rows, k], gaps, np.nan)
+        axes.plot(times, curve, color=MINUS_COLOUR, linewidth=0.9)
+        single = [piece[0] for piece in pieces if len(piece) == 1]
+        if single:
+            axes.plot(time[single], alpha[single, k], ".", color=MINUS_COLOUR)
+        if self.alpha_std is not None:
+            deviation = np.insert(self.alpha_std[rows, k], gaps, np.nan)
+            axes.fill_between(
+                times,
+                curve - deviation,
+                curve + deviation,
                 color=MINUS_COLOUR,
-                linewidth=0.9,
-                marker="." if len(rows) == 1 else None,
+                alpha=0.25,
+                linewidth=0,
             )
-            if self.alpha_std is not None:
-                axes.fill_between(
-                    time[rows],
-                    self.alpha[rows, k] - self.alpha_std[rows, k],
-                    self.alpha[rows, k] + self.alpha_std[rows, k],
-                    color=MINUS_COLOUR,
-                    alpha=0.25,
-                    linewidth=0,
-                )
 
     def _pieces(self, time: NDArray) -> list[NDArray]:
         """Return the rows of each curve, in the order of the table."""
         groups = np.zeros(len(time), int) if self.groups is None else self.groups
         pieces = []
-        for group in np.unique(groups):
-            rows = np.flatnonzero(groups == group)
+        for rows in _rows_of_largest(groups)[1]:
             apart = np.diff(time[rows])
             typical = np.median(apart) if len(apart) else apart.sum()
             cuts = np.flatnonzero((apart > BREAK * typical) | (apart < 0 * typical))
             pieces += np.split(rows, cuts + 1)
         return pieces
+
+
+def _rows_of_largest(groups: NDArray) -> tuple[NDArray, list[NDArray]]:
+    """Return the groups with the most frames, sorted, and the rows of each."""
+    names, numbers, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    rows = np.split(np.argsort(numbers, kind="stable"), np.cumsum(counts)[:-1])
+    largest = np.sort(np.argsort(-counts, kind="stable")[:MOST_GROUPS])
+    return names[largest], [rows[group] for group in largest]
