@@ -30,6 +30,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
@@ -40,6 +41,7 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
+from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
 from isa_nrsfm._joint.starts import rigid_start
@@ -75,6 +77,7 @@ class JointNumbers(NamedTuple):
 
     noise_variance: float
     camera_noise_ratio: float
+    depth_uncertainty: float
     reliability: NDArray
     objective_history: NDArray
     gradient_norm: float
@@ -481,6 +484,8 @@ def _refined_jointly(
         FrameMap.identity(len(paper_shapes) - 1),
         options.camera,
     )
+    if options.camera != "affine":
+        frames = replace(frames, certainty=_certainty(frames, table.rows))
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     _check_determined(motion, table.shown)
@@ -512,10 +517,30 @@ def _refined_jointly(
         JointNumbers(
             unit**2 * fitted.noise_variance,
             fitted.camera_noise_ratio,
+            frames.certainty.total,
             reliabilities(alpha, covariance),
             fitted.history,
             fitted.gradient_norm,
         ),
+    )
+
+
+def _certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
+    """Estimate the uncertainty of depths from some of the frames."""
+    n_frames = rows.n_frames
+    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
+    part = np.asarray(rows.take(chosen), dtype=np.float64)
+    found = frames.posterior(part.transpose(0, 2, 1), covariances=False)
+    known = np.isfinite(found.motion).all(axis=(1, 2))
+    return depth_certainty(
+        frames.shapes,
+        found.motion[known],
+        found.alpha[known],
+        part[known],
+        frames.noise_variance,
+        n_frames=n_frames,
+        extent_weight=EXTENT_WEIGHT,
+        free=frames.camera == "weak_perspective",
     )
 
 

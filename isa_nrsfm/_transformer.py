@@ -22,6 +22,8 @@ from isa_nrsfm._diagnostics import (
 )
 from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.depth import tilts
 from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
@@ -298,9 +300,18 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
                 f"refinement='joint'; got camera={self.camera_!r} and "
                 f"refinement={self.refinement!r}"
             )
-        space = frames.gauge.space
-        covariance = self._model.posterior(table).turn_covariance
-        return np.asarray(space @ covariance @ space.T).astype(table.dtype, copy=False)
+        space, certainty = frames.gauge.space, frames.certainty
+        found = self._model.posterior(table)
+        covariance = space @ found.turn_covariance @ space.T
+        # Rotations that basis shapes contain, and the scale of the depth
+        square = np.einsum("ik,ik->i", found.alpha, found.alpha)
+        covariance += certainty.turns * square[:, None, None] * np.eye(3)
+        if np.isfinite(certainty.scale):
+            mean, _ = full_rotations(self.reference_motion_[None].astype(np.float64))
+            rotations, _ = full_rotations(found.motion @ space.T)
+            turned = tilts(rotations, mean[0])
+            covariance += certainty.scale**2 * turned[:, :, None] * turned[:, None]
+        return np.asarray(covariance).astype(table.dtype, copy=False)
 
     def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
         """

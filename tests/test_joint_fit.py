@@ -158,7 +158,8 @@ class TestFit:
     @pytest.mark.parametrize("camera", CAMERAS)
     def test_shapes_are_centred_and_coefficients_those_of_the_priors(self, camera):
         # The model is right here: there is no prior of the basis shapes, and the most
-        # likely mixing of them has mean_i E[alpha_i alpha_i^T] = I.
+        # likely mixing of them has mean_i E[alpha_i alpha_i^T] = I. The prior of the
+        # extents of calibrated fits moves the mean a little.
         truth = "orthographic" if camera == "orthographic" else "weak_perspective"
         tracks, _ = random_table(
             n_frames=200, unit=camera == "orthographic", camera=truth
@@ -168,7 +169,8 @@ class TestFit:
         frames, _ = frames_of(result, tracks, camera)
         moments = result.alpha.T @ result.alpha + frames.covariance.sum(axis=0)
         assert_allclose(moments / 200, np.eye(2), atol=0.03)
-        assert_allclose(result.alpha.mean(axis=0), 0, atol=0.01)
+        shift = 0.01 if camera == "affine" else 0.02
+        assert_allclose(result.alpha.mean(axis=0), 0, atol=shift)
         # They are those of the frames, but for the noise that was taken.
         assert_allclose(result.alpha, frames.alpha, atol=0.03)
 

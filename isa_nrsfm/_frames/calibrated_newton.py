@@ -75,9 +75,14 @@ class CalibratedSearch:
     """
 
     def __init__(
-        self, shapes: NDArray, scaled: bool, options: FrameOptions = FRAME_OPTIONS
+        self,
+        shapes: NDArray,
+        scaled: bool,
+        options: FrameOptions = FRAME_OPTIONS,
+        misfit: float = 1.0,
     ):
         self.options, self.first_steps = options, options.max_steps
+        self.misfit = misfit
         self._models = CalibratedCameras(scaled, options.largest_turn)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         self._axes = axes
@@ -131,7 +136,7 @@ class CalibratedSearch:
         M, converged = descend(problem, problem.evaluate(M), max_steps)
         M, better, reached = _better_reversed(problem, M, max_steps)
         converged[better] = reached[better]
-        return _found(problem, M, converged, covariances)
+        return _found(problem, M, converged, covariances, self.misfit)
 
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
@@ -425,14 +430,19 @@ def _state(
 
 
 def _found(
-    problem: CalibratedProblem, M: NDArray, converged: NDArray, covariances: bool
+    problem: CalibratedProblem,
+    M: NDArray,
+    converged: NDArray,
+    covariances: bool,
+    misfit: float,
 ) -> FoundFrames:
     """Return the minima of a search from their cameras (2, 3, n)."""
     noise, n = problem.noise, M.shape[-1]
     posterior = _posterior(problem, M)
     spreads = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
     if covariances:
-        spreads = _covariances(problem, M, posterior)
+        wide = problem._replace(noise=misfit * noise)
+        spreads = _covariances(wide, M, _posterior(wide, M))
     return FoundFrames(
         frames_first(M),
         posterior.alpha.T,

@@ -14,9 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.depth import DepthCertainty, depth_deviations
 from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import (
@@ -231,6 +233,8 @@ class PosteriorFrames:
         Model of the cameras. Orthographic ones have the scale one.
     options : FrameOptions
         What steers the fit.
+    certainty : DepthCertainty
+        Uncertainty of the fit of the shapes, with calibrated cameras.
     """
 
     shapes: NDArray
@@ -240,11 +244,16 @@ class PosteriorFrames:
     gauge: FrameMap
     camera: str = "affine"
     options: FrameOptions = FRAME_OPTIONS
+    certainty: DepthCertainty = DepthCertainty()
 
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames. What it knows of the shapes serves all tables."""
-        return SEARCHES[self.camera](self.shapes, options=self.options)
+        if self.camera == "affine":
+            return AffineSearch(self.shapes, options=self.options)
+        search = SEARCHES[self.camera]
+        misfit = self.certainty.misfit
+        return search(self.shapes, options=self.options, misfit=misfit)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes, without what is computed from them."""
@@ -339,6 +348,33 @@ class PosteriorFrames:
         """
         return fit_prepared(
             block, self._search, self.noise_variance, starts=self.starts
+        )
+
+    def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
+        """
+        Compute the standard deviations of the depths of the points of frames.
+
+        Parameters
+        ----------
+        tracks : ndarray of shape (n_frames, n_points, 2)
+            Tracks, in any place; NaN where a point is missing.
+        sizes : ndarray of shape (n_frames,)
+            Sizes of the frames.
+
+        Returns
+        -------
+        ndarray of shape (n_frames, n_points)
+            In the units of the tracks. Only for calibrated cameras.
+        """
+        found = self.posterior(tracks / sizes[:, None, None], covariances=False)
+        return sizes[:, None] * depth_deviations(
+            self.shapes,
+            found.motion,
+            found.alpha,
+            seen_points(tracks),
+            self.noise_variance,
+            self.certainty,
+            self.camera == "weak_perspective",
         )
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:

@@ -3,8 +3,8 @@
 Images of an object that hardly turns determine its depth only to second order. Depths
 that are c times as large, turned by angles that are c times smaller, have nearly the
 same images (bas-relief ambiguity: Belhumeur, Kriegman, Yuille, 1999). Whatever the model
-leaves of the images then decides on the depth. With the second moments ``G = sum_k B_k
-B_k^T`` of all shapes the objective contains ::
+leaves of the images then decides on the depth. With the second moments
+``G = sum_k B_k B_k^T`` of all shapes the objective contains ::
 
     N weight (tr G / (3 det(G)^(1/3)) - 1),
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 # faces that turn by 6 degrees and more have the same errors as without it.
 EXTENT_WEIGHT = 0.02
 # Added to the squared extents, as a share of their mean: flat objects stay flat.
-FLAT = 1e-4
+FLAT = 1e-3
 
 
 def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:

@@ -1,0 +1,293 @@
+"""Uncertainty of depths and rotations of calibrated cameras.
+
+A frame has the unknowns q: rotation vector, logarithm of the scale, coefficients. Their
+tangent T_i of the image and Z_i of the depths give the covariance of the depths ::
+
+    Z_i (T_i^T T_i / v + diag(0, I))^-1 Z_i^T.
+
+The variance v of the misfit is not that of a coordinate. Deformation that K basis
+shapes leave is common to many points, and what looks like a rotation of the frame is
+taken for one. How much of it, is seen in the directions that affine cameras could
+explain in addition: v is the mean square of the residual along these.
+
+The depth of all shapes has an uncertainty of its own, which ends in all frames alike:
+
+- the scale c of the depth. Its information is that of the residual of ``dS / d log c``
+  after the fit of q; the prior of the extents pulls at it where that is small; and the
+  error of the rotations, as a share of their spread, acts as errors in variables do;
+- the depths of single points of the shapes, which only turned frames show;
+- the deformation that the basis shapes leave, which has a depth, too.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._frames.camera_models import full_rotations
+
+# The shapes follow a change of the scale of the depth, so that its information is
+# smaller than with known shapes. Measured on faces with 3 to 9 basis shapes that turn by
+# 2 to 10 degrees, where the true scale is known.
+SHAPES_FOLLOW = 4.0
+# Standard deviation of the logarithm of the ratio of depth and width under the prior.
+PRIOR_DEVIATION = 0.7
+# Frames from which the uncertainty of the shapes is estimated.
+MOST_FRAMES = 200
+
+
+class DepthCertainty(NamedTuple):
+    """
+    Uncertainty of a fit with calibrated cameras, for frames of size one.
+
+    Attributes
+    ----------
+    misfit : float
+        Variance v of the residual along changes of the camera, as a share of the noise
+        variance of the model.
+    scale : float
+        Relative standard deviation of the scale of all depths.
+    points : float
+        Variance of the depth of a point, by the shapes.
+    turns : float
+        Variance of a component of the rotation vector of a frame, by the rotations that
+        basis shapes contain, for coefficients of norm one.
+    total : float
+        Root mean square error of the depths of all frames that is to be expected,
+        relative to their root mean square.
+    """
+
+    misfit: float = 1.0
+    scale: float = np.nan
+    points: float = np.nan
+    turns: float = 0.0
+    total: float = np.nan
+
+
+class _Frame(NamedTuple):
+    """Unknowns of a frame: p for the camera, then K coefficients."""
+
+    image: NDArray  # T (2 * n_points, p + K), rows of unseen points zero
+    depth: NDArray  # Z (n_points, p + K), centred over the seen points
+    z: NDArray  # (n_points,), the depths, centred likewise
+    shape: NDArray  # (3, n_points), likewise
+
+
+def _frame(
+    shapes: NDArray, R: NDArray, scale: float, alpha: NDArray, seen: NDArray, free: bool
+) -> _Frame:
+    """Compute the tangents of a frame: R (3, 3), seen (n_points,), free scale or not."""
+    shapes = shapes - shapes[:, :, seen].mean(axis=2, keepdims=True)
+    shape = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
+    moved = np.stack([*turned, *([shape] if free else []), *shapes[1:]])
+    seen_by = scale * R @ moved  # (p + K, 3, n_points)
+    image = np.where(seen, seen_by[:, :2], 0.0).reshape(len(moved), -1).T
+    return _Frame(image, seen_by[:, 2].T, scale * R[2] @ shape, shape)
+
+
+def _covariance(frame: _Frame, variance: float, n_components: int) -> NDArray:
+    """Compute the posterior covariance of the unknowns (p + K, p + K) of a frame."""
+    precision = frame.image.T @ frame.image / variance
+    last = np.arange(len(precision))[len(precision) - n_components :]
+    precision[last, last] += 1.0
+    return np.linalg.pinv(precision, hermitian=True)
+
+
+def depth_deviations(
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    seen: NDArray,
+    noise: float,
+    certainty: DepthCertainty,
+    free: bool,
+) -> NDArray:
+    """
+    Compute the standard deviations of the depths of the points of frames.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Shapes with coefficients that are drawn from N(0, I).
+    motion : ndarray of shape (n_frames, 2, 3)
+        Calibrated cameras, NaN where a frame has none.
+    alpha : ndarray of shape (n_frames, n_components)
+        Coefficients.
+    seen : ndarray of bool, shape (n_frames, n_points)
+        Visible points.
+    noise : float
+        Noise variance of the model.
+    certainty : DepthCertainty
+        Of the model.
+    free : bool
+        Whether the scales of the cameras are unknown.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, n_points)
+        In the units of the frames, whose size is one.
+    """
+    deviations = np.full(seen.shape, np.nan)
+    rotations, scales = full_rotations(motion)
+    for i in np.flatnonzero(np.isfinite(scales)):
+        frame = _frame(shapes, rotations[i], scales[i], alpha[i], seen[i], free)
+        covariance = _covariance(frame, certainty.misfit * noise, len(alpha[i]))
+        own = np.einsum("jp,pq,jq->j", frame.depth, covariance, frame.depth)
+        common = certainty.points + (certainty.scale * frame.z) ** 2
+        deviations[i] = np.sqrt(own + common)
+    return deviations
+
+
+def depth_certainty(
+    shapes: NDArray,
+    motion: NDArray,
+    alpha: NDArray,
+    rows: NDArray,
+    noise: float,
+    *,
+    n_frames: int,
+    extent_weight: float,
+    free: bool,
+) -> DepthCertainty:
+    """
+    Estimate the uncertainty of a fit from some of its frames.
+
+    Parameters
+    ----------
+    shapes, motion, alpha, noise, free
+        As in `depth_deviations`.
+    rows : ndarray of shape (n_chosen, 2, n_points)
+        The chosen frames, divided by their sizes; NaN where a point is missing.
+    n_frames : int
+        Number of all frames of the fit.
+    extent_weight : float
+        Weight of the prior of the extents, for each coordinate.
+
+    Returns
+    -------
+    DepthCertainty
+        NaN if fewer than two frames are given.
+    """
+    K, n_chosen = alpha.shape[1], len(rows)
+    n_camera = 4 if free else 3
+    if n_chosen < 2:
+        return DepthCertainty()
+    rotations, scales = full_rotations(motion)
+    seen = np.isfinite(rows).all(axis=1)
+    frames = [
+        _frame(shapes, *each, free)
+        for each in zip(rotations, scales, alpha, seen, strict=True)
+    ]
+    # Residual: its variance, and its variance along further changes of the camera
+    square = along = freedom = 0.0
+    # and the information on rotations that basis shapes contain, B_k + w_k x B_0
+    turned = np.stack([np.cross(e, shapes[0], axisb=0, axisc=0) for e in np.eye(3)])
+    rotated = np.zeros((3 * K, 3 * K))
+    for frame, row, scale, R, visible, coefficients in zip(
+        frames, rows, scales, rotations, seen, alpha, strict=True
+    ):
+        row = row - np.nanmean(row, axis=1, keepdims=True)
+        rest = np.where(visible, row - scale * R[:2] @ frame.shape, 0.0).ravel()
+        affine = np.kron(np.eye(2), np.where(visible, frame.shape, 0.0).T)
+        tangent = np.linalg.qr(frame.image)[0]
+        affine = affine - tangent @ (tangent.T @ affine)
+        further = np.linalg.svd(affine, full_matrices=False)[0][:, : 6 - n_camera]
+        along += np.sum((further.T @ rest) ** 2) / (6 - n_camera)
+        square += rest @ rest
+        swapped = np.where(visible, scale * R[:2] @ turned, 0.0).reshape(3, -1).T
+        swapped = swapped - tangent @ (tangent.T @ swapped)
+        rotated += np.kron(np.outer(coefficients, coefficients), swapped.T @ swapped)
+        freedom += max(2 * visible.sum() - 2 - n_camera - K, 1)
+    noise_floor = np.finfo(float).eps * np.mean(scales**2)
+    residual = max(square / freedom, noise_floor)
+    variance = max(along / n_chosen, residual)
+    swaps = np.linalg.pinv(rotated * (n_frames / n_chosen), hermitian=True)
+    swaps = np.trace(swaps.reshape(K, 3, K, 3), axis1=1, axis2=3) / 3
+    size = max(np.sum(alpha**2), np.finfo(float).tiny)
+    turns = variance * np.einsum("ik,kl,il->", alpha, swaps, alpha) / size
+    # Spread of the viewing directions about their mean, less what coefficients predict
+    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
+    axis = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)[2]
+    tilts = rotations[:, :2] @ axis
+    spread = np.sum(tilts**2, axis=1)
+    own_share = _unpredicted(tilts, alpha)
+    # Errors of the frames, and the information on the scale of the depth
+    own, depth, turn, information = np.zeros((4, n_chosen))
+    for i, (frame, R, scale) in enumerate(zip(frames, rotations, scales, strict=True)):
+        covariance = _covariance(frame, variance, K)
+        own[i] = np.einsum("jp,pq,jq->", frame.depth, covariance, frame.depth)
+        depth[i] = frame.z @ frame.z
+        error = covariance[:3, :3]
+        turn[i] = np.trace(error) - R[2] @ error @ R[2]
+        stretched = np.outer(axis, axis @ frame.shape)
+        change = np.where(seen[i], scale * R[:2] @ stretched, 0.0).ravel()
+        pulled = frame.image.T @ change
+        information[i] = change @ change - pulled @ covariance @ pulled / variance
+    information = np.maximum(information, 0.0).mean() * own_share / SHAPES_FOLLOW
+    mean_spread = max(spread.mean() * own_share, np.finfo(float).tiny)
+    prior = extent_weight * 2 * seen.sum() / n_chosen * 4 / 9
+    log_scale = np.sqrt(
+        variance / max(n_frames * information, np.finfo(float).tiny)
+        + (turn.mean() / mean_spread) ** 2
+        + (PRIOR_DEVIATION * prior / (information / residual + prior)) ** 2
+    )
+    # At most what the prior has
+    relative = float(np.expm1(min(log_scale, 3 * PRIOR_DEVIATION)))
+    # Depths of the points of all shapes, and of the deformation that is missing
+    c = np.concatenate([np.ones((n_chosen, 1)), alpha], axis=1) ** 2
+    shown = np.maximum((c * (spread * scales**2)[:, None]).mean(axis=0), 1e-300)
+    by_shapes = (
+        variance * np.mean(scales**2) / n_frames * np.sum(c.mean(axis=0) / shown)
+    )
+    points = float(by_shapes + residual * (1.0 - residual / variance))
+    n_points = shapes.shape[2]
+    total = own.mean() / n_points + points
+    size = max(depth.mean() / n_points, np.finfo(float).tiny)
+    return DepthCertainty(
+        float(variance / noise),
+        relative,
+        points,
+        float(turns),
+        float(np.sqrt(total / size + relative**2)),
+    )
+
+
+def tilts(rotations: NDArray, mean: NDArray) -> NDArray:
+    """
+    Compute the rotation vectors of frames out of the plane of the mean view.
+
+    Parameters
+    ----------
+    rotations : ndarray of shape (n_frames, 3, 3)
+        Rotations; NaN where a frame has none.
+    mean : ndarray of shape (3, 3)
+        Rotation of the mean view.
+
+    Returns
+    -------
+    ndarray of shape (n_frames, 3)
+        Rotation vectors in radians, in the axes of the shapes, without their part along
+        the viewing direction. NaN where a frame has no rotation.
+    """
+    vectors = np.full((len(rotations), 3), np.nan)
+    known = np.isfinite(rotations).all(axis=(1, 2))
+    if known.any():
+        vectors[known] = Rotation.from_matrix(mean.T @ rotations[known]).as_rotvec()
+    return vectors - (vectors @ mean[2])[:, None] * mean[2]
+
+
+def _unpredicted(tilts: NDArray, alpha: NDArray) -> float:
+    """Compute the share of the variance of tilts (n, 2) that alpha (n, K) leaves."""
+    n_frames, K = alpha.shape
+    if n_frames < K + 3:
+        return 1.0
+    centred = tilts - tilts.mean(axis=0)
+    known = np.column_stack([np.ones(n_frames), alpha])
+    rest = centred - known @ np.linalg.lstsq(known, centred)[0]
+    total = np.sum(centred**2)
+    if not total > 0:
+        return 1.0
+    share = np.sum(rest**2) / total * (n_frames - 1) / (n_frames - K - 1)
+    return float(np.clip(share, np.finfo(float).eps, 1.0))
