@@ -181,6 +181,13 @@ class TestFit:
         assert not result.converged
         assert len(result.history) == 4
 
+    def test_steps_that_end_before_further_directions(self):
+        tracks, _ = random_table(n_frames=8, n_points=250)
+        result = fitted(tracks, max_iter=5)
+        assert not result.converged
+        assert result.shapes.shape == (3, 3, 250)
+        assert np.isfinite(result.shapes).all()
+
     def test_is_reproducible(self):
         tracks, _ = random_table()
         results = [fitted(tracks) for _ in "ab"]
