@@ -14,6 +14,7 @@ refinement. All others use the frames of the sample.
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.posterior import spread_starts
+from isa_nrsfm._frames.posterior import FramePosterior, spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
 from isa_nrsfm._gauge.canonical import (
     image_energies,
@@ -41,7 +42,12 @@ from isa_nrsfm._gauge.canonical import (
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
 from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
-from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
+from isa_nrsfm._joint.sample_posterior import (
+    chance_moments,
+    posterior_blocks,
+    posterior_moments,
+    shape_uncertainty,
+)
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
@@ -495,7 +501,13 @@ def _refined_jointly(
         options.limits.gauge,
     )
     frames = replace(frames, gauge=gauge.frames)
-    shown = FrameFit.from_blocks(posteriors.map(frames.shown, table.sizes))
+    share = table.n_seen / table.n_points
+    uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
+    last_pass = partial(_shown_frames, frames=frames, uncertainty=uncertainty)
+    parts, *chance = zip(
+        *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
+    )
+    shown = FrameFit.from_blocks(parts)
     cameras = shown.motion / table.sizes[:, None, None]
     return Refined(
         _model(
@@ -512,10 +524,23 @@ def _refined_jointly(
         JointNumbers(
             unit**2 * fitted.noise_variance,
             fitted.camera_noise_ratio,
-            reliabilities(alpha, covariance),
+            reliabilities(alpha, covariance, *(sum(part) for part in chance)),
             fitted.history,
             fitted.gradient_norm,
         ),
+    )
+
+
+def _shown_frames(
+    posterior: FramePosterior,
+    sizes: NDArray,
+    n_seen: NDArray,
+    frames: PosteriorFrames,
+    uncertainty: NDArray,
+) -> tuple[FrameFit, NDArray, float]:
+    """Return a block of fits in the gauge, and their `chance_moments`."""
+    return frames.shown(posterior, sizes), *chance_moments(
+        posterior, n_seen, uncertainty
     )
 
 

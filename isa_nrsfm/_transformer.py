@@ -504,6 +504,7 @@ class TableTransformer(
             self.noise_variance_ / self._unit**2,
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
+            self.loss,
         )
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
