@@ -25,7 +25,7 @@ from sklearn.exceptions import ConvergenceWarning
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._diagnostics import reliabilities
+from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fit_options import PAPER_TOL, FitOptions, Limits
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
@@ -152,6 +152,12 @@ class Fit(NamedTuple):
     n_iter: int
     reference_motion: NDArray
     reference_translation: NDArray
+
+    @property
+    def n_supported(self) -> int:
+        """Number of reliable directions of the coefficients, after the joint fit."""
+        found = () if self.numbers is None else self.numbers.reliability
+        return int(np.sum(np.asarray(found) >= LEAST_RELIABILITY))
 
 
 def fit_table(
@@ -306,6 +312,14 @@ def _count_components(source: Table, options: FitOptions) -> int:
         tol=options.joint_tol,
         options=options.limits.joint,
     )
+    # Outliers that still count a little look like shapes: a fit with all weights decides.
+    while found > 1 and options.loss != "linear":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fit = fit_ready_table(table, found, options, NoProgress())
+        if fit.n_supported == found:
+            break
+        found = max(fit.n_supported, 1)
     if found == most:
         warn_caller(
             f"all {most} basis shapes that were tried are relevant: the table may "
