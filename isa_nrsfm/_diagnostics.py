@@ -12,9 +12,9 @@ INFORMATIVE_FRAMES = 400
 # Directions of the coefficients with a lower reliability are not supported by the
 # table: noise has zero.
 LEAST_RELIABILITY = 0.1
-# Chance may be so many times its expected value. On tables of rigid objects (60 to 1,000
-# frames, 68 to 478 points, one to twelve basis shapes) all reliabilities are then zero;
-# with 1.25 some are 0.8 (``python -m benchmarks.recovery rigid``).
+# Chance may be so many times its expected value. On tables of rigid objects (60 to
+# 1,000 frames, 68 to 478 points, one to four basis shapes) all reliabilities are zero
+# then; with 1.0 some are 0.9 (``python -m benchmarks.recovery rigid``).
 CHANCE_MARGIN = 1.5
 # Variances of directions below this share of the largest are rounding errors.
 NO_VARIANCE = 1e-14
@@ -213,7 +213,7 @@ def reliabilities(
     covariance : ndarray of shape (n_components, n_components)
         Mean over the frames of their posterior covariances.
     moments, noise : ndarray of shape (n_components, n_components), and float
-        Sums of `chance_moments`.
+        Sums over the blocks of frames, as of `shown_frames`.
 
     Returns
     -------

@@ -32,7 +32,7 @@ from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.posterior import FramePosterior, spread_starts
+from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
 from isa_nrsfm._gauge.canonical import (
     image_energies,
@@ -43,10 +43,10 @@ from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
 from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.sample_posterior import (
-    chance_moments,
     posterior_blocks,
     posterior_moments,
     shape_uncertainty,
+    shown_frames,
 )
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
@@ -312,7 +312,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
         tol=options.joint_tol,
         options=options.limits.joint,
     )
-    # Outliers that still count a little look like shapes: a fit with all weights decides.
+    # Outliers that count a little look like shapes: a fit with final weights decides.
     while found > 1 and options.loss != "linear":
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -517,7 +517,7 @@ def _refined_jointly(
     frames = replace(frames, gauge=gauge.frames)
     share = table.n_seen / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
-    last_pass = partial(_shown_frames, frames=frames, uncertainty=uncertainty)
+    last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)
     parts, *chance = zip(
         *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
     )
@@ -542,19 +542,6 @@ def _refined_jointly(
             fitted.history,
             fitted.gradient_norm,
         ),
-    )
-
-
-def _shown_frames(
-    posterior: FramePosterior,
-    sizes: NDArray,
-    n_seen: NDArray,
-    frames: PosteriorFrames,
-    uncertainty: NDArray,
-) -> tuple[FrameFit, NDArray, float]:
-    """Return a block of fits in the gauge, and their `chance_moments`."""
-    return frames.shown(posterior, sizes), *chance_moments(
-        posterior, n_seen, uncertainty
     )
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
 from isa_nrsfm._frames.posterior import FramePosterior
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.frames import JointFrames
@@ -104,11 +104,15 @@ def shape_uncertainty(
     return np.linalg.pinv(information, hermitian=True)
 
 
-def chance_moments(
-    posterior: FramePosterior, n_seen: NDArray, uncertainty: NDArray
-) -> tuple[NDArray, float]:
+def shown_frames(
+    posterior: FramePosterior,
+    sizes: NDArray,
+    n_seen: NDArray,
+    frames: PosteriorFrames,
+    uncertainty: NDArray,
+) -> tuple[FrameFit, NDArray, float]:
     """
-    Return how the noise of frames enters their own coefficients by way of the shapes.
+    Return fits in the gauge, and how far their noise enters their own coefficients.
 
     The noise of frame i is in the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
     M_i``. From there it moves the coefficients of the frame by ``n_i s2_i Sigma_i / s2
@@ -118,13 +122,19 @@ def chance_moments(
     ----------
     posterior : FramePosterior
         Fits of a block of frames.
+    sizes : ndarray of shape (n_frames,)
+        Their sizes.
     n_seen : ndarray of int, shape (n_frames,)
         Number of points that each frame shows.
+    frames : PosteriorFrames
+        The model of a frame.
     uncertainty : ndarray
         As of `shape_uncertainty`.
 
     Returns
     -------
+    shown : FrameFit
+        Cameras and coefficients in the gauge.
     moments : ndarray of shape (n_components, n_components)
         Sum over the frames of ``alpha_i`` times that shift times s2.
     noise : float
@@ -138,7 +148,7 @@ def chance_moments(
     noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - N_POSE, 1.0)
     own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
     shift = np.einsum("i,ikl,il->ik", n_seen * noise, posterior.covariance, own)
-    return alpha.T @ shift, float(noise.sum())
+    return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
 
 
 def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
