@@ -165,7 +165,7 @@ def components(options):
 
 
 def rigid(options):
-    """Rigid objects at 1 % noise: largest reliability of noise, and what "auto" finds."""
+    """Rigid objects at 1 % noise: the largest reliability, and what "auto" finds."""
     for camera in CAMERAS:
         for n_points in (68, 300, 478):
             for n_frames in (60, 100, 300, 1000):

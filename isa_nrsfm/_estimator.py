@@ -179,8 +179,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         with affine ones, from the frames that the first steps are made on; see
         `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
-        Shares of the variance of the coefficients that are not uncertainty, along
-        uncorrelated directions, decreasing.
+        Shares of the variance of the coefficients that are not uncertainty, of their
+        own or of the shapes, along uncorrelated directions, decreasing; zero for noise.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log posterior, up to a constant, before the last refinement and
         after each of its steps; it never rises.
