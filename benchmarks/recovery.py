@@ -164,6 +164,26 @@ def components(options):
             print(f"{camera} K={K}: {listed}", flush=True)
 
 
+def rigid(options):
+    """Rigid objects at 1 % noise: the largest reliability, and what "auto" finds."""
+    for camera in CAMERAS:
+        for n_points in (68, 300, 478):
+            for n_frames in (60, 100, 300, 1000):
+                largest, counts = [], []
+                for seed in range(options.seeds):
+                    truth = {"camera": camera, "n_frames": n_frames}
+                    X = instance(seed, n_points, 0, 0.01, **truth).data
+                    for K in (1, 4, "auto"):
+                        model = AffineNRSfM(K, camera=camera, random_state=0).fit(X)
+                        largest.append(model.reliability_.max())
+                    counts.append(len(model.basis_))
+                print(
+                    f"{camera}, {n_points} points, {n_frames} frames: reliability "
+                    f"{max(largest):.2f} at most, K = {max(counts)} at most",
+                    flush=True,
+                )
+
+
 def chosen_components(X, choices=range(1, 9), folds=3):
     """Return the n_components that GridSearchCV finds, and the score of each choice."""
     search = GridSearchCV(
@@ -312,6 +332,7 @@ SECTIONS = {
     "noisy": noisy,
     "calibrated": calibrated,
     "components": components,
+    "rigid": rigid,
     "grid": grid,
     "independence": independence,
     "calibration": calibration,

@@ -15,8 +15,12 @@ from isa_nrsfm.skeletons import Skeleton
 # The information matrix of the weak directions is computed from this many frames.
 INFORMATIVE_FRAMES = 400
 # Directions of the coefficients with a lower reliability are not supported by the
-# table.
-LEAST_RELIABILITY = 0.8
+# table: noise has zero.
+LEAST_RELIABILITY = 0.1
+# Chance may be so many times its expected value. On tables of rigid objects (60 to
+# 1,000 frames, 68 to 478 points, one to four basis shapes) all reliabilities are zero
+# then; with 1.0 some are 0.9 (``python -m benchmarks.recovery rigid``).
+CHANCE_MARGIN = 1.5
 # Variances of directions below this share of the largest are rounding errors.
 NO_VARIANCE = 1e-14
 # Entries of V_k with a larger standard deviation count as not determined.
@@ -60,9 +64,9 @@ class Diagnostics(NamedTuple):
         Root mean square of the deformation over that of the mean shape, in the space in
         which the mean shape is white.
     reliability : ndarray of shape (n_components,)
-        Shares of the variance of the coefficients that are not uncertainty, along
-        uncorrelated directions, decreasing. Directions near zero are noise: the table
-        does not support as many basis shapes.
+        Shares of the variance of the coefficients that are not uncertainty, of their
+        own or of the shapes, along uncorrelated directions, decreasing. Directions near
+        zero are noise: the table does not support as many basis shapes.
     effective_frames : ndarray of shape (n_components,)
         Effective number of frames that speak for each basis shape, ``(sum_i
         alpha_ik^2)^2 / sum_i alpha_ik^4``.
@@ -75,6 +79,10 @@ class Diagnostics(NamedTuple):
         value of 0.1 adds a tenth of the mean shape, per standard deviation of a
         coefficient. Calibrated cameras absorb rotations only: for them these are upper
         bounds.
+    depth_uncertainty : float
+        Root mean square error of the depths of the frames that is to be expected,
+        relative to their root mean square. NaN for affine cameras, whose depth is known
+        up to an affinity only.
     camera_noise_ratio : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
         with affine ones; NaN for models that were saved before it was measured.
@@ -96,6 +104,7 @@ class Diagnostics(NamedTuple):
     reliability: NDArray
     effective_frames: NDArray
     weak_deviations: NDArray
+    depth_uncertainty: float
     camera_noise_ratio: float
     camera_meaning: str
     pose_share: NDArray
@@ -111,6 +120,7 @@ def diagnose(
     noise_variance: float,
     reliability: NDArray,
     camera_noise_ratio: float,
+    depth_uncertainty: float,
     distance: NDArray | None = None,
     loss: str = "linear",
 ) -> Diagnostics:
@@ -131,7 +141,7 @@ def diagnose(
         Variance of a coordinate of frames of size one.
     reliability : ndarray of shape (n_components,)
         As of `reliabilities`.
-    camera_noise_ratio : float
+    camera_noise_ratio, depth_uncertainty : float
         As of `Diagnostics`.
     distance : ndarray of shape (n_rows, n_points), default=None
         Lengths of the residuals of frames of size one, NaN where a point is missing.
@@ -166,6 +176,7 @@ def diagnose(
         reliability,
         np.divide(square, fourth, where=fourth > 0, out=np.zeros_like(square)),
         np.sqrt(noise_variance / known),
+        depth_uncertainty,
         camera_noise_ratio,
         camera_meaning(camera_noise_ratio),
         pose_share(motion, alpha),
@@ -175,11 +186,7 @@ def diagnose(
         return found
     unsupported = int(np.sum(reliability < LEAST_RELIABILITY))
     if unsupported:
-        warn_caller(
-            f"the table does not support n_components={len(basis)}: {unsupported} "
-            "direction(s) of the coefficients may well be noise; take at most "
-            f"n_components={len(basis) - unsupported}",
-        )
+        warn_caller(_unsupported(len(basis), unsupported, loss))
     elif found.weak_deviations[-1] > LARGEST_DEVIATION:
         warn_caller(
             "the table hardly determines the part of the basis shapes that cameras "
@@ -349,6 +356,24 @@ def listed(items: Iterable[Any]) -> str:
     return ", ".join(texts[:MOST_LISTED]) + ", ..." * (len(texts) > MOST_LISTED)
 
 
+def _unsupported(n_components: int, unsupported: int, loss: str) -> str:
+    """Return the warning that some basis shapes may be noise."""
+    if unsupported == n_components:
+        text = (
+            "no deformation was found beyond the noise: the object may be rigid, and "
+            "all coefficients may be noise"
+        )
+    else:
+        text = (
+            f"the table does not support n_components={n_components}: {unsupported} "
+            "direction(s) of the coefficients may well be noise; take at most "
+            f"n_components={n_components - unsupported}"
+        )
+    if loss == "linear":
+        text += '. If some points are far from where they belong, take loss="cauchy"'
+    return text
+
+
 def camera_meaning(ratio: float) -> str:
     """
     Return what the noise of calibrated cameras says of the cameras.
@@ -382,9 +407,48 @@ def camera_meaning(ratio: float) -> str:
     return f"{what} (noise variance {ratio:.3g} times that of affine cameras)"
 
 
-def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
+def camera_advice(camera: str, ratio: float, determined: bool) -> str:
     """
-    Return the shares of the variance of coefficients that are not uncertainty.
+    Return the camera model to try next.
+
+    Parameters
+    ----------
+    camera : {"affine", "weak_perspective", "orthographic"}
+        Camera model of the fit.
+    ratio : float
+        As in `camera_meaning`.
+    determined : bool
+        Whether the fit determines the depth. Has no meaning for affine cameras.
+
+    Returns
+    -------
+    str
+        A sentence; empty if the ratio was not measured.
+    """
+    if np.isnan(ratio):
+        return ""
+    if camera != "affine" and not determined:
+        return (
+            "next: a table in which the objects turn, whose model then transforms this "
+            "one, or affine cameras"
+        )
+    if ratio >= OTHER_CAMERAS:
+        return "keep these cameras" if camera == "affine" else "next: affine cameras"
+    if ratio >= SAME_NOISE:
+        return "next: more basis shapes, with these cameras"
+    if camera == "affine":
+        return (
+            "next: weak-perspective cameras, which give angles and proportions if the "
+            "objects turn enough"
+        )
+    return "keep these cameras"
+
+
+def reliabilities(
+    alpha: NDArray, covariance: NDArray, moments: NDArray, noise: float
+) -> NDArray:
+    """
+    Return the shares of the variance of coefficients that are neither noise nor chance.
 
     Parameters
     ----------
@@ -392,22 +456,46 @@ def reliabilities(alpha: NDArray, covariance: NDArray) -> NDArray:
         Coefficients.
     covariance : ndarray of shape (n_components, n_components)
         Mean over the frames of their posterior covariances.
+    moments, noise : ndarray of shape (n_components, n_components), and float
+        Sums over the blocks of frames, as of `shown_frames`.
 
     Returns
     -------
     ndarray of shape (n_components,)
-        Eigenvalues of ``(S + C)^-1 S``, decreasing, with S the second moment of the
-        coefficients and C the mean covariance: ``S + C`` is the whole variance. Zero
-        for directions in which there is no variance at all.
+        Squared correlations of the coefficients with the true ones, along uncorrelated
+        directions, decreasing. Zero for directions that noise alone explains, and for
+        those without any variance.
+
+    Notes
+    -----
+    With known shapes they are the eigenvalues of ``(S + C)^-1 S``, with S the second
+    moment of the coefficients and C the mean covariance: ``S + C`` is the whole
+    variance. Estimated shapes follow the noise. A shape of ``gamma`` numbers a frame
+    raises the variance along it from ``1 + l`` to ``y = (1 + l) (1 + gamma / l)`` noise
+    variances, and noise alone to ``(1 + sqrt(gamma))^2``. The squared correlation is
+    ``(l^2 - gamma) / (l (l + 1))`` (Benaych-Georges, Nadakuditi, "The singular values
+    and vectors of low rank perturbations of large rectangular random matrices", 2012).
+    Here ``y = 1 / (1 - share)``; gamma is y times the share of S that is chance.
     """
     known = alpha / np.sqrt(len(alpha))  # known.T @ known is S
     variance, axes = np.linalg.eigh(known.T @ known + covariance)
     kept = variance > NO_VARIANCE * variance[-1]
     white = axes[:, kept] / np.sqrt(variance[kept])
-    shares = np.zeros(len(kept))
     # Squared singular values are the eigenvalues, with less rounding error.
-    deviations = np.linalg.svd(known @ white, compute_uv=False)
-    shares[: len(deviations)] = deviations**2
+    _, deviations, turn = np.linalg.svd(known @ white, full_matrices=False)
+    own = white @ turn.T
+    share = deviations**2
+    left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
+    caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
+    gamma = CHANCE_MARGIN * np.maximum(caused, 0.0)  # gamma share / y
+    gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
+    rest = share - gamma
+    found = (rest > 0) & (rest**2 > 4 * gamma * left)
+    rest, gamma, left = rest[found], gamma[found], left[found]
+    signal = (rest + np.sqrt(rest**2 - 4 * gamma * left)) / 2  # l / y
+    correlation = (signal**2 - gamma * left) / (signal * (signal + left))
+    shares = np.zeros(len(kept))
+    shares[: len(signal)] = np.sort(correlation)[::-1]
     return shares
 
 

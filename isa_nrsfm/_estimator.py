@@ -12,6 +12,7 @@ from sklearn.base import (
 from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
 from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, fit_table
 from isa_nrsfm._fit_options import FitOptions, Limits
@@ -19,7 +20,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     full_rotations,
 )
-from isa_nrsfm._frames.models import FrameFit
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CAMERA_NAMES,
@@ -159,6 +160,10 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     translation_ : ndarray of shape (n_frames, 2)
         Images of the origin of the shapes, in the units of the table: the centroids of
         complete frames.
+    depth_uncertainty_ : float
+        Root mean square error of the depths of the frames that is to be expected,
+        relative to their root mean square; NaN for affine cameras. Set with the joint
+        refinement.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, of determinant one: the rows are the axes of
         the image, x, y and z (only with such cameras, as `scales_`).
@@ -180,8 +185,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         with affine ones, from the frames that the first steps are made on; see
         `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
-        Shares of the variance of the coefficients that are not uncertainty, along
-        uncorrelated directions, decreasing.
+        Shares of the variance of the coefficients that are not uncertainty, of their
+        own or of the shapes, along uncorrelated directions, decreasing; zero for noise.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log posterior, up to a constant, before the last refinement and
         after each of its steps; it never rises.
@@ -267,6 +272,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     rank_floor_: float
     noise_variance_: float
     camera_noise_ratio_: float
+    depth_uncertainty_: float
     rotations_: NDArray
     scales_: NDArray
     reliability_: NDArray
@@ -380,7 +386,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Warns
         -----
         UserWarning
-            If rows show no point and are left out, if points lack one coordinate, if
+            If calibrated cameras do not determine the depth, if rows show no point and
+            are left out, if points lack one coordinate, if
             the other layout explains the table much better, or if a refinement has not
             converged.
         """
@@ -421,6 +428,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         source, options = fitted._checked(X)
         fit = fit_table(source, self.n_components, options, progress)
         fitted._set(fit, source, keep)
+        frames = fit.model.frames
+        if isinstance(frames, PosteriorFrames) and not frames.certainty.determined:
+            warn_caller(frames.certainty.advice)
         self.__dict__.update(vars(fitted))  # all at once
         progress.end()
 

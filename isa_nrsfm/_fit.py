@@ -14,6 +14,7 @@ refinement. All others use the frames of the sample.
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,13 +25,12 @@ from sklearn.exceptions import ConvergenceWarning
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._diagnostics import reliabilities
+from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fit_options import PAPER_TOL, FitOptions, Limits
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
@@ -41,9 +41,14 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
-from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
-from isa_nrsfm._joint.sample_posterior import posterior_blocks, posterior_moments
+from isa_nrsfm._joint.sample_posterior import (
+    certainty_of,
+    posterior_blocks,
+    posterior_moments,
+    shape_uncertainty,
+    shown_frames,
+)
 from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
@@ -149,6 +154,12 @@ class Fit(NamedTuple):
     n_iter: int
     reference_motion: NDArray
     reference_translation: NDArray
+
+    @property
+    def n_supported(self) -> int:
+        """Number of reliable directions of the coefficients, after the joint fit."""
+        found = () if self.numbers is None else self.numbers.reliability
+        return int(np.sum(np.asarray(found) >= LEAST_RELIABILITY))
 
 
 def fit_table(
@@ -303,6 +314,14 @@ def _count_components(source: Table, options: FitOptions) -> int:
         tol=options.joint_tol,
         options=options.limits.joint,
     )
+    # Outliers that count a little look like shapes: a fit with final weights decides.
+    while found > 1 and options.loss != "linear":
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fit = fit_ready_table(table, found, options, NoProgress())
+        if fit.n_supported == found:
+            break
+        found = max(fit.n_supported, 1)
     if found == most:
         warn_caller(
             f"all {most} basis shapes that were tried are relevant: the table may "
@@ -485,7 +504,7 @@ def _refined_jointly(
         options.camera,
     )
     if options.camera != "affine":
-        frames = replace(frames, certainty=_certainty(frames, table.rows))
+        frames = replace(frames, certainty=certainty_of(frames, table.rows))
     posteriors = posterior_blocks(frames, fitted.frames, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     _check_determined(motion, table.shown)
@@ -500,7 +519,13 @@ def _refined_jointly(
         options.limits.gauge,
     )
     frames = replace(frames, gauge=gauge.frames)
-    shown = FrameFit.from_blocks(posteriors.map(frames.shown, table.sizes))
+    share = table.n_seen / table.n_points
+    uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
+    last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)
+    parts, *chance = zip(
+        *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
+    )
+    shown = FrameFit.from_blocks(parts)
     cameras = shown.motion / table.sizes[:, None, None]
     return Refined(
         _model(
@@ -518,29 +543,10 @@ def _refined_jointly(
             unit**2 * fitted.noise_variance,
             fitted.camera_noise_ratio,
             frames.certainty.total,
-            reliabilities(alpha, covariance),
+            reliabilities(alpha, covariance, *(sum(part) for part in chance)),
             fitted.history,
             fitted.gradient_norm,
         ),
-    )
-
-
-def _certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """Estimate the uncertainty of depths from some of the frames."""
-    n_frames = rows.n_frames
-    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
-    part = np.asarray(rows.take(chosen), dtype=np.float64)
-    found = frames.posterior(part.transpose(0, 2, 1), covariances=False)
-    known = np.isfinite(found.motion).all(axis=(1, 2))
-    return depth_certainty(
-        frames.shapes,
-        found.motion[known],
-        found.alpha[known],
-        part[known],
-        frames.noise_variance,
-        n_frames=n_frames,
-        extent_weight=EXTENT_WEIGHT,
-        free=frames.camera == "weak_perspective",
     )
 
 

@@ -126,6 +126,12 @@ class TableModel(NamedTuple):
         return table.blocks.collect(shape, (self.mean_shape.shape,), table.dtype)[0]
 
     @one_blas_thread
+    def depth_deviations(self, table: Table) -> NDArray:
+        """Compute standard deviations of the depths of points (n_frames, n_points)."""
+        found = partial(_depth_deviations, model=self, dtype=table.dtype)
+        return table.blocks.collect(found, (self.mean_shape.shape[:1],), table.dtype)[0]
+
+    @one_blas_thread
     def reproject(self, table: Table) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
         image = partial(_images, model=self, dtype=table.dtype)
@@ -217,6 +223,17 @@ def _shapes(
     if scaled:
         shapes = frames.scales[:, None, None] * shapes
     return (shapes.astype(dtype, copy=False),)
+
+
+def _depth_deviations(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
+    """Compute standard deviations of depths (n, n_points) in some rows."""
+    assert isinstance(model.frames, PosteriorFrames)
+    ready = model.ready(model.tracks(rows))
+    whole = np.full((len(rows), len(model.mean_shape)), np.nan)
+    if ready.usable.any():
+        found = model.frames.depth_deviations(ready.centred, ready.sizes)
+        whole[ready.usable] = found
+    return (whole.astype(dtype, copy=False),)
 
 
 def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:

@@ -294,12 +294,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         """
         table = self._opened(X)
         frames = self._model.frames
-        if self.camera_ == "affine" or not isinstance(frames, PosteriorFrames):
-            raise ValueError(
-                "rotation_covariance needs a model with calibrated cameras and "
-                f"refinement='joint'; got camera={self.camera_!r} and "
-                f"refinement={self.refinement!r}"
-            )
+        self._check_certainty("rotation_covariance")
         space, certainty = frames.gauge.space, frames.certainty
         found = self._model.posterior(table)
         covariance = space @ found.turn_covariance @ space.T
@@ -313,7 +308,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             covariance += certainty.scale**2 * turned[:, :, None] * turned[:, None]
         return np.asarray(covariance).astype(table.dtype, copy=False)
 
-    def reconstruct(self, X: Any, camera: str | None = None) -> NDArray:
+    def reconstruct(
+        self, X: Any, camera: str | None = None, *, return_std: bool = False
+    ) -> Any:
         """
         Return the 3D shape of each frame of a table.
 
@@ -331,11 +328,19 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             "orthographic" all cameras have one scale, and shapes are in the units of
             the table.
 
+        return_std : bool, default=False
+            Whether to return the standard deviations of the depths, for a model with
+            calibrated cameras.
+
         Returns
         -------
-        ndarray of shape (n_frames, n_points, 3)
+        shapes : ndarray of shape (n_frames, n_points, 3)
             Shapes, without camera; NaN for rows of which too little is seen. Euclidean
             ones are turned to be as near as possible to the mean shape.
+        depth_std : ndarray of shape (n_frames, n_points)
+            Only with `return_std`. Standard deviations of the coordinates of the points
+            along the viewing direction of their frame, in the units of the shapes. They
+            contain the uncertainty of camera, coefficients and shapes.
 
         Raises
         ------
@@ -366,6 +371,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
                 f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
             )
         table = self._opened(X)
+        if return_std:
+            self._check_certainty("return_std")
         fitted, metric = self.camera_, None
         if fitted != "affine" and camera not in (None, fitted):
             raise ValueError(
@@ -376,7 +383,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled = metric is not None and camera == "orthographic"
-        return self._model.reconstruct(table, metric, scaled)
+        shapes = self._model.reconstruct(table, metric, scaled)
+        if not return_std:
+            return shapes
+        _, scales = full_rotations(np.asarray(self._model.decompose(table).motion))
+        return shapes, self._model.depth_deviations(table) / scales[:, None]
 
     def mirror(self) -> Self:
         """
@@ -554,6 +565,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             self.noise_variance_ / self._unit**2,
             self.reliability_,
             getattr(self, "camera_noise_ratio_", np.nan),
+            getattr(self, "depth_uncertainty_", np.nan),
             None if X is None else self._model.distances(self._opened(X)),
             loss,
         )
@@ -568,6 +580,16 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         layout = find_skeleton(len(names), names, shape=image)
         warn_of_coefficients(found, alpha, rows, layout)
         return found
+
+    def _check_certainty(self, name: str) -> None:
+        """Refuse models without calibrated cameras or without a noise variance."""
+        frames = self._model.frames
+        if self.camera_ == "affine" or not isinstance(frames, PosteriorFrames):
+            raise ValueError(
+                f"{name} needs a model with calibrated cameras and "
+                f"refinement='joint'; got camera={self.camera_!r} and "
+                f"refinement={self.refinement!r}"
+            )
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
         """

@@ -16,7 +16,7 @@ from isa_nrsfm._diagnostics import (
     reliabilities,
     weak_information,
 )
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import get_skeleton
 
 
@@ -28,33 +28,83 @@ def random_coefficients(seed, n_frames=50, n_components=3):
     return alpha, 0.2 * factor @ factor.T
 
 
+def of_known_shapes(alpha, covariance):
+    """Return the reliabilities for shapes that do not follow any noise."""
+    return reliabilities(alpha, covariance, np.zeros(covariance.shape), 1.0)
+
+
 class TestReliabilities:
     @pytest.mark.parametrize("seed", range(3))
     def test_are_shares_of_the_variance(self, seed):
         alpha, covariance = random_coefficients(seed)
         moment = sum(np.outer(a, a) for a in alpha) / len(alpha)
         expected = np.sort(eigvals(moment, moment + covariance).real)[::-1]
-        assert_allclose(reliabilities(alpha, covariance), expected, rtol=1e-9)
+        assert_allclose(of_known_shapes(alpha, covariance), expected, rtol=1e-9)
 
     def test_more_frames_alike_change_nothing(self):
         alpha, covariance = random_coefficients(0)
-        expected = reliabilities(alpha, covariance)
-        found = reliabilities(np.tile(alpha, (7, 1)), covariance)
+        expected = of_known_shapes(alpha, covariance)
+        found = of_known_shapes(np.tile(alpha, (7, 1)), covariance)
         assert_allclose(found, expected, rtol=1e-9)
 
     def test_known_coefficients_are_reliable(self):
         alpha, _ = random_coefficients(0)
-        assert_allclose(reliabilities(alpha, np.zeros((3, 3))), 1.0, rtol=1e-9)
+        assert_allclose(of_known_shapes(alpha, np.zeros((3, 3))), 1.0, rtol=1e-9)
 
     def test_directions_without_variance_have_none(self):
         alpha, covariance = random_coefficients(0)
         alpha[:, 1] = 0.0
         covariance[1] = covariance[:, 1] = 0.0
-        found = reliabilities(alpha, covariance)
+        found = of_known_shapes(alpha, covariance)
         assert found[-1] == 0
         kept = [0, 2]
-        expected = reliabilities(alpha[:, kept], covariance[np.ix_(kept, kept)])
+        expected = of_known_shapes(alpha[:, kept], covariance[np.ix_(kept, kept)])
         assert_allclose(found[:2], expected, rtol=1e-9)
+
+    @pytest.mark.parametrize("gamma", [0.2, 2.0, 20.0])
+    def test_are_correlations_with_the_truth(self, gamma):
+        # A random matrix of rank one and noise: its left singular vector.
+        rng = np.random.default_rng(0)
+        n_frames, signal = 300, 10 * np.sqrt(gamma)
+        true = rng.normal(size=n_frames)
+        noise = rng.normal(size=(n_frames, int(gamma * n_frames)))
+        noise[:, 0] += np.sqrt(signal) * true
+        left, values, _ = np.linalg.svd(noise, full_matrices=False)
+        y = values[0] ** 2 / n_frames
+        alpha = np.sqrt(n_frames * (1 - 1 / y)) * left[:, :1]
+        moments = np.full((1, 1), gamma / y * (1 - 1 / y) * n_frames)
+        found = reliabilities(alpha, np.full((1, 1), 1 / y), moments, float(n_frames))
+        correlation = np.corrcoef(true, left[:, 0])[0, 1] ** 2
+        # The margin of chance makes it a little smaller.
+        assert correlation - 0.05 < found[0] < correlation + 0.02
+
+    @pytest.mark.parametrize(
+        ("n_frames", "n_points", "n_components"),
+        [(100, 68, 4), (300, 68, 1), (60, 478, 2)],
+    )
+    @pytest.mark.parametrize("loss", ["linear", "cauchy"])
+    def test_noise_of_rigid_objects_has_none(
+        self, n_frames, n_points, n_components, loss
+    ):
+        rigid = make_nonrigid_tracks(
+            n_frames, n_points, 0, noise=0.01, random_state=n_frames
+        )
+        model = AffineNRSfM(n_components, loss=loss, random_state=0).fit(rigid.data)
+        assert model.reliability_.max() < 0.1
+        with pytest.warns(UserWarning, match="no deformation was found") as told:
+            model.diagnostics()
+        assert ('loss="cauchy"' in str(told[0].message)) == (loss == "linear")
+
+    @pytest.mark.parametrize("n_points", [68, 400])
+    def test_true_shapes_keep_theirs(self, n_points):
+        truth = make_nonrigid_tracks(
+            100, n_points, 2, noise=0.02, amplitude=0.1, random_state=0
+        )
+        model = AffineNRSfM(4, random_state=0).fit(truth.data)
+        assert (model.reliability_[:2] > 0.98).all()
+        assert (model.reliability_[2:] == 0).all()
+        with pytest.warns(UserWarning, match="take at most n_components=2"):
+            model.diagnostics()
 
 
 class TestWeakInformation:

@@ -1325,6 +1325,38 @@ def test_a_table_that_asks_for_more_components_says_so():
         AffineNRSfM("auto", random_state=0).fit(truth.data)
 
 
+@pytest.mark.slow
+def test_outliers_are_no_components():
+    truth = make_nonrigid_tracks(150, 20, 2, noise=0.01, random_state=1)
+    rng = np.random.default_rng(0)
+    moved = rng.random((150, 20)) < 0.05
+    size = np.sqrt(np.mean(truth.clean**2))
+    X = truth.tracks + size * moved[..., None] * rng.normal(size=(150, 20, 2))
+    model = AffineNRSfM("auto", loss="cauchy", random_state=0).fit(X.reshape(150, -1))
+    assert len(model.basis_) == 2
+    assert (model.reliability_ > 0.9).all()
+
+
+@pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
+@pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+def test_intervals_of_coefficients_hold(loss, camera):
+    truth = make_nonrigid_tracks(200, 10, 2, camera=camera, random_state=0)
+    rng = np.random.default_rng(0)
+    tracks = truth.clean - truth.clean.mean(axis=1, keepdims=True)
+    tracks /= np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
+
+    def noisy(deviation):
+        return (tracks + deviation * rng.normal(size=tracks.shape)).reshape(200, -1)
+
+    model = AffineNRSfM(2, camera=camera, loss=loss, random_state=0).fit(noisy(0.02))
+    expected = model.decompose(noisy(0.0)).alpha
+    inside = []
+    for _ in range(3):
+        found = model.decompose(noisy(0.02))
+        inside.append(np.abs(found.alpha - expected) < 1.96 * found.alpha_std)
+    assert 0.92 < np.mean(inside) < 0.98
+
+
 def test_the_number_of_components_is_found_by_the_joint_refinement_only():
     with pytest.raises(ValueError, match="'auto' needs refinement='joint'; got"):
         estimator("auto", refinement=None).fit(TABLE)

@@ -18,7 +18,7 @@ from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frames.depth import DepthCertainty, depth_deviations
+from isa_nrsfm._frames.depth import NOT_MEASURED, DepthCertainty, depth_deviations
 from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import (
@@ -244,7 +244,7 @@ class PosteriorFrames:
     gauge: FrameMap
     camera: str = "affine"
     options: FrameOptions = FRAME_OPTIONS
-    certainty: DepthCertainty = DepthCertainty()
+    certainty: DepthCertainty = NOT_MEASURED
 
     @cached_property
     def _search(self) -> FrameSearch:

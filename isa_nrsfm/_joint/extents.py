@@ -2,9 +2,9 @@
 
 Images of an object that hardly turns determine its depth only to second order. Depths
 that are c times as large, turned by angles that are c times smaller, have nearly the
-same images (bas-relief ambiguity: Belhumeur, Kriegman, Yuille, 1999). Whatever the model
-leaves of the images then decides on the depth. With the second moments
-``G = sum_k B_k B_k^T`` of all shapes the objective contains ::
+same images (bas-relief ambiguity: Belhumeur, Kriegman, Yuille, 1999). Whatever the
+model leaves of the images then decides on the depth. With the second moments ``G =
+sum_k B_k B_k^T`` of all shapes the objective contains ::
 
     N weight (tr G / (3 det(G)^(1/3)) - 1),
 
@@ -16,10 +16,10 @@ the number of coordinates as the misfit does: ``N log s2`` has to fall by as muc
 import numpy as np
 from numpy.typing import NDArray
 
-# An extent that is r times as large as both others has to lower the noise variance by
-# a factor: by 4 % for r = 5, by 12 % for 10. Frontal
-# photos of faces become needles without it. With 0.015 and 0.02
-# faces that turn by 6 degrees and more have the same errors as without it.
+# An extent that is r times as large as both others has to lower the noise variance, by
+# 4 % for r = 5 and by 12 % for r = 10. Frontal photos of faces become needles without
+# it. With 0.015 and 0.02 faces that turn by 6 degrees and more have the same errors as
+# without it.
 EXTENT_WEIGHT = 0.02
 # Added to the squared extents, as a share of their mean: flat objects stay flat.
 FLAT = 1e-3

@@ -245,18 +245,18 @@ def fit_jointly(
         shapes = problem.frames.points(result.state.shapes)
         problem = problem.with_frames(ready.seen)
         result = refined(problem, result.state._replace(shapes=shapes))
-    noise, n_fitted = result.state.noise, 0
+    noise, n_pose = result.state.noise, 2 + cameras.n_parameters
     if ready.left_out is not None:
-        # This noise variance is the residual's after the coefficients were fitted.
-        result, noise = reweighted(problem, rows, ready.left_out, result, loss, refined)
-        n_fitted = n_shapes - 1
+        weighted = partial(reweighted, cameras=cameras, refined=refined)
+        # This noise variance is corrected for the unknowns of the frames already.
+        result, noise = weighted(problem, rows, ready.left_out, result, loss)
+        n_pose = 0
     shapes = problem.frames.points(result.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
     state = result.state._replace(shapes=first.frames.coordinates(shapes))
     if sample.parts:
         state = state._replace(motion=state.motion[sample.parts[0]])
-    unknowns = (2 + cameras.n_parameters, n_fitted)
-    noise *= _freedom_correction(n_seen, n_points, n_shapes, *unknowns)
+    noise *= _freedom_correction(n_seen, n_points, n_shapes, n_pose)
     return JointFit(
         shapes - shapes.mean(axis=2, keepdims=True),
         first.coefficients(state),
@@ -543,19 +543,17 @@ def unregularised(
 
 
 def _freedom_correction(
-    n_seen: NDArray, n_points: int, n_shapes: int, n_pose: int, n_fitted: int
+    n_seen: NDArray, n_points: int, n_shapes: int, n_pose: int
 ) -> float:
     """
     Return the number of seen coordinates N over the residual's degrees of freedom.
 
-    Each frame has n_pose unknowns of camera and position, and n_fitted coefficients:
-    those that are integrated out do not count. The n centred shapes of J points have
+    Each frame has n_pose unknowns of camera and position. Coefficients are integrated
+    out and do not count. The n centred shapes of J points have
     ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: n^2 of the mixing with
     the mean shape and nine of the affinity of space, which share one scale. At least
     ``N / 10`` degrees of freedom are assumed.
     """
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
-    unknowns = (
-        (n_pose + n_fitted) * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
-    )
+    unknowns = n_pose * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))

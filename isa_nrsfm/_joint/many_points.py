@@ -73,6 +73,10 @@ def in_all_points(
         The problem along these directions.
     """
     for _ in range(problem.options.many_points.widenings):
+        # No directions without steps to use them: the shapes are given by the old ones.
+        n_left = problem.steps.max_iter - (len(result.history) - 1)
+        if not n_left:
+            break
         state = result.state
         before = problem.frames.points(state.shapes)
         # Expectation maximisation in all points: solve curvature B = sum_i X_i^T W_i.
@@ -94,9 +98,6 @@ def in_all_points(
         problem = problem.with_frames(frames)
         # Further refinement, with the steps that are left
         shapes = frames.coordinates(after.reshape(before.shape))
-        n_left = problem.steps.max_iter - (len(result.history) - 1)
-        if not n_left:
-            break
         further = refined(problem, state._replace(shapes=shapes), max_iter=n_left)
         # One history: the first value of the further one repeats the last.
         history = np.concatenate([result.history, further.history[1:]])

@@ -255,7 +255,7 @@ class ReweightingOptions(NamedTuple):
 
     rounds: int = 20
     settled: float = 1e-2
-    model_frames: int = 10_000
+    model_frames: int = 2_000
     fewest_shown: int = 200
 
 

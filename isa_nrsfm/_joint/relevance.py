@@ -41,7 +41,8 @@ def relevant_components(
     int
         The number.
     """
-    n_numbers = state.shapes[0].size  # 3J
+    n_points = problem.frames.points(state.shapes).shape[2]
+    n_numbers = 3 * n_points
     penalty = np.full(len(state.shapes) - 1, problem.penalty)
     determined = np.ones(len(penalty))
     options = problem.options.relevance
@@ -50,7 +51,7 @@ def relevant_components(
         start = _orthogonal(state)
         state = part.refined(start, cameras, max_iter=options.steps).state
         # g_k and v_k, with penalty = 1 / (v_k n_frames)
-        energy, uncertain = _image_energies(part, state)
+        energy, uncertain = _image_energies(part, state, n_points)
         if not energy.any():
             return 0  # nothing deforms
         determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
@@ -80,7 +81,7 @@ def _orthogonal(state: JointState) -> JointState:
 
 
 def _image_energies(
-    problem: JointProblem, state: JointState
+    problem: JointProblem, state: JointState, n_points: int
 ) -> tuple[NDArray, NDArray]:
     """Return ``mean_i ||M_i B_k||^2`` and ``tr(C cov B_k)`` of each basis shape."""
     C, basis = _camera_moments(state), state.shapes[1:]
@@ -89,7 +90,7 @@ def _image_energies(
     # Posterior covariance of each point: half the Hessian is curvature / s2.
     covariance = state.noise * np.linalg.inv(regular(curvature))
     # One matrix stands for all points where all weights are one.
-    total = covariance.sum(axis=0) * (basis.shape[2] / len(covariance))
+    total = covariance.sum(axis=0) * (n_points / len(covariance))
     n = len(basis) + 1
     blocks = total.reshape(n, 3, n, 3)[np.arange(1, n), :, np.arange(1, n)]
     return energy, np.einsum("ab,kab->k", C, blocks)

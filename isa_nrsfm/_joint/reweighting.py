@@ -7,15 +7,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._joint.frames import JointFrames, WeightedRows
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._joint.quasi_newton import JointResult, JointState
+from isa_nrsfm._joint.quasi_newton import JointResult, JointState, regular
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
+from isa_nrsfm._linalg.vectors import frames_last
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames
 from isa_nrsfm._tables.visibility import seen_points
+
+# Numbers of an array of derivatives that is made at a time: 32 MB.
+BLOCK_NUMBERS = 2**22
 
 
 class _Weights(NamedTuple):
@@ -49,6 +54,7 @@ def reweighted(
     left_out: NDArray,
     result: JointResult,
     loss: str,
+    cameras: CameraModel,
     refined: Callable[[JointProblem, JointState], JointResult],
 ) -> tuple[JointResult, float]:
     """
@@ -66,6 +72,8 @@ def reweighted(
         The refinement.
     loss : {"huber", "cauchy"}
         The loss.
+    cameras : CameraModel
+        How the cameras may move.
     refined : callable
         Refines a state of a problem.
 
@@ -74,7 +82,8 @@ def reweighted(
     result : JointResult
         The refinement.
     noise_variance : float
-        Variance of a coordinate, from the median of the residuals.
+        Variance of a coordinate, from the median of the residuals, corrected for the
+        degrees of freedom that camera, position and coefficients of each frame take.
     """
     options = problem.options.reweighting
     sizes = rows.joined(_sizes)
@@ -83,6 +92,7 @@ def reweighted(
         rows, left_out.shape[1], options.model_frames, options.fewest_shown
     )
     sampled = rows.take(sample)
+    weights = WeightedRows.without(sampled, left_out[sample]).weights
     for _ in range(options.rounds):
         # Positions, and the noise of a coordinate
         shapes, motion, _ = result.state
@@ -90,6 +100,9 @@ def reweighted(
         position = weighted.joined(partial(_positions, shapes=shapes), motion, alpha)
         distance = _distances(
             sampled, motion[sample], alpha[sample], position[sample], shapes
+        )
+        distance /= _residual_deviations(
+            motion[sample], alpha[sample], shapes, weights, result.state.noise, cameras
         )
         noise = median_noise(distance[np.isfinite(distance)])
         deviation = max(noise, OF_DISTANCES)
@@ -100,9 +113,51 @@ def reweighted(
             break
         # Refinement with the new weights
         weighted = rows.derive(new.of, *fit)
+        weights = new.of(sampled, *(each[sample] for each in fit)).weights
         problem = problem.with_frames(JointFrames.from_weighted(weighted))
         result = refined(problem, result.state)
     return result, deviation**2
+
+
+def _residual_deviations(
+    motion: NDArray,
+    alpha: NDArray,
+    shapes: NDArray,
+    weights: NDArray,
+    noise: float,
+    cameras: CameraModel,
+) -> NDArray:
+    """
+    Return the standard deviations (n, J) of residuals over that of the noise.
+
+    Camera, position and coefficients of a frame follow its noise. With the derivatives
+    A of the image by these and weights W, residuals are ``(I - A (A^T W A + P)^-1 A^T
+    W)`` times the noise, where the prior P is the noise variance for each coefficient.
+    The arrays are motion (n, 2, 3), alpha (n, K), shapes (K + 1, 3, J), weights (n, J).
+    """
+    (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
+    n_pose = 2 + cameras.n_parameters
+    deviations = np.empty(weights.shape)
+    length = max(BLOCK_NUMBERS // (2 * n_points * (n_pose + n_components)), 1)
+    for first in range(0, n_frames, length):
+        part = slice(first, first + length)
+        M, w = motion[part], weights[part, None, None]
+        frames = shapes[0] + np.tensordot(alpha[part], shapes[1:], 1)
+        moved = np.moveaxis(cameras.tangents(frames_last(M)), 3, 0) @ frames[:, None]
+        positions = np.zeros((len(M), 2, 2, n_points))
+        positions[:, [0, 1], [0, 1]] = 1.0
+        A = np.concatenate([moved, positions, M[:, None] @ shapes[1:]], axis=1)
+        flat = A.reshape(*A.shape[:2], -1)
+        weighed = (A * w).reshape(flat.shape)
+        gram = weighed @ flat.swapaxes(1, 2)
+        coefficients = np.arange(n_pose, A.shape[1])
+        gram[:, coefficients, coefficients] += noise
+        Z = np.linalg.solve(regular(gram), flat)
+        spread = np.einsum("ipx,ipx->ix", Z, weighed @ weighed.swapaxes(1, 2) @ Z)
+        leverage = np.einsum("ipx,ipx->ix", weighed, Z)
+        square = (1.0 - 2.0 * leverage + spread).reshape(-1, 2, n_points).mean(axis=1)
+        deviations[part] = np.sqrt(np.maximum(square, OF_DISTANCES))
+    return deviations
 
 
 def _sizes(rows: NDArray) -> NDArray:

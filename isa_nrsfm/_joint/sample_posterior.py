@@ -1,15 +1,22 @@
 """The fit of each frame of the table, block by block, after the joint fit."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
+from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
 from isa_nrsfm._frames.posterior import FramePosterior
+from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._tables.blocks import FrameBlocks
+
+# Unknowns of camera and position of a frame.
+N_POSE = 8
 
 
 def posterior_blocks(
@@ -66,6 +73,119 @@ def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArra
     return np.concatenate(motion), np.concatenate(alpha), total
 
 
+def shape_uncertainty(
+    motion: NDArray,
+    alpha: NDArray,
+    covariance: NDArray,
+    share: NDArray,
+    slices: Sequence[slice],
+) -> NDArray:
+    """
+    Return the covariance of a point of the shapes for noise of variance one.
+
+    Parameters
+    ----------
+    motion, alpha, covariance
+        As `posterior_moments` returns.
+    share : ndarray of shape (n_frames,)
+        Share of the points that each frame shows.
+    slices : sequence of slice
+        Frames that are worked on at a time.
+
+    Returns
+    -------
+    ndarray of shape (3 * n_components + 3, 3 * n_components + 3)
+        Inverse of ``N = sum_i share_i E_i (x) M_i^T M_i`` with the second moments E_i
+        of (1, alpha).
+    """
+    seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
+    information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
+    for frames in slices:
+        X = stacked_motion(motion[frames], alpha[frames])
+        information += X.T @ (np.repeat(share[frames], 2)[:, None] * X)
+    return np.linalg.pinv(information, hermitian=True)
+
+
+def shown_frames(
+    posterior: FramePosterior,
+    sizes: NDArray,
+    n_seen: NDArray,
+    frames: PosteriorFrames,
+    uncertainty: NDArray,
+) -> tuple[FrameFit, NDArray, float]:
+    """
+    Return fits in the gauge, and how far their noise enters their own coefficients.
+
+    The noise of frame i is in the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
+    M_i``. From there it moves the coefficients of the frame by ``n_i s2_i Sigma_i / s2
+    tr(M_i (N^-1 X_i^T)_k)`` on average.
+
+    Parameters
+    ----------
+    posterior : FramePosterior
+        Fits of a block of frames.
+    sizes : ndarray of shape (n_frames,)
+        Their sizes.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that each frame shows.
+    frames : PosteriorFrames
+        The model of a frame.
+    uncertainty : ndarray
+        As of `shape_uncertainty`.
+
+    Returns
+    -------
+    shown : FrameFit
+        Cameras and coefficients in the gauge.
+    moments : ndarray of shape (n_components, n_components)
+        Sum over the frames of ``alpha_i`` times that shift times s2.
+    noise : float
+        Sum of the noise variances s2_i of the frames, from their residuals.
+    """
+    motion, alpha = posterior.motion, posterior.alpha
+    X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
+    Z = X @ uncertainty
+    # Degrees of freedom of the residual, without those that the shapes take
+    leverage = np.einsum("irp,irp->i", X, Z)
+    noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - N_POSE, 1.0)
+    own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
+    shift = np.einsum("i,ikl,il->ik", n_seen * noise, posterior.covariance, own)
+    return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
+
+
 def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
     """Return cameras, coefficients and the sum of their covariances of a block."""
     return posterior.motion, posterior.alpha, posterior.covariance.sum(axis=0)
+
+
+def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
+    """
+    Estimate the uncertainty of a fit with calibrated cameras from some of its frames.
+
+    Parameters
+    ----------
+    frames : PosteriorFrames
+        The model of a frame.
+    rows : FrameBlocks
+        The frames (n_frames, 2, n_points), NaN where a point is missing.
+
+    Returns
+    -------
+    DepthCertainty
+        The uncertainty.
+    """
+    n_frames = rows.n_frames
+    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
+    part = np.asarray(rows.take(chosen), dtype=np.float64)
+    found = frames.posterior(part.transpose(0, 2, 1), covariances=False)
+    known = np.isfinite(found.motion).all(axis=(1, 2))
+    return depth_certainty(
+        frames.shapes,
+        found.motion[known],
+        found.alpha[known],
+        part[known],
+        frames.noise_variance,
+        n_frames=n_frames,
+        extent_weight=EXTENT_WEIGHT,
+        free=frames.camera == "weak_perspective",
+    )

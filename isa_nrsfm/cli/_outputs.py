@@ -46,7 +46,7 @@ ARRAYS = {
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
     "a frame is mean_shape + sum_k alpha_k basis[k]",
 }
-NOT_TOLD = "viewer.html has affine shapes, and cameras.csv no angles"
+NOT_TOLD = "viewer.html shows no true proportions, and cameras.csv has no angles"
 PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
 MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
 

@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, Decomposition, __version__
-from isa_nrsfm._diagnostics import Diagnostics, camera_meaning, outlier_advice
+from isa_nrsfm._diagnostics import (
+    Diagnostics,
+    camera_advice,
+    camera_meaning,
+    outlier_advice,
+)
 from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._answer_text import answer_lines
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
@@ -112,6 +118,7 @@ def model_report(
         "camera": estimator.camera,
         "camera_noise_ratio": ratio,
         "camera_meaning": None if ratio is None else camera_meaning(ratio),
+        **_depth_report(estimator, ratio),
         "skeleton": None if layout is None else layout.name,
         "outliers": None if found is None else _outliers(found, estimator, X),
         "n_iter": estimator.n_iter_,
@@ -152,6 +159,22 @@ def _outliers(found: Diagnostics, estimator: AffineNRSfM, X: Any) -> dict[str, A
             for i, j in zip(rows[:_MOST_ROWS], points[:_MOST_ROWS], strict=True)
         ],
         "message": outlier_advice(found, X.index, names),
+    }
+
+
+def _depth_report(estimator: AffineNRSfM, ratio: float | None) -> dict[str, Any]:
+    """Describe how certain the depth is, and which camera to take next."""
+    frames = frames_of(estimator)
+    certainty = getattr(frames, "certainty", None)
+    determined = certainty is None or certainty.determined
+    advice = ""
+    if ratio is not None:
+        advice = camera_advice(estimator.camera_, ratio, determined)
+    return {
+        "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
+        "depth_determined": determined and estimator.camera_ != "affine",
+        "depth_advice": "" if determined else certainty.advice,
+        "camera_advice": advice,
     }
 
 
@@ -322,8 +345,15 @@ def _digits(number: float, n_digits: int) -> str:
 
 def _camera_lines(model: dict[str, Any]) -> list[str]:
     """Say what cameras the model has, and what the noise says of them."""
-    lines = [CAMERA_TITLES[model["camera"]]]
-    return lines + textwrap.wrap(model["camera_meaning"] or "", _TEXT_WIDTH)
+    title = CAMERA_TITLES[model["camera"]]
+    uncertainty = model["depth_uncertainty"]
+    if model["depth_advice"]:
+        title = f"{title.partition(':')[0]}: {model['depth_advice']}"
+    lines = textwrap.wrap(title, _TEXT_WIDTH)
+    if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
+        lines.append(f"depths are known to {100 * uncertainty:.2g} %, root mean square")
+    meaning = "; ".join(filter(None, (model["camera_meaning"], model["camera_advice"])))
+    return lines + textwrap.wrap(meaning, _TEXT_WIDTH)
 
 
 def lay_out(sections: Mapping[str, Sequence[str]]) -> str:

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._upright import (
@@ -98,7 +100,8 @@ def frame_poses(
     Warns
     -----
     UserWarning
-        If affine cameras hardly determine the metric of space, and so the angles.
+        If the fitted table does not determine the depth, and so the angles, which are
+        NaN then.
 
     Examples
     --------
@@ -145,6 +148,8 @@ def poses_in(
         The poses.
     """
     _, rotations, scales = upright_frames(space, model, motion, alpha)
+    if not _determined(space, model):
+        rotations = np.full_like(rotations, np.nan)
     angles = view_angles(rotations)
     deviations = np.full((3, len(scales)), np.nan)
     if X is not None and space.metric is None and model.refinement == "joint":
@@ -152,6 +157,14 @@ def poses_in(
         turned = space.transform @ covariance @ space.transform.T
         deviations = np.array(angle_deviations(angles, turned))
     return FramePoses(*angles, np.asarray(scales), *deviations)
+
+
+def _determined(space: UprightSpace, model: Any) -> bool:
+    """Return whether the fitted table determines the depth, and so the angles."""
+    if space.metric is not None:
+        return space.metric.condition_number <= LARGEST_CONDITION
+    frames = model._model.frames
+    return not isinstance(frames, PosteriorFrames) or frames.certainty.determined
 
 
 def point_distances(

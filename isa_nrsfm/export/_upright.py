@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._metric_upgrade.deforming import (
     DeformationMetric,
@@ -86,7 +88,7 @@ def upright_space(
     camera : {"weak_perspective", None}
         What is known of the cameras of a model with affine ones. None takes the one
         affinity of space under which they come nearest to weak-perspective ones, as
-        figures do. Without meaning for a model with calibrated cameras.
+        figures do. For a model with calibrated cameras None claims no proportions.
     origin : {"auto", "upper", "lower"}
         Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
     mirrored : bool
@@ -113,7 +115,9 @@ def upright_space(
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
-    told: str | None = camera if fitted == "affine" else fitted
+    told: str | None = fitted if fitted != "affine" and camera is not None else camera
+    if told is not None:
+        warn_of_depth(model)
     if fitted != "affine":
         transform = euclidean_axes(model)
         shape = model.mean_shape_ @ transform.T
@@ -143,6 +147,25 @@ def upright_space(
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
     return UprightSpace(told, metric, transform, image_axes, layout)
+
+
+def warn_of_depth(model: Any) -> None:
+    """
+    Warn if calibrated cameras do not determine the depth.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model.
+
+    Warns
+    -----
+    UserWarning
+        If the scale of its depths is too uncertain for angles and proportions.
+    """
+    frames = model._model.frames
+    if isinstance(frames, PosteriorFrames) and not frames.certainty.determined:
+        warn_caller(frames.certainty.advice)
 
 
 def upright_frames(

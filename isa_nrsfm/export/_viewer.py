@@ -34,7 +34,7 @@ UNLABELLED = "(no label)"
 ABOUT = {
     "weak_perspective": "Proportions are those that weak-perspective cameras tell.",
     "orthographic": "Proportions are those that orthographic cameras tell.",
-    None: "Affine shapes: angles and depth are not those of the object.",
+    None: "The depth is not known: angles and proportions are not those of the object.",
 }
 
 
@@ -89,7 +89,8 @@ def write_viewer(
     camera : {"weak_perspective", None}, default="weak_perspective"
         What is known of the cameras of a model with affine ones. "weak_perspective"
         shows Euclidean shapes, None affine ones, which look like those of figures. A
-        model with calibrated cameras has Euclidean shapes.
+        model with calibrated cameras has Euclidean shapes; with None the page makes no
+        claim of their proportions.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where a face or a body would stand on

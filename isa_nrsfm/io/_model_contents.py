@@ -17,6 +17,7 @@ from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.layout import LAYOUTS
@@ -62,8 +63,8 @@ OF_JOINT = ("noise_variance_", "reliability_", "objective_history_", "gradient_n
 OF_FRAMES = ("motion_", "translation_", "alpha_")
 OF_JOINT_FRAMES = ("alpha_std_",)
 OF_CALIBRATED_FRAMES = ("rotations_", "scales_")
-# Older fits did not measure the ratio.
-NAMES, RATIO = "feature_names_in_", "camera_noise_ratio_"
+# Older fits did not measure the ratio, or the uncertainty of the depth.
+NAMES, RATIO, DEPTH = "feature_names_in_", "camera_noise_ratio_", "depth_uncertainty_"
 ATTRIBUTES = (
     *OF_ALL,
     *OF_JOINT,
@@ -72,6 +73,7 @@ ATTRIBUTES = (
     *OF_CALIBRATED_FRAMES,
     NAMES,
     RATIO,
+    DEPTH,
 )
 # Entries of the model of a table, and of that of a frame.
 OF_TABLE = ("model", "layout", "each_scaled", "unit", "sizes")
@@ -82,6 +84,7 @@ OF_POSTERIOR = (
     "noise_variance",
     "coefficient_starts",
     "basis_change",
+    "certainty",
 )
 OF_RIGID = ("camera", "mean_shape", "basis")
 MODELS = {"posterior": OF_POSTERIOR, "rigid": OF_RIGID}
@@ -157,7 +160,10 @@ def model_from_contents(contents: Any) -> AffineNRSfM:
     _check_head(contents)
     check_entries(contents, "the model", (*HEAD, *PUBLIC_PARTS, "frames"))
     estimator = with_parameters(AffineNRSfM, contents)
-    found = check_entries(contents["attributes"], "attributes", ATTRIBUTES)
+    found = contents["attributes"]
+    if type(found) is dict:
+        found = {DEPTH: None, **found}
+    check_entries(found, "attributes", ATTRIBUTES)
     K, P, _ = check_array(found["basis_"], "basis_", (None, None, 3)).shape
     if not K or not P:
         raise ValueError(f"basis_ should have shapes and points; got {(K, P, 3)}")
@@ -166,7 +172,7 @@ def model_from_contents(contents: Any) -> AffineNRSfM:
     layout = check_choice(contents["frames"]["layout"], "layout of frames", LAYOUTS)
     expected = _expected(frames, sizes is not None)
     joint = isinstance(frames, PosteriorFrames)
-    optional = (NAMES, RATIO) if joint else (NAMES,)
+    optional = (NAMES, RATIO, DEPTH) if joint else (NAMES,)
     for name, value in found.items():
         if value is None and name in expected:
             raise ValueError(f"attributes should have {name}; got None")
@@ -246,6 +252,7 @@ def _checks(K: int, P: int, N: int | None) -> dict[str, Callable[[Any, str], Any
         N_FEATURES: lambda a, w: check_whole(a, w, least=2 * P, most=2 * P),
         "noise_variance_": check_number,
         RATIO: check_number,
+        DEPTH: check_number,
         "reliability_": array(K),
         "objective_history_": array(None),
         "gradient_norm_": check_number,
@@ -284,6 +291,7 @@ def _plain_frames(frames: RigidFrames | PosteriorFrames) -> dict[str, Any]:
         "noise_variance": frames.noise_variance,
         "coefficient_starts": frames.starts,
         "basis_change": {"mixing": frames.gauge.mixing, "space": frames.gauge.space},
+        "certainty": np.array(frames.certainty),
     }
 
 
@@ -294,6 +302,8 @@ def _restored_frames(
     if type(contents) is not dict:
         raise ValueError(f"frames should be a dict; got {kind_of(contents)}")
     model = check_choice(contents.get("model"), "model of frames", MODELS)
+    if model == "posterior":
+        contents = {"certainty": np.array(DepthCertainty()), **contents}
     check_entries(contents, "frames", (*OF_TABLE, *MODELS[model]))
     unit = check_number(contents["unit"], "unit of frames", positive=True)
     sizes = contents["sizes"]
@@ -313,6 +323,8 @@ def _restored_frames(
     mixing = check_array(change["mixing"], "mixing of frames", shape, kind="finite")
     space = check_array(change["space"], "space of frames", (3, 3), kind="finite")
     noise = contents["noise_variance"]
+    n_fields = len(DepthCertainty._fields)
+    certainty = check_array(contents["certainty"], "certainty of frames", (n_fields,))
     posterior = PosteriorFrames(
         shapes=array("shapes", K + 1, 3, P),
         noise_variance=check_number(noise, "noise_variance of frames", positive=True),
@@ -320,5 +332,6 @@ def _restored_frames(
         loss=check_choice(contents["loss"], "loss of frames", LOSSES),
         gauge=FrameMap(mixing, space),
         camera=camera,
+        certainty=DepthCertainty(*certainty.tolist()),
     )
     return posterior, unit, sizes

@@ -87,8 +87,8 @@ print('"auto" finds', len(auto.basis_))
 #
 # `AffineNRSfM.diagnostics` tells how far the table determines a fit, and warns where it
 # does not. With five basis shapes, two directions of the coefficients may well be
-# noise: their reliability, the share of their variance that is not uncertainty, is
-# below 0.8.
+# noise: their reliability, the share of their variance that is neither uncertainty nor
+# noise that the shapes have followed, is zero.
 
 for k in (3, 5):
     with warnings.catch_warnings(record=True) as told:
