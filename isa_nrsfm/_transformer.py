@@ -460,7 +460,9 @@ class TableTransformer(
         float
             ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
             frames scaled as in the fit. Larger is better. Points are left out if the
-            others of the frame do not determine its fit.
+            others of the frame do not determine its fit, or if points are missing and
+            the camera of the others places them with more than twice the noise
+            variance.
         """
         table = self._opened(X)
         return -self._model.held_out_error(table)

@@ -74,7 +74,10 @@ class TestAssociation:
         sex = np.array(["m", "m", "f", "f"])[person]
         found = association(alpha[:, None], sex, person, random_state=0)
         assert found.p_value[0] == pytest.approx(1 / 3, abs=0.06)
-        assert association(alpha[:, None], sex, random_state=0).p_value[0] < 0.01
+        mixed = rng.permutation(120)
+        alone = association(alpha[mixed, None], sex[mixed], random_state=0)
+        assert alone.p_value[0] < 0.01
+        assert (found.permuted, alone.permuted) == ("groups", "frames")
 
     def test_labels_that_differ_within_people_are_permuted_there(self):
         # Who is in a frame explains all; within people nothing goes with the label.
