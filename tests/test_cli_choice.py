@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.cli._choice import choice_report, choose_n_components, extrapolated
+from isa_nrsfm.cli._report import _choice_lines
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = pd.DataFrame(make_nonrigid_tracks(48, 20, 2, noise=0.01, random_state=0).data)
@@ -45,6 +46,15 @@ def test_what_comes_next_is_what_the_table_allows(estimator):
     few = X.iloc[:, :28]
     search = choose_n_components(estimator, few, [3])
     assert "next" not in choice_report(search, few)  # 14 points allow three
+
+
+def test_errors_above_the_centroid_are_told_in_words():
+    choice = {"n_components": [1, 2], "chosen": 2, "held_out_error_deviation": [0, 0]}
+    good = "\n".join(_choice_lines(choice | {"held_out_error": [1.2, 0.9]}))
+    assert "larger K may be better" in good
+    bad = "\n".join(_choice_lines(choice | {"held_out_error": [1.2, 1.1]}))
+    assert "larger K" not in bad
+    assert "no number of basis shapes predicts held-out points" in bad
 
 
 def test_seconds_go_on_along_a_line():

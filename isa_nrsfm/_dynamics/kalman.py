@@ -139,20 +139,20 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
     predicted = np.zeros((n_steps, K)), np.empty((n_steps, K, K))
     mean, covariance = np.empty((n_steps, K)), np.empty((n_steps, K, K))
     m, P = np.zeros(K), first
-    log_likelihood = 0.0
+    growth, square = np.empty((n_steps, K, K)), 0.0
     # Filter: prediction, then update in the information form, P <- (P^-1 + L)^-1
     for t in range(n_steps):
         if t:
             m, P = F @ m, F @ P @ F.T + Q
         predicted[0][t], predicted[1][t] = m, P
         L, h = observed.precision[t], observed.information[t]
-        growth = np.eye(K) + P @ L
-        P, off = _symmetric(np.linalg.solve(growth, P)), h - L @ m
-        # The integral of exp(h^T x - x^T L x / 2) over the predicted density
-        square = m @ (h + off) + off @ P @ off
-        log_likelihood += 0.5 * float(square - np.linalg.slogdet(growth)[1])
+        growth[t] = np.eye(K) + P @ L
+        P, off = _symmetric(np.linalg.solve(growth[t], P)), h - L @ m
+        square += m @ (h + off) + off @ P @ off
         m = m + P @ off
         mean[t], covariance[t] = m, P
+    # Integrals of exp(h^T x - x^T L x / 2) over the predicted densities
+    log_likelihood = 0.5 * float(square - np.linalg.slogdet(growth)[1].sum())
     # Smoother, from the last frame to the first: gain J = P F^T P_predicted^-1
     lagged = np.empty((max(n_steps - 1, 0), K, K))
     for t in range(n_steps - 2, -1, -1):

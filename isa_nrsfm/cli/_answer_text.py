@@ -81,7 +81,8 @@ def _label_block(label: dict[str, Any]) -> Block:
             names, label["values"], label["p_values"], strict=True
         )
     ]
-    return Block(title, ["", what, "p"], rows, [_told(label)])
+    permuted = f"p-values: permutations of {label['permuted']}"
+    return Block(title, ["", what, "p"], rows, [permuted, _told(label)])
 
 
 def _told(label: dict[str, Any]) -> str:

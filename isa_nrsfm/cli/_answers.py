@@ -21,7 +21,7 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
-from isa_nrsfm.analysis._labels import kind_of
+from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._frames import Frames, column_named
 from isa_nrsfm.cli._outputs import component_names, write_figure
 from isa_nrsfm.export import point_distances
@@ -152,6 +152,7 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
         values = values.astype(str)
     if not len(values):
         raise ValueError(f"--label: no frame has a {name!r}")
+    refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
     try:
         found = kind_of(values, kind)
     except ValueError as error:
@@ -246,7 +247,7 @@ def answered(
     if asked.labels:
         aligned = _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, asked.groups, random_state)
+            _label_report(label, alpha, aligned, asked, random_state)
             for label in asked.labels
         ]
     if asked.groups is not None:
@@ -301,14 +302,18 @@ def _label_report(
     label: Label,
     alpha: NDArray,
     aligned: NDArray,
-    groups: NDArray | None,
+    asked: Answers,
     random_state: int,
 ) -> dict[str, Any]:
     """Return how coefficients go with a label."""
     known = label.known
-    chosen = None if groups is None else groups[known]
-    options: dict[str, Any] = {"y": label.values, "groups": chosen, "kind": label.kind}
-    options["random_state"] = random_state
+    options: dict[str, Any] = {
+        "y": label.values,
+        "groups": None if asked.groups is None else asked.groups[known],
+        "time": None if asked.times is None else asked.times[known],
+        "kind": label.kind,
+        "random_state": random_state,
+    }
     found = association(alpha[known], **options)
     report: dict[str, Any] = {
         "column": label.name,
@@ -318,6 +323,7 @@ def _label_report(
         "statistic": "eta_squared" if label.kind == "classes" else "spearman",
         "values": found.statistic,
         "p_values": found.p_value,
+        "permuted": found.permuted,
         "score": "accuracy" if label.kind == "classes" else "r_squared",
     }
     if label.kind == "classes":

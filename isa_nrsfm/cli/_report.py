@@ -12,6 +12,7 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM, Decomposition, __version__
 from isa_nrsfm._diagnostics import camera_meaning
+from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm.cli._answer_text import answer_lines
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._outputs import component_names, fitted_frames, fitted_table
@@ -262,6 +263,8 @@ def _choice_lines(choice: dict[str, Any]) -> list[str]:
             strict=True,
         )
     ]
+    if min(choice["held_out_error"]) >= 1:
+        return lines + textwrap.wrap(NO_SHAPE, _TEXT_WIDTH)
     if choice["chosen"] == choice["n_components"][-1]:
         lines.append("larger K may be better: this is the largest that was tried")
     if "next" in choice:
