@@ -185,7 +185,9 @@ class TableTransformer(
             median difference is a step of the autoregression. Other differences are
             rounded to whole steps. None for frames one step apart.
         groups : array-like of shape (n_frames,), default=None
-            Videos or scenes, between which nothing is carried on. None for one.
+            People, videos or scenes, between which nothing is carried on. Each has an
+            intercept of its own: differences between people are no dynamics. None for
+            one.
         max_gap : int, default=30
             After a gap of more steps nothing is carried on.
         max_iter : int, default=100
@@ -210,7 +212,8 @@ class TableTransformer(
         A linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway, Stoffer, 1982)
         that is observed through the likelihood of each frame. The transition has a
         ridge of greatest evidence. Unless the evidence for dynamics is strong, as it is
-        not for photos in any order, the coefficients are those of `transform`.
+        not for photos in any order, the coefficients are those of `transform`. With
+        groups, the likelihood is compared with that of groups with intercepts alone.
         """
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)

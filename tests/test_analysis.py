@@ -13,6 +13,7 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
+from isa_nrsfm.analysis._association import _step_down_p_values
 from isa_nrsfm.analysis._permutations import FrameOrder, permutations_within
 
 rng_of = np.random.default_rng
@@ -145,8 +146,8 @@ class TestAssociation:
         assert found.p_value[1] == 0.001
 
     def test_sequences_shorter_than_a_block_are_shifted(self):
-        walks = np.cumsum(rng_of(0).normal(size=(60, 2)), axis=0)
-        found = association(walks[:, :1], walks[:, 1], random_state=0)
+        phase = 2 * np.pi * np.arange(60) / 60
+        found = association(np.sin(phase)[:, None], np.cos(phase + 0.7), random_state=0)
         assert found.permuted == "sequences shifted in time"
         assert found.p_value[0] > 0.05
         order = FrameOrder.of(np.arange(60) // 15, np.arange(60))
@@ -186,6 +187,16 @@ class TestAssociation:
         assert found.n_frames == len(y) - 10
         assert_array_equal(found.statistic, expected.statistic)
         assert_array_equal(found.p_value, expected.p_value)
+
+    def test_p_values_step_down(self):
+        energies = rng_of(0).random((200, 5)) * [1.0, 2.0, 0.5, 3.0, 1.0]
+        energies[0] = [0.99, 1.5, 0.45, 3.0, 0.9]
+        found = _step_down_p_values(energies)
+        before = 0.0
+        for k in np.argsort(-energies[0]):  # the strongest first
+            weaker = energies[:, energies[0] <= energies[0, k]]
+            before = max(before, np.mean(weaker.max(axis=1) >= energies[0, k]))
+            assert found[k] == pytest.approx(before)
 
     def test_constant_coefficients_go_with_nothing(self):
         alpha, y = related()

@@ -60,22 +60,20 @@ def smoothed_posterior(
     observed = observations(mean, covariance)
     filled = [_with_gaps(each, observed) for each in sequences]
     # Differences between groups are no dynamics.
-    intercepts = numbers is not None and numbers.any()
+    intercepts = numbers is not None and bool(numbers.any())
     if intercepts:
         filled = [with_intercept(each) for each in filled]
     dynamics = estimated_dynamics(filled, max_iter, tol, intercepts)
     if dynamics is None:
         return mean, covariance, np.empty(0)
     K = mean.shape[1]
+    total = np.tile(np.eye(K), 1 + intercepts)  # of a state (x_t, u)
     mean, covariance = mean.copy(), covariance.copy()
     for sequence, each in zip(sequences, filled, strict=True):
         result = smoothed(each, dynamics)
-        parts = result.mean.reshape(len(result.mean), -1, K).sum(axis=1)
-        mean[sequence.rows] = parts[sequence.steps]
-        spread = result.covariance.reshape(
-            len(parts), 1 + intercepts, K, 1 + intercepts, K
-        )
-        covariance[sequence.rows] = spread.sum(axis=(1, 3))[sequence.steps]
+        mean[sequence.rows] = (result.mean @ total.T)[sequence.steps]
+        of_total = total @ result.covariance @ total.T
+        covariance[sequence.rows] = of_total[sequence.steps]
     size = np.sort(np.abs(np.linalg.eigvals(dynamics.transition[:K, :K])))[::-1]
     scales = np.full(len(size), np.inf)
     resting = (size > 0) & (size < 1)

@@ -53,7 +53,8 @@ class Association(NamedTuple):
         -1 to 1.
     p_value : ndarray of shape (n_components,)
         Permutation p-values, corrected for the number of coefficients: the share of
-        permutations of the labels in which any coefficient goes with them as much.
+        permutations of the labels in which this coefficient, or any that goes with them
+        less, goes with them as much.
     n_frames : int
         Number of frames with coefficients.
     permuted : str
@@ -135,9 +136,9 @@ def association(
 
     Notes
     -----
-    The p-values are those of the largest statistic of all coefficients (Westfall,
-    Young, "Resampling-based multiple testing", 1993): the chance that any of them falls
-    below a level by chance is at most that level.
+    The p-values are those of step-down maximum statistics (Westfall, Young,
+    "Resampling-based multiple testing", 1993): the chance that any of them falls below
+    a level by chance is at most that level.
 
     Labels that differ between groups and within them are tested as both together. Each
     part is divided by its mean over the permutations, and the parts are summed.
@@ -170,9 +171,7 @@ def association(
         statistic = np.sum(covariances**2, axis=0)
     rng = check_random_state(random_state)
     energies, permuted = permuted_energies(alpha, columns, order, n_permutations, rng)
-    # Rounding: a permutation that changes nothing counts as large.
-    larger = energies.max(axis=1, keepdims=True) >= energies[0] * (1 - 1e-12)
-    p_value = (1.0 + larger[1:].sum(axis=0)) / (1.0 + n_permutations)
+    p_value = _step_down_p_values(energies)
     return Association(found, statistic, p_value, len(alpha), permuted)
 
 
@@ -268,6 +267,18 @@ def _known_frames(
     numbers = None if numbers is None else numbers[known]
     order = FrameOrder.of(numbers, checked_times(time, len(known))[known])
     return features[known], labels[known], numbers, order
+
+
+def _step_down_p_values(energies: NDArray) -> NDArray:
+    """Return p-values (K,) of energies (n, K), the first those of labels as they are."""
+    weakest_first = np.argsort(energies[0], kind="stable")
+    energies = energies[:, weakest_first]
+    largest = np.maximum.accumulate(energies, axis=1)
+    # Rounding: a permutation that changes nothing counts as large.
+    larger = (largest >= energies[0] * (1 - 1e-12)).mean(axis=0)
+    p_value = np.empty(len(larger))
+    p_value[weakest_first] = np.maximum.accumulate(larger[::-1])[::-1]
+    return p_value
 
 
 def _label_columns(labels: NDArray, kind: str) -> NDArray:
