@@ -270,7 +270,7 @@ def _known_frames(
 
 
 def _step_down_p_values(energies: NDArray) -> NDArray:
-    """Return p-values (K,) of energies (n, K), the first those of labels as they are."""
+    """Return p-values (K,) of energies (n, K), of which the first row is observed."""
     weakest_first = np.argsort(energies[0], kind="stable")
     energies = energies[:, weakest_first]
     largest = np.maximum.accumulate(energies, axis=1)
