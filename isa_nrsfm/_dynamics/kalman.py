@@ -4,9 +4,10 @@ The coefficients x_t of the frames of a sequence follow a first-order autoregres
 
     x_t = F x_t-1 + w_t,  w_t ~ N(0, Q),  x_1 ~ N(0, I).
 
-With sequences of several people, coefficients are ``x_t + u``: u is an intercept of the
-sequence, drawn from N(0, B). The state of the filter is (x_t, u) then, and the first
-x_1 has the covariance of all x_t. So differences between people are no dynamics.
+With sequences of several people, ``x_t - u`` follows the autoregression: u is an
+intercept of the sequence, drawn from N(0, B). The state of the filter is (x_t, u) then,
+and ``x_1 - u`` has the covariance of all ``x_t - u``. So differences between people are
+no dynamics.
 
 A frame is observed through its likelihood as a function of x, a normal density with
 the precision L_t and the information vector h_t. The posterior of a frame by itself,
@@ -80,14 +81,15 @@ class Smoothed(NamedTuple):
         Posterior covariances.
     lagged : ndarray of shape (n_steps - 1, K, K)
         Posterior covariances of x_t+1 and x_t.
-    log_likelihood : float
-        Logarithm of the likelihood of the dynamics, up to a constant.
+    log_likelihood : ndarray of shape (n_steps,)
+        Logarithms of the likelihoods of the frames given those before, up to constants
+        of the frames.
     """
 
     mean: NDArray
     covariance: NDArray
     lagged: NDArray
-    log_likelihood: float
+    log_likelihood: NDArray
 
 
 def observations(mean: NDArray, covariance: NDArray) -> Observations:
@@ -139,7 +141,7 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
     predicted = np.zeros((n_steps, K)), np.empty((n_steps, K, K))
     mean, covariance = np.empty((n_steps, K)), np.empty((n_steps, K, K))
     m, P = np.zeros(K), first
-    growth, square = np.empty((n_steps, K, K)), 0.0
+    growth, square = np.empty((n_steps, K, K)), np.empty(n_steps)
     # Filter: prediction, then update in the information form, P <- (P^-1 + L)^-1
     for t in range(n_steps):
         if t:
@@ -148,11 +150,11 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
         L, h = observed.precision[t], observed.information[t]
         growth[t] = np.eye(K) + P @ L
         P, off = _symmetric(np.linalg.solve(growth[t], P)), h - L @ m
-        square += m @ (h + off) + off @ P @ off
+        square[t] = m @ (h + off) + off @ P @ off
         m = m + P @ off
         mean[t], covariance[t] = m, P
     # Integrals of exp(h^T x - x^T L x / 2) over the predicted densities
-    log_likelihood = 0.5 * float(square - np.linalg.slogdet(growth)[1].sum())
+    log_likelihood = 0.5 * (square - np.linalg.slogdet(growth)[1])
     # Smoother, from the last frame to the first: gain J = P F^T P_predicted^-1
     lagged = np.empty((max(n_steps - 1, 0), K, K))
     for t in range(n_steps - 2, -1, -1):
@@ -195,12 +197,14 @@ def estimated_dynamics(
     # Intercepts and a slow autoregression are alike in short sequences.
     still = _most_likely(np.zeros((K, K)), *options)
     assert still is not None
-    likely, other = (
-        sum(smoothed(each, dynamics).log_likelihood for each in sequences)
-        for dynamics in (found, still)
-    )
+    # Frame by frame: their constants are large where noise is small.
+    gains = [
+        smoothed(each, found).log_likelihood - smoothed(each, still).log_likelihood
+        for each in sequences
+    ]
     # Akaike's criterion: F has K^2 numbers.
-    return found if likely - other > K**2 + STRONG_EVIDENCE else None
+    enough = np.concatenate(gains).sum() > K**2 + STRONG_EVIDENCE
+    return found if enough else None
 
 
 def _most_likely(
@@ -213,6 +217,8 @@ def _most_likely(
     """Maximise the likelihood from a transition F (K, K), which stays if it is zero."""
     K = len(F)
     moves, one = F.any(), np.eye(K) / (1 + intercepts)
+    # From the state to what follows the autoregression, x_t - u
+    relative = np.hstack([np.eye(K), -np.eye(K)][: 1 + intercepts])
     moving, between = Dynamics(F, one - F @ one @ F.T, one), one
     dynamics = _joined(moving, between) if intercepts else moving
     before = None
@@ -220,7 +226,7 @@ def _most_likely(
         # Expectation: second moments of x_t and x_t+1, summed over all pairs
         ends = [smoothed(each, dynamics) for each in sequences]
         moments = np.sum([_pair_moments(each) for each in ends], axis=0)
-        early, late, across = moments[:, :K, :K]
+        early, late, across = relative @ moments @ relative.T
         n_pairs = sum(len(each.lagged) for each in ends)
         # Maximisation: F by regression with a ridge, Q from what is left
         if moves:
@@ -243,7 +249,7 @@ def _most_likely(
 
 def with_intercept(observed: Observations) -> Observations:
     """
-    Return the observations of states (x_t, u), of which frames show the sum.
+    Return the observations of states (x_t, u), of which frames show x_t.
 
     Parameters
     ----------
@@ -256,16 +262,21 @@ def with_intercept(observed: Observations) -> Observations:
         Those of 2 K numbers.
     """
     precision, information = observed
-    return Observations(np.tile(precision, (1, 2, 2)), np.tile(information, (1, 2)))
+    more = (0, information.shape[1])
+    none = (0, 0)
+    return Observations(
+        np.pad(precision, (none, more, more)), np.pad(information, (none, more))
+    )
 
 
 def _joined(moving: Dynamics, between: NDArray) -> Dynamics:
     """Return the dynamics of states (x_t, u); u has the covariance between (K, K)."""
     F, Q, first = moving
+    one, zero = np.eye(len(F)), np.zeros_like(F)
     return Dynamics(
-        block_diag(F, np.eye(len(F))),
-        block_diag(Q, np.zeros_like(Q)),
-        block_diag(first, between),
+        np.block([[F, one - F], [zero, one]]),
+        block_diag(Q, zero),
+        np.block([[first + between, between], [between, between]]),
     )
 
 

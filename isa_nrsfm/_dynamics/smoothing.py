@@ -67,13 +67,11 @@ def smoothed_posterior(
     if dynamics is None:
         return mean, covariance, np.empty(0)
     K = mean.shape[1]
-    total = np.tile(np.eye(K), 1 + intercepts)  # of a state (x_t, u)
     mean, covariance = mean.copy(), covariance.copy()
     for sequence, each in zip(sequences, filled, strict=True):
         result = smoothed(each, dynamics)
-        mean[sequence.rows] = (result.mean @ total.T)[sequence.steps]
-        of_total = total @ result.covariance @ total.T
-        covariance[sequence.rows] = of_total[sequence.steps]
+        mean[sequence.rows] = result.mean[sequence.steps, :K]
+        covariance[sequence.rows] = result.covariance[sequence.steps, :K, :K]
     size = np.sort(np.abs(np.linalg.eigvals(dynamics.transition[:K, :K])))[::-1]
     scales = np.full(len(size), np.inf)
     resting = (size > 0) & (size < 1)
