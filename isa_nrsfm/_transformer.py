@@ -215,7 +215,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             median difference is a step of the autoregression. Other differences are
             rounded to whole steps. None for frames one step apart.
         groups : array-like of shape (n_frames,), default=None
-            Videos or scenes, between which nothing is carried on. None for one.
+            People, videos or scenes, between which nothing is carried on. Each has an
+            intercept of its own: differences between people are no dynamics. None for
+            one.
         max_gap : int, default=30
             After a gap of more steps nothing is carried on.
         max_iter : int, default=100
@@ -240,7 +242,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         A linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway, Stoffer, 1982)
         that is observed through the likelihood of each frame. The transition has a
         ridge of greatest evidence. Unless the evidence for dynamics is strong, as it is
-        not for photos in any order, the coefficients are those of `transform`.
+        not for photos in any order, the coefficients are those of `transform`. With
+        groups, the likelihood is compared with that of groups with intercepts alone.
         """
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
@@ -284,8 +287,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ndarray of shape (n_frames, 3, 3)
             Posterior covariances, in radians squared, of the rotation vectors w by
             which rotations R may be off: ``R exp(hat(w))``, w in the axes of the
-            shapes. They contain the uncertainty of the coefficients, but not that of
-            the shapes. NaN for rows of which too little is seen.
+            shapes. They contain the uncertainty of coefficients and shapes, and count
+            the misfit as common to many points. NaN for rows of which too little is
+            seen.
 
         Raises
         ------
@@ -293,8 +297,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             If the model has affine cameras, or was not refined jointly.
         """
         table = self._opened(X)
-        frames = self._model.frames
-        self._check_certainty("rotation_covariance")
+        frames = self._calibrated_frames("rotation_covariance")
         space, certainty = frames.gauge.space, frames.certainty
         found = self._model.posterior(table)
         covariance = space @ found.turn_covariance @ space.T
@@ -372,7 +375,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             )
         table = self._opened(X)
         if return_std:
-            self._check_certainty("return_std")
+            self._calibrated_frames("return_std")
         fitted, metric = self.camera_, None
         if fitted != "affine" and camera not in (None, fitted):
             raise ValueError(
@@ -510,7 +513,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         float
             ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
             frames scaled as in the fit. Larger is better. Points are left out if the
-            others of the frame do not determine its fit.
+            others of the frame do not determine its fit, or if points are missing and
+            the camera of the others places them with more than twice the noise
+            variance.
         """
         table = self._opened(X)
         return -self._model.held_out_error(table)
@@ -581,8 +586,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         warn_of_coefficients(found, alpha, rows, layout)
         return found
 
-    def _check_certainty(self, name: str) -> None:
-        """Refuse models without calibrated cameras or without a noise variance."""
+    def _calibrated_frames(self, name: str) -> PosteriorFrames:
+        """Return the model of a frame, with calibrated cameras and noise, or raise."""
         frames = self._model.frames
         if self.camera_ == "affine" or not isinstance(frames, PosteriorFrames):
             raise ValueError(
@@ -590,6 +595,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
                 f"refinement='joint'; got camera={self.camera_!r} and "
                 f"refinement={self.refinement!r}"
             )
+        return frames
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
         """

@@ -13,6 +13,8 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
+from isa_nrsfm.analysis._association import _step_down_p_values
+from isa_nrsfm.analysis._permutations import FrameOrder, permutations_within
 
 rng_of = np.random.default_rng
 
@@ -23,6 +25,27 @@ def related(seed=0, n=120, effect=1.5):
     alpha, y = rng.normal(size=(n, 3)), rng.integers(2, size=n)
     alpha[:, 1] += effect * y
     return alpha, y
+
+
+def video(seed, n=200, memory=0.9, n_classes=2):
+    """Return three autoregressions, and classes in blocks that do not go with them."""
+    rng = rng_of(seed)
+    alpha = rng.normal(size=(n, 3))
+    for t in range(1, n):
+        alpha[t] = memory * alpha[t - 1] + np.sqrt(1 - memory**2) * alpha[t]
+    y = np.repeat(rng.integers(n_classes, size=n), rng.geometric(1 / 20, n))[:n]
+    return alpha, y
+
+
+def least_p(trial, n_trials=60, **options):
+    """Return the least p-value of each random trial (alpha, y, groups)."""
+    least = []
+    for seed in range(n_trials):
+        found = association(
+            *trial(seed), n_permutations=99, random_state=seed, **options
+        )
+        least.append(found.p_value.min())
+    return np.array(least)
 
 
 class TestAssociation:
@@ -74,7 +97,10 @@ class TestAssociation:
         sex = np.array(["m", "m", "f", "f"])[person]
         found = association(alpha[:, None], sex, person, random_state=0)
         assert found.p_value[0] == pytest.approx(1 / 3, abs=0.06)
-        assert association(alpha[:, None], sex, random_state=0).p_value[0] < 0.01
+        mixed = rng.permutation(120)
+        alone = association(alpha[mixed, None], sex[mixed], random_state=0)
+        assert alone.p_value[0] < 0.01
+        assert (found.permuted, alone.permuted) == ("groups", "frames")
 
     def test_labels_that_differ_within_people_are_permuted_there(self):
         # Who is in a frame explains all; within people nothing goes with the label.
@@ -83,7 +109,75 @@ class TestAssociation:
         alpha = 3.0 * (person % 3 > 0) + 0.1 * rng_of(1).normal(size=120)
         found = association(alpha[:, None], y, person, random_state=0)
         assert found.p_value[0] > 0.05
-        assert association(alpha[:, None], y, random_state=0).p_value[0] < 0.01
+        mixed = rng_of(2).permutation(120)
+        alone = association(alpha[mixed, None], y[mixed], random_state=0)
+        assert alone.p_value[0] < 0.01
+
+    def test_labels_in_blocks_of_a_video_go_with_nothing_by_chance(self):
+        # Nine in ten are significant if single frames are permuted.
+        assert np.mean(least_p(video) <= 0.05) < 0.15
+        alone = least_p(
+            lambda seed: [a[rng_of(0).permutation(200)] for a in video(seed)]
+        )
+        assert np.mean(alone <= 0.05) > 0.5
+
+    def test_a_real_effect_in_a_video_is_found(self):
+        def trial(seed):
+            alpha, y = video(seed, n=400)
+            alpha[:, 1] += 2.0 * y
+            return alpha, y
+
+        assert np.mean(least_p(trial, n_trials=20) <= 0.05) > 0.8
+
+    def test_blocks_follow_time(self):
+        alpha, y = video(0)
+        expected = association(alpha, y, random_state=0)
+        assert expected.permuted.startswith("blocks of ")
+        mixed = rng_of(0).permutation(len(y))
+        found = association(alpha[mixed], y[mixed], time=mixed / 25, random_state=0)
+        assert found.permuted == expected.permuted
+        assert_allclose(found.p_value, expected.p_value)
+
+    def test_photos_sorted_by_label_are_independent_frames(self):
+        alpha, y = related(effect=1.0)
+        order = np.argsort(y, kind="stable")
+        found = association(alpha[order], y[order], random_state=0)
+        assert found.permuted == "frames"
+        assert found.p_value[1] == 0.001
+
+    def test_sequences_shorter_than_a_block_are_shifted(self):
+        phase = 2 * np.pi * np.arange(60) / 60
+        found = association(np.sin(phase)[:, None], np.cos(phase + 0.7), random_state=0)
+        assert found.permuted == "sequences shifted in time"
+        assert found.p_value[0] > 0.05
+        order = FrameOrder.of(np.arange(60) // 15, np.arange(60))
+        (place,) = permutations_within(order, 20, 1, np.random.RandomState(0))
+        for rows in place.reshape(4, 15):
+            shifted = np.roll(rows, -1 - rows.argmax())
+            assert_array_equal(shifted, np.arange(15) + rows.min())
+
+    def test_an_age_that_changes_in_one_frame_still_belongs_to_the_person(self):
+        person = np.repeat(np.arange(20), 15)
+        alpha = rng_of(0).normal(size=20)[person] + 0.1 * rng_of(1).normal(size=300)
+        age = 40 + 10 * alpha[::15][person] + rng_of(2).normal(size=20)[person]
+        age[7] += 1.5
+        found = association(alpha[:, None], age, person, random_state=0)
+        assert found.permuted == "groups, and frames within groups"
+        assert found.p_value[0] < 0.01
+
+    @pytest.mark.parametrize("effect", [0.0, 1.0])
+    def test_labels_that_vary_within_people_of_many_and_few_frames(self, effect):
+        def trial(seed):
+            rng = rng_of(seed)
+            person = np.repeat(np.arange(25), rng.integers(1, 12, 25))
+            alpha = 2.0 * rng.normal(size=(25, 3))[person]
+            alpha += rng.normal(size=alpha.shape)
+            y = rng.integers(2, size=len(person))
+            alpha[:, 0] += effect * y
+            return alpha, y, person
+
+        share = np.mean(least_p(trial, n_trials=40) <= 0.05)
+        assert share > 0.8 if effect else share < 0.15
 
     def test_frames_without_coefficients_are_left_out_and_counted(self):
         alpha, y = related()
@@ -93,6 +187,16 @@ class TestAssociation:
         assert found.n_frames == len(y) - 10
         assert_array_equal(found.statistic, expected.statistic)
         assert_array_equal(found.p_value, expected.p_value)
+
+    def test_p_values_step_down(self):
+        energies = rng_of(0).random((200, 5)) * [1.0, 2.0, 0.5, 3.0, 1.0]
+        energies[0] = [0.99, 1.5, 0.45, 3.0, 0.9]
+        found = _step_down_p_values(energies)
+        before = 0.0
+        for k in np.argsort(-energies[0]):  # the strongest first
+            weaker = energies[:, energies[0] <= energies[0, k]]
+            before = max(before, np.mean(weaker.max(axis=1) >= energies[0, k]))
+            assert found[k] == pytest.approx(before)
 
     def test_constant_coefficients_go_with_nothing(self):
         alpha, y = related()
@@ -116,6 +220,7 @@ class TestAssociation:
             (np.arange(120), {}, "all different.*kind='number'"),
             (["a"] * 119 + [None], {}, "missing in 1 of 120, the first is row 119"),
             (np.r_[np.nan, np.ones(119)], {}, "missing in 1 of 120"),
+            (np.r_[0.5, np.inf, -np.inf, np.ones(117)], {}, "2 of 120.*in row 1: "),
             (["a", "b"], {}, "each of the 120 frames; got 2"),
             (["a", "b"] * 60, {"kind": "number"}, "numbers are expected; got"),
             (["a", "b"] * 60, {"kind": "odd"}, "kind must be"),
@@ -154,6 +259,16 @@ class TestPredictability:
         alone = predictability(alpha, y, random_state=0).mean()
         grouped = predictability(alpha, y, person, random_state=0).mean()
         assert alone > grouped + 0.15
+
+    def test_blocks_of_a_video_stay_together(self):
+        # Neighbours of a frame give its class away, though nothing goes with classes.
+        alpha, y = video(3, n=400, memory=0.97, n_classes=3)
+        mixed = rng_of(0).permutation(400)
+        alone = predictability(alpha[mixed], y[mixed], random_state=0).mean()
+        found = predictability(alpha, y, random_state=0).mean()
+        assert alone > found + 0.15
+        timed = predictability(alpha[mixed], y[mixed], time=mixed, random_state=0)
+        assert timed.mean() == pytest.approx(found, abs=0.05)
 
     def test_fewer_folds_for_small_classes(self):
         alpha, y = related(n=40)

@@ -63,10 +63,15 @@ def test_labels_are_answered_as_in_python(run):
         model.alpha_[known],
         table["mood"][known],
         table["person"][known],
+        time=table["seconds"][known],
         random_state=0,
     )
     np.testing.assert_allclose(mood["values"], expected.statistic)
     np.testing.assert_allclose(mood["p_values"], expected.p_value)
+    assert mood["permuted"] == expected.permuted
+    assert (
+        f"permutations of {expected.permuted}" in (folder / "report.html").read_text()
+    )
     assert mood["n_without_label"] == 1
     assert mood["classes"] == {"down": (table["mood"] == "down").sum(), "up": 66}
     assert mood["cross_validated"] > 0.9
@@ -169,6 +174,7 @@ def test_times_are_said_in_words(scales, said):
         (["--label", "same"], "--label same: all 120 labels are 1: there is nothing"),
         (["--label", "seconds:classes"], "--label seconds:classes: the 120 labels are"),
         (["--label", "mood:number"], "labels that are numbers are expected; got"),
+        (["--label", "far"], "--label far must be finite; 1 of 120 .* in row 7: "),
         (["--label", "none"], "--label: no frame has a 'none'"),
         (["--group", "gaps"], "--group: 3 of 120 frames have no 'gaps'"),
         (["--time", "mood"], "--time: expected numbers or dates; 120 of 120 frames"),
@@ -187,6 +193,7 @@ def test_refused_before_the_fit(tmp_path, capsys, options, message):
     table["none"] = None
     table["gaps"] = np.arange(N, dtype=float)
     table.loc[[3, 4, 9], "gaps"] = np.nan
+    table["far"] = np.where(np.arange(N) == 7, np.inf, table["age"])
     table.to_csv(tmp_path / "table.csv", index=False)
     arguments = ["fit", str(tmp_path / "table.csv"), "-o", str(tmp_path / "out")]
     try:

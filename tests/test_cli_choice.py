@@ -70,6 +70,16 @@ def test_numbers_of_the_choice_have_no_point_at_the_end():
     assert lines[-1] == "to try K = 3, too, would take about 10 s"
 
 
+def test_errors_above_the_centroid_are_told_in_words():
+    choice = {"n_components": [1, 2], "chosen": 2}
+    choice["held_out_error_standard_error"] = [0, 0]
+    good = "\n".join(_choice_lines(choice | {"held_out_error": [1.2, 0.9]}))
+    assert "larger K may be better" in good
+    bad = "\n".join(_choice_lines(choice | {"held_out_error": [1.2, 1.1]}))
+    assert "larger K" not in bad
+    assert "no number of basis shapes predicts held-out points" in bad
+
+
 def test_seconds_go_on_along_a_line():
     tried = np.array([1, 2, 3, 4])
     # The first one, which searches for starts, does not count.

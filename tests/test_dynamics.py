@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import block_diag
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._dynamics.kalman import (
@@ -11,6 +12,7 @@ from isa_nrsfm._dynamics.kalman import (
     smoothed,
 )
 from isa_nrsfm._dynamics.sequences import sequences_of
+from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 K = 3
@@ -21,12 +23,12 @@ def random_dynamics(seed=0, size=0.9):
     rng = np.random.default_rng(seed)
     Q, _ = np.linalg.qr(rng.normal(size=(K, K)))
     F = size * Q
-    return Dynamics(F, np.eye(K) - F @ F.T)
+    return Dynamics(F, np.eye(K) - F @ F.T, np.eye(K))
 
 
 def simulated(dynamics, n_steps, rng):
     """Return coefficients (n_steps, K) that follow an autoregression."""
-    F, Q = dynamics
+    F, Q, _ = dynamics
     root = np.linalg.cholesky(Q)
     x = [rng.normal(size=K)]
     for _ in range(n_steps - 1):
@@ -46,7 +48,7 @@ def observed(x, rng, noise=0.3):
 
 def dense_posterior(data, dynamics):
     """Return mean and covariance of all steps as one normal distribution."""
-    F, Q = dynamics
+    F, Q, _ = dynamics
     n = len(data.information)
     prior = np.zeros((n, K, n, K))
     cov = np.eye(K)
@@ -81,10 +83,24 @@ class TestSmoother:
         for t in range(11):
             assert_allclose(got.lagged[t], covariance[t + 1, :, t], atol=1e-10)
 
+    def test_likelihood_is_that_of_the_joint_normal_distribution(self):
+        rng = np.random.default_rng(4)
+        data = observations(*observed(rng.normal(size=(6, K)), rng))
+        values = []
+        for dynamics in (random_dynamics(0), random_dynamics(1, 0.5)):
+            mean, covariance = dense_posterior(data, dynamics)
+            size = (6 * K, 6 * K)
+            precision = np.linalg.inv(covariance.reshape(size))
+            prior = precision - block_diag(*data.precision)
+            dense = mean.ravel() @ precision @ mean.ravel()
+            dense += np.linalg.slogdet(prior)[1] - np.linalg.slogdet(precision)[1]
+            values.append((smoothed(data, dynamics).log_likelihood.sum(), dense / 2))
+        assert_allclose(*np.transpose(values))
+
     def test_without_transition_frames_keep_their_posterior(self):
         rng = np.random.default_rng(1)
         mean, covariance = observed(rng.normal(size=(20, K)), rng)
-        still = Dynamics(np.zeros((K, K)), np.eye(K))
+        still = Dynamics(np.zeros((K, K)), np.eye(K), np.eye(K))
         got = smoothed(observations(mean, covariance), still)
         assert_allclose(got.mean, mean, atol=1e-10)
         assert_allclose(got.covariance, covariance, atol=1e-10)
@@ -112,7 +128,7 @@ class TestEstimation:
             observations(*observed(simulated(true, 400, rng), rng, 0.5))
             for _ in range(3)
         ]
-        found = estimated_dynamics(data, 60, 1e-4)
+        found = estimated_dynamics(data, 60, 1e-4, False)
         assert_allclose(found.transition, true.transition, atol=0.06)
         assert_allclose(found.innovation, true.innovation, atol=0.06)
 
@@ -121,7 +137,7 @@ class TestEstimation:
         x = simulated(true, 300, rng)
         mean, covariance = observed(x, rng, 2.0)
         data = observations(mean, covariance)
-        found = estimated_dynamics([data], 100, 1e-4)
+        found = estimated_dynamics([data], 100, 1e-4, False)
         error = np.linalg.norm(smoothed(data, found).mean - x)
         assert error < 0.6 * np.linalg.norm(mean - x)
 
@@ -129,16 +145,45 @@ class TestEstimation:
     def test_independent_frames_have_none(self, seed):
         rng = np.random.default_rng(seed)
         data = observations(*observed(rng.normal(size=(150, K)), rng, 1.0))
-        assert estimated_dynamics([data], 100, 1e-4) is None
+        assert estimated_dynamics([data], 100, 1e-4, False) is None
 
     def test_does_not_depend_on_the_basis(self):
         rng, true = np.random.default_rng(2), random_dynamics(2)
         data = observations(*observed(simulated(true, 200, rng), rng))
         R = np.linalg.qr(rng.normal(size=(K, K)))[0]
         turned = Observations(R @ data.precision @ R.T, data.information @ R.T)
-        first = estimated_dynamics([data], 30, 1e-6)
-        second = estimated_dynamics([turned], 30, 1e-6)
+        first = estimated_dynamics([data], 30, 1e-6, False)
+        second = estimated_dynamics([turned], 30, 1e-6, False)
         assert_allclose(second.transition, R @ first.transition @ R.T, atol=1e-5)
+
+
+class TestPeople:
+    @pytest.mark.parametrize(("n_people", "n_frames"), [(60, 3), (20, 8), (4, 60)])
+    def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
+        rng = np.random.default_rng(0)
+        person = np.repeat(np.arange(n_people), n_frames)
+        x = np.sqrt(0.8) * rng.normal(size=(n_people, K))[person]
+        x += np.sqrt(0.2) * rng.normal(size=x.shape)
+        frames = observed(x, rng)
+        options = {"max_gap": 10, "max_iter": 100, "tol": 1e-3}
+        mean, _, scales = smoothed_posterior(*frames, None, person, **options)
+        assert scales.shape == (0,)
+        assert_array_equal(mean, frames[0])
+
+    def test_videos_of_people_are_smoothed(self):
+        rng, true = np.random.default_rng(0), random_dynamics()
+        person = np.repeat(np.arange(5), 40)
+        x = np.concatenate([simulated(true, 40, rng) for _ in range(5)])
+        x = np.sqrt(0.5) * (x + rng.normal(size=(5, K))[person])
+        frames = observed(x, rng, 0.5)
+        options = {"max_gap": 10, "max_iter": 100, "tol": 1e-3}
+        mean, covariance, scales = smoothed_posterior(*frames, None, person, **options)
+        assert_allclose(scales, -1 / np.log(0.9), rtol=0.5)
+        error = np.linalg.norm(mean - x)
+        assert error < 0.7 * np.linalg.norm(frames[0] - x)
+        # Deviations of the sum of motion and intercept hold.
+        off = (mean - x) ** 2 / np.diagonal(covariance, axis1=1, axis2=2)
+        assert 0.8 < off.mean() < 1.25
 
 
 class TestSequences:

@@ -292,6 +292,15 @@ def test_a_memory_map_is_a_table(tmp_path, fitted):
     assert_allclose(search.cv_results_[name], fitted.cv_results_[name], rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_a_table_of_noise_is_told():
+    noise = np.random.default_rng(0).normal(size=(45, 24))
+    estimator = inner(refinement=None)
+    with pytest.warns(UserWarning, match="better than the centroid"):
+        search = AffineNRSfMCV((1, 2), estimator=estimator).fit(noise)
+    assert search.best_score_ < -1
+
+
 def test_fits_that_do_not_converge_are_counted():
     search = AffineNRSfMCV((1, 2), estimator=inner(max_iter=2))
     with pytest.warns(ConvergenceWarning) as told:

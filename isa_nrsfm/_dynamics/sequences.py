@@ -1,12 +1,9 @@
 """Rows of a table as sequences in time."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import check_array
-
-from isa_nrsfm._tables.frame_columns import checked_column
 
 
 class Sequence(NamedTuple):
@@ -24,39 +21,6 @@ class Sequence(NamedTuple):
 
     rows: NDArray
     steps: NDArray
-
-
-def checked_times(time: Any, n_rows: int) -> NDArray:
-    """
-    Return the times of rows.
-
-    Parameters
-    ----------
-    time : array-like of shape (n_rows,) or None
-        Times; None for rows in order, one step apart.
-    n_rows : int
-        Number of rows.
-
-    Returns
-    -------
-    ndarray of shape (n_rows,)
-        The times.
-
-    Raises
-    ------
-    ValueError
-        If there is not one finite number for each row.
-    """
-    if time is None:
-        return np.arange(n_rows, dtype=float)
-    return _numbers(checked_column("time", time, n_rows))
-
-
-def _numbers(time: NDArray) -> NDArray:
-    """Return times as numbers: dates and durations in seconds."""
-    if time.dtype.kind in "mM":
-        return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
-    return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
 
 
 def sequences_of(

@@ -10,9 +10,10 @@ from isa_nrsfm._dynamics.kalman import (
     estimated_dynamics,
     observations,
     smoothed,
+    with_intercept,
 )
-from isa_nrsfm._dynamics.sequences import Sequence, checked_times, sequences_of
-from isa_nrsfm._tables.frame_columns import group_numbers
+from isa_nrsfm._dynamics.sequences import Sequence, sequences_of
+from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 
 
 def smoothed_posterior(
@@ -58,15 +59,20 @@ def smoothed_posterior(
     sequences, unit = sequences_of(times, numbers, max_gap)
     observed = observations(mean, covariance)
     filled = [_with_gaps(each, observed) for each in sequences]
-    dynamics = estimated_dynamics(filled, max_iter, tol)
+    # Differences between groups are no dynamics.
+    intercepts = numbers is not None and bool(numbers.any())
+    if intercepts:
+        filled = [with_intercept(each) for each in filled]
+    dynamics = estimated_dynamics(filled, max_iter, tol, intercepts)
     if dynamics is None:
         return mean, covariance, np.empty(0)
+    K = mean.shape[1]
     mean, covariance = mean.copy(), covariance.copy()
     for sequence, each in zip(sequences, filled, strict=True):
         result = smoothed(each, dynamics)
-        mean[sequence.rows] = result.mean[sequence.steps]
-        covariance[sequence.rows] = result.covariance[sequence.steps]
-    size = np.sort(np.abs(np.linalg.eigvals(dynamics.transition)))[::-1]
+        mean[sequence.rows] = result.mean[sequence.steps, :K]
+        covariance[sequence.rows] = result.covariance[sequence.steps, :K, :K]
+    size = np.sort(np.abs(np.linalg.eigvals(dynamics.transition[:K, :K])))[::-1]
     scales = np.full(len(size), np.inf)
     resting = (size > 0) & (size < 1)
     scales[resting] = -unit / np.log(size[resting])

@@ -228,8 +228,8 @@ def depth_certainty(
     variance = max(along / n_chosen, residual)
     swaps = np.linalg.pinv(rotated * (n_frames / n_chosen), hermitian=True)
     swaps = np.trace(swaps.reshape(K, 3, K, 3), axis1=1, axis2=3) / 3
-    size = max(np.sum(alpha**2), np.finfo(float).tiny)
-    turns = variance * np.einsum("ik,kl,il->", alpha, swaps, alpha) / size
+    length = max(float(np.sum(alpha**2)), np.finfo(float).tiny)
+    turns = variance * np.einsum("ik,kl,il->", alpha, swaps, alpha) / length
     # Spread of the viewing directions about their mean, less what coefficients predict
     U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
     axis = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)[2]

@@ -1,4 +1,4 @@
-"""Tables of scores by the number of basis shapes, and the choice from them."""
+"""Tables of scores by the number of basis shapes, the choice, and its warnings."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,11 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
+from sklearn.exceptions import ConvergenceWarning
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._selection.path import Row
 
 BEST, ONE_STANDARD_ERROR = "best", "one_standard_error"
 SELECTIONS = (BEST, ONE_STANDARD_ERROR)
+# For held-out errors of 100 % and more.
+NO_SHAPE = (
+    "no number of basis shapes predicts held-out points better than the centroid of "
+    "their frame does (an error of 100 %): the fitted frames share no shape with the "
+    "others. Check that each column is the same point in all frames."
+)
 
 
 def results_of(rows: Sequence[Row]) -> dict[str, Any]:
@@ -135,3 +143,24 @@ def line(row: Row, held_out: bool) -> str:
         )
     seconds = row.path_seconds + row.fit_seconds.sum() + row.score_seconds.sum()
     return f"n_components={row.n_components}: {score}, {seconds:.1f} s"
+
+
+def warn_of_no_shape(scores: NDArray) -> None:
+    """Warn if no held-out error, minus a mean score (n_candidates, n_splits), is small.
+
+    The limit is the error of the centroid of each frame, one.
+    """
+    if np.nanmax(scores.mean(axis=1)) <= -1:
+        warn_caller(NO_SHAPE)
+
+
+def warn_of_unconverged(rows: Sequence[Row]) -> None:
+    """Warn if fits of a path did not converge."""
+    which = [str(row.n_components) for row in rows if row.n_unconverged]
+    if which:
+        n_fits = sum(row.n_unconverged for row in rows)
+        warn_caller(
+            f"{n_fits} fit(s) did not converge while n_components was chosen, with "
+            f"n_components of {', '.join(which)}; increase max_iter or tol",
+            ConvergenceWarning,
+        )

@@ -14,7 +14,6 @@ from sklearn.base import (
     TransformerMixin,
     clone,
 )
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import check_cv
 from sklearn.utils import get_tags, indexable
@@ -26,7 +25,6 @@ from sklearn.utils.metadata_routing import (
 )
 from sklearn.utils.validation import check_is_fitted
 
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
     HasMethods,
     Interval,
@@ -36,8 +34,15 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
-from isa_nrsfm._selection.choice import SELECTIONS, line, results_of, selected
-from isa_nrsfm._selection.path import Row, Split, ready_part, walk
+from isa_nrsfm._selection.choice import (
+    SELECTIONS,
+    line,
+    results_of,
+    selected,
+    warn_of_no_shape,
+    warn_of_unconverged,
+)
+from isa_nrsfm._selection.path import Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm._transformer import CoefficientNamesMixin, Decomposition
 
@@ -222,7 +227,8 @@ class AffineNRSfMCV(
         Warns
         -----
         UserWarning
-            As of `AffineNRSfM.fit`, and if fits of the path have not converged.
+            As of `AffineNRSfM.fit`, and if fits of the path have not converged or all
+            held-out errors are above 100 %.
         """
         estimator = self._estimator()
         candidates = checked_candidates(self.n_components)
@@ -251,7 +257,10 @@ class AffineNRSfMCV(
                     flush=True,
                 )
         warn_of_unconverged(rows)
-        best = selected(np.array([row.scores for row in rows]), self.select)
+        scores = np.array([row.scores for row in rows])
+        best = selected(scores, self.select)
+        if self.scoring is None:
+            warn_of_no_shape(scores)
         since = time.perf_counter()
         fitted = estimator.set_params(n_components=candidates[best]).fit(X)
         self.refit_time_ = time.perf_counter() - since
@@ -560,15 +569,3 @@ def held_out_score(
     part = taken_rows(X, split.test)
     wanted = None if y is None else taken_rows(y, split.test)
     return float(scorer(model, part, wanted, **own))
-
-
-def warn_of_unconverged(rows: list[Row]) -> None:
-    """Warn if fits of a path did not converge."""
-    which = [str(row.n_components) for row in rows if row.n_unconverged]
-    if which:
-        n_fits = sum(row.n_unconverged for row in rows)
-        warn_caller(
-            f"{n_fits} fit(s) did not converge while n_components was chosen, with "
-            f"n_components of {', '.join(which)}; increase max_iter or tol",
-            ConvergenceWarning,
-        )

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import column_or_1d
+from sklearn.utils import check_array, column_or_1d
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
@@ -63,3 +63,36 @@ def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
         return None
     names = checked_column("groups", groups, n_frames)
     return np.asarray(np.unique(names, return_inverse=True)[1])
+
+
+def checked_times(time: Any, n_rows: int) -> NDArray:
+    """
+    Return the times of rows.
+
+    Parameters
+    ----------
+    time : array-like of shape (n_rows,) or None
+        Times; None for rows in order, one step apart.
+    n_rows : int
+        Number of rows.
+
+    Returns
+    -------
+    ndarray of shape (n_rows,)
+        The times.
+
+    Raises
+    ------
+    ValueError
+        If there is not one finite number for each row.
+    """
+    if time is None:
+        return np.arange(n_rows, dtype=float)
+    return _numbers(checked_column("time", time, n_rows))
+
+
+def _numbers(time: NDArray) -> NDArray:
+    """Return times as numbers: dates and durations in seconds."""
+    if time.dtype.kind in "mM":
+        return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
+    return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")

@@ -1,6 +1,5 @@
 """How coefficients go with a label: a class or a number for each frame."""
 
-from collections.abc import Callable
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,8 +20,17 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.frame_columns import checked_column, group_numbers
-from isa_nrsfm.analysis._labels import kind_of
+from isa_nrsfm._tables.frame_columns import (
+    checked_column,
+    checked_times,
+    group_numbers,
+)
+from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
+from isa_nrsfm.analysis._permutations import (
+    FrameOrder,
+    dependent_blocks,
+    permuted_energies,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,15 +53,20 @@ class Association(NamedTuple):
         -1 to 1.
     p_value : ndarray of shape (n_components,)
         Permutation p-values, corrected for the number of coefficients: the share of
-        permutations of the labels in which any coefficient has a statistic as large.
+        permutations of the labels in which this coefficient, or any that goes with them
+        less, goes with them as much.
     n_frames : int
         Number of frames with coefficients.
+    permuted : str
+        The units that were permuted: "frames", "groups", "blocks of 37 frames" or
+        "sequences shifted in time"; with "within groups" where they were.
     """
 
     kind: str
     statistic: NDArray
     p_value: NDArray
     n_frames: int
+    permuted: str
 
     def to_frame(self) -> "pd.DataFrame":
         """
@@ -82,6 +95,7 @@ def association(
     y: Any,
     groups: Any = None,
     *,
+    time: Any = None,
     kind: str = "auto",
     n_permutations: int = 999,
     random_state: Any = None,
@@ -97,9 +111,11 @@ def association(
         A label for each frame: classes, such as expressions, or a number, such as an
         age.
     groups : array-like of shape (n_frames,), default=None
-        People, videos or other groups whose frames are alike. Labels that differ within
-        groups are permuted within them only. Labels that are the same for all frames of
-        a group are permuted among the groups.
+        People, videos or other groups whose frames are alike. Means of labels over
+        groups are permuted among the groups, differences from them within each group.
+    time : array-like of shape (n_frames,), default=None
+        Times of the frames; None for the order of the rows. Where neighbours in time
+        depend on each other, blocks of frames are permuted.
     kind : {"auto", "classes", "number"}, default="auto"
         What the labels are. "auto" takes names, truth values and whole numbers for
         classes, as scikit-learn does.
@@ -111,18 +127,25 @@ def association(
     Returns
     -------
     Association
-        Named tuple of kind, statistic, p_value (n_components,) and n_frames.
+        Named tuple of kind, statistic, p_value (n_components,), n_frames and permuted.
 
     Raises
     ------
     ValueError
-        If labels are missing, all equal, or classes that are all different.
+        If labels are missing, infinite, all equal, or classes that are all different.
 
     Notes
     -----
-    The p-values are those of the largest statistic of all coefficients (Westfall,
-    Young, "Resampling-based multiple testing", 1993): the chance that any of them falls
-    below a level by chance is at most that level.
+    The p-values are those of step-down maximum statistics (Westfall, Young,
+    "Resampling-based multiple testing", 1993): the chance that any of them falls below
+    a level by chance is at most that level.
+
+    Labels that differ between groups and within them are tested as both together. Each
+    part is divided by its mean over the permutations, and the parts are summed.
+
+    A block has five times the integrated autocorrelation time of labels and
+    coefficients together. It is measured on the part of the coefficients that labels
+    do not explain, so that frames sorted by their label can be independent.
 
     Examples
     --------
@@ -136,26 +159,20 @@ def association(
     array([False,  True])
     """
     check_scalar(n_permutations, "n_permutations", Integral, min_val=1)
-    alpha, known = _known_frames(alpha)
-    labels = checked_column("y", y, len(known))[known]
-    numbers = group_numbers(groups, len(known))
-    numbers = None if numbers is None else numbers[known]
+    alpha, labels, _, order = _known_frames(alpha, y, groups, time)
     found = kind_of(labels, kind)
-    rng = check_random_state(random_state)
-    statistics: Callable[[NDArray, NDArray], NDArray]
+    columns = _label_columns(labels, found)
+    if found == "number":
+        alpha = rankdata(alpha, axis=0)
+    alpha = _unit_columns(alpha)
+    covariances = columns.T @ alpha
+    statistic = covariances[0]
     if found == "classes":
-        values, statistics = np.unique(labels, return_inverse=True)[1], _eta_squared
-    else:
-        values, statistics = _unit_ranks(labels[:, None])[:, 0], _correlations
-        alpha = _unit_ranks(alpha)
-    statistic = statistics(alpha, values)
-    larger = np.zeros(len(statistic))
-    for _ in range(n_permutations):
-        shuffled = statistics(alpha, _permuted(values, numbers, rng))
-        # Rounding: a permutation that changes nothing counts as large.
-        larger += np.abs(shuffled).max() >= np.abs(statistic) * (1 - 1e-12)
-    p_value = (1.0 + larger) / (1.0 + n_permutations)
-    return Association(found, statistic, p_value, len(alpha))
+        statistic = np.sum(covariances**2, axis=0)
+    rng = check_random_state(random_state)
+    energies, permuted = permuted_energies(alpha, columns, order, n_permutations, rng)
+    p_value = _step_down_p_values(energies)
+    return Association(found, statistic, p_value, len(alpha), permuted)
 
 
 def predictability(
@@ -163,6 +180,7 @@ def predictability(
     y: Any,
     groups: Any = None,
     *,
+    time: Any = None,
     kind: str = "auto",
     n_folds: int = 5,
     random_state: Any = None,
@@ -178,6 +196,8 @@ def predictability(
         A label for each frame.
     groups : array-like of shape (n_frames,), default=None
         People, videos or other groups. Frames of a group are in one fold.
+    time : array-like of shape (n_frames,), default=None
+        As of `association`. Without groups, blocks of dependent frames are in one fold.
     kind : {"auto", "classes", "number"}, default="auto"
         As of `association`.
     n_folds : int, default=5
@@ -198,11 +218,10 @@ def predictability(
         As of `association`, or if a class or the table is too small for two folds.
     """
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
-    features, known = _known_frames(features)
-    labels = checked_column("y", y, len(known))[known]
-    numbers = group_numbers(groups, len(known))
-    numbers = None if numbers is None else numbers[known]
+    features, labels, numbers, order = _known_frames(features, y, groups, time)
     found = kind_of(labels, kind)
+    if numbers is None:
+        numbers = _dependent_frames(features, labels, found, order, n_folds)
     most = len(labels)
     if found == "classes":
         most = int(np.unique(labels, return_counts=True)[1].min())
@@ -232,52 +251,65 @@ def predictability(
     )
 
 
-def _known_frames(features: Any) -> tuple[NDArray, NDArray]:
-    """Return features of the frames without NaN, and which those are (n_frames,)."""
+def _known_frames(
+    features: Any, y: Any, groups: Any, time: Any
+) -> tuple[NDArray, NDArray, NDArray | None, FrameOrder]:
+    """Return features, labels, groups and order of the frames without NaN."""
     features = check_array(
         features, dtype=np.float64, ensure_all_finite="allow-nan", input_name="alpha"
     )
     known = np.isfinite(features).all(axis=1)
     if not known.any():
         raise ValueError("no frame has coefficients: all rows of alpha have NaN")
-    return features[known], known
+    labels = checked_column("y", y, len(known))
+    refuse_infinite("y", labels, np.arange(len(known)))
+    numbers = group_numbers(groups, len(known))
+    numbers = None if numbers is None else numbers[known]
+    order = FrameOrder.of(numbers, checked_times(time, len(known))[known])
+    return features[known], labels[known], numbers, order
 
 
-def _eta_squared(alpha: NDArray, classes: NDArray) -> NDArray:
-    """Return the share of the variance of each coefficient between classes (n,)."""
-    centred = alpha - alpha.mean(axis=0)
-    sizes = np.bincount(classes)
-    sums = np.stack([np.bincount(classes, column) for column in centred.T], axis=1)
-    between = np.sum(sums**2 / sizes[:, None], axis=0)
-    total = np.sum(centred**2, axis=0)
-    return np.divide(between, total, where=total > 0, out=np.zeros_like(total))
+def _step_down_p_values(energies: NDArray) -> NDArray:
+    """Return p-values (K,) of energies (n, K), of which the first row is observed."""
+    weakest_first = np.argsort(energies[0], kind="stable")
+    energies = energies[:, weakest_first]
+    largest = np.maximum.accumulate(energies, axis=1)
+    # Rounding: a permutation that changes nothing counts as large.
+    larger = (largest >= energies[0] * (1 - 1e-12)).mean(axis=0)
+    p_value = np.empty(len(larger))
+    p_value[weakest_first] = np.maximum.accumulate(larger[::-1])[::-1]
+    return p_value
 
 
-def _unit_ranks(values: NDArray) -> NDArray:
-    """Return ranks of columns (n, k), centred and of norm one."""
-    ranks = rankdata(values, axis=0)
-    ranks = ranks - ranks.mean(axis=0)
-    size = np.linalg.norm(ranks, axis=0)
-    return ranks / np.where(size > 0, size, 1.0)
+def _label_columns(labels: NDArray, kind: str) -> NDArray:
+    """Return ranks, or indicators of classes, as columns (n_frames, n_columns).
+
+    The sum of their squared covariances with a column of norm one is eta squared, or
+    the square of Spearman's rank correlation.
+    """
+    if kind == "number":
+        return _unit_columns(rankdata(labels)[:, None])
+    indicators = labels[:, None] == np.unique(labels)
+    return indicators / np.sqrt(indicators.sum(axis=0))
 
 
-def _correlations(alpha: NDArray, values: NDArray) -> NDArray:
-    """Return the correlations of columns (n, K) with values (n,), both of norm one."""
-    return values @ alpha
+def _unit_columns(values: NDArray) -> NDArray:
+    """Return columns (n, k), centred and of norm one; zero where constant."""
+    values = values - values.mean(axis=0)
+    size = np.linalg.norm(values, axis=0)
+    return np.asarray(values / np.where(size > 0, size, 1.0))
 
 
-def _permuted(
-    values: NDArray, groups: NDArray | None, rng: np.random.RandomState
-) -> NDArray:
-    """Return labels (n,) permuted within groups (n,), or among them."""
-    if groups is None:
-        return np.asarray(rng.permutation(values))
-    first = np.unique(groups, return_index=True)[1]
-    if (values == values[first][groups]).all():
-        return np.asarray(rng.permutation(values[first])[groups])
-    # Rows in the order of their groups, once as they are and once shuffled inside
-    order = np.argsort(groups, kind="stable")
-    shuffled = np.lexsort((rng.random_sample(len(groups)), groups))
-    permuted = np.empty_like(values)
-    permuted[order] = values[shuffled]
-    return permuted
+def _dependent_frames(
+    features: NDArray, labels: NDArray, kind: str, order: FrameOrder, n_folds: int
+) -> NDArray | None:
+    """Return the block of each frame (n_frames,), None for independent frames."""
+    columns = _label_columns(labels, kind)
+    columns = columns - columns.mean(axis=0)
+    features = _unit_columns(features)
+    length = dependent_blocks(features[order.rows], columns[order.rows], order).length
+    if length == 1:
+        return None
+    blocks = np.empty(len(labels), dtype=int)
+    blocks[order.rows] = order.blocks(min(length, -(-len(labels) // n_folds)))
+    return blocks

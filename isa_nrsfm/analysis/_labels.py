@@ -48,3 +48,30 @@ def kind_of(y: NDArray, kind: str) -> Kind:
             "for a measure of something say kind='number'"
         )
     return found
+
+
+def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
+    """
+    Refuse labels that are infinite numbers.
+
+    Parameters
+    ----------
+    name : str
+        Name of the labels in the message.
+    labels : ndarray of shape (n_frames,)
+        Labels.
+    rows : ndarray of shape (n_frames,)
+        Numbers of their rows.
+
+    Raises
+    ------
+    ValueError
+        If a label is infinite.
+    """
+    infinite = rows[np.isinf(labels)] if labels.dtype.kind == "f" else rows[:0]
+    if len(infinite):
+        raise ValueError(
+            f"{name} must be finite; {len(infinite)} of {len(labels)} labels are "
+            f"infinite, the first is in row {infinite[0]}: correct these labels, or "
+            "leave their frames out"
+        )

@@ -84,7 +84,10 @@ def _label_block(label: dict[str, Any]) -> Block:
             names, label["values"], label["p_values"], strict=True
         )
     ]
-    return Block(title, ["", what, "p"], rows, [*_class_lines(label), _told(label)])
+    permuted = f"p-values: permutations of {label['permuted']}"
+    return Block(
+        title, ["", what, "p"], rows, [permuted, *_class_lines(label), _told(label)]
+    )
 
 
 def _class_lines(label: dict[str, Any]) -> list[str]:

@@ -12,8 +12,8 @@ from sklearn.decomposition import PCA
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._dynamics.sequences import checked_times, sequences_of
-from isa_nrsfm._tables.frame_columns import group_numbers
+from isa_nrsfm._dynamics.sequences import sequences_of
+from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,
@@ -21,7 +21,7 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
-from isa_nrsfm.analysis._labels import kind_of
+from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._frames import Frames, column_named
 from isa_nrsfm.cli._outputs import component_names, figure_named, write_figure
 from isa_nrsfm.cli._progress import show_stage
@@ -155,6 +155,7 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
         values = values.astype(str)
     if not len(values):
         raise ValueError(f"--label: no frame has a {name!r}")
+    refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
     try:
         found = kind_of(values, kind)
     except ValueError as error:
@@ -249,7 +250,7 @@ def answered(
     if asked.labels:
         aligned = _aligned_pca(estimator, X)
         report["labels"] = [
-            _label_report(label, alpha, aligned, asked.groups, random_state)
+            _label_report(label, alpha, aligned, asked, random_state)
             for label in asked.labels
         ]
     if asked.groups is not None:
@@ -305,14 +306,18 @@ def _label_report(
     label: Label,
     alpha: NDArray,
     aligned: NDArray,
-    groups: NDArray | None,
+    asked: Answers,
     random_state: int,
 ) -> dict[str, Any]:
     """Return how coefficients go with a label."""
     known = label.known
-    chosen = None if groups is None else groups[known]
-    options: dict[str, Any] = {"y": label.values, "groups": chosen, "kind": label.kind}
-    options["random_state"] = random_state
+    options: dict[str, Any] = {
+        "y": label.values,
+        "groups": None if asked.groups is None else asked.groups[known],
+        "time": None if asked.times is None else asked.times[known],
+        "kind": label.kind,
+        "random_state": random_state,
+    }
     found = association(alpha[known], **options)
     report: dict[str, Any] = {
         "column": label.name,
@@ -322,6 +327,7 @@ def _label_report(
         "statistic": "eta_squared" if label.kind == "classes" else "spearman",
         "values": found.statistic,
         "p_values": found.p_value,
+        "permuted": found.permuted,
         "score": "accuracy" if label.kind == "classes" else "r_squared",
     }
     if label.kind == "classes":
@@ -436,13 +442,13 @@ def draw_answers(
             write_figure(folder / TIME_FIGURE, display.plot(kind="time").figure_)
 
 
-def _draw_shapes(label: Label, estimator: AffineNRSfM, drawn: dict[str, Any]) -> Any:
+def _draw_shapes(label: Label, estimator: AffineNRSfM, options: dict[str, Any]) -> Any:
     """Draw the mean shape of each class over that of all frames."""
     from isa_nrsfm.plotting import BasisShapeDisplay
     from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
     from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
 
-    whole = BasisShapeDisplay.from_estimator(estimator, **drawn)
+    whole = BasisShapeDisplay.from_estimator(estimator, **options)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     means = _class_means(label, estimator.alpha_)
     shapes = whole.mean_shape + np.tensordot(means, whole.basis, 1)

@@ -17,6 +17,8 @@ from isa_nrsfm._diagnostics import (
     camera_meaning,
     outlier_advice,
 )
+from isa_nrsfm._frames.depth import NOT_MEASURED
+from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._answer_text import answer_lines
@@ -165,8 +167,8 @@ def _outliers(found: Diagnostics, estimator: AffineNRSfM, X: Any) -> dict[str, A
 def _depth_report(estimator: AffineNRSfM, ratio: float | None) -> dict[str, Any]:
     """Describe how certain the depth is, and which camera to take next."""
     frames = frames_of(estimator)
-    certainty = getattr(frames, "certainty", None)
-    determined = certainty is None or certainty.determined
+    certainty = getattr(frames, "certainty", NOT_MEASURED)
+    determined = certainty.determined
     advice = ""
     if ratio is not None:
         advice = camera_advice(estimator.camera_, ratio, determined)
@@ -329,6 +331,8 @@ def _choice_lines(choice: dict[str, Any]) -> list[str]:
             strict=True,
         )
     ]
+    if min(choice["held_out_error"]) >= 1:
+        return lines + textwrap.wrap(NO_SHAPE, _TEXT_WIDTH)
     if choice["chosen"] == choice["n_components"][-1]:
         lines.append("larger K may be better: this is the largest that was tried")
     if "next" in choice:

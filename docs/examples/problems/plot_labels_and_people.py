@@ -37,9 +37,9 @@ for label, y, column in (("gesture", hands.labels, 0), ("person", people, 1)):
 # ----------
 #
 # Eta squared is the share of the variance of a coefficient that lies between the
-# gestures. Gestures change within people, so labels are permuted within people for the
-# p-values. `between_share` says the same of people: about zero where they do not
-# differ.
+# gestures. For the p-values labels are permuted among people, and in blocks of frames
+# within them: the frames of a video are alike. `between_share` says the same of people:
+# about zero where they do not differ.
 
 found = association(model.alpha_, hands.labels, people, random_state=0)
 share = between_share(model.alpha_, people)
