@@ -324,6 +324,8 @@ def warn_of_coefficients(
     effective = found.effective_frames
     fewest = min(FEWEST_FRAMES, FEWEST_SHARE * n_frames)
     few = (effective > 0) & (effective < fewest)
+    if (found.reliability < LEAST_RELIABILITY).any():
+        few[:] = False  # noise, which `diagnose` warns of
     if few.any():
         largest = {
             k: rows[np.nanargmax(np.abs(alpha[:, k]))] for k in np.flatnonzero(few)

@@ -20,7 +20,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     full_rotations,
 )
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
+from isa_nrsfm._frames.models import FrameFit
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CAMERA_NAMES,
@@ -162,7 +162,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         complete frames.
     depth_uncertainty_ : float
         Root mean square error of the depths of the frames that is to be expected,
-        relative to their root mean square; NaN for affine cameras. Set with the joint
+        relative to their root mean square. Set with calibrated cameras and the joint
         refinement.
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, of determinant one: the rows are the axes of
@@ -428,9 +428,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         source, options = fitted._checked(X)
         fit = fit_table(source, self.n_components, options, progress)
         fitted._set(fit, source, keep)
-        frames = fit.model.frames
-        if isinstance(frames, PosteriorFrames) and not frames.certainty.determined:
-            warn_caller(frames.certainty.advice)
+        certainty = fit.model.frames.certainty
+        if not certainty.determined:
+            warn_caller(certainty.advice)
         self.__dict__.update(vars(fitted))  # all at once
         progress.end()
 
@@ -531,6 +531,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         }
         if fit.numbers is not None:
             found |= fit.numbers._asdict()
+            if self.camera == "affine":
+                del found["depth_uncertainty"]
         if self.keep_frames:
             kept = FrameFit(**keep(fit.frames._asdict()))
             kept = FrameFit(*map(source.blocks.as_collected, kept))

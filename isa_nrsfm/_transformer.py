@@ -300,10 +300,13 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         frames = self._calibrated_frames("rotation_covariance")
         space, certainty = frames.gauge.space, frames.certainty
         found = self._model.posterior(table)
-        covariance = space @ found.turn_covariance @ space.T
+        covariance = found.turn_covariance
         # Rotations that basis shapes contain, and the scale of the depth
-        square = np.einsum("ik,ik->i", found.alpha, found.alpha)
-        covariance += certainty.turns * square[:, None, None] * np.eye(3)
+        if certainty.turns is not None:
+            covariance = covariance + np.einsum(
+                "ik,kalb,il->iab", found.alpha, certainty.turns, found.alpha
+            )
+        covariance = space @ covariance @ space.T
         if np.isfinite(certainty.scale):
             mean, _ = full_rotations(self.reference_motion_[None].astype(np.float64))
             rotations, _ = full_rotations(found.motion @ space.T)
@@ -574,6 +577,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             None if X is None else self._model.distances(self._opened(X)),
             loss,
         )
+        if not frames_of(self).certainty.determined:  # neither are the poses
+            found = found._replace(pose_share=np.full(len(found.pose_share), np.nan))
         rows = X.index if hasattr(X, "iloc") else range(len(fitted))
         if loss == "linear" and (advice := outlier_advice(found, rows, names)):
             warn_caller(

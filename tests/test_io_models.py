@@ -532,6 +532,7 @@ def test_altered_entries_are_found(case, fitted, path):
     assert {name.partition(":")[0] for name in passed} <= {
         "tol", "working_memory", "n_jobs", "random_state", "isa", "density",
         "refinement", "independence", "keep_frames", "package_version",
+        "depth_uncertainty_", "certainty", "turns",
         "camera_noise_ratio_", "coefficient_starts", "objective_history_",
         "criteria_", "log_likelihoods_", "n_iters_",
     }  # fmt: skip

@@ -54,9 +54,9 @@ class DepthCertainty(NamedTuple):
         Relative standard deviation of the scale of all depths.
     points : float
         Variance of the depth of a point, by the shapes.
-    turns : float
-        Variance of a component of the rotation vector of a frame, by the rotations that
-        basis shapes contain, for coefficients of norm one.
+    turns : ndarray of shape (n_components, 3, n_components, 3) or None
+        Covariance of the rotation vectors w_k that the basis shapes ``B_k + w_k x B_0``
+        contain.
     total : float
         Root mean square error of the depths of all frames that is to be expected,
         relative to their root mean square.
@@ -65,8 +65,8 @@ class DepthCertainty(NamedTuple):
     misfit: float = 1.0
     scale: float = np.nan
     points: float = np.nan
-    turns: float = 0.0
     total: float = np.nan
+    turns: NDArray | None = None
 
     @property
     def determined(self) -> bool:
@@ -78,10 +78,11 @@ class DepthCertainty(NamedTuple):
         """Reason and way out for depths that are not determined."""
         return (
             "the depth of the shapes is not determined: its scale has a standard "
-            f"deviation of {100 * self.scale:.0f} %, because the objects hardly turn "
-            "in these images. Fit a table in which they turn, and transform this one "
-            'with that model; or take affine shapes (camera="affine"). See "How sure '
-            'is the depth?" in the documentation'
+            f"deviation of {100 * self.scale:.0f} %, because the objects turn too "
+            "little in these images for the noise and deformation that the model "
+            "leaves. Fit a table in which they turn, and transform this one with that "
+            'model; or take affine shapes (camera="affine"). See "How sure is the '
+            'depth?" in the documentation'
         )
 
 
@@ -172,6 +173,7 @@ def depth_certainty(
     *,
     n_frames: int,
     extent_weight: float,
+    basis_std: float,
     free: bool,
 ) -> DepthCertainty:
     """
@@ -187,6 +189,8 @@ def depth_certainty(
         Number of all frames of the fit.
     extent_weight : float
         Weight of the prior of the extents, for each coordinate.
+    basis_std : float
+        Standard deviation of the images of basis shapes under their prior.
 
     Returns
     -------
@@ -207,29 +211,30 @@ def depth_certainty(
     square = along = freedom = 0.0
     # and the information on rotations that basis shapes contain, B_k + w_k x B_0
     turned = np.stack([np.cross(e, shapes[0], axisb=0, axisc=0) for e in np.eye(3)])
-    rotated = np.zeros((3 * K, 3 * K))
+    rotated, images = np.zeros((3 * K, 3 * K)), np.zeros((3, 3))
     for frame, row, scale, R, visible, coefficients in zip(
         frames, rows, scales, rotations, seen, alpha, strict=True
     ):
-        row = row - np.nanmean(row, axis=1, keepdims=True)
-        rest = np.where(visible, row - scale * R[:2] @ frame.shape, 0.0).ravel()
+        centred = row - np.nanmean(row, axis=1, keepdims=True)
+        rest = np.where(visible, centred - scale * R[:2] @ frame.shape, 0.0).ravel()
         affine = np.kron(np.eye(2), np.where(visible, frame.shape, 0.0).T)
         tangent = np.linalg.qr(frame.image)[0]
         affine = affine - tangent @ (tangent.T @ affine)
         further = np.linalg.svd(affine, full_matrices=False)[0][:, : 6 - n_camera]
-        along += np.sum((further.T @ rest) ** 2) / (6 - n_camera)
-        square += rest @ rest
+        along += float(np.sum((further.T @ rest) ** 2)) / (6 - n_camera)
+        square += float(rest @ rest)
         swapped = np.where(visible, scale * R[:2] @ turned, 0.0).reshape(3, -1).T
+        images += swapped.T @ swapped
         swapped = swapped - tangent @ (tangent.T @ swapped)
         rotated += np.kron(np.outer(coefficients, coefficients), swapped.T @ swapped)
         freedom += max(2 * visible.sum() - 2 - n_camera - K, 1)
     noise_floor = np.finfo(float).eps * np.mean(scales**2)
     residual = max(square / freedom, noise_floor)
     variance = max(along / n_chosen, residual)
-    swaps = np.linalg.pinv(rotated * (n_frames / n_chosen), hermitian=True)
-    swaps = np.trace(swaps.reshape(K, 3, K, 3), axis1=1, axis2=3) / 3
-    length = max(float(np.sum(alpha**2)), np.finfo(float).tiny)
-    turns = variance * np.einsum("ik,kl,il->", alpha, swaps, alpha) / length
+    # with the prior of the basis shapes, whose images have the deviation basis_std
+    rotated *= n_frames / n_chosen / variance
+    rotated += np.kron(np.eye(K), images / (n_chosen * basis_std**2))
+    swaps = np.linalg.pinv(rotated, hermitian=True)
     # Spread of the viewing directions about their mean, less what coefficients predict
     U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
     axis = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)[2]
@@ -267,13 +272,13 @@ def depth_certainty(
     points = float(by_shapes + residual * (1.0 - residual / variance))
     n_points = shapes.shape[2]
     total = own.mean() / n_points + points
-    size = max(depth.mean() / n_points, np.finfo(float).tiny)
+    size = max(float(depth.mean()) / n_points, np.finfo(float).tiny)
     return DepthCertainty(
         float(variance / noise),
         relative,
         points,
-        float(turns),
         float(np.sqrt(total / size + relative**2)),
+        swaps.reshape(K, 3, K, 3),
     )
 
 

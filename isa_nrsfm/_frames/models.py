@@ -106,6 +106,11 @@ class RigidFrames(NamedTuple):
     basis: NDArray
     camera: str = "affine"
 
+    @property
+    def certainty(self) -> DepthCertainty:
+        """Not measured: there is no noise variance."""
+        return NOT_MEASURED
+
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
         return self._replace(

@@ -13,6 +13,7 @@ from isa_nrsfm._frames.posterior import FramePosterior
 from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Unknowns of camera and position of a frame.
@@ -187,5 +188,6 @@ def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
         frames.noise_variance,
         n_frames=n_frames,
         extent_weight=EXTENT_WEIGHT,
+        basis_std=JOINT_OPTIONS.basis_std,
         free=frames.camera == "weak_perspective",
     )

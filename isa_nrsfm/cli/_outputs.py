@@ -46,7 +46,8 @@ ARRAYS = {
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
     "a frame is mean_shape + sum_k alpha_k basis[k]",
 }
-NOT_TOLD = "viewer.html shows no true proportions, and cameras.csv has no angles"
+NOT_TOLD = "viewer.html has affine shapes, and cameras.csv no angles"
+WITHHELD = "cameras.csv has no angles"
 PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
 MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
 
@@ -134,7 +135,8 @@ def write_results(
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
-    poses = told_poses(estimator, X, NOT_TOLD, edges=edges, origin=origin)
+    otherwise = NOT_TOLD if estimator.camera_ == "affine" else WITHHELD
+    poses = told_poses(estimator, X, otherwise, edges=edges, origin=origin)
     cameras = camera_table(estimator, fit, X).join(poses)
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)

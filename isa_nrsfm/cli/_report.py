@@ -17,7 +17,6 @@ from isa_nrsfm._diagnostics import (
     camera_meaning,
     outlier_advice,
 )
-from isa_nrsfm._frames.depth import NOT_MEASURED
 from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._transformer import frames_of
@@ -166,8 +165,7 @@ def _outliers(found: Diagnostics, estimator: AffineNRSfM, X: Any) -> dict[str, A
 
 def _depth_report(estimator: AffineNRSfM, ratio: float | None) -> dict[str, Any]:
     """Describe how certain the depth is, and which camera to take next."""
-    frames = frames_of(estimator)
-    certainty = getattr(frames, "certainty", NOT_MEASURED)
+    certainty = frames_of(estimator).certainty
     determined = certainty.determined
     advice = ""
     if ratio is not None:

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._upright import (
     Camera,
@@ -163,8 +163,7 @@ def _determined(space: UprightSpace, model: Any) -> bool:
     """Return whether the fitted table determines the depth, and so the angles."""
     if space.metric is not None:
         return space.metric.condition_number <= LARGEST_CONDITION
-    frames = model._model.frames
-    return not isinstance(frames, PosteriorFrames) or frames.certainty.determined
+    return bool(frames_of(model).certainty.determined)
 
 
 def point_distances(

@@ -16,7 +16,6 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._metric_upgrade.deforming import (
     DeformationMetric,
@@ -27,7 +26,7 @@ from isa_nrsfm._metric_upgrade.deforming import (
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
 from isa_nrsfm._tables.landmark_columns import names_of_points
-from isa_nrsfm._transformer import check_frames_kept
+from isa_nrsfm._transformer import check_frames_kept, frames_of
 from isa_nrsfm.plotting._edges import (
     UPSIDE_DOWN,
     Origin,
@@ -88,7 +87,8 @@ def upright_space(
     camera : {"weak_perspective", None}
         What is known of the cameras of a model with affine ones. None takes the one
         affinity of space under which they come nearest to weak-perspective ones, as
-        figures do. For a model with calibrated cameras None claims no proportions.
+        figures do. For a model with calibrated cameras None only keeps the warning of
+        uncertain depths.
     origin : {"auto", "upper", "lower"}
         Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
     mirrored : bool
@@ -115,8 +115,8 @@ def upright_space(
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
-    told: str | None = fitted if fitted != "affine" and camera is not None else camera
-    if told is not None:
+    told: str | None = camera if fitted == "affine" else fitted
+    if camera is not None:
         warn_of_depth(model)
     if fitted != "affine":
         transform = euclidean_axes(model)
@@ -163,9 +163,9 @@ def warn_of_depth(model: Any) -> None:
     UserWarning
         If the scale of its depths is too uncertain for angles and proportions.
     """
-    frames = model._model.frames
-    if isinstance(frames, PosteriorFrames) and not frames.certainty.determined:
-        warn_caller(frames.certainty.advice)
+    certainty = frames_of(model).certainty
+    if not certainty.determined:
+        warn_caller(certainty.advice)
 
 
 def upright_frames(

@@ -17,6 +17,7 @@ from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_r
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._tables.frame_columns import checked_times
 from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.export._drawing import Links, choose_drawing
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.export._upright import (
@@ -34,7 +35,9 @@ UNLABELLED = "(no label)"
 ABOUT = {
     "weak_perspective": "Proportions are those that weak-perspective cameras tell.",
     "orthographic": "Proportions are those that orthographic cameras tell.",
-    None: "The depth is not known: angles and proportions are not those of the object.",
+    None: "Affine shapes: angles and depth are not those of the object.",
+    "unknown": "The depth is not known: angles and proportions are not those of the "
+    "object.",
 }
 
 
@@ -89,8 +92,8 @@ def write_viewer(
     camera : {"weak_perspective", None}, default="weak_perspective"
         What is known of the cameras of a model with affine ones. "weak_perspective"
         shows Euclidean shapes, None affine ones, which look like those of figures. A
-        model with calibrated cameras has Euclidean shapes; with None the page makes no
-        claim of their proportions.
+        model with calibrated cameras has Euclidean shapes. If their depth is not
+        determined the page says so, and None avoids the warning.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where a face or a body would stand on
@@ -149,7 +152,9 @@ def write_viewer(
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
     rotations = _rotations(space, model, motion, alpha)
     content = {
-        "about": ABOUT[space.camera]
+        "about": ABOUT[
+            space.camera if frames_of(model).certainty.determined else "unknown"
+        ]
         + " The mirror image in depth fits the images as well.",
         "points": list(names_of_points(model)),
         "components": components,

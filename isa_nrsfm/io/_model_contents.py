@@ -17,7 +17,7 @@ from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.depth import DepthCertainty
+from isa_nrsfm._frames.depth import NOT_MEASURED, DepthCertainty
 from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.layout import LAYOUTS
@@ -85,6 +85,7 @@ OF_POSTERIOR = (
     "coefficient_starts",
     "basis_change",
     "certainty",
+    "turns",
 )
 OF_RIGID = ("camera", "mean_shape", "basis")
 MODELS = {"posterior": OF_POSTERIOR, "rigid": OF_RIGID}
@@ -291,7 +292,8 @@ def _plain_frames(frames: RigidFrames | PosteriorFrames) -> dict[str, Any]:
         "noise_variance": frames.noise_variance,
         "coefficient_starts": frames.starts,
         "basis_change": {"mixing": frames.gauge.mixing, "space": frames.gauge.space},
-        "certainty": np.array(frames.certainty),
+        "certainty": np.array(frames.certainty[:-1]),
+        "turns": frames.certainty.turns,
     }
 
 
@@ -303,7 +305,8 @@ def _restored_frames(
         raise ValueError(f"frames should be a dict; got {kind_of(contents)}")
     model = check_choice(contents.get("model"), "model of frames", MODELS)
     if model == "posterior":
-        contents = {"certainty": np.array(DepthCertainty()), **contents}
+        unknown = np.array(NOT_MEASURED[:-1])
+        contents = {"certainty": unknown, "turns": None, **contents}
     check_entries(contents, "frames", (*OF_TABLE, *MODELS[model]))
     unit = check_number(contents["unit"], "unit of frames", positive=True)
     sizes = contents["sizes"]
@@ -323,8 +326,10 @@ def _restored_frames(
     mixing = check_array(change["mixing"], "mixing of frames", shape, kind="finite")
     space = check_array(change["space"], "space of frames", (3, 3), kind="finite")
     noise = contents["noise_variance"]
-    n_fields = len(DepthCertainty._fields)
-    certainty = check_array(contents["certainty"], "certainty of frames", (n_fields,))
+    certainty = check_array(
+        contents["certainty"], "certainty of frames", (len(NOT_MEASURED) - 1,)
+    )
+    turns = None if contents["turns"] is None else array("turns", K, 3, K, 3)
     posterior = PosteriorFrames(
         shapes=array("shapes", K + 1, 3, P),
         noise_variance=check_number(noise, "noise_variance of frames", positive=True),
@@ -332,6 +337,6 @@ def _restored_frames(
         loss=check_choice(contents["loss"], "loss of frames", LOSSES),
         gauge=FrameMap(mixing, space),
         camera=camera,
-        certainty=DepthCertainty(*certainty.tolist()),
+        certainty=DepthCertainty(*map(float, certainty[:4]), turns=turns),
     )
     return posterior, unit, sizes

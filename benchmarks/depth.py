@@ -1,0 +1,124 @@
+"""Measure depths of made tables, their stated deviations, and those of rotations."""
+
+import argparse
+import warnings
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks._data import ICT, load_arrays
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
+
+# Spread of pitch, yaw and roll, relative to that of yaw; of the scales of cameras.
+SHARES, SCALES = (0.7, 1.0, 0.5), 0.2
+
+
+def shapes_of(kind, n_frames, seed, ict):
+    """Return true shapes (n_frames, n_points, 3), or None if they are not there."""
+    if kind == "ICT-68 faces":
+        if ict is None:
+            return None
+        rng = np.random.default_rng(seed)
+        return ict["S3d"][rng.choice(len(ict["S3d"]), n_frames, replace=False)]
+    make = make_body_tracks if kind == "bodies" else make_face_tracks
+    return make(n_frames, random_state=seed).shapes
+
+
+def seen(shapes, degrees, noise, seed):
+    """Return a table, points in the axes of the camera, and rotations."""
+    rng, n_frames = np.random.default_rng(seed), len(shapes)
+    shapes = shapes - shapes.mean(axis=1, keepdims=True)
+    vectors = np.radians(degrees) * rng.normal(size=(n_frames, 3)) * SHARES
+    rotations = Rotation.from_rotvec(np.clip(vectors, -1.4, 1.4)).as_matrix()
+    points = shapes @ rotations.transpose(0, 2, 1)
+    points *= np.exp(SCALES * rng.normal(size=(n_frames, 1, 1)))
+    size = np.sqrt(np.mean(points[:, :, :2] ** 2, axis=(1, 2), keepdims=True))
+    tracks = points[:, :, :2] + noise * size * rng.normal(size=points[:, :, :2].shape)
+    return tracks.reshape(n_frames, -1), points, rotations
+
+
+def depth_error(model, X, points):
+    """Return the relative error of depths, of the better mirror image."""
+    z = np.einsum("ijc,ic->ij", model.reconstruct(X), model.rotations_[:, 2])
+    z = model.scales_[:, None] * (z - z.mean(axis=1, keepdims=True))
+    truth = points[:, :, 2] - points[:, :, 2].mean(axis=1, keepdims=True)
+    off = np.sign(np.sum(z * truth)) * z - truth
+    return np.sqrt(np.sum(off**2) / np.sum(truth**2))
+
+
+def rotation_ratio(model, X, rotations):
+    """Return the error of rotations over its deviation, and its median in degrees."""
+    precision = np.linalg.inv(model.rotation_covariance(X))
+    found = []
+    for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
+        turned = mirror @ model.rotations_ @ mirror
+        U, _, Vt = np.linalg.svd(np.einsum("iab,iac->bc", rotations, turned))
+        common = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        off = (rotations @ common).transpose(0, 2, 1) @ turned
+        off = Rotation.from_matrix(off).as_rotvec() @ mirror
+        ratio = np.sqrt(np.einsum("ia,iab,ib->i", off, precision, off).mean() / 3)
+        found.append((np.degrees(np.median(np.linalg.norm(off, axis=1))), ratio))
+    return min(found)[::-1]
+
+
+def measured(kind, n_components, degrees, noise, seed, n_frames, ict):
+    """Return the figures of one table, None if its shapes are not there."""
+    shapes = shapes_of(kind, n_frames, seed, ict)
+    if shapes is None:
+        return None
+    X, points, rotations = seen(shapes, degrees, noise, seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model = AffineNRSfM(n_components, camera="weak_perspective", random_state=0)
+        model.fit(X)
+    certainty = model._model.frames.certainty
+    ratio, angle = rotation_ratio(model, X, rotations)
+    error = depth_error(model, X, points)
+    return error, model.depth_uncertainty_, ratio, angle, certainty.determined
+
+
+def main(argv=None):
+    """Print a row for each kind of table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.depth")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.01])
+    parser.add_argument(
+        "--degrees", type=float, nargs="+", default=[2, 4, 6, 10, 20, 40]
+    )
+    options = parser.parse_args(argv)
+    ict = load_arrays(ICT)
+    cases = [("ICT-68 faces", 3), ("ICT-68 faces", 9)]
+    cases += [("generated faces", 3), ("generated faces", 9), ("bodies", 3)]
+    print(
+        "| shapes | K | noise | turned by | error of depths | stated deviation | "
+        "within two deviations | angles given | error of rotations, degrees | "
+        "over its deviation |"
+    )
+    print("|---" * 10 + "|")
+    for kind, n_components in cases:
+        for noise in options.noise:
+            for degrees in options.degrees:
+                found = [
+                    measured(
+                        kind, n_components, degrees, noise, seed, options.frames, ict
+                    )
+                    for seed in range(options.seeds)
+                ]
+                if found[0] is None:
+                    continue
+                error, stated, ratio, angle, given = np.array(found, dtype=float).T
+                within = int(np.sum(error < 2 * stated))
+                print(
+                    f"| {kind} | {n_components} | {100 * noise:g} % | {degrees:g} | "
+                    f"{np.sqrt(np.mean(error**2)):.3f} | "
+                    f"{np.sqrt(np.mean(stated**2)):.3f} | {within} of {len(error)} | "
+                    f"{int(given.sum())} of {len(error)} | {np.median(angle):.1f} | "
+                    f"{np.sqrt(np.mean(ratio**2)):.1f} |",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

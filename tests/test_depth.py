@@ -1,0 +1,243 @@
+import warnings
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.depth import DepthCertainty, tilts
+from isa_nrsfm._joint.extents import extent_penalty
+from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export import frame_poses, write_viewer
+from isa_nrsfm.io import load_model, save_model
+
+
+def faces_turned_by(degrees, seed=0, n_frames=150, noise=0.01, missing=0.0):
+    """Return a table of faces whose rotation vectors have this spread, and the truth.
+
+    The truth are points in the axes of the camera, in pixels, and rotations.
+    """
+    rng = np.random.default_rng(seed)
+    shapes = make_face_tracks(n_frames, random_state=seed).shapes
+    shapes = shapes - shapes.mean(axis=1, keepdims=True)
+    vectors = np.radians(degrees) * rng.normal(size=(n_frames, 3)) * [0.7, 1.0, 0.5]
+    rotations = Rotation.from_rotvec(np.clip(vectors, -1.4, 1.4)).as_matrix()
+    points = shapes @ rotations.transpose(0, 2, 1)
+    points *= np.exp(0.2 * rng.normal(size=(n_frames, 1, 1)))
+    tracks = points[:, :, :2]
+    size = np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
+    tracks = tracks + noise * size * rng.normal(size=tracks.shape)
+    tracks[rng.random(tracks.shape[:2]) < missing] = np.nan
+    return tracks.reshape(n_frames, -1), points, rotations
+
+
+def fitted(X, n_components=3, camera="weak_perspective", **options):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the depth of the shapes is not determined")
+        model = AffineNRSfM(n_components, camera=camera, random_state=0, **options)
+        return model.fit(X)
+
+
+def depths_of(model, X):
+    """Return depths of the points (n_frames, n_points) in the units of the table."""
+    shapes = model.reconstruct(X)
+    z = np.einsum("ijc,ic->ij", shapes, model.rotations_[:, 2])
+    z = model.scales_[:, None] * z
+    return z - z.mean(axis=1, keepdims=True)
+
+
+def error_of_depths(model, X, points):
+    """Return depths less the true ones, of the better mirror image, and their ratio."""
+    truth = points[:, :, 2] - points[:, :, 2].mean(axis=1, keepdims=True)
+    z = depths_of(model, X)
+    off = np.sign(np.sum(z * truth)) * z - truth
+    return off, np.sqrt(np.sum(off**2) / np.sum(truth**2))
+
+
+@pytest.fixture(scope="module")
+def frontal():
+    X, *_ = faces_turned_by(2)
+    return X, fitted(X)
+
+
+@pytest.fixture(scope="module")
+def turned():
+    X, points, rotations = faces_turned_by(20)
+    return X, points, rotations, fitted(X)
+
+
+class TestExtents:
+    def test_gradient_by_differences(self):
+        rng = np.random.default_rng(0)
+        shapes = rng.normal(size=(3, 3, 20)) * np.array([3.0, 1.0, 0.2])[:, None]
+        step = 1e-6 * rng.normal(size=shapes.shape)
+        for centred in (True, False):
+            _, gradient = extent_penalty(shapes, centred)
+            change = [extent_penalty(shapes + s * step, centred)[0] for s in (1, -1)]
+            assert_allclose(
+                np.sum(gradient * step), np.subtract(*change) / 2, rtol=1e-5
+            )
+
+    def test_by_definition_and_in_all_units(self):
+        shapes = np.zeros((1, 3, 6))
+        shapes[0, [0, 0, 1, 1, 2, 2], range(6)] = [8, -8, 1, -1, 1, -1]
+        squares = np.array([128.0, 2.0, 2.0])
+        ratio = squares.mean() / np.prod(squares) ** (1 / 3)
+        assert_allclose(extent_penalty(shapes)[0], ratio - 1, rtol=0.05)
+        assert_allclose(
+            extent_penalty(7 * shapes)[0], extent_penalty(shapes)[0], rtol=1e-12
+        )
+
+    def test_is_zero_for_equal_extents_and_finite_for_flat_and_empty_shapes(self):
+        cube = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(1, 3, 8)
+        value, gradient = extent_penalty(cube.astype(float))
+        assert_allclose(value, 0, atol=1e-12)
+        assert_allclose(gradient, 0, atol=1e-12)
+        for flat in (cube * np.array([1.0, 1.0, 0.0])[:, None], 0.0 * cube):
+            value, gradient = extent_penalty(flat)
+            assert np.isfinite(value)
+            assert np.isfinite(gradient).all()
+            assert_allclose(gradient[:, 2], 0)  # flat objects stay flat
+
+
+class TestFrontalFaces:
+    def test_are_no_needles(self, frontal):
+        _, model = frontal
+        extents = np.linalg.svd(model.mean_shape_, compute_uv=False)
+        assert extents[0] < 4 * extents[-1]
+
+    def test_fit_warns_with_the_way_out(self, frontal):
+        X, _ = frontal
+        with pytest.warns(UserWarning, match="transform this one with that model"):
+            AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(X)
+
+    def test_depths_are_uncertain(self, frontal):
+        assert frontal[1].depth_uncertainty_ > 0.2
+        with pytest.warns(UserWarning, match="hardly determines"):
+            found = frontal[1].diagnostics()
+        assert found.depth_uncertainty == frontal[1].depth_uncertainty_
+
+    def test_angles_are_withheld(self, frontal):
+        X, model = frontal
+        with pytest.warns(UserWarning, match="is not determined"):
+            poses = frame_poses(model, X)
+        assert np.isnan(poses[:3]).all()
+        assert np.isnan(poses[4:]).all()
+        assert np.isfinite(poses.scale).all()
+
+    def test_the_page_claims_no_proportions(self, frontal, tmp_path):
+        X, model = frontal
+        write_viewer(model, tmp_path / "page.html", X=X, camera=None)
+        assert "The depth is not known" in (tmp_path / "page.html").read_text()
+
+    def test_affine_angles_are_withheld_likewise(self):
+        X, *_ = faces_turned_by(2)
+        model = fitted(X, camera="affine")
+        with pytest.warns(UserWarning, match="hardly determine the metric"):
+            poses = frame_poses(model, X)
+        assert np.isnan(poses[:3]).all()
+
+    def test_a_model_of_turned_faces_determines_them(self, turned):
+        model = turned[3]
+        X, _, rotations = faces_turned_by(2, seed=0)
+        poses = frame_poses(model, X)
+        yaw = np.degrees(Rotation.from_matrix(rotations).as_rotvec()[:, 1])
+        assert np.isfinite(poses.yaw).all()
+        assert abs(np.corrcoef(poses.yaw, yaw)[0, 1]) > 0.9
+
+
+class TestTurnedFaces:
+    def test_fit_does_not_warn(self, turned):
+        X, *_ = turned
+        AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(X)
+
+    def test_depth_uncertainty_is_the_error(self, turned):
+        X, points, _, model = turned
+        _, error = error_of_depths(model, X, points)
+        assert error / 3 < model.depth_uncertainty_ < 3 * error
+
+    @pytest.mark.parametrize("missing", [0.0, 0.2])
+    def test_deviations_of_depths_are_the_errors(self, missing):
+        X, points, _ = faces_turned_by(20, missing=missing)
+        model = fitted(X)
+        shapes, deviation = model.reconstruct(X, return_std=True)
+        assert_allclose(shapes, model.reconstruct(X))
+        assert deviation.shape == shapes.shape[:2]
+        off, _ = error_of_depths(model, X, points)
+        relative = off / (model.scales_[:, None] * deviation)
+        assert 0.4 < np.sqrt(np.mean(relative**2)) < 2
+
+    def test_deviations_of_rotations_are_the_errors(self, turned):
+        X, _, rotations, model = turned
+        worst = []
+        for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
+            found = mirror @ model.rotations_ @ mirror
+            U, _, Vt = np.linalg.svd(np.einsum("iab,iac->bc", rotations, found))
+            common = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+            off = (rotations @ common).transpose(0, 2, 1) @ found
+            vectors = Rotation.from_matrix(off).as_rotvec() @ mirror
+            precision = np.linalg.inv(model.rotation_covariance(X))
+            square = np.einsum("ia,iab,ib->i", vectors, precision, vectors) / 3
+            worst.append(np.sqrt(square.mean()))
+        assert 0.3 < min(worst) < 2
+
+    def test_rows_without_points_have_no_deviations(self, turned):
+        X, *_, model = turned
+        X = X[:3].copy()
+        X[1] = np.nan
+        _, deviation = model.reconstruct(X, return_std=True)
+        assert np.isnan(deviation).all(axis=1).tolist() == [False, True, False]
+
+    def test_units_make_no_difference(self, turned):
+        X, _, _, model = turned
+        other = fitted(100 * X)
+        assert_allclose(other.depth_uncertainty_, model.depth_uncertainty_, rtol=0.02)
+        _, deviation = model.reconstruct(X, return_std=True)
+        _, larger = other.reconstruct(100 * X, return_std=True)
+        assert_allclose(
+            other.scales_[:, None] * larger,
+            100 * model.scales_[:, None] * deviation,
+            rtol=0.02,
+        )
+
+    def test_models_keep_their_certainty_in_files(self, turned, tmp_path):
+        X, *_, model = turned
+        save_model(model, tmp_path / "model.skops")
+        loaded = load_model(tmp_path / "model.skops")
+        assert loaded.depth_uncertainty_ == model.depth_uncertainty_
+        for name in ("rotation_covariance", "transform"):
+            assert_allclose(getattr(loaded, name)(X), getattr(model, name)(X))
+        found = loaded.reconstruct(X, return_std=True)[1]
+        assert_allclose(found, model.reconstruct(X, return_std=True)[1])
+
+
+def test_affine_models_have_no_deviations_of_depths():
+    X, *_ = faces_turned_by(20, n_frames=60)
+    model = fitted(X, 1, camera="affine")
+    assert not hasattr(model, "depth_uncertainty_")
+    with pytest.raises(ValueError, match="return_std needs a model with calibrated"):
+        model.reconstruct(X, return_std=True)
+
+
+def test_orthographic_deviations_of_depths_are_the_errors():
+    _, points, _ = faces_turned_by(20)
+    points /= np.linalg.norm(points, axis=(1, 2), keepdims=True) / 100
+    noise = np.random.default_rng(0).normal(size=points[:, :, :2].shape)
+    X = (points[:, :, :2] + 0.1 * noise).reshape(len(points), -1)
+    model = fitted(X, camera="orthographic")
+    off, _ = error_of_depths(model, X, points)
+    relative = off / model.reconstruct(X, return_std=True)[1]
+    assert 0.3 < np.sqrt(np.mean(relative**2)) < 2
+
+
+def test_unmeasured_certainty_withholds_nothing():
+    assert DepthCertainty().determined
+    assert not DepthCertainty(scale=0.5).determined
+
+
+def test_tilts_leave_the_viewing_direction_out():
+    mean = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    turns = Rotation.from_euler("zx", [[40, 0], [0, 10]], degrees=True).as_matrix()
+    found = tilts(turns @ mean, mean)
+    assert_allclose(np.degrees(np.linalg.norm(found, axis=1)), [0, 10], atol=1e-6)
