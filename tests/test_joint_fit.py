@@ -720,8 +720,8 @@ class TestDegenerate:
         assert np.isfinite(result.shapes).all()
         assert np.isfinite(result.alpha).all()
         rest = images(result, tracks) - tracks
-        # Without noise the thickness of the fit is rounding errors, and the search for a
-        # single frame may end in another minimum.
+        # Without noise the thickness of the fit is rounding errors, and the search for
+        # a single frame may end in another minimum.
         of_frames = np.quantile(np.mean(rest**2, axis=(1, 2)), 0.95)
         assert of_frames < max(2 * deviation**2, 1e-7)
 

@@ -151,11 +151,9 @@ def write_viewer(
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
     rotations = _rotations(space, model, motion, alpha)
+    told = space.camera if frames_of(model).certainty.determined else "unknown"
     content = {
-        "about": ABOUT[
-            space.camera if frames_of(model).certainty.determined else "unknown"
-        ]
-        + " The mirror image in depth fits the images as well.",
+        "about": ABOUT[told] + " The mirror image in depth fits the images as well.",
         "points": list(names_of_points(model)),
         "components": components,
         "categories": categories,

@@ -337,6 +337,6 @@ def _restored_frames(
         loss=check_choice(contents["loss"], "loss of frames", LOSSES),
         gauge=FrameMap(mixing, space),
         camera=camera,
-        certainty=DepthCertainty(*map(float, certainty[:4]), turns=turns),
+        certainty=DepthCertainty(*certainty.tolist())._replace(turns=turns),
     )
     return posterior, unit, sizes
