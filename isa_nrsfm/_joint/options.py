@@ -153,7 +153,8 @@ class Effort(NamedTuple):
     n_compared : int
         Frames on which starts are compared.
     n_finalists : int
-        How many starts go on with cameras that move.
+        Starts that are fitted. If there are several, all starts go on with cameras
+        that move before the best are chosen.
     polish : float
         Convergence tolerance, as a share of the user's.
     reversals : int

@@ -204,15 +204,20 @@ def _without_noise(
     if not np.isfinite(iterate.value):
         return None
     alpha = likelihood.coefficients(*iterate.state)
-    found = fit_without_noise(
-        likelihood.frames,
-        shapes,
-        motion,
-        alpha,
-        likelihood.penalty,
-        iterate.cameras,
-        options.noise_free,
-    )
+    try:
+        with np.errstate(over="raise", invalid="raise"):
+            found = fit_without_noise(
+                likelihood.frames,
+                shapes,
+                motion,
+                alpha,
+                likelihood.penalty,
+                iterate.cameras,
+                options.noise_free,
+            )
+    except FloatingPointError:
+        # Points on a line do not determine cameras, whose squares can leave the range.
+        return None
     if found is None:
         return None
     left = likelihood(*found, floor).residual / likelihood.n_seen
