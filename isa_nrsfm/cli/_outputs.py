@@ -15,6 +15,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm._compat.whole_files import refuse_replacing, write_whole
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._runs import DIGESTS, REPORT, digests_of, files_of_report
@@ -47,7 +48,6 @@ ARRAYS = {
     "a frame is mean_shape + sum_k alpha_k basis[k]",
 }
 NOT_TOLD = "viewer.html has affine shapes, and cameras.csv no angles"
-WITHHELD = "cameras.csv has no angles"
 PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
 MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
 
@@ -135,8 +135,11 @@ def write_results(
     write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
 
     X = frames.points[frames.usable]
-    otherwise = NOT_TOLD if estimator.camera_ == "affine" else WITHHELD
-    poses = told_poses(estimator, X, otherwise, edges=edges, origin=origin)
+    if frames_of(estimator).certainty.determined:
+        poses = told_poses(estimator, X, NOT_TOLD, edges=edges, origin=origin)
+    else:  # the fit has warned
+        pd = import_optional("pandas", extra="io")
+        poses = pd.DataFrame(index=X.index)
     cameras = camera_table(estimator, fit, X).join(poses)
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)

@@ -11,7 +11,7 @@ from typing import Any
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._answer_text import answer_tables
 from isa_nrsfm.cli._parser import PROGRAM
-from isa_nrsfm.cli._report import fit_sections, fit_title, pose_cell
+from isa_nrsfm.cli._report import camera_text, fit_sections, fit_title, pose_cell
 
 REPORT_PAGE = "report.html"
 
@@ -49,8 +49,8 @@ def _advice(report: dict[str, Any]) -> list[str]:
         f"by {_percent(model['inverse_snr'])}. Too many basis shapes make the first "
         "much larger than the second. Both are frames to which the shapes were fitted."
     ]
-    if model["camera_meaning"]:
-        lines.append(_sentence(model["camera_meaning"]))
+    if cameras := camera_text(model):
+        lines.append(_sentence(cameras))
     return [
         "<h2>What it says</h2>",
         *(_paragraph(line) for line in lines),

@@ -173,7 +173,9 @@ def _depth_report(estimator: AffineNRSfM, ratio: float | None) -> dict[str, Any]
     return {
         "depth_uncertainty": getattr(estimator, "depth_uncertainty_", None),
         "depth_determined": determined and estimator.camera_ != "affine",
-        "depth_advice": "" if determined else certainty.advice,
+        "depth_advice": ""
+        if determined
+        else certainty.advice.replace('camera="affine"', "--camera affine"),
         "camera_advice": advice,
     }
 
@@ -350,12 +352,21 @@ def _camera_lines(model: dict[str, Any]) -> list[str]:
     title = CAMERA_TITLES[model["camera"]]
     uncertainty = model["depth_uncertainty"]
     if model["depth_advice"]:
-        title = f"{title.partition(':')[0]}: {model['depth_advice']}"
+        title = (
+            f"{title.partition(':')[0]}: {model['depth_advice']}. cameras.csv has no "
+            "angles, and viewer.html claims no proportions"
+        )
     lines = textwrap.wrap(title, _TEXT_WIDTH)
     if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
         lines.append(f"depths are known to {100 * uncertainty:.2g} %, root mean square")
-    meaning = "; ".join(filter(None, (model["camera_meaning"], model["camera_advice"])))
-    return lines + textwrap.wrap(meaning, _TEXT_WIDTH)
+    return lines + textwrap.wrap(camera_text(model), _TEXT_WIDTH)
+
+
+def camera_text(model: dict[str, Any]) -> str:
+    """Say how far the noise agrees with the cameras, and which ones to try next."""
+    # Where the depth is not determined, the same noise means nothing.
+    meaning = "" if model["depth_advice"] else model["camera_meaning"]
+    return "; ".join(filter(None, (meaning, model["camera_advice"])))
 
 
 def lay_out(sections: Mapping[str, Sequence[str]]) -> str:
