@@ -100,6 +100,7 @@ def frames_with_outliers(n_frames=24):
     "camera", slow_after(1, ["affine", "weak_perspective", "orthographic"])
 )
 @pytest.mark.parametrize("loss", slow_after(2, LOSSES))
+@pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     X, Y = frames_with_outliers()
     model = AffineNRSfM(1, loss=loss, camera=camera, random_state=0).fit(X)

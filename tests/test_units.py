@@ -28,6 +28,7 @@ OF_JOINT_FIT = {
     "alpha_std_",
     "noise_variance_",
     "camera_noise_ratio_",
+    "depth_uncertainty_",
     "reliability_",
     "objective_history_",
     "gradient_norm_",
