@@ -37,6 +37,7 @@ PRIOR_DEVIATION = 0.7
 # Faces of known shape that turn by 10 degrees have 0.05 (error of the depths 0.13), by
 # 6 degrees 0.2 to 0.4 (0.25), by 4 degrees 0.5 to 1 (0.7).
 LARGEST_SCALE = 0.15
+TINY = np.finfo(float).tiny
 # Frames from which the uncertainty of the shapes is estimated.
 MOST_FRAMES = 200
 
@@ -96,6 +97,8 @@ class _Frame(NamedTuple):
     depth: NDArray  # Z (n_points, p + K), centred over the seen points
     z: NDArray  # (n_points,), the depths, centred likewise
     shape: NDArray  # (3, n_points), likewise
+    seen_by: NDArray  # (2, 3), the camera
+    seen: NDArray  # (n_points,)
 
 
 def _frame(
@@ -106,9 +109,10 @@ def _frame(
     shape = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
     turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
     moved = np.stack([*turned, *([shape] if free else []), *shapes[1:]])
-    seen_by = scale * R @ moved  # (p + K, 3, n_points)
-    image = np.where(seen, seen_by[:, :2], 0.0).reshape(len(moved), -1).T
-    return _Frame(image, seen_by[:, 2].T, scale * R[2] @ shape, shape)
+    changes = scale * R @ moved  # (p + K, 3, n_points)
+    image = np.where(seen, changes[:, :2], 0.0).reshape(len(moved), -1).T
+    z = scale * R[2] @ shape
+    return _Frame(image, changes[:, 2].T, z, shape, scale * R[:2], seen)
 
 
 def _covariance(frame: _Frame, variance: float, n_components: int) -> NDArray:
@@ -197,9 +201,7 @@ def depth_certainty(
     DepthCertainty
         NaN if fewer than two frames are given.
     """
-    K, n_chosen = alpha.shape[1], len(rows)
-    n_camera = 4 if free else 3
-    if n_chosen < 2:
+    if len(rows) < 2:
         return DepthCertainty()
     rotations, scales = full_rotations(motion)
     seen = np.isfinite(rows).all(axis=1)
@@ -207,78 +209,124 @@ def depth_certainty(
         _frame(shapes, *each, free)
         for each in zip(rotations, scales, alpha, seen, strict=True)
     ]
-    # Residual: its variance, and its variance along further changes of the camera
+    variance, residual = _misfit(frames, rows, alpha.shape[1])
+    prior = extent_weight * 2 * seen.sum() / len(rows) * 4 / 9
+    scale, own = _scale(
+        frames, rotations, alpha, variance, residual, prior=prior, n_frames=n_frames
+    )
+    turns = _turns(frames, shapes[0], alpha, n_frames / variance, basis_std)
+    # Depths of the points of all shapes, and of the deformation that is missing
+    moments = np.insert(alpha**2, 0, 1.0, axis=1)
+    size = np.mean(scales**2)
+    shown = np.mean(
+        _spread(rotations)[:, None] * scales[:, None] ** 2 * moments, axis=0
+    )
+    by_shapes = variance * size / n_frames
+    by_shapes *= np.sum(moments.mean(axis=0) / np.maximum(shown, TINY))
+    points = float(by_shapes + residual * (1.0 - residual / variance))
+    depth = np.mean([np.mean(frame.z**2) for frame in frames])
+    relative = (own + points) / max(depth, TINY)
+    total = float(np.sqrt(relative + scale**2))
+    return DepthCertainty(variance / noise, scale, points, total, turns)
+
+
+def _misfit(
+    frames: list[_Frame], rows: NDArray, n_components: int
+) -> tuple[float, float]:
+    """Estimate the variance of residuals along changes of the camera, and of all."""
     square = along = freedom = 0.0
-    # and the information on rotations that basis shapes contain, B_k + w_k x B_0
-    turned = np.stack([np.cross(e, shapes[0], axisb=0, axisc=0) for e in np.eye(3)])
-    rotated, images = np.zeros((3 * K, 3 * K)), np.zeros((3, 3))
-    for frame, row, scale, R, visible, coefficients in zip(
-        frames, rows, scales, rotations, seen, alpha, strict=True
-    ):
+    for frame, row in zip(frames, rows, strict=True):
+        n_camera = frame.image.shape[1] - n_components
+        n_further = 6 - n_camera
         centred = row - np.nanmean(row, axis=1, keepdims=True)
-        rest = np.where(visible, centred - scale * R[:2] @ frame.shape, 0.0).ravel()
-        affine = np.kron(np.eye(2), np.where(visible, frame.shape, 0.0).T)
-        tangent = np.linalg.qr(frame.image)[0]
-        affine = affine - tangent @ (tangent.T @ affine)
-        further = np.linalg.svd(affine, full_matrices=False)[0][:, : 6 - n_camera]
-        along += float(np.sum((further.T @ rest) ** 2)) / (6 - n_camera)
+        rest = np.where(frame.seen, centred - frame.seen_by @ frame.shape, 0.0).ravel()
+        affine = np.kron(np.eye(2), np.where(frame.seen, frame.shape, 0.0).T)
+        affine = _unexplained(frame, affine)
+        further = np.linalg.svd(affine, full_matrices=False)[0][:, :n_further]
+        along += float(np.sum((further.T @ rest) ** 2)) / n_further
         square += float(rest @ rest)
-        swapped = np.where(visible, scale * R[:2] @ turned, 0.0).reshape(3, -1).T
-        images += swapped.T @ swapped
-        swapped = swapped - tangent @ (tangent.T @ swapped)
-        rotated += np.kron(np.outer(coefficients, coefficients), swapped.T @ swapped)
-        freedom += max(2 * visible.sum() - 2 - n_camera - K, 1)
-    noise_floor = np.finfo(float).eps * np.mean(scales**2)
-    residual = max(square / freedom, noise_floor)
-    variance = max(along / n_chosen, residual)
-    # with the prior of the basis shapes, whose images have the deviation basis_std
-    rotated *= n_frames / n_chosen / variance
-    rotated += np.kron(np.eye(K), images / (n_chosen * basis_std**2))
-    swaps = np.linalg.pinv(rotated, hermitian=True)
-    # Spread of the viewing directions about their mean, less what coefficients predict
-    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
-    axis = (U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)[2]
-    tilts = rotations[:, :2] @ axis
-    spread = np.sum(tilts**2, axis=1)
-    own_share = _unpredicted(tilts, alpha)
-    # Errors of the frames, and the information on the scale of the depth
-    own, depth, turn, information = np.zeros((4, n_chosen))
-    for i, (frame, R, scale) in enumerate(zip(frames, rotations, scales, strict=True)):
-        covariance = _covariance(frame, variance, K)
-        own[i] = np.einsum("jp,pq,jq->", frame.depth, covariance, frame.depth)
-        depth[i] = frame.z @ frame.z
+        freedom += max(2 * frame.seen.sum() - 2 - frame.image.shape[1], 1)
+    size = np.mean([np.sum(frame.seen_by**2) / 2 for frame in frames])
+    residual = max(square / freedom, float(np.finfo(float).eps * size))
+    return max(along / len(frames), residual), residual
+
+
+def _unexplained(frame: _Frame, change: NDArray) -> NDArray:
+    """Project changes (2 * n_points, m) of the image off the unknowns of a frame."""
+    tangent = np.linalg.qr(frame.image)[0]
+    return change - tangent @ (tangent.T @ change)
+
+
+def _turns(
+    frames: list[_Frame],
+    mean_shape: NDArray,
+    alpha: NDArray,
+    weight: float,
+    basis_std: float,
+) -> NDArray:
+    """Compute the covariance (K, 3, K, 3) of w_k in shapes ``B_k + w_k x B_0``."""
+    n_chosen, K = alpha.shape
+    turned = np.stack([np.cross(e, mean_shape, axisb=0, axisc=0) for e in np.eye(3)])
+    precision, images = np.zeros((3 * K, 3 * K)), np.zeros((3, 3))
+    for frame, coefficients in zip(frames, alpha, strict=True):
+        change = np.where(frame.seen, frame.seen_by @ turned, 0.0).reshape(3, -1).T
+        images += change.T @ change
+        change = _unexplained(frame, change)
+        precision += np.kron(np.outer(coefficients, coefficients), change.T @ change)
+    # The prior of the basis shapes: the deviation of their images is basis_std
+    precision = weight * precision + np.kron(np.eye(K), images / basis_std**2)
+    covariance = np.linalg.pinv(precision / n_chosen, hermitian=True)
+    return np.asarray(covariance).reshape(K, 3, K, 3)
+
+
+def _scale(
+    frames: list[_Frame],
+    rotations: NDArray,
+    alpha: NDArray,
+    variance: float,
+    residual: float,
+    *,
+    prior: float,
+    n_frames: int,
+) -> tuple[float, float]:
+    """
+    Estimate the relative standard deviation of the scale of the depth.
+
+    Also returned is the mean variance of a depth by the unknowns of its frame.
+    """
+    axis = _mean_view(rotations)[2]
+    own_share = _unpredicted(rotations[:, :2] @ axis, alpha)
+    own, turn, information = np.zeros((3, len(frames)))
+    for i, (frame, R) in enumerate(zip(frames, rotations, strict=True)):
+        covariance = _covariance(frame, variance, alpha.shape[1])
+        own[i] = np.einsum("jp,pq,jq->j", frame.depth, covariance, frame.depth).mean()
         error = covariance[:3, :3]
         turn[i] = np.trace(error) - R[2] @ error @ R[2]
         stretched = np.outer(axis, axis @ frame.shape)
-        change = np.where(seen[i], scale * R[:2] @ stretched, 0.0).ravel()
+        change = np.where(frame.seen, frame.seen_by @ stretched, 0.0).ravel()
         pulled = frame.image.T @ change
         information[i] = change @ change - pulled @ covariance @ pulled / variance
-    information = np.maximum(information, 0.0).mean() * own_share / SHAPES_FOLLOW
-    mean_spread = max(spread.mean() * own_share, np.finfo(float).tiny)
-    prior = extent_weight * 2 * seen.sum() / n_chosen * 4 / 9
+    shown = max(float(information.mean()), 0.0) * own_share / SHAPES_FOLLOW
+    spread = max(float(_spread(rotations).mean()) * own_share, TINY)
     log_scale = np.sqrt(
-        variance / max(n_frames * information, np.finfo(float).tiny)
-        + (turn.mean() / mean_spread) ** 2
-        + (PRIOR_DEVIATION * prior / (information / residual + prior)) ** 2
+        variance / max(n_frames * shown, TINY)
+        + (turn.mean() / spread) ** 2
+        + (PRIOR_DEVIATION * prior / (shown / residual + prior)) ** 2
     )
-    # At most what the prior has
-    relative = float(np.expm1(min(log_scale, 3 * PRIOR_DEVIATION)))
-    # Depths of the points of all shapes, and of the deformation that is missing
-    c = np.concatenate([np.ones((n_chosen, 1)), alpha], axis=1) ** 2
-    shown = np.maximum((c * (spread * scales**2)[:, None]).mean(axis=0), 1e-300)
-    by_shapes = (
-        variance * np.mean(scales**2) / n_frames * np.sum(c.mean(axis=0) / shown)
-    )
-    points = float(by_shapes + residual * (1.0 - residual / variance))
-    n_points = shapes.shape[2]
-    total = own.mean() / n_points + points
-    size = max(float(depth.mean()) / n_points, np.finfo(float).tiny)
-    return DepthCertainty(
-        float(variance / noise),
-        relative,
-        points,
-        float(np.sqrt(total / size + relative**2)),
-        swaps.reshape(K, 3, K, 3),
+    # At most three deviations of the prior
+    return float(np.expm1(min(log_scale, 3 * PRIOR_DEVIATION))), float(own.mean())
+
+
+def _mean_view(rotations: NDArray) -> NDArray:
+    """Compute the rotation (3, 3) that is nearest to all rotations (n, 3, 3)."""
+    U, _, Vt = np.linalg.svd(rotations.mean(axis=0))
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def _spread(rotations: NDArray) -> NDArray:
+    """Compute squared sines (n,) of the angles between views and the mean view."""
+    return np.asarray(
+        np.sum((rotations[:, :2] @ _mean_view(rotations)[2]) ** 2, axis=1)
     )
 
 

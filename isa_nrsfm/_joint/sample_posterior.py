@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
 from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
 from isa_nrsfm._frames.posterior import FramePosterior
-from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._frames.projection import distances, stacked_motion
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.options import JOINT_OPTIONS
@@ -18,6 +18,9 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Unknowns of camera and position of a frame.
 N_POSE = 8
+# Residuals that are longer, in standard deviations of a coordinate, are left out of the
+# uncertainty of fits with a robust loss: one of 3,000 points without outliers.
+OUTLYING = 4.0
 
 
 def posterior_blocks(
@@ -178,7 +181,12 @@ def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
     n_frames = rows.n_frames
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)
-    found = frames.posterior(part.transpose(0, 2, 1), covariances=False)
+    tracks = part.transpose(0, 2, 1)
+    found = frames.posterior(tracks, covariances=False)
+    if frames.loss != "linear":  # without outliers
+        off = distances(tracks, frames.shapes, *found[:3])
+        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
+        part = np.where(outlying[:, None], np.nan, part)
     known = np.isfinite(found.motion).all(axis=(1, 2))
     return depth_certainty(
         frames.shapes,
