@@ -55,7 +55,8 @@ def test_files_of_points_whose_names_are_not_utf8(run, faces, tmp_path):
         (folder / f"{i:02d} {NOT_UTF8}.pts").write_text(text)
     found = read_landmarks(folder)
     assert found.frames["file"][3] == "03 caf\\udce9 \\udcff.pts"
-    assert run("fit", folder, "-o", tmp_path / "results", *QUICK)[0] == 0
+    code, _, errors = run("fit", folder, "-o", tmp_path / "results", *QUICK)
+    assert code == 0, errors
     alpha = pd.read_csv(tmp_path / "results" / "alpha.csv")
     assert list(alpha["file"]) == list(found.frames["file"])
 
