@@ -178,6 +178,7 @@ def depth_certainty(
     n_frames: int,
     extent_weight: float,
     basis_std: float,
+    least_misfit: float,
     free: bool,
 ) -> DepthCertainty:
     """
@@ -195,6 +196,9 @@ def depth_certainty(
         Weight of the prior of the extents, for each coordinate.
     basis_std : float
         Standard deviation of the images of basis shapes under their prior.
+    least_misfit : float
+        Lower bound of v. Basis shapes can follow the images of motion capture to a
+        smaller residual than their depths deserve.
 
     Returns
     -------
@@ -210,6 +214,7 @@ def depth_certainty(
         for each in zip(rotations, scales, alpha, seen, strict=True)
     ]
     variance, residual = _misfit(frames, rows, alpha.shape[1])
+    variance = max(variance, least_misfit)
     prior = extent_weight * 2 * seen.sum() / len(rows) * 4 / 9
     scale, own = _scale(
         frames, rotations, alpha, variance, residual, prior=prior, n_frames=n_frames

@@ -197,5 +197,7 @@ def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
         n_frames=n_frames,
         extent_weight=EXTENT_WEIGHT,
         basis_std=JOINT_OPTIONS.basis_std,
+        # The noise of a model that is right may be lower than the floor.
+        least_misfit=min(JOINT_OPTIONS.least_noise, frames.noise_variance),
         free=frames.camera == "weak_perspective",
     )
