@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import nearest_calibrated
@@ -254,11 +253,10 @@ class PosteriorFrames:
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames. What it knows of the shapes serves all tables."""
-        if self.camera == "affine":
-            return AffineSearch(self.shapes, options=self.options)
-        search = SEARCHES[self.camera]
-        misfit = self.certainty.misfit
-        return search(self.shapes, options=self.options, misfit=misfit)
+        known: dict[str, Any] = {"options": self.options}
+        if self.camera != "affine":
+            known["misfit"] = self.certainty.misfit
+        return SEARCHES[self.camera](self.shapes, **known)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes, without what is computed from them."""

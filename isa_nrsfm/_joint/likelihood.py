@@ -199,10 +199,8 @@ class MarginalLikelihood:
             weight = self.extent_weight * self.n_seen
             # With one curvature for all points the shapes are centred already.
             penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
-            value, shape_gradient = (
-                value + weight * penalty,
-                shape_gradient + weight * slope,
-            )
+            value += weight * penalty
+            shape_gradient = shape_gradient + weight * slope
         return LikelihoodTerms(
             float(value),
             shape_gradient,
