@@ -1,9 +1,105 @@
-"""Small problems with a known solution, for the tests of the numerical stages."""
+"""Small problems with a known solution, and tables, for the tests of all parts."""
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.datasets import make_face_tracks
+
+
+class Scene(NamedTuple):
+    """Tracks of a model, with its parameters; without weights all are one."""
+
+    tracks: NDArray  # (I, J, 2), NaN where missing
+    shapes: NDArray  # (K + 1, 3, J), centred, the mean shape first
+    motion: NDArray  # (I, 2, 3)
+    translation: NDArray  # (I, 2)
+    alpha: NDArray  # (I, K)
+    weights: NDArray | None = None  # (I, J), zero where missing
+
+    @property
+    def centred(self):
+        """The tracks, each frame centred over the points that are there."""
+        return self.tracks - np.nanmean(self.tracks, axis=1, keepdims=True)
+
+
+def images(shapes, motion, translation, alpha):
+    """Return the tracks (I, J, 2) of a model."""
+    frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+    return (motion @ frames).swapaxes(1, 2) + translation[:, None]
+
+
+def random_scene(
+    seed=0,
+    n_frames=30,
+    n_points=20,
+    n_components=3,
+    *,
+    noise=0.0,
+    camera="affine",
+    kind="complete",
+    deformation=0.3,
+    extent=(1.0, 1.0, 1.0),
+):
+    """
+    Return a scene of random shapes and cameras of a model.
+
+    The points are "complete", "weighted", or "missing": weighted, and NaN at some.
+    """
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points)) * np.reshape(
+        extent, (3, 1)
+    )
+    shapes[1:] *= deformation
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    motion = rng.normal(size=(n_frames, 2, 3))
+    if camera != "affine":
+        motion = random_cameras(rng, n_frames)
+    if camera == "weak_perspective":
+        motion = rng.uniform(0.5, 2.0, n_frames)[:, None, None] * motion
+    translation = rng.normal(size=(n_frames, 2))
+    alpha = rng.normal(size=(n_frames, n_components))
+    tracks = images(shapes, motion, translation, alpha)
+    tracks = tracks + noise * rng.normal(size=tracks.shape)
+    weights = None
+    if kind != "complete":
+        weights = rng.uniform(0.2, 2.0, tracks.shape[:2])
+    if kind == "missing":
+        weights[rng.random(weights.shape) < 0.2] = 0.0
+        tracks[weights == 0] = np.nan
+    return Scene(tracks, shapes, motion, translation, alpha, weights)
+
+
+def with_gaps(tracks, share=0.3, seed=0):
+    """Return a copy of tracks (I, J, 2) or a table (I, 2J), NaN at random points."""
+    pairs = np.array(tracks).reshape(len(tracks), -1, 2)
+    pairs[np.random.default_rng(seed).random(pairs.shape[:2]) < share] = np.nan
+    return pairs.reshape(tracks.shape)
+
+
+def random_cameras(rng, n_frames):
+    """Return cameras with orthonormal rows, (I, 2, 3), in all orientations."""
+    return Rotation.random(n_frames, rng).as_matrix()[:, :2]
+
+
+@cache
+def faces(n_frames=60, n_components=2, **options):
+    """Return generated faces, to be left as they are."""
+    return make_face_tracks(
+        n_frames, n_components=n_components, random_state=0, **options
+    )
+
+
+@cache
+def face_model(n_frames=60, n_components=2, camera="weak_perspective", **options):
+    """Return a model of `faces`, to be left as it is."""
+    table = faces(n_frames, n_components, **options).data
+    model = AffineNRSfM(n_components, camera=camera, random_state=0)
+    return model.fit(table)
 
 
 class StructuredMotion(NamedTuple):
