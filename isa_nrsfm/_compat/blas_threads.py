@@ -19,21 +19,8 @@ def one_blas_thread(function: Function) -> Function:
     """
     Decorate a function to run with one BLAS thread.
 
-    Stages of a fit and fits of frames are many products of small matrices. Threads do
-    not make them faster, and where other programs run on the same cores each product
-    waits for the system to let the other threads run: two threads beside one other
-    program take 2 to 12 times as long. Blocks of frames run in parallel instead, by
-    ``n_jobs``.
-
-    Parameters
-    ----------
-    function : callable
-        The function.
-
-    Returns
-    -------
-    callable
-        The function, with BLAS limited to one thread while it runs.
+    Products of small matrices are not faster with threads. Beside another program, two
+    threads take 2 to 12 times as long. Blocks of frames run in parallel instead.
     """
 
     @wraps(function)

@@ -10,24 +10,14 @@ import sklearn
 
 # Files whose frames are skipped on the way from the warning up to the user's line.
 INSIDE = (
+    *(str(Path(inner).parent) for inner in (sklearn.__file__, joblib.__file__)),
     str(Path(__file__).parents[1]),
-    str(Path(sklearn.__file__).parent),
-    str(Path(joblib.__file__).parent),
     contextlib.__file__,
 )
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
-    """
-    Warn at the line that called this package, however deep the warning stands.
-
-    Parameters
-    ----------
-    message : str
-        What is said.
-    category : type, default=UserWarning
-        Kind of warning.
-    """
+    """Warn at the line that called this package, however deep the warning is raised."""
     level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(INSIDE):
         level, frame = level + 1, frame.f_back

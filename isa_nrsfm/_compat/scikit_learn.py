@@ -1,53 +1,18 @@
-"""All private names of scikit-learn that are used, each with a public fallback.
-
-Parameters are checked by scikit-learn's own code, so that messages are the same as its
-own. A version that lacks this code gets the fallbacks of `plain_checks`.
-"""
+"""The private names of scikit-learn that are used. All supported versions have them."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from isa_nrsfm._compat.plain_checks import check_values
-
-try:
-    from sklearn.base import _fit_context
-    from sklearn.utils._param_validation import (
-        HasMethods,
-        Interval as _Interval,
-        StrOptions,
-        validate_params,
-    )
-except ImportError:
-    from isa_nrsfm._compat.plain_checks import (
-        HasMethods,
-        Interval as _Interval,
-        StrOptions,
-        fit_context as _fit_context,
-        validate_params,
-    )
-
-try:
-    from sklearn.utils._missing import is_pandas_na
-except ImportError:
-
-    def is_pandas_na(x: Any) -> bool:
-        """Return whether a value is pandas' mark of a missing one."""
-        return type(x).__name__ == "NAType"
-
-
-try:
-    from sklearn.utils import _safe_indexing as taken_rows
-    from sklearn.utils.validation import _num_samples as number_of_rows
-except ImportError:
-
-    def taken_rows(X: Any, indices: Any) -> Any:
-        """Return rows of an array or a dataframe."""
-        return X.iloc[indices] if hasattr(X, "iloc") else X[indices]
-
-    def number_of_rows(x: Any) -> int:
-        """Return the number of rows of an array or a dataframe."""
-        return len(x)
-
+from sklearn.base import _fit_context
+from sklearn.utils import _safe_indexing as taken_rows
+from sklearn.utils._missing import is_pandas_na
+from sklearn.utils._param_validation import (
+    HasMethods,
+    Interval as _Interval,
+    StrOptions,
+    validate_params,
+)
+from sklearn.utils.validation import _num_samples as number_of_rows
 
 __all__ = [
     "HasMethods",
@@ -61,31 +26,22 @@ __all__ = [
     "taken_rows",
 ]
 
+Function = TypeVar("Function", bound=Callable[..., Any])
+
 
 class Interval(_Interval):
-    """Numbers of a type between two bounds. True and False are no numbers."""
+    """Numbers of a type between two bounds, without True and False."""
 
     def is_satisfied_by(self, value: Any) -> bool:
-        """Return whether a value is such a number."""
+        """Return whether a value is in the interval."""
         return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
-
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
     """
-    Return the decorator of `fit` methods that checks the estimator's parameters.
+    Return a decorator of `fit` that checks the estimator's parameters.
 
-    Parameters
-    ----------
-    nested : bool
-        Whether estimators that this one fits check their parameters, too.
-
-    Returns
-    -------
-    callable
-        The decorator.
+    With `nested`, estimators that this one fits check theirs.
     """
     decorate: Callable[[Function], Function] = _fit_context(
         prefer_skip_nested_validation=not nested
@@ -96,19 +52,7 @@ def fit_context(*, nested: bool) -> Callable[[Function], Function]:
 def checked_parameters(
     constraints: dict[str, list[Any]],
 ) -> Callable[[Function], Function]:
-    """
-    Return a decorator of functions that checks their parameters.
-
-    Parameters
-    ----------
-    constraints : dict
-        For each parameter what it may be, as in scikit-learn's estimators.
-
-    Returns
-    -------
-    callable
-        The decorator.
-    """
+    """Return a decorator that checks parameters of a function against constraints."""
     decorate: Callable[[Function], Function] = validate_params(
         constraints, prefer_skip_nested_validation=True
     )
@@ -116,24 +60,6 @@ def checked_parameters(
 
 
 def check_parameters(estimator: Any) -> None:
-    """
-    Check the parameters of an estimator.
-
-    Parameters
-    ----------
-    estimator : estimator
-        The estimator. One without constraints is not checked.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not what it may be.
-    """
-    if not hasattr(estimator, "_parameter_constraints"):
-        return
-    if hasattr(estimator, "_validate_params"):
+    """Check the parameters of an estimator, if it has constraints for them."""
+    if hasattr(estimator, "_parameter_constraints"):
         estimator._validate_params()
-    else:
-        name = type(estimator).__name__
-        constraints = estimator._parameter_constraints
-        check_values(constraints, estimator.get_params(deep=False), name)
