@@ -1,14 +1,14 @@
 """
 Halve and double what steers the stages of a fit, one by one: errors and CPU seconds.
 
-Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are the fields of `Limits`
-and of `JointOptions`. The first line of each is that of the values as they are; then a
-line a value follows. Errors in 3D are `affine_shape_error` in percent, "SNR" is inverse
-SNR in percent. Of missing points of real tables it is their error in percent of the
-size of frames, of the stage "joint.relevance" the mean number of basis shapes that
-"auto" finds, of the gauge the least similarity of a basis shape to the true one, in
-percent. Tables are small: every few frames of real ones, and artificial ones. "s" are
-the CPU seconds of all fits.
+Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are "fit", for the numbers
+of `Limits`, and the tuples in `Limits` and `JointOptions`. The first line of each is
+that of the values as they are; then a line a value follows. Errors in 3D are
+`affine_shape_error` in percent, "SNR" is inverse SNR in percent. Of missing points of
+real tables it is their error in percent of the size of frames, of the stage
+"joint.relevance" the mean number of basis shapes that "auto" finds, of the gauge the
+least similarity of a basis shape to the true one, in percent. Tables are small: every
+few frames of real ones, and artificial ones. "s" are the CPU seconds of all fits.
 """
 
 import time
@@ -158,12 +158,6 @@ MISSING = {
     "noisy 3D": partial(of_instances, missing=0.2),
     "exact 3D": partial(of_instances, noise=0.0, missing=0.2),
 }
-BY_PAPER = {
-    "yoga 3D": partial(of_set, "yoga", 3, 4, "affine", refinement="alternating"),
-    "drink 3D": partial(of_set, "drink", 8, 3, "affine", refinement="alternating"),
-    "faces 3D": partial(of_set, "ict_68", 8, 9, "affine", refinement="alternating"),
-    "noisy 3D": partial(of_instances, refinement="alternating"),
-}
 LARGE = {
     "large 3D": partial(of_instances, n_frames=6000, n_points=30),
     "noisy": partial(of_instances, n_frames=6000, n_points=30, noise=0.1),
@@ -193,9 +187,7 @@ COUNTS = {
 STAGES = {
     "outliers": ROBUST,
     "completion": MISSING,
-    "svd": MATRIX,
-    "sample": LARGE,
-    "paper": BY_PAPER,
+    "fit": {**LARGE, **MATRIX},
     "joint": USUAL,
     "joint.small": USUAL,
     "joint.large": LARGE,
@@ -252,7 +244,7 @@ def stage(name, cases, options):
         if getattr(case, "func", None) not in (of_set, of_missing)
         or is_present(case.args[0])
     }
-    path = name.split(".")
+    path = [] if name == "fit" else name.split(".")
     known = Limits()
     for part in path:
         known = getattr(known, part)

@@ -248,7 +248,7 @@ def fit_ready_table(
             outliers,
             sample,
             factors,
-            starts[0].shapes if paper is None else _stacked_shapes(paper),
+            starts[0].shapes if paper is None else paper.shapes,
             starts,
             spectrum,
             options,
@@ -306,7 +306,7 @@ def _count_components(source: Table, options: FitOptions) -> int:
         table.n_seen,
         sample,
         factors,
-        _stacked_shapes(paper),
+        paper.shapes,
         camera=options.camera,
         outliers=outliers,
         loss=options.loss,
@@ -387,10 +387,12 @@ def _factors(
 ) -> tuple[Triplets, Sample, Factorisation]:
     """Return the singular triplets of completed frames, a sample, and its factors."""
     shape = 2 * len(table.sizes), table.n_points
-    triplets = block_triplets(used, shape, 3 * n_components + 3, limits.svd)
+    triplets = block_triplets(used, shape, 3 * n_components + 3, limits.dense)
     if joint:
         rigid_shape = triplets.vectors[:3]
-        sample = sample_frames(used, table.n_points, rigid_shape, limits.sample)
+        sample = sample_frames(
+            used, table.n_points, rigid_shape, limits.sample, limits.small_table
+        )
     else:
         sample = Sample(used.whole().reshape(shape), [])
     factors = factorise(sample.W, n_components, table.precision, triplets)
@@ -420,7 +422,6 @@ def _paper_result(
             max_iter=limits.start_steps if joint else options.max_iter,
             tol=limits.start_tol if joint else tol,
             report=report,
-            options=limits.paper,
         )
     return isa, result
 
@@ -433,7 +434,7 @@ def _refined_by_paper(
     unit: float,
 ) -> Refined:
     """Return the model and the frames of the paper's pipeline."""
-    shapes = _stacked_shapes(paper)
+    shapes = paper.shapes
     if options.camera != "affine":
         scaled = options.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
@@ -592,9 +593,3 @@ def _reference(cameras: NDArray, table: ScaledTable, camera: str) -> NDArray:
         row, scale = nearest_calibrated(reference[None])
         reference = (scale[:, None, None] * row)[0]
     return reference.astype(table.dtype)
-
-
-def _stacked_shapes(paper: PaperResult) -> NDArray:
-    """Return mean shape and basis shapes (n_components + 1, 3, n_points)."""
-    shapes = np.concatenate([paper.mean_shape[None], paper.basis])
-    return shapes.transpose(0, 2, 1)

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._gauge.independent import GaugeOptions
 from isa_nrsfm._joint.options import JointOptions
-from isa_nrsfm._paper.options import PaperOptions, SampleOptions, SvdOptions
 from isa_nrsfm._prepare.options import CompletionOptions, OutlierOptions
 from isa_nrsfm._tables.layout import Layout
 
@@ -26,12 +25,13 @@ class Limits(NamedTuple):
         Of the search for gross outliers.
     completion : CompletionOptions
         Of missing points.
-    svd : SvdOptions
-        Of the factorisation.
-    sample : SampleOptions
-        Of the sample.
-    paper : PaperOptions
-        Of the paper's pipeline.
+    dense : int
+        A table with more points and more rows of images than this is not factorised as
+        a whole.
+    sample : int
+        Number of frames of the first sample of a large table.
+    small_table : int
+        Tables with fewer coordinates than this are fitted without a sample.
     joint : JointOptions
         Of the joint refinement.
     gauge : GaugeOptions
@@ -48,9 +48,9 @@ class Limits(NamedTuple):
 
     outliers: OutlierOptions = OutlierOptions()
     completion: CompletionOptions = CompletionOptions()
-    svd: SvdOptions = SvdOptions()
-    sample: SampleOptions = SampleOptions()
-    paper: PaperOptions = PaperOptions()
+    dense: int = 1500
+    sample: int = 600
+    small_table: int = 150_000
     joint: JointOptions = JointOptions()
     gauge: GaugeOptions = GaugeOptions()
     start_steps: int = 200

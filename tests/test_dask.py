@@ -120,9 +120,7 @@ class TestThreads:
 
 
 # The first steps are taken on few frames, as of large tables.
-SampledNRSfM = limited(
-    Limits()._replace(sample=Limits().sample._replace(small_table=1000, first=40))
-)
+SampledNRSfM = limited(Limits()._replace(small_table=1000, sample=40))
 
 
 @pytest.mark.cluster

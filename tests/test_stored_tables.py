@@ -38,7 +38,8 @@ def table(missing=0.0, n_points=20, n_frames=150):
 
 # Small tables are worked on as large ones are.
 SAMPLED = Limits()._replace(
-    sample=Limits().sample._replace(small_table=1000, first=50),
+    small_table=1000,
+    sample=50,
     completion=Limits().completion._replace(model_frames=100, fewest_shown=20),
     outliers=Limits().outliers._replace(model_frames=100, fewest_shown=20),
     joint=Limits().joint._replace(
@@ -47,7 +48,7 @@ SAMPLED = Limits()._replace(
         )
     ),
 )
-KRYLOV = Limits()._replace(svd=Limits().svd._replace(dense=300))
+KRYLOV = Limits(dense=300)
 
 
 def estimator(limits=None, **params):

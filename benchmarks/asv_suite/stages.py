@@ -224,7 +224,6 @@ class JointRefinement(Stage):
         n_points = self.W.shape[1]
         self.sample = sample_frames(self.rows, n_points, self.factors.rigid_shape)
         self.of_sample = factorise(self.sample.W, self.K)
-        self.shapes = np.concatenate([self.paper.mean_shape[None], self.paper.basis])
 
     def run(self):
         return fit_jointly(
@@ -233,7 +232,7 @@ class JointRefinement(Stage):
             self.n_seen,
             self.sample,
             self.of_sample,
-            self.shapes.transpose(0, 2, 1),
+            self.paper.shapes,
             spectrum=Spectrum.from_singular_values(
                 np.linalg.svd(self.W, compute_uv=False)[: 3 * self.K + 3],
                 self.model.rank_floor_,

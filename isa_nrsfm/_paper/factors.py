@@ -1,7 +1,7 @@
 """Rigid and non-rigid factorisation of the measurement matrix by one SVD.
 
-The rigid part is the factorisation of Tomasi and Kanade (1992); the non-rigid part
-is what the next 3K singular triplets hold (Brandt et al. 2018, section 3).
+The rigid part is the factorisation of Tomasi and Kanade (1992). The non-rigid part
+consists of the next 3K singular triplets (Brandt et al. 2018, section 3).
 """
 
 from typing import NamedTuple
@@ -34,18 +34,12 @@ class Factorisation(NamedTuple):
         B', centred and white, orthogonal to B_0. `n_signals` is 3K, or less where W has
         a lower rank: the least multiple of three with room for all singular values
         above rounding errors.
-    singular_values : ndarray of shape (3K + 3,)
-        Largest singular values of W, decreasing; fewer if W does not have as many.
-    rest : float
-        Energy of W that is left: the sum of the squares of its other singular values.
     """
 
     rigid_motion: NDArray
     rigid_shape: NDArray
     motion: NDArray
     signals: NDArray
-    singular_values: NDArray
-    rest: float
 
 
 def factorise(
@@ -57,51 +51,26 @@ def factorise(
     """
     Return the rigid and the non-rigid factors of a measurement matrix.
 
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix, rows centred.
-    n_components : int
-        K, the number of basis shapes.
-    precision : float, default=0.0
-        Rounding error of the entries of W, relative to their root mean square.
-    triplets : Triplets, optional
-        The 3K + 3 leading triplets of a larger matrix, of which W has some of the
-        frames. By default those of W are computed.
-
-    Returns
-    -------
-    Factorisation
-        The factors. With triplets of a larger matrix, its factors for these frames.
+    W is (2 * n_frames, n_points) with centred rows. `precision` is the rounding error
+    of its entries, relative to their root mean square. `triplets` are the 3K + 3
+    leading ones of a larger matrix that contains the frames of W, by default of W.
     """
     n_points = W.shape[1]
-    root = np.sqrt(n_points)
-    if triplets is None:
-        triplets = leading_triplets(W, 3 * n_components + 3)
-    S, Vt, rest = triplets
+    S, Vt, _ = triplets or leading_triplets(W, 3 * n_components + 3)
     # Rows of Vt above rounding errors, centred, their signs fixed.
-    null = max(OF_RANKS, precision) * S[0]
-    rank = int(np.sum(S > null))
+    rank = int(np.sum(S > max(OF_RANKS, precision) * S[0]))
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
-
     # The first three are the rigid shape, the next ones the signals.
+    root = np.sqrt(n_points)
     B_0 = np.zeros((3, n_points))
     B_0[: min(rank, 3)] = root * Vt[:3]
-    B = _completed(Vt, 3 * max(1, -(-(rank - 3) // 3))) * root
+    signals = Vt[3:]
+    n_missing = 3 * max(1, -(-(rank - 3) // 3)) - len(signals)
+    if n_missing:  # completed by centred, orthonormal rows, orthogonal to Vt
+        others = null_space(np.vstack([np.ones((1, n_points)), Vt])).T
+        signals = np.vstack([signals, others[:n_missing]])
+    B = root * signals
     M = W @ B.T / n_points
     M[:, max(rank - 3, 0) :] = 0.0
-    return Factorisation(W @ B_0.T / n_points, B_0, M, B, S, rest)
-
-
-def _completed(Vt: NDArray, n_signals: int) -> NDArray:
-    """Return rows 3 onwards of Vt (rank, n_points), completed to n_signals rows.
-
-    The rows that are added are centred, orthonormal, and orthogonal to Vt.
-    """
-    rows = Vt[3:]
-    n_missing = n_signals - len(rows)
-    if n_missing:
-        ones = np.ones((1, Vt.shape[1]))
-        rows = np.vstack([rows, null_space(np.vstack([ones, Vt])).T[:n_missing]])
-    return rows
+    return Factorisation(W @ B_0.T / n_points, B_0, M, B)

@@ -16,7 +16,6 @@ from sklearn.utils.validation import has_fit_parameter
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._paper.alternating import refine_alternating
 from isa_nrsfm._paper.block_structure import (
-    MotionProducts,
     leading_blocks,
     lifted_moments,
     motion_products,
@@ -24,19 +23,17 @@ from isa_nrsfm._paper.block_structure import (
     structure_energies,
 )
 from isa_nrsfm._paper.factors import Factorisation
-from isa_nrsfm._paper.options import PAPER_OPTIONS, PaperOptions
 
 
 class PaperResult(NamedTuple):
     """
-    What the paper's pipeline finds, before a gauge is chosen.
+    Result of the paper's pipeline, before a gauge is chosen.
 
     Attributes
     ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0 of the rigid factorisation.
-    basis : ndarray of shape (n_components, n_points, 3)
-        ``B_k = E_k B_ISA,k``; zero for subspaces without motion.
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        B_0 of the rigid factorisation, and ``B_k = E_k B_ISA,k``; zero for subspaces
+        without motion.
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
         ``(J / 2I) M_ISA^T M_ISA``, in the order of the basis.
     n_iter : int
@@ -45,8 +42,7 @@ class PaperResult(NamedTuple):
         Whether it has converged.
     """
 
-    mean_shape: NDArray
-    basis: NDArray
+    shapes: NDArray
     mode_covariance: NDArray
     n_iter: int
     converged: bool
@@ -62,7 +58,6 @@ def run_paper_pipeline(
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
-    options: PaperOptions = PAPER_OPTIONS,
 ) -> PaperResult:
     """
     Run the stages of the paper after the factorisation.
@@ -70,7 +65,7 @@ def run_paper_pipeline(
     Parameters
     ----------
     factors : Factorisation
-        Of the measurement matrix.
+        Factors of the measurement matrix.
     n_components : int
         K.
     isa : object
@@ -79,30 +74,21 @@ def run_paper_pipeline(
         Method of `recover_blocks`.
     refinement : {"alternating", None}
         Whether the blocks are refined.
-    max_iter : int
-        The most steps of the refinement.
-    tol : float
-        Tolerance of the refinement.
+    max_iter, tol : int, float
+        As in `refine_alternating`.
     report : callable
-        Called with the name of each stage that has ended.
-    options : PaperOptions
-        What steers the stages.
+        Called with the name of each finished stage.
 
     Returns
     -------
     PaperResult
-        Shapes before a gauge is chosen.
+        The shapes.
     """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
-    moments = lifted_moments(products, options.lift_ridge)
-    components = _independent_subspaces(
-        isa,
-        np.round(factors.signals, options.signal_decimals),
-        products,
-        moments,
-        n_points / n_rows,
-    )
+    moments = lifted_moments(products)
+    covariance = products.gram * (n_points / n_rows)
+    components = _independent_subspaces(isa, factors.signals, covariance, moments)
     report("independent subspaces")
 
     # Block structure. E_k is the inverse of D_k.
@@ -110,55 +96,44 @@ def run_paper_pipeline(
     E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=OF_RANKS)
     n_iter, converged = 1, True
     if refinement == "alternating":
-        subspaces = components.reshape(len(E), 3, -1)
-        lifted = leading_blocks(moments, subspaces, options.n_lifted_starts)
+        lifted = leading_blocks(moments, components.reshape(len(E), 3, -1))
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)
         E, _, n_iter, converged = refine_alternating(
-            products, starts, max_iter=max_iter, tol=tol, options=options
+            products, starts, max_iter=max_iter, tol=tol
         )
     report("block structure and refinement")
 
     # Shapes. Subspaces that W has no rank for stay zero.
-    basis = np.zeros((n_components, 3, n_points))
-    basis[: len(E)] = E @ (components @ factors.signals).reshape(-1, 3, n_points)
-    used = 3 * len(E)
+    shapes = np.zeros((n_components + 1, 3, n_points))
+    shapes[0] = factors.rigid_shape
+    shapes[1 : len(E) + 1] = E @ (components @ factors.signals).reshape(len(E), 3, -1)
     covariance = np.zeros((3 * n_components, 3 * n_components))
-    covariance[:used, :used] = products.gram * (n_points / n_rows)
-    return PaperResult(
-        factors.rigid_shape.T,
-        basis.transpose(0, 2, 1),
-        covariance,
-        n_iter,
-        converged,
-    )
+    covariance[: 3 * len(E), : 3 * len(E)] = products.gram * (n_points / n_rows)
+    return PaperResult(shapes, covariance, n_iter, converged)
 
 
 def _independent_subspaces(
-    isa: Any,
-    signals: NDArray,
-    products: MotionProducts,
-    moments: NDArray,
-    scale: float,
+    isa: Any, signals: NDArray, covariance: NDArray, moments: NDArray
 ) -> NDArray:
     """
-    Fit a strategy to the signals and return its orthogonal unmixing matrix.
+    Fit a strategy to signals (n_signals, n_points) and return its unmixing matrix.
 
     If `fit` of the strategy has a parameter `covariance`, it gets the covariance over
     the images, ``C = (J / 2I) M'^T M'`` (Brandt et al. 2018, section 3.3). Their mean
     term is left out: it would depend on the rotation of single images. If it has a
-    parameter `criterion`, it gets the function `structure_energies`, which values
-    candidates for subspaces by their block structure.
-
-    Signals are (n_signals, n_points), moments as of `lifted_moments`, `scale` is J /
-    2I.
+    parameter `criterion`, it gets the function `structure_energies` of `lifted_moments`
+    to rate candidates for subspaces by their block structure.
     """
     fit_params: dict[str, Any] = {}
     if has_fit_parameter(isa, "covariance"):
-        fit_params["covariance"] = products.gram * scale
+        fit_params["covariance"] = covariance
     if has_fit_parameter(isa, "criterion"):
         fit_params["criterion"] = partial(structure_energies, moments)
-    samples = signals.T
+    # Fixed-point iterations from random starts magnify rounding errors, so that another
+    # order of frames or points could lead to another optimum. Five decimals are far
+    # coarser than rounding errors, and far finer than the errors of the signals.
+    samples = np.round(signals, 5).T
     isa.fit(samples[np.lexsort(samples.T)], **fit_params)
     n_signals = len(signals)
     if isa.components_.shape != (n_signals, n_signals):

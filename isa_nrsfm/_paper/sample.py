@@ -1,4 +1,4 @@
-"""Which frames of a large table the first stages work on.
+"""Frames of a large table for the first stages.
 
 The stages of the paper and the first steps of the joint refinement only make a start
 for the steps that follow. A sample of the frames makes one as good. It is spread evenly
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import energies
-from isa_nrsfm._paper.options import SAMPLE_OPTIONS, SampleOptions
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import spread
 
@@ -40,57 +39,34 @@ def sample_frames(
     rows: FrameBlocks,
     n_points: int,
     rigid_shape: NDArray,
-    options: SampleOptions = SAMPLE_OPTIONS,
+    first: int = 600,
+    small_table: int = 150_000,
 ) -> Sample:
     """
-    Return frames for the first stages.
+    Return frames for the first stages, from blocks of complete ones (n, 2, n_points).
 
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of complete frames (n_frames, 2, n_points).
-    n_points : int
-        Number of points.
-    rigid_shape : ndarray of shape (3, n_points)
-        Shape of the rigid factorisation.
-    options : SampleOptions
-        When and how many frames are taken.
-
-    Returns
-    -------
-    Sample
-        The frames.
+    `rigid_shape` is (3, n_points), `first` the size of the first sample. Tables with
+    fewer coordinates than `small_table` are taken whole.
     """
     n_frames = rows.n_frames
     parts: list[NDArray] = []
-    large = 2 * n_frames * n_points >= options.small_table
-    if large and n_frames > options.first:
-        energy = partial(rigid_energy, shape=rigid_shape)
-        order = np.argsort(rows.joined(energy), kind="stable")
-        n = options.first
-        while not parts or n < min(n_frames / 2, options.most):
+    if 2 * n_frames * n_points >= small_table and n_frames > first:
+        energy = rows.joined(partial(rigid_energy, shape=rigid_shape))
+        order = np.argsort(energy, kind="stable")
+        n = first
+        while not parts or n < min(n_frames / 2, 40_000):
             parts.append(np.sort(spread(order, n)))
-            n *= options.growth
+            n *= 4
     W = rows.take(parts[0]) if parts else rows.whole()
-    W = W.reshape(-1, n_points).astype(np.float64, copy=False)
-    return Sample(W, parts)
+    return Sample(W.reshape(-1, n_points).astype(np.float64, copy=False), parts)
 
 
 def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
     """
-    Return for each frame the energy of its residual after the fit of a rigid shape.
+    Return the residual energy (n_frames,) of frames after the fit of a rigid shape.
 
-    Parameters
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_points)
-        Complete frames.
-    shape : ndarray of shape (3, n_points)
-        The shape.
-
-    Returns
-    -------
-    ndarray of shape (n_frames,)
-        ``min_M ||W_i - M shape||_F^2``, with the rounding errors of ``||W_i||_F^2``.
+    Rows are (n_frames, 2, n_points), the shape (3, n_points). The energies ``min_M
+    ||W_i - M shape||_F^2`` have the rounding errors of ``||W_i||_F^2``.
     """
     axes, size, _ = np.linalg.svd(shape.T, full_matrices=False)
     axes = axes[:, size > OF_RANKS * size[0]]
