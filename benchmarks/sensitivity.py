@@ -194,7 +194,6 @@ STAGES = {
     "joint.starts": USUAL,
     "joint.judgement": {**USUAL, "exact 3D": partial(of_instances, noise=0.0)},
     "joint.search": {**USUAL, "exact 3D": partial(of_instances, noise=0.0)},
-    "joint.noise_free": EXACT,
     "joint.many_points": DENSE,
     "joint.reweighting": ROBUST,
     "joint.relevance": COUNTS,

@@ -10,7 +10,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
-from isa_nrsfm._joint import quasi_newton as module
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
@@ -484,7 +483,7 @@ class TestCalibratedCameras:
 
     @CALIBRATED
     @KINDS
-    def test_tables_without_noise_are_fitted_to_rounding_errors(self, camera, kind):
+    def test_tables_without_noise_are_fitted_to_the_floor(self, camera, kind):
         scene, cameras = calibrated_scene(camera, noise=0.0, kind=kind), CAMERAS[camera]
         likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
         start = disturbed_by(cameras, scene.truth)
@@ -565,62 +564,16 @@ class TestLeastNoise:
 
 class TestWithoutNoise:
     @KINDS
-    def test_reaches_the_floor_and_the_true_images(self, kind):
-        scene = random_scene(noise=0.0, kind=kind)
-        result = refined(scene)
-        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
-        floor = SEARCH.noise_floor * likelihood.square / likelihood.n_seen
-        assert result.converged
-        assert result.state.noise == pytest.approx(floor, rel=1e-6)
-        assert likelihood(*result.state).residual < 1e-9 * likelihood.square
-
-    @KINDS
     @pytest.mark.parametrize("penalty", [0.0, 10.0])
-    def test_residual_is_rounding_errors(self, kind, penalty):
+    def test_reaches_the_floor_and_the_true_images(self, kind, penalty):
         scene = random_scene(noise=0.0, kind=kind)
         result = refined(scene, penalty=penalty)
+        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
+        floor = SEARCH.noise_floor * likelihood.square / likelihood.n_seen
         assert result.converged
         assert (np.diff(result.history) <= 0).all()
-        weights = 1.0 if scene.weights is None else np.sqrt(scene.weights)[..., None]
-        for i, (frame, camera) in enumerate(
-            zip(scene.tracks, result.state.motion, strict=True)
-        ):
-            root = np.broadcast_to(
-                weights if kind == "complete" else weights[i], (25, 1)
-            )
-            seen = root[:, 0] > 0
-            columns = [(camera @ B).T[seen] for B in result.state.shapes]
-            columns += [np.broadcast_to(axis, (seen.sum(), 2)) for axis in np.eye(2)]
-            columns = [(root[seen] * column).ravel() for column in columns]
-            rest = (root[seen] * frame[seen]).ravel() - columns[0]
-            rest -= (
-                np.array(columns[1:]).T
-                @ np.linalg.lstsq(np.array(columns[1:]).T, rest, rcond=None)[0]
-            )
-            assert_allclose(rest, 0.0, atol=1e-6)
-
-    def test_tables_with_noise_are_left_alone(self, monkeypatch):
-        def refuse(*args):
-            raise AssertionError
-
-        monkeypatch.setattr(module, "fit_without_noise", refuse)
-        assert refined(random_scene(noise=2e-3)).converged
-        with pytest.raises(AssertionError):
-            refined(random_scene(noise=0.0))
-
-    def test_tries_again_from_closer_by(self, monkeypatch):
-        likelihood = likelihood_of(random_scene(noise=0.0).tracks, None, 0.0)
-        noises = []
-
-        def fail(blocks, shapes, motion, *others):
-            passed = likelihood(shapes, motion, 1e-12)
-            noises.append(passed.residual / likelihood.n_seen)
-
-        monkeypatch.setattr(module, "fit_without_noise", fail)
-        result = refined(random_scene(noise=0.0))
-        assert result.converged
-        assert 2 <= len(noises) <= 5
-        assert (np.diff(noises) < 0).all()
+        assert result.state.noise == pytest.approx(floor, rel=1e-6)
+        assert likelihood(*result.state).residual < 1e-9 * likelihood.square
 
     def test_starts_at_the_floor_where_the_start_has_no_noise(self):
         scene = random_scene()

@@ -10,6 +10,7 @@ from scenes import permute_frames, rotate_frames
 
 from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
 from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.problem import JointProblem, Steps
 from isa_nrsfm._joint.quasi_newton import JointState
@@ -360,3 +361,42 @@ class TestAffineStart:
         state = affine_start(problem_of(scene), scene.W, paper)
         assert_array_equal(state.shapes[2], 0.0)
         assert np.isfinite(state.shapes).all()
+
+
+def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):
+    """Return shapes, cameras and coefficients."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes[1:] *= 0.3
+    motion = rng.normal(size=(n_frames, 2, 3))
+    return shapes, motion, rng.normal(size=(n_frames, n_components))
+
+
+class TestLikelyBasis:
+    @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
+    def test_no_other_basis_is_likelier(self, penalty):
+        truth, motion, true_alpha = random_frames()
+        shapes = likely_basis(truth, motion, true_alpha, penalty)
+        frames = truth[0] + np.tensordot(true_alpha, truth[1:], 1)
+
+        def objective(shift, mixing):
+            # alpha of these shapes from the true ones: S = B_0 + alpha B.
+            basis = np.tensordot(mixing, shapes[1:], 1).reshape(2, -1)
+            mean = shapes[0] + np.tensordot(shift, shapes[1:], 1)
+            alpha = (frames - mean).reshape(40, -1) @ np.linalg.pinv(basis)
+            seen = np.einsum("ira,kaj->ikrj", motion, basis.reshape(2, 3, -1))
+            gram = np.einsum("ikrj,ilrj->ikl", seen, seen)
+            value = np.linalg.slogdet(gram)[1].sum() + np.sum(alpha**2)
+            return value + penalty * np.trace(gram, axis1=1, axis2=2).sum()
+
+        least = objective(np.zeros(2), np.eye(2))
+        rng = np.random.default_rng(6)
+        for _ in range(10):
+            step = 0.01 * rng.normal(size=2), np.eye(2) + 0.01 * rng.normal(size=(2, 2))
+            assert objective(*step) > least
+
+    def test_coefficients_that_are_all_zero(self):
+        truth, motion, alpha = random_frames()
+        shapes = likely_basis(truth, motion, 0 * alpha, 0.0)
+        assert_allclose(shapes[0], truth[0])
+        assert np.isfinite(shapes).all()

@@ -20,12 +20,6 @@ class SearchOptions(NamedTuple):
     noise_floor : float
         Lower bound of the noise variance, as a share of the mean square of the tracks.
         It keeps the objective finite for tables without noise.
-    exact_noise : float
-        Gauss-Newton steps are tried once the noise variance is below this share of the
-        mean square of the tracks.
-    closer : float
-        Where they lead nowhere, they are tried again when the noise variance has fallen
-        to this share of its value at the last trial.
     largest_noise_step : float
         The logarithm of the noise variance changes by at most so much in a step.
     sufficient_decrease : float
@@ -43,60 +37,12 @@ class SearchOptions(NamedTuple):
     memory_numbers: int = 2**25
     least_memory: int = 3
     noise_floor: float = 1e-11
-    exact_noise: float = 1e-7
-    closer: float = 0.1
     largest_noise_step: float = 1.5
     sufficient_decrease: float = 1e-4
     shortest_step: float = 1e-8
     strongest_cut: float = 0.1
     weakest_cut: float = 0.5
     least_curvature: float = 1e-10
-
-
-class NoiseFreeOptions(NamedTuple):
-    """
-    How the Gauss-Newton steps of `fit_without_noise` go on.
-
-    ``python -m benchmarks.sensitivity joint.noise_free``: with half or twice of each
-    field errors of tables without noise stay below 1e-11. Only half of `eased` raises
-    that of tables with missing points, to 1e-9.
-
-    Attributes
-    ----------
-    step_cost : float
-        Largest number of multiplications of one step, less than a second. It limits how
-        many frames are used.
-    max_steps : int
-        Largest number of steps.
-    first_damping, smallest_damping, largest_damping : float
-        Levenberg-Marquardt damping: at the start, and its bounds.
-    eased, raised : float
-        Its factors after a step that lowers the residual, and after one that does not.
-    little : float
-        Convergence tolerance: the iteration ends after two consecutive steps that lower
-        the sum of squares by less than this share of it.
-    counted : float
-        Points with at least this weight count as seen, with weight one; others as
-        missing.
-    determined : float
-        The seen points of a frame determine the others if the Gram matrix of the basis
-        of the row space over these points has no eigenvalue below this. Over all points
-        it is the identity.
-    completion_steps : int
-        Largest number of alternations that fill missing points in.
-    """
-
-    step_cost: float = 2e9
-    max_steps: int = 50
-    first_damping: float = 1e-3
-    smallest_damping: float = 1e-14
-    largest_damping: float = 1e2
-    eased: float = 0.05
-    raised: float = 8.0
-    little: float = 1e-2
-    counted: float = 0.5
-    determined: float = 1e-3
-    completion_steps: int = 60
 
 
 class StartOptions(NamedTuple):
@@ -320,7 +266,7 @@ class JointOptions(NamedTuple):
         For small tables, and for large ones and samples. Small tables, such as motion
         capture, have several minima, and comparing them costs little. Large tables show
         many people or things: all starts find the same minimum.
-    starts, judgement, search, noise_free, many_points, reweighting, relevance
+    starts, judgement, search, many_points, reweighting, relevance
         Of the stages.
     """
 
@@ -334,7 +280,6 @@ class JointOptions(NamedTuple):
     starts: StartOptions = StartOptions()
     judgement: JudgementOptions = JudgementOptions()
     search: SearchOptions = SearchOptions()
-    noise_free: NoiseFreeOptions = NoiseFreeOptions()
     many_points: ManyPointOptions = ManyPointOptions()
     reweighting: ReweightingOptions = ReweightingOptions()
     relevance: RelevanceOptions = RelevanceOptions()

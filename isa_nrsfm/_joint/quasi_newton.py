@@ -4,9 +4,7 @@ Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a
 memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
 7.2). The initial inverse Hessian of each step is the inverse of the curvature that
 expectation maximisation uses, at the current iterate. A step without remembered pairs
-is thus a generalised step of expectation maximisation. On tables without noise the
-method converges slowly: once the noise variance is small enough to tell, Gauss-Newton
-steps on the residual take over (`noise_free`).
+is thus a generalised step of expectation maximisation.
 """
 
 from collections import deque
@@ -19,7 +17,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.noise_free import fit_without_noise
 from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions, SearchOptions
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
@@ -108,7 +105,7 @@ def refine_joint(
     on_step : callable, optional
         Called before each step.
     options : JointOptions
-        How steps are made; `search` and `noise_free` are looked at.
+        How steps are made; only `search` is looked at.
 
     Returns
     -------
@@ -125,22 +122,10 @@ def refine_joint(
         maxlen=max(min(most, search.memory), search.least_memory)
     )
     history = [iterate.value]
-    small_steps, exact = 0, search.exact_noise * likelihood.square / likelihood.n_seen
-    if not cameras.n_parameters:
-        exact = 0.0
+    small_steps = 0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
             on_step()
-        # Gauss-Newton steps where hardly any noise is left
-        if iterate.left < exact:
-            reached = _without_noise(likelihood, iterate, floor, options)
-            # One success is enough. After a failure they are tried again with less.
-            exact = 0.0 if reached else search.closer * iterate.left
-            if reached:
-                memory.clear()
-                iterate = reached
-                history.append(iterate.value)
-                continue
         # L-BFGS direction, or the preconditioned gradient if that is no descent
         direction = -_inverse_hessian_product(iterate, memory)
         if not iterate.gradient @ direction < 0:
@@ -191,41 +176,6 @@ def _remember(
     size = least_curvature * np.linalg.norm(step) * np.linalg.norm(change)
     if curvature > size:
         memory.append((step, change, curvature))
-
-
-def _without_noise(
-    likelihood: MarginalLikelihood,
-    iterate: "_Iterate",
-    floor: float,
-    options: JointOptions,
-) -> "_Iterate | None":
-    """Return the iterate after Gauss-Newton steps, None if it is no better."""
-    shapes, motion, _ = iterate.state
-    if not np.isfinite(iterate.value):
-        return None
-    alpha = likelihood.coefficients(*iterate.state)
-    try:
-        with np.errstate(over="raise", invalid="raise"):
-            found = fit_without_noise(
-                likelihood.frames,
-                shapes,
-                motion,
-                alpha,
-                likelihood.penalty,
-                iterate.cameras,
-                options.noise_free,
-            )
-    except FloatingPointError:
-        # Points on a line do not determine cameras, whose squares can leave the range.
-        return None
-    if found is None:
-        return None
-    left = likelihood(*found, floor).residual / likelihood.n_seen
-    if left > iterate.left:
-        return None
-    state = JointState(*found, max(left, floor))
-    reached = _Iterate(likelihood, iterate.cameras, state, floor)
-    return reached if reached.value < iterate.value else None
 
 
 class _Iterate:
