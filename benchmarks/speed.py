@@ -354,7 +354,7 @@ def start(options):
     package = ["-m", "isa_nrsfm"]
     with TemporaryDirectory() as folder:
         model, table, output = (
-            str(Path(folder, name)) for name in ("faces.skops", "one.csv", "alpha.csv")
+            str(Path(folder, name)) for name in ("faces.npz", "one.csv", "alpha.csv")
         )
         faces = make_face_tracks(400, n_components=3, random_state=0)
         X = pd.DataFrame(faces.data, columns=faces.feature_names)

@@ -12,7 +12,7 @@ FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
 FILES = {
     "alpha.csv",
     "cameras.csv",
-    "model.skops",
+    "model.npz",
     "report.html",
     "report.json",
     "shapes.npz",

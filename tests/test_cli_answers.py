@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 pd = pytest.importorskip("pandas")
-pytest.importorskip("skops")
 pytest.importorskip("matplotlib")
 
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
@@ -57,7 +56,7 @@ def report_of(folder):
 
 def test_labels_are_answered_as_in_python(run):
     folder, table = run
-    model, (mood, age) = load_model(folder / "model.skops"), report_of(folder)["labels"]
+    model, (mood, age) = load_model(folder / "model.npz"), report_of(folder)["labels"]
     known = table["mood"].notna()
     expected = association(
         model.alpha_[known],
@@ -82,7 +81,7 @@ def test_labels_are_answered_as_in_python(run):
 
 def test_means_of_classes_are_said_in_words(run):
     folder, table = run
-    model = load_model(folder / "model.skops")
+    model = load_model(folder / "model.npz")
     report = report_of(folder)
     mood, age = report["labels"]
     standard = (model.alpha_ - model.alpha_.mean(axis=0)) / model.alpha_.std(axis=0)
@@ -104,7 +103,7 @@ def test_means_of_classes_are_said_in_words(run):
 
 def test_groups_and_coefficients_within_them(run):
     folder, table = run
-    model, alpha = load_model(folder / "model.skops"), pd.read_csv(folder / "alpha.csv")
+    model, alpha = load_model(folder / "model.npz"), pd.read_csv(folder / "alpha.csv")
     within = WithinGroups().fit_transform(model.alpha_, groups=table["person"])
     columns = ["alpha_1_within", "alpha_2_within"]
     np.testing.assert_allclose(alpha[columns], within, atol=1e-9)
@@ -116,7 +115,7 @@ def test_groups_and_coefficients_within_them(run):
 
 def test_time_smooths(run):
     folder, table = run
-    model, alpha = load_model(folder / "model.skops"), pd.read_csv(folder / "alpha.csv")
+    model, alpha = load_model(folder / "model.npz"), pd.read_csv(folder / "alpha.csv")
     X = table[[name for name in table if name[0] in "xy"]]
     expected = model.smooth(X, time=table["seconds"], groups=table["person"])
     columns = ["alpha_1_smooth", "alpha_2_smooth"]

@@ -37,7 +37,7 @@ def test_paths_that_are_not_utf8(run, faces, tmp_path):
     assert "caf\\udce9 \\udcff" in out
     report = json.loads((results / "report.json").read_text(encoding="utf-8"))
     assert report["table"]["path"].endswith("caf\\udce9 \\udcff.csv")
-    model, alpha = results / "model.skops", folder / f"alpha {NOT_UTF8}.csv"
+    model, alpha = results / "model.npz", folder / f"alpha {NOT_UTF8}.csv"
     assert run("transform", model, table, "-o", alpha)[0] == 0
     assert len(pd.read_csv(alpha)) == 40
     page = folder / f"{NOT_UTF8}.html"
@@ -82,7 +82,7 @@ def test_output_in_any_encoding(faces, tmp_path, monkeypatch, encoding):
     assert main(argv) == 0
     text = shown.getvalue().decode(encoding)
     assert text.startswith("2 basis shapes fitted to 40 frames")
-    assert load_model(tmp_path / "results" / "model.skops").basis_.shape[0] == 2
+    assert load_model(tmp_path / "results" / "model.npz").basis_.shape[0] == 2
 
 
 INTERRUPTED = """

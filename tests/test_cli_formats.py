@@ -137,9 +137,7 @@ def test_files_are_fitted_and_transformed(write, run, tracks, lost, tmp_path):
         assert " 1 left out: tracking failed" in out
 
     output = tmp_path / "again.csv"
-    code, _, err = run(
-        "transform", folder / "model.skops", path, "-o", output, *options
-    )
+    code, _, err = run("transform", folder / "model.npz", path, "-o", output, *options)
     assert (code, err) == (0, "")
     again = pd.read_csv(output)
     assert list(again) == list(alpha)
@@ -187,13 +185,13 @@ def test_a_model_of_other_points_is_refused(run, tracks, lost, tmp_path):
     assert run("fit", path, "-o", folder, *options, *QUICK)[0] == 0
     mesh, options, _ = write_mediapipe(tmp_path, tracks, lost)
     code, _, err = run(
-        "transform", folder / "model.skops", mesh, "-o", tmp_path / "a.csv", *options
+        "transform", folder / "model.npz", mesh, "-o", tmp_path / "a.csv", *options
     )
     assert code == 1
     assert "820 columns are only in the table (x_68, y_68," in err
     openface, _, _ = write_openface(tmp_path, tracks, lost)
     code, out, _ = run(
-        "transform", folder / "model.skops", openface, "-o", tmp_path / "a.csv"
+        "transform", folder / "model.npz", openface, "-o", tmp_path / "a.csv"
     )
     assert code == 0
     assert "1 without coefficients: tracking failed" in out

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 pd = pytest.importorskip("pandas")
-pytest.importorskip("skops")
 pytest.importorskip("matplotlib")
 
 from isa_nrsfm.cli import main  # noqa: E402

@@ -113,7 +113,7 @@ def test_edges_of_a_file(run, table, folder, tmp_path):
     sides = {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
     assert edges_of(tmp_path / "out/viewer.html")[0] == sides
     skeleton = ["--skeleton", "coco-17"]
-    export = ["export", folder / "model.skops", "-o", tmp_path / "a.glb"]
+    export = ["export", folder / "model.npz", "-o", tmp_path / "a.glb"]
     assert run(*export, *skeleton)[0] == 0
     materials = Read(tmp_path / "a.glb").document["materials"]
     assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
@@ -129,7 +129,7 @@ def test_the_configuration_of_deeplabcut(run, table, tmp_path):
 
 def test_transform_writes_a_page_of_the_new_frames(run, table, folder, tmp_path):
     page = tmp_path / "new.html"
-    transform = ["transform", folder / "model.skops", table]
+    transform = ["transform", folder / "model.npz", table]
     transform += ["-o", tmp_path / "alpha.csv", "--skeleton", "coco-17"]
     code, report, _ = run(*transform, "--viewer", page)
     assert code == 0
@@ -149,7 +149,7 @@ def test_where_y_is_zero_is_said(run, tmp_path):
     lower = ["--origin", "lower"]
     options = ["--camera", "weak_perspective", "-k", "1", "--no-figures"]
     assert run("fit", path, "-o", fitted, *options, *lower)[0] == 0
-    model = fitted / "model.skops"
+    model = fitted / "model.npz"
     exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}
     for name, page in exported.items():
         run("export", model, path, "-o", page, "--origin", name)
@@ -214,7 +214,7 @@ def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, opt
     assert "coordinates not used: --points inner (17)" in report
     assert "points recognised as ibug-51" in report
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("ibug-51")
-    names = load_model(tmp_path / "model.skops").feature_names_in_
+    names = load_model(tmp_path / "model.npz").feature_names_in_
     assert names.tolist()[:2] == ["x_17", "y_17"]
     alpha = pd.read_csv(tmp_path / "alpha.csv")
     assert alpha.columns.tolist() == ["row", "alpha_1"]
@@ -222,7 +222,7 @@ def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, opt
     for columns in ([], ["--columns", "x_#,y_#"]):
         page = ["--viewer", tmp_path / "v.html"]
         code, report, _ = run(
-            "transform", tmp_path / "model.skops", faces, "-o", tmp_path / "a.csv",
+            "transform", tmp_path / "model.npz", faces, "-o", tmp_path / "a.csv",
             *columns, *page,
         )  # fmt: skip
         assert code == 0
@@ -242,7 +242,7 @@ def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, opt
 def test_points_are_named(run, faces, tmp_path, points, kept):
     fit = ["fit", faces, "-o", tmp_path, "--no-figures", "--points", points, *QUICK]
     assert run(*fit)[0] == 0
-    names = load_model(tmp_path / "model.skops").feature_names_in_
+    names = load_model(tmp_path / "model.npz").feature_names_in_
     assert names[::2].tolist() == [f"x_{j}" for j in kept]
     expected = get_skeleton("ibug-68").subset(kept).edges.tolist()
     found, _ = edges_of(tmp_path / "viewer.html")

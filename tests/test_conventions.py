@@ -28,7 +28,6 @@ OPTIONAL = [
     "polars",
     "pooch",
     "pyarrow",
-    "skops",
     "yaml",
 ]
 LINT_IMPORTS = "from importlinter.cli import lint_imports_command as run; run()"

@@ -38,7 +38,7 @@ from isa_nrsfm.io import (
 )
 
 resource = pytest.importorskip("resource", reason="limits the memory of a process")
-for library in ("h5py", "tables", "pyarrow", "skops"):
+for library in ("h5py", "tables", "pyarrow"):
     pytest.importorskip(library, reason="needs the extra cli, and tables")
 
 REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
@@ -47,7 +47,6 @@ SECONDS, MEMORY = 60, 2**31
 QUICK, ALL = 8, 500
 
 TRACKS = files.scene(n_frames=4)
-OLD_MODEL = Path(__file__).with_name("saved_models") / "0b_alternating.skops"
 FACES = make_face_tracks(20, n_components=1, random_state=0).data[:, :28]
 PDM = PointDistributionModel(
     files.scene(7, 3)[..., 0][:, :3].copy(), np.ones((2, 7, 3)), np.array([2.0, 1.0])
@@ -196,7 +195,7 @@ def export_edges(path):
     said = path.with_name("said")
     with said.open("w") as file, contextlib.redirect_stderr(file):
         with contextlib.redirect_stdout(None):
-            model = path.with_name("a.skops")
+            model = path.with_name("a.npz")
             code = main(
                 ["export", str(model), "--edges", str(path), "--output", str(output)]
             )
@@ -247,13 +246,8 @@ def write_model(path):
     return path
 
 
-def write_old_model(path):
-    path.write_bytes(OLD_MODEL.read_bytes())
-    return path
-
-
 def write_edges(path):
-    write_model(path.with_name("a.skops"))
+    write_model(path.with_name("a.npz"))
     path.write_text("0,1\n1,2\n2,3\n3,4\n")
     return path
 
@@ -340,8 +334,7 @@ FORMATS = {
         rewritten(of_json),
         read_format("coco"),
     ),
-    "model": Format(lambda d: write_model(d / "a.skops"), npz, read_model),
-    "old model": Format(lambda d: write_old_model(d / "a.skops"), npz, read_model),
+    "model": Format(lambda d: write_model(d / "a.npz"), npz, read_model),
     "pdm npz": Format(lambda d: write_shape_model(d / "a.npz"), npz, read_shape_model),
     "pdm txt": Format(
         lambda d: write_shape_model(d / "a.txt"), of_text(" "), read_shape_model

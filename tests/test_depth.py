@@ -204,8 +204,8 @@ class TestTurnedFaces:
 
     def test_models_keep_their_certainty_in_files(self, turned, tmp_path):
         X, *_, model = turned
-        save_model(model, tmp_path / "model.skops")
-        loaded = load_model(tmp_path / "model.skops")
+        save_model(model, tmp_path / "model.npz")
+        loaded = load_model(tmp_path / "model.npz")
         assert loaded.depth_uncertainty_ == model.depth_uncertainty_
         for name in ("rotation_covariance", "transform"):
             assert_allclose(getattr(loaded, name)(X), getattr(model, name)(X))

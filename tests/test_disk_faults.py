@@ -97,7 +97,7 @@ WRITERS = {
         lambda path: is_table(path, LONG_TABLE),
     ),
     "a.parquet": (lambda path: write_table(TABLE, path), is_table),
-    "a.skops": (lambda path: save_model(model(), path), is_model),
+    "a.npz": (lambda path: save_model(model(), path), is_model),
     "pdm.txt": (lambda path: write_pdm(pdm(), path), is_pdm),
     "pdm.npz": (lambda path: write_pdm(pdm(), path), is_pdm),
     "pdm.mat": (lambda path: write_pdm(pdm(), path), is_pdm),
@@ -285,9 +285,9 @@ class TestKeepFrames:
 
     def test_a_saved_model_has_its_frames(self, tmp_path, table):
         fitted = self.estimator(tmp_path / "kept").fit(table)
-        save_model(fitted, tmp_path / "a.skops")
+        save_model(fitted, tmp_path / "a.npz")
         shutil.rmtree(tmp_path / "kept")
-        loaded = load_model(tmp_path / "a.skops")
+        loaded = load_model(tmp_path / "a.npz")
         assert_array_equal(loaded.alpha_, fitted.alpha_)
         assert_array_equal(loaded.motion_, fitted.motion_)
 
@@ -486,7 +486,7 @@ def test_transform_and_export(capsys, landmarks, old_run, tmp_path, strike, comm
     name = {"transform": "a.csv", "export": "a.html"}[command]
     output = tmp_path / "folder" / name
     table = [str(landmarks)] * (command == "transform")
-    argv = [command, str(old_run / "model.skops"), *table, "-o", str(output)]
+    argv = [command, str(old_run / "model.npz"), *table, "-o", str(output)]
     assert main([*argv[:-1], str(tmp_path / name)]) == 0
     codes = []
     for raised, before, operations in every_fault(
@@ -513,7 +513,7 @@ class TestRunsThatAreMixed:
         copied(old_run, folder)
         return folder
 
-    def warned(self, run, folder, landmarks, model="model.skops"):
+    def warned(self, run, folder, landmarks, model="model.npz"):
         errors = []
         for argv in (
             ("transform", folder / model, landmarks, "-o", folder / "new.csv"),
@@ -536,15 +536,15 @@ class TestRunsThatAreMixed:
 
     def test_files_of_two_runs(self, run, folder, landmarks, tmp_path):
         assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
-        for name in ("alpha.csv", "model.skops"):
+        for name in ("alpha.csv", "model.npz"):
             shutil.copy(tmp_path / "other" / name, folder)
         said = self.warned(run, folder, landmarks)
-        assert f"{folder / 'report.json'} is of another run than model.skops" in said
+        assert f"{folder / 'report.json'} is of another run than model.npz" in said
 
     def test_a_model_elsewhere(self, run, folder, landmarks):
-        shutil.copy(folder / "model.skops", folder / "copy.skops")
-        (folder / "model.skops").write_bytes(OLD)
-        assert self.warned(run, folder, landmarks, "copy.skops") == ""
+        shutil.copy(folder / "model.npz", folder / "copy.npz")
+        (folder / "model.npz").write_bytes(OLD)
+        assert self.warned(run, folder, landmarks, "copy.npz") == ""
 
     @pytest.mark.parametrize(
         "text", ["", "[]", "{", '{"sha256": 3}', '{"sha256": {"../a": "b"}}']

@@ -1147,7 +1147,7 @@ COPIES = {
     "pickle": lambda model, path: pickle.loads(pickle.dumps(model)),
     "deepcopy": lambda model, path: copy.deepcopy(model),
     "joblib": lambda model, path: joblib.load(joblib.dump(model, path)[0]),
-    "skops": lambda model, path: (save_model(model, path), load_model(path))[1],
+    "model file": lambda model, path: (save_model(model, path), load_model(path))[1],
 }
 
 

@@ -29,10 +29,10 @@ NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 def folder(tmp_path_factory):
     """Return a folder with a model and a table with labels and a row too few."""
     folder = tmp_path_factory.mktemp("export")
-    save_model(face_model(), folder / "model.skops")
+    save_model(face_model(), folder / "model.npz")
     named = AffineNRSfM(2, random_state=0)
     named.fit(pd.DataFrame(faces().data[:50], columns=NAMES))
-    save_model(named, folder / "named.skops")
+    save_model(named, folder / "named.npz")
     table = pd.DataFrame(faces().data[:9], columns=NAMES).round(3)
     table.insert(0, " mood", ["calm", "glad", "sad"] * 3)
     table.loc[4, NAMES[6:]] = np.nan
@@ -44,7 +44,7 @@ def folder(tmp_path_factory):
 def export(folder, tmp_path, capsys):
     """Return a function that exports a model: output file, report and errors."""
 
-    def run(name, *options, model="named.skops"):
+    def run(name, *options, model="named.npz"):
         output = tmp_path / name
         options = [str(folder / o) if o == "table.csv" else str(o) for o in options]
         argv = ["export", str(folder / model), *options, "--output", str(output)]
@@ -58,23 +58,23 @@ def export(folder, tmp_path, capsys):
 
 
 def test_the_suffix_tells_what_is_written(export, tmp_path):
-    output, report, _ = export("face.glb", model="model.skops")
+    output, report, _ = export("face.glb", model="model.npz")
     write_glb(face_model(), tmp_path / "expected.glb")
     assert output.read_bytes() == (tmp_path / "expected.glb").read_bytes()
     assert f"{output.stat().st_size} bytes" in report
 
-    output, _, _ = export("face.HTML", model="model.skops")
+    output, _, _ = export("face.HTML", model="model.npz")
     write_viewer(face_model(), tmp_path / "expected.html")
     assert output.read_text() == (tmp_path / "expected.html").read_text()
 
-    output, report, _ = export("pdm.txt", model="model.skops")
+    output, report, _ = export("pdm.txt", model="model.npz")
     for read, computed in zip(
         read_pdm(output), point_distribution_model(face_model()), strict=True
     ):
         assert_array_equal(read, computed)
     assert "3 modes of 68 points" in report
 
-    output, _, _ = export("shapes.npz", model="model.skops")
+    output, _, _ = export("shapes.npz", model="model.npz")
     with np.load(output) as arrays:
         assert set(arrays) == set(ShapeArrays._fields)
         assert_array_equal(arrays["basis"], face_model().basis_)
@@ -88,7 +88,7 @@ def test_content_tells_a_point_distribution_model_from_shapes(export):
 
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
-    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model="model.skops")
+    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model="model.npz")
     expected = point_distribution_model(
         face_model(), n_modes=1, camera=None, origin="lower", mirrored=True
     )
@@ -185,7 +185,7 @@ def test_numbers_of_modes_are_checked(export, n_modes, capsys):
 
 def test_inputs_are_not_overwritten(folder, capsys):
     model = folder / "model.txt"
-    model.write_bytes((folder / "model.skops").read_bytes())
+    model.write_bytes((folder / "model.npz").read_bytes())
     assert main(["export", str(model), "--output", str(model)]) == 1
     assert "would be overwritten by the results" in capsys.readouterr().err
 

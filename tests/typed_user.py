@@ -26,8 +26,8 @@ def fitted(table: Floats, n_components: int = 4) -> AffineNRSfM:
 def of_methods(model: AffineNRSfM, table: Floats, folder: Path) -> Floats:
     found: Decomposition = model.decompose(table)
     image: Floats = model.inverse_transform(found.alpha, found.motion)
-    save_model(model, folder / "model.skops")
-    loaded: AffineNRSfM = load_model(folder / "model.skops")
+    save_model(model, folder / "model.npz")
+    loaded: AffineNRSfM = load_model(folder / "model.npz")
     reliable: bool = bool((loaded.diagnostics().reliability > 0.5).all())
     score: float = model.score(table)
     error: float = inverse_snr(table, model.reproject(table)) if reliable else score

@@ -81,8 +81,7 @@ def fit_table(
     **extra : callable
         Further entries of the report, computed from the model and its table.
     """
-    # What is missing at the end of a long fit should be known before it.
-    import_optional("skops.io", extra="share")
+    # A library that is missing at the end of a long fit should be known before it.
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
     if args.std and args.refinement != "joint":

@@ -22,10 +22,10 @@ Write what a fit has found for other programs. The suffix of the output tells wh
   .npz, .mat   the arrays of the model for NumPy, MATLAB and Octave""",
     """\
 examples:
-  isa-nrsfm export results/model.skops --output faces.glb
-  isa-nrsfm export results/model.skops --output pdm.txt --n-modes 0.98
-  isa-nrsfm export results/model.skops --output pdm.mat --content pdm
-  isa-nrsfm export results/model.skops faces.csv --label expression --output faces.html
+  isa-nrsfm export results/model.npz --output faces.glb
+  isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
+  isa-nrsfm export results/model.npz --output pdm.mat --content pdm
+  isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
 
 Shapes are upright and frontal, and have the proportions that weak-perspective cameras
 tell, except in .npz and .mat, which have the arrays as they are in the model. Models of

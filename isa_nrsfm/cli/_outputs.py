@@ -49,7 +49,7 @@ ARRAYS = {
 }
 NOT_TOLD = "viewer.html has affine shapes, and cameras.csv no angles"
 PAGE = {"viewer.html": "the shapes and the frames in 3D, for any browser"}
-MODEL = {"model.skops": "the fitted model, for isa-nrsfm transform"}
+MODEL = {"model.npz": "the fitted model, for isa-nrsfm transform"}
 
 
 def component_names(n_components: int) -> list[str]:
@@ -156,7 +156,7 @@ def write_results(
         times=times,
         camera="weak_perspective" if len(poses.columns) else None,
     )
-    save_model(estimator, folder / "model.skops")
+    save_model(estimator, folder / "model.npz")
 
 
 def camera_table(

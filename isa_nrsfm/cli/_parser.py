@@ -37,9 +37,9 @@ examples:
       fit an artificial table of faces, and see what a table looks like
   isa-nrsfm fit faces.csv --n-components 9 --output results
       fit a table and write coefficients, shapes, cameras, figures and the model
-  isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
+  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
       coefficients of new frames
-  isa-nrsfm export results/model.skops --output faces.glb
+  isa-nrsfm export results/model.npz --output faces.glb
       the shapes for other programs
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
@@ -63,7 +63,7 @@ replaced, all together, before the figures are drawn."""
 
 _TRANSFORM_EXAMPLES = """\
 example:
-  isa-nrsfm transform results/model.skops new.csv --output new-alpha.csv
+  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
 
 The table must have the landmark columns that the model was fitted to. Every row has its
 row in the output; where too few points are seen, the coefficients are empty."""
@@ -113,7 +113,7 @@ def build_parser() -> argparse.ArgumentParser:
         ),
     )
     transform.add_argument(
-        "model", metavar="MODEL", type=_path, help="model.skops, written by fit"
+        "model", metavar="MODEL", type=_path, help="model.npz, written by fit"
     )
     _add_table_options(transform)
     transform.add_argument(
@@ -137,7 +137,7 @@ def build_parser() -> argparse.ArgumentParser:
         "export", help="shape models, animated 3D, a viewer", **_manners(*EXPORT_HELP)
     )
     export.add_argument(
-        "model", metavar="MODEL", type=_path, help="model.skops, written by fit"
+        "model", metavar="MODEL", type=_path, help="model.npz, written by fit"
     )
     add_export_options(export, _path)
     _add_table_options(export, required=False)

@@ -27,7 +27,7 @@ from isa_nrsfm.cli._parser import AUTO
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.metrics import inverse_snr
 
-_LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas", "skops")
+_LIBRARIES = ("numpy", "scipy", "scikit-learn", "joblib", "pandas")
 _LABEL_WIDTH = 11
 _MOST_ROWS = 10
 _TEXT_WIDTH = 90

@@ -6,7 +6,6 @@ from isa_nrsfm._compat.lazy import lazy_names
 
 __all__ = [
     "FORMATS",
-    "TRUSTED_TYPES",
     "LandmarkFormat",
     "LandmarkTable",
     "Landmarks",
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
         read_landmarks,
     )
     from isa_nrsfm.io._landmarks import Landmarks
-    from isa_nrsfm.io._models import TRUSTED_TYPES, load_model, save_model
+    from isa_nrsfm.io._models import load_model, save_model
     from isa_nrsfm.io._results import from_mediapipe, from_movement
     from isa_nrsfm.io._stored_tables import open_table
     from isa_nrsfm.io._tables import (
@@ -50,7 +49,7 @@ else:
                 "read_landmarks",
             ],
             "isa_nrsfm.io._landmarks": ["Landmarks"],
-            "isa_nrsfm.io._models": ["TRUSTED_TYPES", "load_model", "save_model"],
+            "isa_nrsfm.io._models": ["load_model", "save_model"],
             "isa_nrsfm.io._results": ["from_mediapipe", "from_movement"],
             "isa_nrsfm.io._stored_tables": ["open_table"],
             "isa_nrsfm.io._tables": [

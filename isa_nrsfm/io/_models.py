@@ -1,46 +1,83 @@
-"""Save and load fitted models without pickle."""
+"""Save and load fitted models: NumPy arrays and a JSON header in one ``.npz`` file.
 
+The array ``header`` holds the header as UTF-8 text: number of the format, version of
+the package, parameters, fitted attributes, model of a frame, names of all other arrays,
+and a digest of all of these. `_packed_values` describes its values.
+"""
+
+import hashlib
+import json
 import os
+import zipfile
 from pathlib import Path
+from typing import Any
 
-from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.whole_files import write_whole
+import numpy as np
+from sklearn.utils.validation import check_is_fitted
+
+from isa_nrsfm import __version__
+from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.stored_arrays import array_in
+from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
-from isa_nrsfm.io._model_contents import model_contents, model_from_contents
-from isa_nrsfm.io._old_models import contents_of_old, is_old_model
-from isa_nrsfm.io._skops_values import read_values
+from isa_nrsfm._fitted_model import TableModel
+from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.depth import DepthCertainty
+from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
+from isa_nrsfm._parameters.choices import LOSSES
+from isa_nrsfm._tables.layout import LAYOUTS
+from isa_nrsfm.io._packed_values import (
+    Arrays,
+    check_names,
+    full_name,
+    packed,
+    packed_parts,
+    unpacked,
+    with_parts,
+)
 
-#: The types that a model file contains beside those that skops trusts by itself: none.
-#: Files that named types of this package are read as well, by their plain contents.
-TRUSTED_TYPES: tuple[str, ...] = ()
+FORMAT, FORMAT_VERSION = "isa_nrsfm model", 1
+HEADER = "header"
+ENTRIES = (
+    *("format", "format_version", "package_version", "arrays", "digest"),
+    *("parameters", "attributes", "set_output", "frames"),
+)
+# Of the model of a frame: those of all, of the joint refinement, and of the others.
+OF_TABLE = ("camera", "layout", "each_scaled", "unit", "sizes")
+OF_POSTERIOR = (
+    *("loss", "shapes", "noise_variance", "coefficient_starts"),
+    *("mixing", "space", "certainty", "turns"),
+)
+OF_RIGID = ("mean_shape", "basis")
+# Not in every model. Names of columns may be missing, and what only some fits measure.
+OPTIONAL = ("feature_names_in_", "camera_noise_ratio_", "depth_uncertainty_", "turns")
+
+Shape = tuple[int | None, ...]
 
 
 def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     """
     Save a fitted model to a file that is safe to share.
 
-    The file is written by skops. It holds a dict of numbers, texts and arrays under
-    public names, and no code, so that opening it runs nothing and later versions read
-    it. `load_model` is tried on it before it is put in place: the file is written as a
-    whole or not at all.
+    The file holds numbers, texts and arrays, and no code: opening it runs nothing.
+    Later versions of the package read it.
 
     Parameters
     ----------
     estimator : AffineNRSfM
-        A fitted estimator. Arrays that are memory maps (a path as `keep_frames`) go
-        into the file, which needs no other one; callbacks are left out.
+        A fitted estimator. Memory maps (a path as `keep_frames`) are copied into the
+        file. Callbacks are left out. Of strategies that are not part of
+        `isa_nrsfm.isa` the file holds the name and the fitted arrays.
     path : str or path-like
-        The file to write, by custom with the suffix ``.skops``. An existing file is
-        replaced.
+        The file to write, by custom with the suffix ``.npz``. An existing file is
+        replaced, as a whole or not at all.
 
     Raises
     ------
     ValueError
-        If the estimator is no AffineNRSfM, is not fitted, or has parts that
-        `load_model` would refuse: they are named. Strategies are `FastISA` and
-        `PooledFastICA`, not subclasses or others.
-    ImportError
-        If skops is not installed.
+        If the estimator is no AffineNRSfM, is not fitted, or has a part that a model
+        file cannot hold.
     OSError
         If the file cannot be written.
 
@@ -58,27 +95,44 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     >>> table = make_face_tracks(n_frames=50, random_state=0).data
     >>> model = AffineNRSfM(n_components=2, random_state=0).fit(table)
     >>> with TemporaryDirectory() as folder:
-    ...     save_model(model, Path(folder, "faces.skops"))
-    ...     loaded = load_model(Path(folder, "faces.skops"))
+    ...     save_model(model, Path(folder, "faces.npz"))
+    ...     loaded = load_model(Path(folder, "faces.npz"))
     >>> bool((loaded.transform(table) == model.transform(table)).all())
     True
     """
-    skops_io = import_optional("skops.io", extra="share")
-    contents = skops_io.dumps(model_contents(estimator))
-    try:
-        model_from_contents(read_values(contents))
-    except ValueError as error:
-        raise ValueError(f"the estimator cannot be saved: {error}") from error
-    write_whole(path, contents)
+    if type(estimator) is not AffineNRSfM:
+        raise ValueError(
+            f"only an AffineNRSfM can be saved; got {full_name(type(estimator))}"
+        )
+    check_is_fitted(estimator)
+    arrays: Arrays = {}
+    header = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "package_version": __version__,
+        **packed_parts(estimator, "", arrays),
+        "set_output": vars(estimator)
+        .get("_sklearn_output_config", {})
+        .get("transform"),
+        "frames": {
+            name: packed(value, f"frames.{name}", arrays)
+            for name, value in _frame_entries(estimator).items()
+        },
+        "arrays": sorted(arrays),
+    }
+    header["digest"] = _digest(header, arrays)
+    text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    stored: dict[str, Any] = {HEADER: text, **arrays}
+    with whole_file(path) as file:
+        np.savez(file, **stored)
 
 
 def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     """
     Load a model that `save_model` has saved.
 
-    Files of this and of all earlier versions of the package are read. Numbers, texts
-    and arrays are read and checked, and nothing else, so that files of unknown origin
-    do no harm.
+    Numbers, texts and arrays are read, and nothing else: files of unknown origin do no
+    harm.
 
     Parameters
     ----------
@@ -88,38 +142,203 @@ def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
     Returns
     -------
     AffineNRSfM
-        The fitted estimator.
+        The fitted estimator. In place of a strategy that the file only names it has an
+        object with the fitted arrays, which cannot be fitted again.
 
     Raises
     ------
     ValueError
-        If the file is no model file, is damaged, was written by a newer version, or has
-        entries that are missing, not known, of the wrong type or shape or that do not
-        belong together, or objects that are not part of a model, or if it unpacks to
-        more than it is large. What is wrong is named.
+        If the file is no model file, is damaged or was written by a newer version; if
+        arrays are missing, are not known or have wrong shapes; or if its contents need
+        more memory than the file is large.
     OSError
         If the file cannot be opened.
-
-    Warns
-    -----
-    UserWarning
-        If the model was fitted with a parameter that there is no more, and that a new
-        fit would need for the same result.
 
     See Also
     --------
     save_model : Save a model.
     """
-    stored = Path(path).read_bytes()
-    try:
-        values = read_values(stored)
-    except ValueError as error:
+    with reading(path, "a model of isa_nrsfm"):
+        return _restored(*_read(Path(path)))
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Arrays]:
+    """Return the header and the arrays of a file whose digest is right."""
+    with zipfile.ZipFile(path) as archive:
+        size, found = path.stat().st_size, archive.infolist()
+        if sum(member.file_size for member in found) > size:
+            raise ValueError(f"its contents need more than the {size} bytes it has")
+        arrays = {
+            member.filename.removesuffix(".npy"): array_in(archive.read(member))
+            for member in found
+        }
+    if HEADER not in arrays or arrays[HEADER].dtype != np.uint8:
+        raise ValueError("it has no header")
+    header = json.loads(arrays.pop(HEADER).tobytes())
+    if type(header) is not dict or header.get("format") != FORMAT:
+        raise ValueError("its header is not that of a model")
+    version = header.get("format_version")
+    if type(version) is not int or version > FORMAT_VERSION:
         raise ValueError(
-            f"{os.fspath(path)} is not a model file written by save_model, or it is "
-            f"damaged: {error}"
-        ) from error
-    try:
-        contents = contents_of_old(values) if is_old_model(values) else values
-        return model_from_contents(contents)
-    except ValueError as error:
-        raise ValueError(f"{os.fspath(path)}: {error}") from error
+            f"it was written by a newer isa_nrsfm (format {version}); this one reads "
+            f"formats up to {FORMAT_VERSION}"
+        )
+    check_names(header, ENTRIES, "entries")
+    check_names(arrays, header["arrays"], "arrays")
+    if _digest(header, arrays) != header["digest"]:
+        raise ValueError("its digest is wrong: it is damaged or was changed")
+    return header, arrays
+
+
+def _digest(header: dict[str, Any], arrays: Arrays) -> str:
+    """Return the SHA-256 digest of a header, but for its digest, and of all arrays."""
+    text = {name: value for name, value in header.items() if name != "digest"}
+    digest = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
+    """Return the fitted estimator of a model file."""
+    estimator = with_parts(AffineNRSfM, header, arrays)
+    entries = {
+        name: unpacked(value, arrays) for name, value in header["frames"].items()
+    }
+    joint = "loss" in entries
+    check_names(entries, (*OF_TABLE, *(OF_POSTERIOR if joint else OF_RIGID)), "entries")
+    for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
+        if (name in entries) and entries[name] not in choices:
+            raise ValueError(f"its {name} is not known: {entries[name]}")
+    _check_shapes(vars(estimator), entries)
+    each_scaled = entries["each_scaled"] is True
+    estimator._model = TableModel(
+        _frame_model(entries),
+        estimator.mean_shape_,
+        estimator.basis_,
+        entries["layout"],
+        getattr(estimator, "feature_names_in_", None),
+        None if each_scaled else entries["unit"],
+    )
+    estimator._unit, estimator._n_features_out = entries["unit"], len(estimator.basis_)
+    estimator.camera_, estimator.frames_scaled_ = entries["camera"], each_scaled
+    if entries["sizes"] is not None:
+        estimator._frame_sizes = entries["sizes"]
+    if header["set_output"] is not None:
+        estimator.set_output(transform=header["set_output"])
+    return estimator
+
+
+def _check_shapes(held: dict[str, Any], entries: dict[str, Any]) -> None:
+    """Raise if numbers are missing or do not have the right shapes."""
+    _check_numbers(held.get("basis_"), (None, None, 3), "basis_")
+    K, P, _ = held["basis_"].shape
+    if not K or not P or "isa_" not in held:
+        raise ValueError("it lacks basis shapes or a strategy")
+    joint, kept = "loss" in entries, entries["sizes"] is not None
+    attributes: dict[str, Shape] = {
+        "mean_shape_": (P, 3),
+        "inverse_snr_": (),
+        "rank_floor_": (),
+        "energy_share_": (K,),
+        "mode_covariance_": (3 * K, 3 * K),
+        "singular_values_": (3 * K + 3,),
+        "reference_motion_": (2, 3),
+        "reference_translation_": (2,),
+        "n_iter_": (),
+        "n_features_in_": (),
+        "camera_noise_ratio_": (),
+        "depth_uncertainty_": (),
+        "feature_names_in_": (2 * P,),
+    }
+    of_frames: dict[str, Shape] = {"unit": ()}
+    if joint:
+        attributes |= {
+            "noise_variance_": (),
+            "reliability_": (K,),
+            "objective_history_": (None,),
+            "gradient_norm_": (),
+        }
+        of_frames |= {
+            "shapes": (K + 1, 3, P),
+            "noise_variance": (),
+            "coefficient_starts": (None, K),
+            "mixing": (K + 1, K + 1),
+            "space": (3, 3),
+            "certainty": (4,),
+            "turns": (K, 3, K, 3),
+        }
+    else:
+        of_frames |= {"mean_shape": (P, 3), "basis": (K, P, 3)}
+    if kept:
+        _check_numbers(entries["sizes"], (None,), "sizes")
+        N = len(entries["sizes"])
+        attributes |= {"motion_": (N, 2, 3), "translation_": (N, 2), "alpha_": (N, K)}
+        if joint:
+            attributes["alpha_std_"] = (N, K)
+        if entries["camera"] != "affine":
+            attributes |= {"rotations_": (N, 3, 3), "scales_": (N,)}
+    for values, shapes in ((held, attributes), (entries, of_frames)):
+        for name, shape in shapes.items():
+            if name not in OPTIONAL or values.get(name) is not None:
+                _check_numbers(values.get(name), shape, name)
+
+
+def _check_numbers(value: Any, shape: Shape, name: str) -> None:
+    """Raise if a value is no number or array of the given shape; None is any length."""
+    if value is None:
+        raise ValueError(f"it lacks {name}")
+    kinds = "O" if name == "feature_names_in_" else "iuf"
+    found = np.shape(value)
+    if (
+        isinstance(value, list | str)
+        or np.asarray(value).dtype.kind not in kinds
+        or len(found) != len(shape)
+        or any(n not in (None, m) for n, m in zip(shape, found, strict=True))
+    ):
+        raise ValueError(
+            f"{name} should be numbers of shape {shape}; got shape {found}"
+        )
+
+
+def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
+    """Return the model of a frame and the sizes of frames, by the names in a file."""
+    model, frames = estimator._model, estimator._model.frames
+    entries = {
+        "camera": frames.camera,
+        "layout": model.layout,
+        "each_scaled": model.unit is None,
+        "unit": estimator._unit,
+        "sizes": vars(estimator).get("_frame_sizes"),
+    }
+    if isinstance(frames, RigidFrames):
+        return {**entries, "mean_shape": frames.mean_shape, "basis": frames.basis}
+    return {
+        **entries,
+        "loss": frames.loss,
+        "shapes": frames.shapes,
+        "noise_variance": frames.noise_variance,
+        "coefficient_starts": frames.starts,
+        "mixing": frames.gauge.mixing,
+        "space": frames.gauge.space,
+        "certainty": np.array(frames.certainty[:-1]),
+        "turns": frames.certainty.turns,
+    }
+
+
+def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
+    """Return the model of a frame of `_frame_entries`."""
+    if "loss" not in entries:
+        return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
+    return PosteriorFrames(
+        shapes=entries["shapes"],
+        noise_variance=entries["noise_variance"],
+        starts=entries["coefficient_starts"],
+        loss=entries["loss"],
+        gauge=FrameMap(entries["mixing"], entries["space"]),
+        camera=entries["camera"],
+        certainty=DepthCertainty(
+            *entries["certainty"].tolist(), turns=entries["turns"]
+        ),
+    )

@@ -62,7 +62,7 @@ display.plot(n_columns=2)
 # ``pdm.txt`` is what OpenFace reads as the shape model of a landmark detector. glTF
 # files (``.glb``) open in any 3D program, each basis shape as a morph target. The page
 # has a slider for each basis shape, and needs nothing but a browser. On the command
-# line: ``isa-nrsfm export model.skops --output pdm.txt``, or ``face.glb``, or
+# line: ``isa-nrsfm export model.npz --output pdm.txt``, or ``face.glb``, or
 # ``viewer.html``.
 
 correlation = np.abs(np.corrcoef(faces.alpha.T, model.alpha_.T)[:4, 4:])
