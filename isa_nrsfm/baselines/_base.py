@@ -1,8 +1,7 @@
-"""What the methods of this folder have in common: tables in, shapes and cameras out.
+"""Common base of the baselines: from a table to a camera and a shape for each frame.
 
-A method finds an orthographic camera and a 3D shape for each frame of a table. It says
-nothing about other frames. The estimators make a model of its shapes, their mean and
-principal components, and fit that to the frames of any table.
+A method finds an orthographic camera and a 3D shape for each frame of a table. Other
+frames are fitted by the mean and the principal components of these shapes.
 """
 
 from abc import abstractmethod
@@ -35,9 +34,8 @@ from isa_nrsfm._tables.layout import (
 )
 from isa_nrsfm._tables.sources import checked_range, unmasked
 from isa_nrsfm._transformer import Decomposition
-from isa_nrsfm.baselines._orthographic_frames import OrthographicFrames
+from isa_nrsfm.baselines._orthographic_frames import fit_orthographic
 from isa_nrsfm.baselines._shape_sequence import (
-    ShapeSequence,
     camera_signs,
     principal_shapes,
     shape_signs,
@@ -51,24 +49,23 @@ class ShapeSequenceNRSfM(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
 ):
     """
-    Base of the methods that find a shape for each frame of a table.
+    Base of the methods that find one shape for each frame.
 
-    A method implements `_factorise`, where it may set attributes of its own, and adds
-    its parameters to these.
+    A method implements `_factorise`, where it may set attributes of its own.
 
     Parameters
     ----------
-    n_components : int
+    n_components : int, default=3
         K, the number of basis shapes besides the mean shape.
-    layout : {"interleaved", "planar"}
+    layout : {"interleaved", "planar"}, default="interleaved"
         Order of the columns.
-    scale_frames : bool
-        Whether each centred frame is divided by the root mean square of its
+    scale_frames : bool, default=False
+        Whether to divide each centred frame by the root mean square of its
         coordinates before the fit.
-    ordered : bool
-        Whether the rows are successive frames of a camera that turns little from one
-        to the next, which tells the sign of each frame's camera and shape. Otherwise
-        the signs are those with which the shapes resemble each other.
+    ordered : bool, default=False
+        Whether the rows are successive frames of a slowly turning camera. If True,
+        each frame has the sign that turns the camera least from the frame before.
+        If False, signs are chosen to make the shapes similar.
     """
 
     mean_shape_: NDArray
@@ -90,7 +87,12 @@ class ShapeSequenceNRSfM(
     }
 
     def __init__(
-        self, n_components: int, *, layout: Layout, scale_frames: bool, ordered: bool
+        self,
+        n_components: int = 3,
+        *,
+        layout: Layout = "interleaved",
+        scale_frames: bool = False,
+        ordered: bool = False,
     ):
         self.n_components = n_components
         self.layout = layout
@@ -98,21 +100,12 @@ class ShapeSequenceNRSfM(
         self.ordered = ordered
 
     @abstractmethod
-    def _factorise(self, W: NDArray) -> ShapeSequence:
+    def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """
-        Return cameras and shapes of a measurement matrix.
+        Return cameras (n_frames, 2, 3) and centred shapes (n_frames, n_points, 3).
 
-        Parameters
-        ----------
-        W : ndarray of shape (2 * n_frames, n_points)
-            For each frame the row of x, then of y, in double precision, rows centred;
-            the mean square of the entries is one, with `scale_frames` in each frame.
-
-        Returns
-        -------
-        ShapeSequence
-            In any orientation of space, mirrored or not; the signs of frames are
-            chosen afterwards.
+        W (2 * n_frames, n_points) is in double precision, has centred rows and mean
+        square one. Space may be turned or mirrored; signs of frames are chosen later.
         """
 
     @fit_context(nested=False)
@@ -141,8 +134,7 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         tracks = self._tracks(X, reset=True)
-        names = getattr(self, "feature_names_in_", None)
-        check_names(names, self.layout)
+        check_names(getattr(self, "feature_names_in_", None), self.layout)
         check_size(len(tracks), tracks.shape[1], self.n_components)
         centred, translation = centred_tracks(tracks)
         warn_if_other_layout(
@@ -158,8 +150,10 @@ class ShapeSequenceNRSfM(
         cameras, shapes = cameras @ space.T, shapes @ space.T
         mean_shape, basis, coefficients = principal_shapes(shapes, self.n_components)
         model = compose(mean_shape, basis, coefficients)
-        noise = np.mean((W - _images(cameras, model)) ** 2)
-        error = np.mean((W - _images(cameras, shapes)) ** 2)
+        noise, error = (
+            np.mean((W - measurement_matrix(each @ cameras.transpose(0, 2, 1))) ** 2)
+            for each in (model, shapes)
+        )
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
@@ -206,7 +200,7 @@ class ShapeSequenceNRSfM(
         Returns
         -------
         ndarray of shape (n_frames, n_components)
-            Coefficients, as of `decompose`; those of the fitted table are `alpha_`.
+            Coefficients from `decompose`; for the fitted table they are `alpha_`.
         """
         return self.decompose(X).alpha
 
@@ -215,11 +209,11 @@ class ShapeSequenceNRSfM(
         """
         Return camera and coefficients of each frame of a table.
 
-        Each frame is fitted by itself, with a camera as in the fit and the principal
-        shapes: ``sum_j ||m_j - M_i (b_0j + sum_k alpha_ik b_kj) - t_i||^2 / s_i^2 +
-        noise_variance_ * ||alpha_i||^2`` is least, where M_i has orthonormal rows
-        times the scale s_i of the frame. It is one without `scale_frames`, and with it
-        the root mean square of the centred coordinates of the frame.
+        Each frame is fitted separately, by the principal shapes and an orthographic
+        camera. The fit minimises ``sum_j ||m_j - M_i (b_0j + sum_k alpha_ik b_kj) -
+        t_i||^2 / s_i^2 + noise_variance_ * ||alpha_i||^2``, where M_i has orthonormal
+        rows times the scale s_i of the frame. Without `scale_frames` s_i is one; with
+        it, s_i is the root mean square of the centred coordinates of the frame.
 
         Parameters
         ----------
@@ -231,7 +225,7 @@ class ShapeSequenceNRSfM(
         Decomposition
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
             alpha_std (n_frames, n_components), which is NaN. For the fitted table the
-            cameras are not `motion_`, which belong to `shapes_`.
+            cameras differ from `motion_`, which belong to `shapes_`.
         """
         check_is_fitted(self)
         return self._decompose(self._tracks(X, reset=False))
@@ -248,14 +242,14 @@ class ShapeSequenceNRSfM(
         Returns
         -------
         ndarray of shape (n_frames, n_points, 3)
-            Shapes of the model in the space of `mean_shape_`, without camera. Those of
-            the fitted table are not `shapes_`, which is what the method itself finds.
+            Shapes of the model in the space of `mean_shape_`, without camera. For the
+            fitted table they differ from `shapes_`, the result of the method itself.
         """
         return compose(self.mean_shape_, self.basis_, self.decompose(X).alpha)
 
     def reproject(self, X: Any) -> NDArray:
         """
-        Return a table as the model sees it.
+        Return the images of the fitted model, as a table.
 
         Parameters
         ----------
@@ -266,7 +260,7 @@ class ShapeSequenceNRSfM(
         -------
         ndarray of shape (n_frames, 2 * n_points)
             Points of the model's shapes in their cameras, in the order of `layout`.
-            `inverse_snr_` is not of these, but of `shapes_` in `motion_`.
+            `inverse_snr_` refers to `shapes_` in `motion_` instead.
         """
         motion, translation, alpha, _ = self.decompose(X)
         shapes = compose(self.mean_shape_, self.basis_, alpha)
@@ -280,13 +274,14 @@ class ShapeSequenceNRSfM(
 
     def _tracks(self, X: Any, reset: bool) -> NDArray:
         """Return the tracks of a valid table without missing points."""
+        fewest = 2 if reset else 1
         X = validate_data(
             self,
             unmasked(X),
             dtype=[np.float64, np.float32],
             ensure_all_finite="allow-nan",
-            ensure_min_samples=2 if reset else 1,
-            ensure_min_features=2 if reset else 1,
+            ensure_min_samples=fewest,
+            ensure_min_features=fewest,
             reset=reset,
         )
         checked_range(X)
@@ -306,17 +301,12 @@ class ShapeSequenceNRSfM(
         sizes = np.full(len(tracks), self._unit)
         if self.scale_frames:
             sizes = weighting_sizes(centred, True)
-        frames = OrthographicFrames(
+        cameras, alpha = fit_orthographic(
+            centred / sizes[:, None, None],
             self.mean_shape_.astype(np.float64) / self._unit,
             self.basis_.astype(np.float64) / self._unit,
             self.noise_variance_ / self._unit**2,
         )
-        cameras, alpha = frames.fit(centred / sizes[:, None, None])
         motion = (sizes / self._unit)[:, None, None] * cameras
         found = (motion, translation, alpha, np.full_like(alpha, np.nan))
         return Decomposition(*(part.astype(tracks.dtype) for part in found))
-
-
-def _images(cameras: NDArray, shapes: NDArray) -> NDArray:
-    """Return the measurement matrix of shapes in cameras."""
-    return measurement_matrix(shapes @ cameras.transpose(0, 2, 1))

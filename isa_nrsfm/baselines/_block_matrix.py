@@ -1,7 +1,7 @@
 """The block matrix method: shapes of least nuclear norm, then of low rank."""
 
 from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,35 +16,6 @@ from isa_nrsfm.baselines._pseudo_inverse import (
     orthographic_cameras,
     truncate_rank,
 )
-from isa_nrsfm.baselines._shape_sequence import ShapeSequence
-
-# Prices of the nuclear norm, one after the other.
-PRICES = tuple(4.0**-k for k in range(18))
-# Step of the published iteration; accelerated ones take the longest that is safe, the
-# inverse of the curvature of the images, whose cameras have orthonormal rows.
-PUBLISHED_STEP = 0.2
-# Tolerances where none is given. Steps with momentum are some hundred times as long as
-# the published ones, which end where these do.
-ACCELERATED_TOL, PUBLISHED_TOL = 1e-4, 1e-6
-
-
-class NuclearNormShapes(NamedTuple):
-    """
-    Shapes of all frames by the price of their nuclear norm.
-
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_frames, n_points, 3)
-        The shapes.
-    n_iter : int
-        Steps taken.
-    converged : bool
-        Whether the last one changed the shapes by no more than the tolerance.
-    """
-
-    shapes: NDArray
-    n_iter: int
-    converged: bool
 
 
 def nuclear_norm_shapes(
@@ -56,37 +27,19 @@ def nuclear_norm_shapes(
     accelerated: bool = True,
     max_iter: int,
     tol: float,
-) -> NuclearNormShapes:
+) -> tuple[NDArray, int, bool]:
     """
-    Return shapes that show a measurement matrix and have a small nuclear norm.
+    Minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` over the shapes.
 
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix.
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras R_i with orthonormal rows.
-    price : float
-        Price mu of the nuclear norm.
-    start : ndarray of shape (n_frames, n_points, 3)
-        Shapes to start from.
-    accelerated : bool, default=True
-        Whether steps of length one have the momentum of Nesterov, which is dropped when
-        it leads up (Beck, Teboulle 2009; O'Donoghue, Candes 2015), or they have length
-        0.2 without momentum, as published. The solution is the same.
-    max_iter : int
-        The most steps.
-    tol : float
-        Change of the shapes by a step, relative to their norm, that ends the steps.
-
-    Returns
-    -------
-    NuclearNormShapes
-        Shapes that minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2``, where S
-        has one row a frame, by proximal gradient steps.
+    S has one row for each frame, mu is the price; the cameras (n_frames, 2, 3) have
+    orthonormal rows. Proximal gradient steps of length one have Nesterov's momentum,
+    reset when it leads up (Beck, Teboulle 2009; O'Donoghue, Candes 2015). The published
+    steps have length 0.2 and no momentum. Return shapes (n_frames, n_points, 3), the
+    number of steps, and whether the relative change in the last was at most `tol`.
     """
     images = W.reshape(len(cameras), 2, -1).transpose(0, 2, 1)
-    step = 1.0 if accelerated else PUBLISHED_STEP
+    # The curvature of the images is one, as the cameras have orthonormal rows.
+    step = 1.0 if accelerated else 0.2
     shapes = ahead = start
     momentum = 1.0
     for n_iter in range(1, max_iter + 1):
@@ -104,26 +57,16 @@ def nuclear_norm_shapes(
             momentum = larger
         shapes = moved
         if np.linalg.norm(change) <= tol * size:
-            return NuclearNormShapes(shapes, n_iter, True)
-    return NuclearNormShapes(shapes, max_iter, False)
+            return shapes, n_iter, True
+    return shapes, max_iter, False
 
 
 def shrink(shapes: NDArray, amount: float) -> NDArray:
     """
-    Return shapes with smaller singular values.
+    Subtract an amount from the singular values of shapes (n_frames, n_points, 3).
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_frames, n_points, 3)
-        Shapes; their matrix has one row a frame.
-    amount : float
-        What is taken off the singular values, down to zero.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 3)
-        The shapes. Singular values come from the eigenvalues of the smaller Gram
-        matrix: those below 1e-8 of the largest are not exact.
+    The matrix has one row for each frame. Singular values below 1e-8 of the largest
+    are inexact, as they are roots of eigenvalues of the smaller Gram matrix.
     """
     rows = shapes.reshape(len(shapes), -1)
     tall = len(rows) > rows.shape[1]
@@ -280,30 +223,29 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         self.max_iter = max_iter
         self.tol = tol
 
-    def _factorise(self, W: NDArray) -> ShapeSequence:
+    def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """Return cameras and the shapes of least nuclear norm, of rank K + 1."""
         rank = self.n_components + 1
         cameras = orthographic_cameras(W, rank)
         shapes = least_norm_shapes(W, cameras)
-        tol = ACCELERATED_TOL if self.accelerated else PUBLISHED_TOL
+        # Accelerated steps are some hundred times as long as the published ones.
+        default = 1e-4 if self.accelerated else 1e-6
+        options = {
+            "accelerated": self.accelerated,
+            "max_iter": self.max_iter,
+            "tol": default if self.tol is None else self.tol,
+        }
         self.n_iter_, converged = 0, True
-        for price in PRICES:
-            found = nuclear_norm_shapes(
-                W,
-                cameras,
-                price,
-                shapes,
-                accelerated=self.accelerated,
-                max_iter=self.max_iter,
-                tol=tol if self.tol is None else self.tol,
+        for k in range(18):
+            shapes, n_iter, settled = nuclear_norm_shapes(
+                W, cameras, 4.0**-k, shapes, **options
             )
-            shapes = found.shapes
-            self.n_iter_ += found.n_iter
-            converged &= found.converged
+            self.n_iter_ += n_iter
+            converged &= settled
         if not converged:
             warn_caller(
                 f"the shapes did not converge in max_iter={self.max_iter} steps; "
                 "increase max_iter or tol",
                 ConvergenceWarning,
             )
-        return ShapeSequence(cameras, truncate_rank(shapes, rank))
+        return cameras, truncate_rank(shapes, rank)

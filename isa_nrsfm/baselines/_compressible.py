@@ -6,7 +6,7 @@ dictionary are known up to one 3x3 matrix for each atom.
 """
 
 from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,60 +22,22 @@ from isa_nrsfm._metric_upgrade.quadric import (
 )
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
-from isa_nrsfm.baselines._block_dictionary import (
-    BlockCode,
-    BlockDictionary,
-    block_ksvd,
-    group_sparse_factors,
-)
-from isa_nrsfm.baselines._shape_sequence import ShapeSequence
+from isa_nrsfm.baselines._block_dictionary import block_ksvd, group_sparse_factors
 
-# An atom is aligned by the cameras of frames that it shares with the atoms before it,
-# if there are so many. Where few share, their second blocks are small, and the result
-# is often mirrored or wrong.
+# Fewest frames by whose cameras an atom is aligned. If few frames are shared, their
+# second blocks are small, and the result is often mirrored or wrong.
 FEWEST_SHARED = 10
-# Rounds of `align_blocks`, and the change of an entry below which they end.
-MAX_ROUNDS = 100
-ALIGNED = 1e-12
-
-
-class ChainedAtoms(NamedTuple):
-    """
-    Cameras and shapes of frames over a dictionary.
-
-    Attributes
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        R_i, with orthonormal rows.
-    coefficients : ndarray of shape (n_frames, n_atoms)
-        c_il, zero where an atom is not active.
-    atoms : ndarray of shape (n_atoms, 3, n_points)
-        X_l, zero for atoms that no frame uses.
-    """
-
-    cameras: NDArray
-    coefficients: NDArray
-    atoms: NDArray
 
 
 def metric_correction(blocks: NDArray) -> NDArray:
     """
-    Return the matrix that makes the blocks of an atom scaled orthographic cameras.
+    Return G (3, 3) that makes blocks P_i (n_frames, 2, 3) scaled orthographic cameras.
 
-    Parameters
-    ----------
-    blocks : ndarray of shape (n_frames, 2, 3)
-        Blocks P_i.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        G, up to a scale, such that the rows of ``P_i G`` are orthogonal and of equal
-        length: ``Q = G G^T`` is the symmetric matrix of unit norm that has the least
-        sum of squares of ``p1 Q p1^T - p2 Q p2^T`` and ``2 p1 Q p2^T``, an eigenvector.
-        Of several solutions, as of fewer than three frames, it is the one next to the
-        identity. Where Q is not positive definite its axes are kept, and none is
-        stretched more than 20 times as much as another.
+    The rows of ``P_i G`` are orthogonal and of equal length: ``Q = G G^T`` is the
+    symmetric matrix of unit norm with the least sum of squares of ``p1 Q p1^T - p2 Q
+    p2^T`` and ``2 p1 Q p2^T``, an eigenvector. Of several solutions, with fewer than
+    three frames, it is the nearest to the identity. If Q is not positive definite, its
+    axes are kept, and stretches differ by a factor of at most 20.
     """
     equations = conformal_equations(blocks)
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
@@ -89,56 +51,37 @@ def metric_correction(blocks: NDArray) -> NDArray:
 
 def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
     """
-    Return the rotation or reflection of space that brings blocks to cameras.
+    Return the orthogonal O (3, 3) that, with the best c_i, aligns blocks to cameras.
 
-    Parameters
-    ----------
-    blocks : ndarray of shape (n_frames, 2, 3)
-        Scaled cameras ``c_i R_i O^T``, the signs of c_i unknown.
-    cameras : ndarray of shape (n_frames, 2, 3)
-        R_i, with orthonormal rows.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        Orthogonal O that, with the best c_i, minimises ``sum_i ||P_i O - c_i R_i||^2``:
-        in turns the coefficients and an orthogonal Procrustes problem, from the
-        matrix of any shape that has the largest ``sum_i <P_i O, R_i>^2``.
+    It minimises ``sum_i ||P_i O - c_i R_i||^2`` for P_i and R_i (n_frames, 2, 3), by
+    alternation of coefficients and orthogonal Procrustes problems. The start is the
+    unconstrained matrix with the largest ``sum_i <P_i O, R_i>^2``.
     """
     products = np.einsum("irc,ird->icd", blocks, cameras).reshape(-1, 9)
     start = np.linalg.eigh(products.T @ products)[1][:, -1]
     O = polar(start.reshape(3, 3)).rows  # noqa: E741
-    for _ in range(MAX_ROUNDS):
-        coefficients = products @ O.ravel()
+    for _ in range(100):
         before = O
-        O = polar((coefficients @ products).reshape(3, 3)).rows  # noqa: E741
-        if np.abs(O - before).max() < ALIGNED:
+        O = polar((products @ O.ravel() @ products).reshape(3, 3)).rows  # noqa: E741
+        if np.abs(O - before).max() < 1e-12:
             break
     return O
 
 
-def chain_atoms(atoms: NDArray, code: BlockCode) -> ChainedAtoms:
+def chain_atoms(
+    atoms: NDArray, blocks: NDArray, active: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
     """
     Make cameras of the blocks of all atoms, in one orientation of space.
 
-    Parameters
-    ----------
-    atoms : ndarray of shape (n_atoms, 3, n_points)
-        D_l.
-    code : BlockCode
-        Blocks P_il of the frames.
-
-    Returns
-    -------
-    ChainedAtoms
-        The most used atom comes first, then always the one that shares most frames with
-        those before it. Its blocks become ``P_il G_l``, with G_l the
-        `metric_correction` times the orthogonal matrix that aligns them with the
-        cameras of the shared frames or, where these are fewer than ten, its shape with
-        the first. A frame has the camera R_i next to the block of the first atom that
-        it uses, ``c_il = <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
+    Return cameras R_i (n_frames, 2, 3), coefficients c_il (n_frames, n_atoms) and
+    corrected atoms X_l (n_atoms, 3, n_points), zero if unused. The most used atom comes
+    first, then always the one that shares most frames with those before it. Blocks
+    become ``P_il G_l``: G_l is the `metric_correction` times the orthogonal matrix that
+    aligns them with the cameras of shared frames, or, with fewer than ten of these, the
+    shape with the first. R_i is the camera nearest to the block of the frame's first
+    atom, ``c_il = <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
     """
-    blocks, active = code
     n_frames, n_atoms = active.shape
     cameras, seen = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)
     coefficients, shapes = np.zeros((n_frames, n_atoms)), np.zeros_like(atoms)
@@ -162,7 +105,7 @@ def chain_atoms(atoms: NDArray, code: BlockCode) -> ChainedAtoms:
         seen[users] = True
         coefficients[users, atom] = np.einsum("irc,irc->i", motion, cameras[users]) / 2
         shapes[atom] = np.linalg.pinv(G) @ atoms[atom]
-    return ChainedAtoms(cameras, coefficients, shapes)
+    return cameras, coefficients, shapes
 
 
 class CompressibleNRSfM(ShapeSequenceNRSfM):
@@ -336,22 +279,9 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         self.tol = tol
         self.random_state = random_state
 
-    def _factorise(self, W: NDArray) -> ShapeSequence:
+    def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """Return cameras and shapes that are sums of few atoms."""
-        frames, basis = _row_space(W)
-        # The mean square norm of a frame is 2J.
-        unit = np.sqrt(2 * W.shape[1])
-        found = self._dictionary(frames / unit)
-        cameras, coefficients, atoms = chain_atoms(found.atoms, found.code)
-        self.dictionary_residual_ = found.residual
-        self.n_users_ = found.code.active.sum(axis=0)
-        self.n_iter_ = found.n_iter
-        shapes = np.tensordot(coefficients, unit * (atoms @ basis), 1)
-        return ShapeSequence(cameras, shapes.transpose(0, 2, 1))
-
-    def _dictionary(self, frames: NDArray) -> BlockDictionary:
-        """Return the dictionary of frames of mean square norm one."""
-        n_frames = len(frames)
+        n_frames, n_points = len(W) // 2, W.shape[1]
         n_atoms = self.n_components + 1 if self.n_atoms is None else self.n_atoms
         if n_atoms > n_frames:
             raise ValueError(
@@ -363,9 +293,15 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
                 f"sparsity={self.sparsity} must not be larger than the number of "
                 f"atoms, n_atoms={n_atoms}"
             )
+        # Frames over an orthonormal basis (rank >= 3, n_points) of the rows of W
+        triangle = np.linalg.qr(W, mode="r") if len(W) > n_points else W
+        _, values, basis = np.linalg.svd(triangle, full_matrices=False)
+        basis = basis[: max(3, int(np.sum(values > OF_RANKS * values[0])))]
+        unit = np.sqrt(2 * n_points)  # the mean square norm of a frame is 2J
+        frames = (W @ basis.T).reshape(n_frames, 2, -1) / unit
         random_state = check_random_state(self.random_state)
         _, atoms = group_sparse_factors(frames, n_atoms, self.penalty, random_state)
-        return block_ksvd(
+        atoms, blocks, active, self.dictionary_residual_, self.n_iter_ = block_ksvd(
             frames,
             atoms,
             self.sparsity,
@@ -373,15 +309,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
             max_iter=self.max_iter,
             tol=self.tol,
         )
-
-
-def _row_space(W: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return frames (n_frames, 2, rank) over an orthonormal basis (rank, n_points).
-
-    The basis, of at least three rows, is that of what the rows of W span.
-    """
-    triangle = np.linalg.qr(W, mode="r") if len(W) > W.shape[1] else W
-    _, values, basis = np.linalg.svd(triangle, full_matrices=False)
-    rank = max(3, int(np.sum(values > OF_RANKS * values[0])))
-    return (W @ basis[:rank].T).reshape(len(W) // 2, 2, -1), basis[:rank]
+        self.n_users_ = active.sum(axis=0)
+        cameras, coefficients, atoms = chain_atoms(atoms, blocks, active)
+        shapes = np.tensordot(coefficients, unit * (atoms @ basis), 1)
+        return cameras, shapes.transpose(0, 2, 1)

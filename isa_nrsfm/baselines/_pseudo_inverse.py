@@ -9,33 +9,15 @@ from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormal_cameras,
 )
 from isa_nrsfm._paper.svd import leading_triplets
-from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
-from isa_nrsfm.baselines._shape_sequence import ShapeSequence
 
 
 def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
     """
-    Return the orthographic camera of each frame of a measurement matrix.
+    Return the orthographic camera (n_frames, 2, 3) of each frame of W.
 
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix, rows centred.
-    rank : int
-        Number of shapes that the shapes of all frames are mixtures of.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2, 3)
-        Cameras R_i with orthonormal rows, nearest to those that `orthonormal_cameras`
-        finds as a mixture of the first ``3 * rank`` left singular vectors of W. What
-        W has besides is taken for noise.
-
-    Raises
-    ------
-    ValueError
-        If W has less than rank three.
+    Cameras are the nearest to those that `orthonormal_cameras` finds in the span of
+    the first ``3 * rank`` left singular vectors; the rest of W counts as noise.
     """
     S, Vt, rest = leading_triplets(W, 3 * rank)
     n_columns = int(np.sum(S > OF_RANKS * S[0]))
@@ -51,41 +33,12 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
 
 
 def least_norm_shapes(W: NDArray, cameras: NDArray) -> NDArray:
-    """
-    Return the shapes of least norm that show a measurement matrix exactly.
-
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix.
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras R_i with orthonormal rows.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 3)
-        ``S_i^T = W_i^T R_i``, that is ``S_i = R_i^+ W_i``: flat, in the image plane.
-    """
+    """Return the flat shapes of least norm ``S_i = R_i^+ W_i`` that reproduce W."""
     return W.reshape(len(cameras), 2, -1).transpose(0, 2, 1) @ cameras
 
 
 def truncate_rank(shapes: NDArray, rank: int) -> NDArray:
-    """
-    Return the nearest shapes that are mixtures of a few.
-
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_frames, n_points, 3)
-        Shapes.
-    rank : int
-        Number of shapes that are mixed.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 3)
-        Shapes whose matrix, one row a frame, has this rank: its singular values beyond
-        are set to zero.
-    """
+    """Return the nearest shapes whose matrix, one row a frame, has this rank."""
     U, S, Vt = np.linalg.svd(shapes.reshape(len(shapes), -1), full_matrices=False)
     return ((U[:, :rank] * S[:rank]) @ Vt[:rank]).reshape(shapes.shape)
 
@@ -188,21 +141,8 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
     ((100, 68, 3), (100, 3))
     """
 
-    def __init__(
-        self,
-        n_components: int = 3,
-        *,
-        layout: Layout = "interleaved",
-        scale_frames: bool = False,
-        ordered: bool = False,
-    ):
-        super().__init__(
-            n_components, layout=layout, scale_frames=scale_frames, ordered=ordered
-        )
-
-    def _factorise(self, W: NDArray) -> ShapeSequence:
+    def _factorise(self, W: NDArray) -> tuple[NDArray, NDArray]:
         """Return cameras and the shapes of least norm, of rank K + 1."""
         rank = self.n_components + 1
         cameras = orthographic_cameras(W, rank)
-        shapes = least_norm_shapes(W, cameras)
-        return ShapeSequence(cameras, truncate_rank(shapes, rank))
+        return cameras, truncate_rank(least_norm_shapes(W, cameras), rank)
