@@ -198,7 +198,6 @@ STAGES = {
     "joint.reweighting": ROBUST,
     "joint.relevance": COUNTS,
     "gauge": GAUGE,
-    "gauge.mixing": GAUGE,
 }
 
 

@@ -164,11 +164,11 @@ class TestReturned:
         new = np.tensordot(alpha @ W.T, np.tensordot(np.linalg.inv(W).T, basis, 1), 1)
         assert_allclose(new, np.tensordot(alpha, basis, 1), atol=1e-10)
 
-    def test_number_of_starts_and_seed_do_not_matter_for_a_clear_optimum(self):
+    @pytest.mark.parametrize("n_starts", [1, 3])
+    def test_number_of_starts_does_not_matter_for_a_clear_optimum(self, n_starts):
         signals = sources(["product"] * 4, 0, 200, 3)
-        for arguments in ({"n_starts": 1}, {"n_starts": 3}, {"random_state": 5}):
-            W = shared_mixing(signals, **arguments)
-            assert_allclose(W, shared_mixing(signals), atol=1e-9)
+        W = shared_mixing(signals, n_starts)
+        assert_allclose(W, shared_mixing(signals), atol=1e-9)
 
 
 @pytest.mark.parametrize("size", [1, 3])
@@ -216,19 +216,19 @@ class TestOptimality:
     def test_no_mixing_near_by_is_likelier(self, size):
         Z = white(sources(["product", "uniform", "student", "laplace"], 0, 200, size))
         W = shared_mixing(Z)
-        most = _shared_mixing._fit_densities(W, Z).total
+        most = _shared_mixing._fit_densities(W, Z)[0]
         rng = np.random.default_rng(0)
         for _ in range(50):
             E = 1e-3 * rng.normal(size=W.shape)
-            assert _shared_mixing._fit_densities(W + E @ W, Z).total < most
+            assert _shared_mixing._fit_densities(W + E @ W, Z)[0] < most
 
     @pytest.mark.parametrize("seed", range(5))
     @pytest.mark.parametrize("size", [1, 3])
     def test_likelier_than_the_truth(self, size, seed):
         truth = sources(["product", "student", "uniform", "laplace"], seed, 200, size)
         W = shared_mixing(truth)
-        found = _shared_mixing._fit_densities(W, truth).total
-        assert found > _shared_mixing._fit_densities(np.eye(4), truth).total
+        found = _shared_mixing._fit_densities(W, truth)[0]
+        assert found > _shared_mixing._fit_densities(np.eye(4), truth)[0]
 
     @pytest.mark.parametrize("size", [1, 3])
     def test_newton_steps_end_at_a_maximum(self, size):
@@ -277,7 +277,7 @@ class TestOptimality:
         for seed in range(4):
             Z = white(sources(["gaussian"] * 5, seed, 68, 3))
             few, many = (
-                _shared_mixing._fit_densities(shared_mixing(Z, n_starts=n), Z).total
+                _shared_mixing._fit_densities(shared_mixing(Z, n_starts=n), Z)[0]
                 for n in (1, 8)
             )
             gains.append(many - few)
@@ -319,9 +319,9 @@ class TestDensities:
         )
         uniform = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size=shape)
         Z = scale * np.concatenate([student, uniform])
-        fit = _shared_mixing._fit_densities(np.eye(2), Z)
-        assert_array_equal(fit.tails, [8.0, LIGHT])
-        assert_allclose(fit.variance[0], scale**2, rtol=0.05)
+        _, tails, variance, _ = _shared_mixing._fit_densities(np.eye(2), Z)
+        assert_array_equal(tails, [8.0, LIGHT])
+        assert_allclose(variance[0], scale**2, rtol=0.05)
 
 
 class TestDegenerate:

@@ -19,11 +19,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
-from isa_nrsfm.isa._shared_mixing import (
-    MixingOptions,
-    independent_coefficients,
-    shared_mixing,
-)
+from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
 
 
 class GaugeOptions(NamedTuple):
@@ -38,13 +34,10 @@ class GaugeOptions(NamedTuple):
         Largest number of alternations of the shifts u and v.
     smallest_scale : float
         If the scale of a frame gets below this share of the mean, v stays zero.
-    mixing : MixingOptions
-        Of `shared_mixing`.
     """
 
     max_shifts: int = 200
     smallest_scale: float = 0.1
-    mixing: MixingOptions = MixingOptions()
 
 
 GAUGE_OPTIONS = GaugeOptions()
@@ -116,9 +109,9 @@ def independent_gauge(
     # The mixing of the basis shapes, then their order, scale and signs.
     mixing: NDArray
     if independence == "shapes":
-        mixing = shared_mixing(white, options=options.mixing)
+        mixing = shared_mixing(white)
     elif independence == "coefficients":
-        unmixing = independent_coefficients(alpha, options=options.mixing)
+        unmixing = independent_coefficients(alpha)
         mixing = np.linalg.inv(unmixing).T
     else:
         mixing = _principal_axes(white, alpha)

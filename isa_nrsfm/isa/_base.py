@@ -1,7 +1,7 @@
-"""What the strategies of independent subspace analysis share."""
+"""Base class of the strategies of independent subspace analysis."""
 
 from abc import ABCMeta, abstractmethod
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -36,6 +36,8 @@ class BaseSubspaceAnalysis(
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "subspace_size": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
+        "max_iter": [Interval(Integral, 1, None, closed="left")],
+        "tol": [Interval(Real, 0, None, closed="neither")],
         "random_state": ["random_state"],
     }
 
@@ -43,7 +45,7 @@ class BaseSubspaceAnalysis(
 
     # Threads cost more than they give on matrices of this size.
     @one_blas_thread
-    def _fit(self, signals: Any, **fit_params: Any) -> Self:
+    def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
         signals = validate_data(
             self,
@@ -94,23 +96,11 @@ class BaseSubspaceAnalysis(
 
 def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return uncorrelated signals of unit variance, near to the given ones.
+    Return white signals Z (n_signals, n_samples), and the whitening matrix.
 
-    This is ZCA whitening of the standardised signals. Signals that are white already
-    stay as they are, up to rounding.
-
-    Parameters
-    ----------
-    centred : ndarray of shape (n_samples, n_signals)
-        Signals with zero mean.
-
-    Returns
-    -------
-    Z : ndarray of shape (n_signals, n_samples)
-        White signals, ``Z Z^T = n_samples I``.
-    whitening : ndarray of shape (n_signals, n_signals)
-        ``Z = whitening @ centred.T``: the inverse square root of the correlation
-        matrix, each column divided by the standard deviation of its signal.
+    ZCA whitening of the standardised signals: ``Z = whitening @ centred.T`` with ``Z
+    Z^T = n_samples I``. Signals that are white already stay as they are, up to
+    rounding. `centred` is (n_samples, n_signals), with zero mean.
     """
     n_samples, n_signals = centred.shape
     scale = centred.std(axis=0)

@@ -8,7 +8,7 @@ from sklearn.base import BaseEstimator
 
 
 class SubspaceDensity(Protocol):
-    """What FastISA asks of a density: F(u) ~ log p and its two derivatives."""
+    """Density of FastISA: F(u) ~ log p and its first two derivatives."""
 
     def log_density(self, energy: NDArray) -> NDArray:
         """Return F(u)."""
@@ -53,7 +53,7 @@ class SqrtDensity(BaseEstimator):
         Parameters
         ----------
         energy : ndarray
-            The energies u, not negative.
+            The energies u, non-negative.
 
         Returns
         -------
@@ -69,7 +69,7 @@ class SqrtDensity(BaseEstimator):
         Parameters
         ----------
         energy : ndarray
-            The energies u, not negative.
+            The energies u, non-negative.
 
         Returns
         -------
@@ -82,7 +82,7 @@ class SqrtDensity(BaseEstimator):
         return -0.5 * root, 0.25 * root**2 * root
 
     def _checked_eps(self) -> float:
-        """Return eps, or say that it is not positive."""
+        """Return eps, or raise an error if it is not positive."""
         if not self.eps > 0:
             raise ValueError(f"eps must be above zero; got {self.eps}")
         return self.eps

@@ -1,6 +1,6 @@
 """FastISA with many starts: ISA1."""
 
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -11,7 +11,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, fit_context
+from isa_nrsfm._compat.scikit_learn import HasMethods, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
 from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
@@ -20,13 +20,6 @@ from isa_nrsfm.isa._grouping import (
     rows_by_subspace,
     swap_until_best,
 )
-
-# Starts that are iterated together: enough to make numpy's overhead small, few enough
-# that their arrays stay in the cache.
-BATCH_SIZE = 16
-# Least tolerance of the FastICA that makes a start. It need not converge further:
-# inside a subspace the components may not be determined.
-ICA_TOL = 1e-4
 
 
 class FastISA(BaseSubspaceAnalysis):
@@ -112,8 +105,6 @@ class FastISA(BaseSubspaceAnalysis):
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
         "density": [None, HasMethods(["log_density", "derivatives"])],
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="neither")],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
     }
@@ -162,7 +153,7 @@ class FastISA(BaseSubspaceAnalysis):
             If the number of signals is not a multiple of `subspace_size`, or the
             signals are linearly dependent.
         """
-        return self._fit(signals)
+        return self._fit_signals(signals)
 
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
         density = SqrtDensity() if self.density is None else self.density
@@ -171,10 +162,8 @@ class FastISA(BaseSubspaceAnalysis):
         starts = orthogonalise(
             random_state.standard_normal((self.n_init, n_signals, n_signals))
         )
-        batches = [
-            starts[first : first + BATCH_SIZE]
-            for first in range(0, self.n_init, BATCH_SIZE)
-        ]
+        # Batches that make numpy's overhead small and whose arrays stay in the cache.
+        batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
         n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
         runs = Parallel(n_jobs=n_jobs, return_as="generator")(
             delayed(_run)(
@@ -214,19 +203,18 @@ def _run(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """
-    Return unmixing, likelihood, steps and convergence of a batch of starts.
+    """Return unmixing, likelihood, steps and convergence of a batch of starts.
 
     Starts and unmixing are (n_batch, n_signals, n_signals), Z is (n_signals,
     n_samples), the other results are (n_batch,).
     """
-    # FastICA: subspaces of size one.
+    # FastICA: subspaces of size one. Inside a subspace the components may not be
+    # determined, so it does not need to converge further than this.
     W, n_iter_ica, _ = iterate(
-        starts, Z, 1, density, max_iter=max_iter, tol=max(tol, ICA_TOL)
+        starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
     )
     # Group the components into subspaces.
-    n_signals = len(Z)
-    first = np.repeat(np.arange(n_signals // subspace_size), subspace_size)
+    first = np.arange(len(Z)) // subspace_size
     for r in range(len(W)):
         assignment = swap_until_best(first, likelihood_gains(W[r] @ Z, density))
         W[r] = W[r][rows_by_subspace(assignment)]
@@ -234,9 +222,5 @@ def _run(
     W, n_iter, converged = iterate(
         W, Z, subspace_size, density, max_iter=max_iter, tol=tol
     )
-    return (
-        W,
-        log_likelihood(W, Z, subspace_size, density),
-        n_iter_ica + n_iter,
-        converged,
-    )
+    likelihood = log_likelihood(W, Z, subspace_size, density)
+    return W, likelihood, n_iter_ica + n_iter, converged

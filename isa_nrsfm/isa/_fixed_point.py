@@ -5,37 +5,19 @@ from numpy.typing import NDArray
 
 from isa_nrsfm.isa._density import SubspaceDensity
 
-# A start cycles if its smallest change has not fallen for this many steps. Its step
-# length is then halved, down to SHORTEST_STEP.
-PATIENCE = 10
-SHORTEST_STEP = 1.0 / 16.0
-# If the smallest eigenvalue of W W^T over the largest is below this, `orthogonalise`
-# takes the SVD of W.
-SMALLEST_RATIO = 1e-8
-
 
 def orthogonalise(W: NDArray) -> NDArray:
     """
-    Return the orthogonal matrices nearest to the given ones.
+    Return the orthogonal matrices nearest to matrices (n_batch, n, n).
 
-    The result comes from the eigenvectors of ``W W^T``, in two thirds of the time of an
-    SVD of W. Squaring costs precision, which one Newton step restores (Higham 2008,
-    chapter 8). Where W is nearly singular the SVD is taken instead.
-
-    Parameters
-    ----------
-    W : ndarray of shape (n_batch, n, n)
-        Square matrices.
-
-    Returns
-    -------
-    ndarray of shape (n_batch, n, n)
-        ``(W W^T)^(-1/2) W``, the symmetric orthogonalisation.
+    The symmetric orthogonalisation ``(W W^T)^(-1/2) W`` comes from the eigenvectors of
+    ``W W^T``, in two thirds of the time of an SVD of W. Squaring costs precision, which
+    one Newton step restores (Higham 2008, chapter 8).
     """
     values, axes = np.linalg.eigh(W @ W.swapaxes(-1, -2))
-    poor = values[:, 0] <= SMALLEST_RATIO * values[:, -1]
-    root = np.sqrt(np.where(poor[:, None], 1.0, values))
-    nearest = (axes / root[:, None]) @ (axes.swapaxes(-1, -2) @ W)
+    poor = values[:, 0] <= 1e-8 * values[:, -1]  # nearly singular
+    values[poor] = 1.0
+    nearest = (axes / np.sqrt(values)[:, None]) @ (axes.swapaxes(-1, -2) @ W)
     error = nearest @ nearest.swapaxes(-1, -2) - np.eye(W.shape[-1])
     nearest -= 0.5 * error @ nearest
     if poor.any():
@@ -45,20 +27,9 @@ def orthogonalise(W: NDArray) -> NDArray:
 
 
 def subspace_energies(Y: NDArray, subspace_size: int) -> NDArray:
-    """
-    Return the energy of each subspace at each sample.
+    """Return the energies (..., n_subspaces, n_samples) of signals by subspaces.
 
-    Parameters
-    ----------
-    Y : ndarray of shape (..., n_signals, n_samples)
-        Signals; consecutive rows form a subspace.
-    subspace_size : int
-        Rows in a subspace.
-
-    Returns
-    -------
-    ndarray of shape (..., n_signals // subspace_size, n_samples)
-        Sums of squares.
+    Y is (..., n_signals, n_samples); consecutive rows form a subspace.
     """
     *batch, _, n_samples = Y.shape
     return (Y * Y).reshape(*batch, -1, subspace_size, n_samples).sum(axis=-2)
@@ -67,24 +38,9 @@ def subspace_energies(Y: NDArray, subspace_size: int) -> NDArray:
 def log_likelihood(
     W: NDArray, Z: NDArray, subspace_size: int, density: SubspaceDensity
 ) -> NDArray:
-    """
-    Return the mean log-likelihood of a sample, up to a constant.
+    """Return ``sum_k E F(u_k)``, the mean log-likelihood of a sample up to a constant.
 
-    Parameters
-    ----------
-    W : ndarray of shape (..., n_signals, n_signals)
-        Orthogonal matrices.
-    Z : ndarray of shape (n_signals, n_samples)
-        White signals.
-    subspace_size : int
-        Rows in a subspace.
-    density : SubspaceDensity
-        Gives F.
-
-    Returns
-    -------
-    ndarray of shape (...)
-        ``sum_k E F(u_k)``.
+    W is (..., n_signals, n_signals), orthogonal, Z (n_signals, n_samples), white.
     """
     u = subspace_energies(W @ Z, subspace_size)
     return density.log_density(u).mean(axis=-1).sum(axis=-1)
@@ -98,27 +54,13 @@ def fixed_point_step(
     length: NDArray | float = 1.0,
 ) -> NDArray:
     """
-    Return one step of FastISA (Hyvarinen and Koster 2006).
+    Return W after one step of FastISA (Hyvarinen and Koster 2006).
 
-    Parameters
-    ----------
-    W : ndarray of shape (n_batch, n_signals, n_signals)
-        Orthogonal matrices.
-    Z : ndarray of shape (n_signals, n_samples)
-        White signals.
-    subspace_size : int
-        Rows in a subspace.
-    density : SubspaceDensity
-        Gives g = F' and g'.
-    length : float or ndarray of shape (n_batch,), default=1.0
-        Step length. Below 1.0 a multiple of w is added to each new row, so that it
-        turns by about this share of the full step. The fixed points are the same.
-
-    Returns
-    -------
-    ndarray of shape (n_batch, n_signals, n_signals)
-        For each row w of subspace k, with y = w z, the orthogonalised
-        ``E[z y g(u_k)] - E[g(u_k) + 2 y^2 g'(u_k)] w``.
+    For each row w of subspace k, with y = w z, that is the orthogonalised ``E[z y
+    g(u_k)] - E[g(u_k) + 2 y^2 g'(u_k)] w``. With a step length (n_batch,) below 1.0 a
+    multiple of w is added, so that each row turns by about this share of the full step.
+    The fixed points are the same. W is (n_batch, n_signals, n_signals), orthogonal, Z
+    (n_signals, n_samples), white.
     """
     n_batch, n_signals, n_samples = len(W), *Z.shape
     Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
@@ -135,23 +77,11 @@ def fixed_point_step(
 
 def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
     """
-    Return how far the subspaces of two orthogonal matrices are apart.
+    Return the largest change (n_batch,) of a subspace between two orthogonal matrices.
 
-    Projectors are compared, not rows: rows may rotate inside their subspace for ever.
-
-    Parameters
-    ----------
-    W, W_new : ndarray of shape (n_batch, n_signals, n_signals)
-        Orthogonal matrices.
-    subspace_size : int
-        Rows in a subspace.
-
-    Returns
-    -------
-    ndarray of shape (n_batch,)
-        The largest value over the subspaces k of ``||P_k - P_new,k||_F^2 / (2 d)``,
-        with projectors ``P_k = W_k^T W_k``. It is the mean square sine of the d
-        principal angles.
+    It is ``||P_k - P_new,k||_F^2 / (2 d)`` with projectors ``P_k = W_k^T W_k``, the
+    mean square sine of the d principal angles. Rows may rotate inside their subspace
+    for ever. W and W_new are (n_batch, n_signals, n_signals).
     """
     shape = (len(W), -1, subspace_size, W.shape[-1])
     cosines = W.reshape(shape) @ W_new.reshape(shape).swapaxes(-1, -2)
@@ -184,7 +114,7 @@ def iterate(
     density : SubspaceDensity
         The model.
     max_iter : int
-        The most steps of a start.
+        Largest number of steps of a start.
     tol : float
         Convergence tolerance on `subspace_change` by a step of length 1.
 
@@ -212,12 +142,12 @@ def iterate(
         W[running] = new
         n_iter[running] += 1
 
-        # Halve the step length of starts that cycle.
+        # Halve the step length of starts whose change has not fallen for ten steps.
         nearer = change < least_change[running]
         least_change[running[nearer]] = change[nearer]
         waited[running] = np.where(nearer, 0, waited[running] + 1)
-        cycling = running[waited[running] >= PATIENCE]
-        length[cycling] = np.maximum(length[cycling] / 2, SHORTEST_STEP)
+        cycling = running[waited[running] >= 10]
+        length[cycling] = np.maximum(length[cycling] / 2, 1 / 16)
         waited[cycling] = 0
 
         # Starts that have converged stop.

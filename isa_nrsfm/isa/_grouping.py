@@ -8,27 +8,14 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.isa._density import SubspaceDensity
 
+# Takes an assignment (n_signals,) of signals to subspaces. Returns the gain of the
+# objective by the swap of any two signals, (n_signals, n_signals), and the size of the
+# objective, to which rounding errors are relative.
+Gains = Callable[[NDArray], tuple[NDArray, float]]
 
-def swap_until_best(
-    assignment: NDArray, gains: Callable[[NDArray], tuple[NDArray, float]]
-) -> NDArray:
-    """
-    Swap the two signals whose swap gains most, until no swap gains.
 
-    Parameters
-    ----------
-    assignment : ndarray of int, shape (n_signals,)
-        The subspace of each signal at the start.
-    gains : callable
-        Takes an assignment. Returns how much the swap of any two signals raises the
-        objective, a symmetric matrix (n_signals, n_signals), and the size of the
-        objective, to which rounding errors are relative.
-
-    Returns
-    -------
-    ndarray of int, shape (n_signals,)
-        An assignment that no swap of two signals improves.
-    """
+def swap_until_best(assignment: NDArray, gains: Gains) -> NDArray:
+    """Swap the two signals whose swap gains most, until no swap gains."""
     assignment = assignment.copy()
     while True:
         gain, size = gains(assignment)
@@ -48,24 +35,12 @@ def rows_by_subspace(assignment: NDArray) -> NDArray:
     return np.argsort(first[group], kind="stable")
 
 
-def covariance_gains(
-    covariance: NDArray,
-) -> Callable[[NDArray], tuple[NDArray, float]]:
+def covariance_gains(covariance: NDArray) -> Gains:
     """
-    Return the gains for pooling by covariance.
+    Return the gains for pooling by a covariance (n_signals, n_signals).
 
     The objective is the energy (sum of squares) of the covariance inside the diagonal
     blocks of the subspaces (Brandt et al. 2018, section 3.3).
-
-    Parameters
-    ----------
-    covariance : ndarray of shape (n_signals, n_signals)
-        Symmetric.
-
-    Returns
-    -------
-    callable
-        For `swap_until_best`.
     """
     energy = covariance**2
     total = float(energy.sum())
@@ -84,25 +59,12 @@ def covariance_gains(
     return gains
 
 
-def value_gains(
-    value: Callable[[NDArray], NDArray], n_signals: int
-) -> Callable[[NDArray], tuple[NDArray, float]]:
+def value_gains(value: Callable[[NDArray], NDArray], n_signals: int) -> Gains:
     """
     Return the gains for an objective that is a sum over the subspaces.
 
-    Parameters
-    ----------
-    value : callable
-        Takes groups of signals, ndarray of int of shape (n_groups, subspace_size).
-        Returns the value of each group as a subspace, ndarray of shape (n_groups,). The
-        order inside a group must not matter.
-    n_signals : int
-        Number of signals.
-
-    Returns
-    -------
-    callable
-        For `swap_until_best`.
+    `value` returns the value of each of some groups of signals as a subspace. Groups
+    are ndarrays of int of shape (n_groups, subspace_size), in any order inside.
     """
     # with_b[a, b] is the value of the subspace of a with a replaced by b. Row a depends
     # only on the mates of a, the signals of its subspace. A swap changes the mates of
@@ -126,23 +88,10 @@ def value_gains(
     return gains
 
 
-def likelihood_gains(
-    signals: NDArray, density: SubspaceDensity
-) -> Callable[[NDArray], tuple[NDArray, float]]:
-    """
-    Return the gains for grouping by the likelihood of ISA, ``sum_k E F(u_k)``.
+def likelihood_gains(signals: NDArray, density: SubspaceDensity) -> Gains:
+    """Return the gains for grouping by the likelihood of ISA, ``sum_k E F(u_k)``.
 
-    Parameters
-    ----------
-    signals : ndarray of shape (n_signals, n_samples)
-        Uncorrelated signals of unit variance.
-    density : SubspaceDensity
-        Gives F of the energy u_k of subspace k.
-
-    Returns
-    -------
-    callable
-        For `swap_until_best`.
+    Signals are (n_signals, n_samples), uncorrelated with unit variance.
     """
     square = signals**2
 

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -11,21 +10,18 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_array, check_random_state
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
+from isa_nrsfm._compat.scikit_learn import StrOptions, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity
 from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise
 from isa_nrsfm.isa._grouping import (
+    Gains,
     covariance_gains,
     likelihood_gains,
     rows_by_subspace,
     swap_until_best,
     value_gains,
 )
-
-# Number of groupings from which the greedy swaps start. The first takes the components
-# in order, the others are random.
-N_GROUPINGS = 8
 
 Criterion = Callable[[NDArray], NDArray]
 
@@ -95,8 +91,6 @@ class PooledFastICA(BaseSubspaceAnalysis):
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **BaseSubspaceAnalysis._parameter_constraints,
         "fun": [StrOptions({"exp", "logcosh", "cube"})],
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
-        "tol": [Interval(Real, 0, None, closed="neither")],
     }
 
     def __init__(
@@ -158,7 +152,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
             If the number of signals is not a multiple of `subspace_size`, the signals
             are linearly dependent, or `covariance` is not a symmetric matrix of theirs.
         """
-        return self._fit(signals, covariance=covariance, criterion=criterion)
+        return self._fit_signals(signals, covariance=covariance, criterion=criterion)
 
     def _unmix(
         self,
@@ -175,25 +169,27 @@ class PooledFastICA(BaseSubspaceAnalysis):
         random_state = check_random_state(self.random_state)
         starts = random_state.standard_normal((self.n_init, n_signals, n_signals))
         in_order = np.arange(n_signals) // self.subspace_size
-        groupings = [in_order] + [
-            random_state.permutation(in_order) for _ in range(N_GROUPINGS - 1)
-        ]
+        # Greedy swaps start from the components in order, and from random groupings.
+        groupings = [in_order, *(random_state.permutation(in_order) for _ in range(7))]
         runs: list[tuple[float, NDArray, int, bool]] = []
         for start in starts:
             W, n_iter, converged = self._fastica(Z, start)
-            if covariance is None:
-                W, value = _pool_by_likelihood(W, Z, groupings, self.subspace_size)
-            else:
-                W, value = _pool_by_covariance(W, W @ covariance @ W.T, groupings)
+            gains, value_of = _objective(W, Z, covariance, in_order)
+            swapped = [swap_until_best(first, gains) for first in groupings]
+            rows = max(map(rows_by_subspace, swapped), key=value_of)
+            value, W = value_of(rows), W[rows]
             if criterion is not None:
-                rows = (W @ whitening).reshape(-1, self.subspace_size, n_signals)
-                value = float(np.sum(criterion(rows)))
+                subspaces = (W @ whitening).reshape(-1, self.subspace_size, n_signals)
+                value = float(np.sum(criterion(subspaces)))
             runs.append((value, W, n_iter, converged))
         self.criteria_ = np.array([run[0] for run in runs])
         _, W, n_iter, converged = runs[int(np.argmax(self.criteria_))]
         self.n_iter_ = n_iter
         if criterion is not None:
-            W = _regroup(W, W @ whitening, in_order, criterion)
+            # All swaps between subspaces that raise the criterion
+            components = W @ whitening
+            gains = value_gains(lambda groups: criterion(components[groups]), n_signals)
+            W = W[rows_by_subspace(swap_until_best(in_order, gains))]
         if not converged:
             warn_caller(
                 f"FastICA did not converge in max_iter={self.max_iter} steps in the "
@@ -223,7 +219,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
 
 
 def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
-    """Return a covariance matrix as an array, or say what is wrong with it."""
+    """Return a covariance matrix as an array, or raise an error."""
     covariance = check_array(covariance, dtype=np.float64, input_name="covariance")
     if covariance.shape != (n_signals, n_signals):
         raise ValueError(
@@ -235,54 +231,27 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
     return covariance
 
 
-def _pool_by_covariance(
-    W: NDArray, covariance: NDArray, groupings: list[NDArray]
-) -> tuple[NDArray, float]:
-    """Return the rows of W by subspaces, and the share of energy inside the blocks.
-
-    W and the covariance of its signals are (n_signals, n_signals), each grouping is
-    (n_signals,).
+def _objective(
+    W: NDArray, Z: NDArray, covariance: NDArray | None, in_order: NDArray
+) -> tuple[Gains, Callable[[NDArray], float]]:
     """
-    gains = covariance_gains(covariance)
-    energy = covariance**2
+    Return the gains of swaps of rows of W, and the value of the rows in an order.
+
+    The value is the share of the energy of the covariance inside the blocks, or without
+    one the log-likelihood. W and the covariance of the white signals Z (n_signals,
+    n_samples) are (n_signals, n_signals).
+    """
+    if covariance is None:
+        density, size = SqrtDensity(), np.count_nonzero(in_order == 0)
+        return (
+            likelihood_gains(W @ Z, density),
+            lambda rows: float(log_likelihood(W[rows], Z, size, density)),
+        )
+    pooled = W @ covariance @ W.T
+    energy, inside = pooled**2, in_order[:, None] == in_order
     total = float(energy.sum())
 
-    def inside(assignment: NDArray) -> float:
-        return float(energy[assignment[:, None] == assignment].sum())
+    def share(rows: NDArray) -> float:
+        return float(energy[np.ix_(rows, rows)][inside].sum()) / total if total else 1.0
 
-    pooled = max((swap_until_best(first, gains) for first in groupings), key=inside)
-    return W[rows_by_subspace(pooled)], inside(pooled) / total if total > 0 else 1.0
-
-
-def _pool_by_likelihood(
-    W: NDArray, Z: NDArray, groupings: list[NDArray], subspace_size: int
-) -> tuple[NDArray, float]:
-    """Return the rows of W by subspaces, and the log-likelihood.
-
-    W is (n_signals, n_signals), Z (n_signals, n_samples), each grouping (n_signals,).
-    """
-    density = SqrtDensity()
-    gains = likelihood_gains(W @ Z, density)
-
-    def likelihood(rows: NDArray) -> float:
-        return float(log_likelihood(W[rows], Z, subspace_size, density))
-
-    pooled = [swap_until_best(first, gains) for first in groupings]
-    rows = max((rows_by_subspace(a) for a in pooled), key=likelihood)
-    return W[rows], likelihood(rows)
-
-
-def _regroup(
-    W: NDArray, components: NDArray, assignment: NDArray, criterion: Criterion
-) -> NDArray:
-    """Return the rows of W after all swaps between subspaces that raise the criterion.
-
-    W is orthogonal, `components` is W with the whitening, which the criterion takes.
-    Both are (n_signals, n_signals), the assignment (n_signals,).
-    """
-
-    def value(groups: NDArray) -> NDArray:
-        return criterion(components[groups])
-
-    gains = value_gains(value, len(W))
-    return W[rows_by_subspace(swap_until_best(assignment, gains))]
+    return covariance_gains(pooled), share

@@ -6,8 +6,6 @@ each of the coordinates. This is the freedom that a fit leaves to its basis shap
 samples are points, d is 3. With d = 1 it is plain ICA, as for coefficients.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, expm
@@ -26,83 +24,16 @@ TAILS = (LIGHT, 16.0, 8.0, 4.0, 2.0)
 # likelihood has no bound where a signal vanishes at a large share of the samples.
 TEMPER = 1e-3
 
-# FastICA makes the starts: its density, with mild tails, has few local optima.
-FIRST_TAIL = 8.0
 
-
-class MixingOptions(NamedTuple):
-    """
-    How the likeliest mixing is searched for.
-
-    ``python -m benchmarks.sensitivity gauge.mixing`` shows half and twice of each.
-
-    Attributes
-    ----------
-    fixed_point_steps : int
-        Steps of FastICA from each start. A few lead to a basin of attraction. More
-        would go astray where signals are Gaussian, and magnify rounding errors.
-    same_basin : float
-        Two orthogonal matrices are in one basin if each row of one has a row of the
-        other with at least this cosine, up to sign.
-    n_finalists : int
-        Number of basins, the likeliest ones, from which the likelihood is maximised.
-    many_samples, first_samples : int
-        With more than the first number of samples the likelihood is first maximised on
-        the second.
-    turns : int
-        Alternations of mixing and densities.
-    scale_steps : int
-        Newton steps for the scale of a density.
-    newton_steps : int
-        Newton steps for the mixing.
-    gradient_tol : float
-        Convergence tolerance: the largest entry of the relative gradient, divided by
-        `size`.
-    longest_step : float
-        Largest entry of a step E. A longer one would turn past the next maximum.
-    smallest_shift, largest_shift, shift_factor : float
-        Levenberg-Marquardt shift of the Hessian, relative to `size`: bounds, and the
-        factor by which it rises when a Newton step fails and falls when one succeeds.
-    least_gain : float
-        A step is accepted if it gains this share of what the gradient predicts
-        (Armijo).
-    """
-
-    fixed_point_steps: int = 8
-    same_basin: float = 0.97
-    n_finalists: int = 2
-    many_samples: int = 3000
-    first_samples: int = 1500
-    turns: int = 10
-    scale_steps: int = 5
-    newton_steps: int = 100
-    gradient_tol: float = 1e-11
-    longest_step: float = 1.0
-    smallest_shift: float = 1e-3
-    largest_shift: float = 1e8
-    shift_factor: float = 4.0
-    least_gain: float = 1e-3
-
-
-MIXING_OPTIONS = MixingOptions()
-
-
-# Threads cost more than they give on matrices of this size.
-def shared_mixing(
-    signals: NDArray,
-    *,
-    n_starts: int = 8,
-    random_state: int = 0,
-    options: MixingOptions = MIXING_OPTIONS,
-) -> NDArray[np.float64]:
+def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     """
     Return the mixing, the same for all coordinates, that makes signals independent.
 
     The signals are whitened. From several orthogonal starts, a few steps of FastICA for
-    vectors lead to basins of attraction. From the best of these the likelihood of
-    independent spherical signals, ``sum_k E log p_k(||y_k||) + size * log |det W|``
-    with ``y = W signals``, is maximised over all invertible W by Newton steps. Each
-    density p_k is the likeliest of a few, with heavy or light tails.
+    vectors are taken. From the likeliest result the likelihood of independent spherical
+    signals, ``sum_k E log p_k(||y_k||) + size * log |det W|`` with ``y = W signals``,
+    is maximised over all invertible W by Newton steps. Each density p_k is the
+    likeliest of a few, with heavy or light tails.
 
     Parameters
     ----------
@@ -112,18 +43,14 @@ def shared_mixing(
         are taken as centred: means are not removed.
     n_starts : int, default=8
         Number of orthogonal starts: a canonical one, and rotations of it.
-    random_state : int, default=0
-        Draws the rotations.
-    options : MixingOptions
-        How the mixing is searched for.
 
     Returns
     -------
     ndarray of shape (n_signals, n_signals)
         W, invertible: ``tensordot(W, signals, 1)`` are the independent signals, each
         with mean square 1 over its ``n_samples * size`` numbers. They are sorted by
-        likelihood, the least Gaussian one first. The third moment of each, over all of
-        its numbers, is not negative. Where the signals have a rank r below their
+        likelihood, the least Gaussian one first. The skewness of each, over all of its
+        numbers, is non-negative. Where the signals have a rank r below their
         number, only the first r rows give independent signals. The other rows give
         signals of zeros.
 
@@ -151,79 +78,41 @@ def shared_mixing(
         return np.eye(n_signals)
     Z = np.tensordot(whitening, signals, 1)
 
-    # Basins of attraction, and the likelihood's maximum in the likeliest of them.
-    some = _some_samples(Z, options)
-    starts = _starts(some, n_starts, random_state)
-    ends = _fixed_point(starts, some, options.fixed_point_steps)
-    basins = _distinct(ends, options.same_basin)
-    if len(basins) > options.n_finalists:
-        likely = [-_fit_densities(W, some, options).total for W in basins]
-        basins = [basins[b] for b in np.argsort(likely)[: options.n_finalists]]
-    optima = [_maximise(W, some, options) for W in basins]
-    W, fit = max(optima, key=lambda optimum: optimum[1].total)
-    if some is not Z:
-        W, fit = _maximise(W, Z, options)
+    # The likeliest of the starts. A few steps lead to a basin of attraction. More would
+    # go astray where signals are Gaussian, and magnify rounding errors.
+    few = _few_samples(Z)
+    ends = _fixed_point(_starts(few, n_starts), few, 8)
+    W = max(ends, key=lambda end: _fit_densities(end, few)[0])
+    # The maximum of the likelihood, for many samples first that of a part of them
+    for samples in [few] if few is Z else [few, Z]:
+        W, of_signals = _maximise(W, samples)
 
     # Scale, sign and order. Of all signals of unit mean square, Gaussian ones are the
     # least likely.
     Y = np.tensordot(W, Z, 1).reshape(len(W), -1)
     scale = np.sqrt(np.mean(Y**2, axis=1))
-    order = np.argsort(-(fit.of_signals + size * np.log(scale)), kind="stable")
+    order = np.argsort(-(of_signals + size * np.log(scale)), kind="stable")
     W = (W * (orientations(Y) / scale)[:, None])[order]
     return np.vstack([W @ whitening, null])
 
 
-def independent_coefficients(
-    alpha: NDArray,
-    *,
-    n_starts: int = 8,
-    random_state: int = 0,
-    options: MixingOptions = MIXING_OPTIONS,
-) -> NDArray[np.float64]:
+def independent_coefficients(alpha: NDArray) -> NDArray[np.float64]:
     """
-    Return the mixing that makes coefficients independent over the frames.
+    Return the mixing that makes coefficients (n_frames, n_components) independent.
 
-    Parameters
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients; their means do not matter.
-    n_starts, random_state, options
-        As for `shared_mixing`.
-
-    Returns
-    -------
-    ndarray of shape (n_components, n_components)
-        W, invertible: the columns of ``alpha @ W.T`` are independent, with unit
-        variance over the frames. Order, sign and linear dependencies as for
-        `shared_mixing`, with frames as samples of one coordinate.
-
-    Notes
-    -----
-    With the basis ``tensordot(inv(W).T, basis, 1)`` the new coefficients give the same
-    shapes.
+    The columns of ``alpha @ W.T`` are independent over the frames, with unit variance.
+    With the basis ``tensordot(inv(W).T, basis, 1)`` they give the same shapes. Order,
+    sign and linear dependencies are as for `shared_mixing`.
     """
-    centred = alpha - alpha.mean(axis=0)
-    signals = centred.T[:, :, None]
-    return shared_mixing(
-        signals, n_starts=n_starts, random_state=random_state, options=options
-    )
+    return shared_mixing((alpha - alpha.mean(axis=0)).T[:, :, None])
 
 
 def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return the mixings to uncorrelated rows of mean square 1 and to rows of zeros.
+    Return the mixings to uncorrelated rows of mean square 1, and to rows of zeros.
 
-    Parameters
-    ----------
-    rows : ndarray of shape (n_rows, n)
-        Any rows.
-
-    Returns
-    -------
-    whitening : ndarray of shape (rank, n_rows)
-        ``whitening @ rows`` are uncorrelated.
-    null : ndarray of shape (n_rows - rank, n_rows)
-        ``null @ rows`` vanishes up to rounding; orthogonal to `whitening`.
+    Of n_rows rows of a given rank, the mixings are (rank, n_rows) and (n_rows - rank,
+    n_rows), orthogonal to each other.
     """
     # The triangular factor keeps the precision that rows @ rows.T would lose.
     R = np.linalg.qr(rows.T, mode="r") / np.sqrt(rows.shape[1])
@@ -234,26 +123,26 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
     return (U[:, :rank] / S[:rank]).T, U[:, rank:].T / S[0]
 
 
-def _some_samples(Z: NDArray, options: MixingOptions) -> NDArray:
+def _few_samples(Z: NDArray) -> NDArray:
     """
     Return some of many samples, spread evenly from the smallest to the largest.
 
     Z is (n_signals, n_samples, size). Neither the order of the samples nor an
     orthogonal mixing of the signals changes which samples are taken.
     """
-    if Z.shape[1] <= options.many_samples:
+    if Z.shape[1] <= 3000:
         return Z
     order = np.argsort(np.einsum("kjc,kjc->j", Z, Z), kind="stable")
-    return np.ascontiguousarray(Z[:, spread(order, options.first_samples)])
+    return np.ascontiguousarray(Z[:, spread(order, 1500)])
 
 
-def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
+def _starts(Z: NDArray, n_starts: int) -> NDArray:
     """
     Return orthogonal matrices (n_starts, n_signals, n_signals) to start from.
 
     ``W Z`` is the same for any orthogonal mixing of the white signals Z (n_signals,
     n_samples, size). The first W has the axes of a fourth-order moment (FOBI, Cardoso
-    1989) with bounded weights. The others are random rotations of it, from a seed.
+    1989) with bounded weights. The others are random rotations of it.
     """
     n_signals = len(Z)
     energy = np.einsum("kjc,kjc->j", Z, Z)
@@ -266,7 +155,7 @@ def _starts(Z: NDArray, n_starts: int, random_state: int) -> NDArray:
     side = axes @ weighted.mean(axis=1)
     axes[side @ np.linalg.svd(side)[2][0] < 0] *= -1.0
 
-    rng = np.random.default_rng(random_state)
+    rng = np.random.default_rng(0)
     turned = rng.standard_normal((n_starts - 1, n_signals, n_signals)) @ axes
     return np.concatenate([axes[None], orthogonalise(turned)])
 
@@ -280,25 +169,15 @@ def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
     n_signals, n_signals), orthogonal, and Z (n_signals, n_samples, size), white.
     """
     n_signals, n_samples, size = Z.shape
-    flat = Z.reshape(n_signals, -1)
+    flat, tail = Z.reshape(n_signals, -1), np.array(8.0)  # mild: few local optima
     for _ in range(n_steps):
         Y = (W @ flat).reshape(*W.shape[:2], n_samples, size)
         u = np.einsum("skjc,skjc->skj", Y, Y)
-        g, dg = _slopes(u, np.array(FIRST_TAIL), size)
+        g, dg = _slopes(u, tail, size)
         curvature = np.mean(size * g + 2.0 * u * dg, axis=-1)
         step = (g[..., None] * Y).reshape(*W.shape[:2], -1) @ flat.T / n_samples
         W = orthogonalise(step - curvature[..., None] * W)
     return W
-
-
-def _distinct(W: NDArray, same_basin: float) -> list[NDArray]:
-    """Return one orthogonal matrix of each basin, from W (n_starts, n, n)."""
-    kept: list[NDArray] = []
-    for candidate in W:
-        cosines = [np.abs(candidate @ other.T).max(axis=1).min() for other in kept]
-        if max(cosines, default=0.0) < same_basin:
-            kept.append(candidate)
-    return kept
 
 
 def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
@@ -335,34 +214,14 @@ def _log_integral(tail: float, size: int) -> float:
     return float(sphere + np.log(radial))
 
 
-class DensityFit(NamedTuple):
+def _fit_densities(W: NDArray, Z: NDArray) -> tuple[float, NDArray, NDArray, NDArray]:
     """
-    The likeliest density of each signal.
+    Return the likelihood of the signals ``y = W z`` with their likeliest densities.
 
-    Attributes
-    ----------
-    tails : ndarray of shape (n_signals,)
-        Which of `TAILS`.
-    variance : ndarray of shape (n_signals,)
-        Squared scale: signal k divided by its scale has the density `tails` names.
-    of_signals : ndarray of shape (n_signals,)
-        ``E log p_k(||y_k||)`` of the signals y = W z.
-    total : float
-        The likelihood: their sum plus ``size * log |det W|``.
-    """
-
-    tails: NDArray
-    variance: NDArray
-    of_signals: NDArray
-    total: float
-
-
-def _fit_densities(
-    W: NDArray, Z: NDArray, options: MixingOptions = MIXING_OPTIONS
-) -> DensityFit:
-    """Return the likeliest density and scale of each signal ``W z``.
-
-    W is (n_signals, n_signals), Z is (n_signals, n_samples, size).
+    W is (n_signals, n_signals), Z (n_signals, n_samples, size). The other results are
+    (n_signals,): the density of each signal, one of `TAILS`, its squared scale, and
+    ``E log p_k(||y_k||)``. The likelihood is the sum of these plus ``size * log |det
+    W|``.
     """
     size = Z.shape[2]
     Y = np.tensordot(W, Z, 1)
@@ -370,7 +229,7 @@ def _fit_densities(
     log_variance = np.log(u.mean(axis=1) / size)
     variances, values = [], []
     for tail in TAILS:
-        for _ in range(options.scale_steps):
+        for _ in range(5):
             v = u * np.exp(-log_variance)[:, None]
             g, dg = _slopes(v, np.array(tail), size)
             # Newton step for the scale. The likelihood is largest where
@@ -385,30 +244,25 @@ def _fit_densities(
     best = np.argmax(values, axis=0), np.arange(len(W))
     of_signals = np.array(values)[best]
     total = float(of_signals.sum() + size * np.linalg.slogdet(W)[1])
-    return DensityFit(
-        np.array(TAILS)[best[0]], np.array(variances)[best], of_signals, total
-    )
+    return total, np.array(TAILS)[best[0]], np.array(variances)[best], of_signals
 
 
-def _maximise(
-    W: NDArray, Z: NDArray, options: MixingOptions
-) -> tuple[NDArray, DensityFit]:
-    """Return a local maximum of the likelihood near W, by alternating maximisation.
+def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, NDArray]:
+    """Return a local maximum of the likelihood near W, and log densities of signals.
 
     The mixing and the densities take turns, until the densities stay the same.
     """
-    fit = _fit_densities(W, Z, options)
-    for _ in range(options.turns):
-        W = _newton(W / np.sqrt(fit.variance)[:, None], Z, fit.tails, options)
-        before, fit = fit, _fit_densities(W, Z, options)
-        if np.array_equal(fit.tails, before.tails):
+    _, tails, variance, of_signals = _fit_densities(W, Z)
+    for _ in range(10):
+        before = tails
+        W = _newton(W / np.sqrt(variance)[:, None], Z, tails)
+        _, tails, variance, of_signals = _fit_densities(W, Z)
+        if np.array_equal(tails, before):
             break
-    return W, fit
+    return W, of_signals
 
 
-def _newton(
-    W: NDArray, Z: NDArray, tails: NDArray, options: MixingOptions = MIXING_OPTIONS
-) -> NDArray:
+def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
     """
     Maximise the likelihood over all mixings W for fixed densities `tails` (n_signals,).
 
@@ -427,27 +281,26 @@ def _newton(
         return float(F + size * np.linalg.slogdet(W)[1]), Y, u
 
     value, Y, u = likelihood(W)
-    shift = 0.0
-    for _ in range(options.newton_steps):
+    shift = 0.0  # relative to `size`
+    for _ in range(100):
         gradient, hessian = _relative_derivatives(Y, *_slopes(u, tail, size))
-        if np.abs(gradient).max() < options.gradient_tol * size:
+        if np.abs(gradient).max() < 1e-11 * size:
             break
-        # Raise the shift until a step succeeds.
-        while shift < options.largest_shift:
+        # Raise the shift until a step succeeds. A long step would turn past the next
+        # maximum.
+        while shift < 1e8:
             E = _ascent(gradient, hessian, shift * size)
-            if E is not None and np.abs(E).max() < options.longest_step:
+            if E is not None and np.abs(E).max() < 1.0:
                 trial = expm(E) @ W
                 raised, Y, u = likelihood(trial)
-                least = options.least_gain * np.vdot(gradient, E)
-                least -= OF_STEPS * abs(value)
-                if raised - value > least:
+                armijo = 1e-3 * np.vdot(gradient, E)
+                if raised - value > armijo - OF_STEPS * abs(value):
                     break
-            shift = max(options.shift_factor * shift, options.smallest_shift)
+            shift = max(4.0 * shift, 1e-3)
         else:
             break
         W, value = trial, raised
-        eased = shift > options.smallest_shift
-        shift = shift / options.shift_factor if eased else 0.0
+        shift = shift / 4.0 if shift > 1e-3 else 0.0
     return W
 
 
