@@ -376,9 +376,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             If X has an odd number of columns, infinite values, too few points or
             frames for `n_components`, a frame whose points are all equal, that shows
             one to three points or some on one line only, a point that is seen in too
-            few frames, or column names that contradict `layout`; or if `loss` is not
-            linear without the joint refinement, or either is not the default for a
-            `StoredTable` or a dask array; or if `keep_frames` is an empty text.
+            few frames, or column names that contradict `layout`; if `loss` is not
+            linear, or X a `StoredTable` or a dask array, without the joint refinement;
+            or if `keep_frames` is an empty text.
         OSError
             If the folder of `keep_frames` cannot be made or written to, before the fit;
             if the disk is full, after it.

@@ -8,7 +8,7 @@ from scenes import measurements, permute_frames, rotate_frames
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.svd import block_triplets, leading_triplets
-from isa_nrsfm._tables.blocks import MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 SIZES = [(40, 25), (15, 60)]  # frames, points: W is tall, W is wide
 
@@ -242,7 +242,7 @@ class TestLargeBothWays:
         frames = W.reshape(len(W) // 2, 2, -1)
         expected = leading_triplets(W, 5, KRYLOV)
         found = block_triplets(
-            MemoryBlocks.from_array(frames, block_frames), W.shape, 5, KRYLOV
+            FrameBlocks.of_array(frames, block_frames), W.shape, 5, KRYLOV
         )
         assert_allclose(found.values, expected.values, rtol=1e-7)
         assert_allclose(found.rest, expected.rest, rtol=1e-6)

@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from isa_nrsfm._tables.blocks import MemoryBlocks, StoredBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 N_FRAMES = 23
 
 
 def blocks_of(kind, array, length):
     if kind == "stored":
-        return StoredBlocks.from_table(array, length)
-    return MemoryBlocks.from_array(
-        array, length, n_threads=3 if kind == "threads" else 1
-    )
+        return FrameBlocks.of_stored(array, length)
+    return FrameBlocks.of_array(array, length, n_threads=3 if kind == "threads" else 1)
 
 
 @pytest.fixture(params=["memory", "threads", "stored"])
@@ -79,13 +77,13 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
         calls.append(len(block))
         return block
 
-    stored = StoredBlocks.from_table(array, 10).derive(recorded)
+    stored = FrameBlocks.of_stored(array, 10).derive(recorded)
     assert calls == []
     list(stored.map(len))
     stored.whole()
     assert calls == [10, 10, 3] * 2
     calls.clear()
-    kept = MemoryBlocks.from_array(array, 10).derive(recorded)
+    kept = FrameBlocks.of_array(array, 10).derive(recorded)
     kept.whole()
     assert calls == [10, 10, 3]
 
@@ -97,7 +95,7 @@ def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
         calls.append(len(block))
         return block
 
-    stored = StoredBlocks.from_table(array, 4).derive(recorded)
+    stored = FrameBlocks.of_stored(array, 4).derive(recorded)
     frames = np.isin(np.arange(N_FRAMES), [0, 22])
     assert_array_equal(stored.subset(frames).whole(), array[frames])
     assert max(calls) == 4
@@ -105,7 +103,7 @@ def test_kept_frames_far_apart_are_read_a_block_at_a_time(array):
 
 @pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
 def test_small_blocks_are_regrouped(array, n_frames, lengths):
-    blocks = MemoryBlocks.from_array(array, 3)
+    blocks = FrameBlocks.of_array(array, 3)
     larger = blocks.regrouped(np.concatenate, n_frames)
     assert larger.lengths == lengths
     assert_array_equal(larger.whole(), array)
@@ -116,11 +114,11 @@ def test_an_error_in_a_thread_is_raised(array):
         raise ValueError("no good")
 
     with pytest.raises(ValueError, match="no good"):
-        list(MemoryBlocks.from_array(array, 2, n_threads=2).map(fail))
+        list(FrameBlocks.of_array(array, 2, n_threads=2).map(fail))
 
 
 def test_no_frames():
-    blocks = MemoryBlocks.from_array(np.empty((0, 4)), 5)
+    blocks = FrameBlocks.of_array(np.empty((0, 4)), 5)
     (got,) = blocks.collect(lambda b: (b,), ((4,),), np.float32)
     assert got.shape == (0, 4)
     assert got.dtype == np.float32

@@ -26,7 +26,7 @@ from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._prepare.completion import complete_tracks
-from isa_nrsfm._tables.blocks import MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -65,7 +65,7 @@ def with_gaps(tracks, share=0.1):
 def rows_of(tracks):
     """Return tracks in blocks, as the table's stage does."""
     rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
-    return MemoryBlocks.from_array(rows, 64)
+    return FrameBlocks.of_array(rows, 64)
 
 
 def fitted(

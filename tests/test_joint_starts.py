@@ -22,7 +22,7 @@ from isa_nrsfm._joint.starts import (
     rigid_start,
 )
 from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._tables.blocks import MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 N_POINTS = 40
@@ -246,7 +246,7 @@ class TestLiftedShapes:
 
 
 def problem_of(scene, effort=JOINT_OPTIONS.small):
-    rows = MemoryBlocks.from_array(scene.rows, 64)
+    rows = FrameBlocks.of_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
     return JointProblem(frames, Steps(1000, 0.01, effort=effort), 0.0)
 

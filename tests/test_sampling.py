@@ -6,7 +6,7 @@ from scenes import measurements, permute_frames
 
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import rigid_energy, sample_frames
-from isa_nrsfm._tables.blocks import MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -19,7 +19,7 @@ def matrix(n_frames, n_points=20):
 
 
 def sample(W, block_frames=64, **options):
-    rows = MemoryBlocks.from_array(W.reshape(len(W) // 2, 2, -1), block_frames)
+    rows = FrameBlocks.of_array(W.reshape(len(W) // 2, 2, -1), block_frames)
     return sample_frames(
         rows, W.shape[1], factorise(W, 2).rigid_shape, **{**FEW, **options}
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES
 from isa_nrsfm._linalg.vectors import energies
-from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
 
@@ -119,7 +119,7 @@ class JointFrames(NamedTuple):
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
         taken = [part for part in self.blocks.map(_taken, chosen) if len(part.weight)]
-        blocks = MemoryBlocks(taken, [len(part.weight) for part in taken])
+        blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
         blocks = blocks.regrouped(joined_frames, BLOCK_FRAMES)
         return type(self)(blocks, self.directions)
 

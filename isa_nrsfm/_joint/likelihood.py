@@ -43,7 +43,7 @@ from isa_nrsfm._frames.point_sums import (
 from isa_nrsfm._joint.extents import extent_penalty
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
-from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
@@ -115,7 +115,7 @@ def likelihood_of(
     pieces = frame_tracks(tracks, weights).pieces(block_frames)
     blocks = [block for _, block in pieces]
     lengths = [len(block.weight) for block in blocks]
-    return MarginalLikelihood(MemoryBlocks(blocks, lengths), penalty)
+    return MarginalLikelihood(FrameBlocks.of_blocks(blocks, lengths), penalty)
 
 
 class MarginalLikelihood:

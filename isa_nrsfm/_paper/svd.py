@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import energies
-from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
 
 # A matrix with more rows and more columns is not factorised as a whole.
@@ -41,7 +41,7 @@ class Triplets(NamedTuple):
 
 def leading_triplets(W: NDArray, k: int, dense: int = DENSE) -> Triplets:
     """Return the k leading triplets of a matrix (n_rows, n_columns) in memory."""
-    blocks = MemoryBlocks([W], [len(W)])
+    blocks = FrameBlocks.of_blocks([W], [len(W)])
     return block_triplets(blocks, (len(W), W.shape[1]), k, dense)
 
 

@@ -6,7 +6,6 @@ that are read from disk block by block, or on a dask cluster.
 """
 
 import mmap
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -16,100 +15,128 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class FrameBlocks(ABC):
+class FrameBlocks:
     """
-    Consecutive blocks of the frames of a table.
+    Consecutive blocks of the frames of a table, in memory or read when they are needed.
 
-    A block holds what belongs to some consecutive frames: an array with a row for each
-    of them, or any object that a function given to `derive` has returned.
+    A block holds some consecutive frames: an array with a row for each of them, or any
+    object that a function given to `derive` has returned.
 
     Parameters
     ----------
+    read : callable
+        Returns a block, given its number.
     lengths : sequence of int
-        How many frames each block has.
+        Number of frames of each block.
+    cached : bool
+        Whether derived blocks are computed at once and kept. Otherwise they are
+        computed anew each time they are read.
+    n_threads : int, default=1
+        Threads that work on blocks at the same time.
     """
 
-    def __init__(self, lengths: Sequence[int]):
+    def __init__(
+        self,
+        read: Callable[[int], Any],
+        lengths: Sequence[int],
+        cached: bool,
+        n_threads: int = 1,
+    ):
+        self.read, self.cached, self.n_threads = read, cached, n_threads
         self.lengths = list(lengths)
-        ends = np.cumsum(self.lengths, dtype=int)
-        self.slices = [
-            slice(int(end) - length, int(end))
-            for end, length in zip(ends, self.lengths, strict=True)
-        ]
+        ends = np.cumsum(self.lengths, dtype=int).tolist()
+        self.slices = list(map(slice, [0, *ends[:-1]], ends))
+
+    @classmethod
+    def of_blocks(
+        cls, blocks: Sequence[Any], lengths: Sequence[int], n_threads: int = 1
+    ) -> Self:
+        """Return blocks in memory."""
+        return cls(blocks.__getitem__, lengths, True, n_threads)
+
+    @classmethod
+    def of_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
+        """Return the blocks of an array (n_frames, ...), block_frames frames each."""
+        starts = range(0, len(array), block_frames)
+        blocks = [array[start : start + block_frames] for start in starts]
+        return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
+
+    @classmethod
+    def of_stored(cls, table: Any, block_frames: int) -> Self:
+        """Return blocks that are read from a table that can be sliced."""
+        return cls._read_later(partial(read_rows, table), table.shape[0], block_frames)
+
+    @classmethod
+    def _read_later(
+        cls, rows: Callable[[slice], Any], n_frames: int, block_frames: int
+    ) -> Self:
+        """Return blocks of rows that a function returns for a slice."""
+        starts = range(0, n_frames, block_frames)
+        parts = [slice(s, min(s + block_frames, n_frames)) for s in starts]
+        lengths = [part.stop - part.start for part in parts]
+        return cls(lambda number: rows(parts[number]), lengths, False)
 
     @property
     def n_frames(self) -> int:
         """The number of frames of all blocks."""
         return sum(self.lengths)
 
-    @abstractmethod
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """
-        Yield what a function makes of each block, in order.
+        Yield the results of a function of each block, in order.
 
-        Parameters
-        ----------
-        function : callable
-            Called with a block and the rows of the arrays that belong to its frames.
-        *by_frame : ndarray of shape (n_frames, ...)
-            Arrays with a row for each frame.
-
-        Yields
-        ------
-        object
-            What the function returns.
+        The function is called with a block and the rows of the arrays (n_frames, ...)
+        that belong to its frames.
         """
+        run = self._reader(function, by_frame)
+        numbers = range(len(self.lengths))
+        if min(self.n_threads, len(numbers)) < 2:
+            yield from map(run, numbers)
+            return
+        with ThreadPoolExecutor(self.n_threads) as pool:
+            yield from pool.map(run, numbers)
 
-    @abstractmethod
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
-        """
-        Return new blocks, the results of a function of each of these blocks.
+        """Return new blocks, the results of a function of each of these (see `map`)."""
+        if self.cached:
+            blocks = list(self.map(function, *by_frame))
+            return self.of_blocks(blocks, self.lengths, self.n_threads)
+        read = self._reader(function, by_frame)
+        return type(self)(read, self.lengths, False)
 
-        They stay where these blocks are. In memory they are computed at once and kept.
-        Blocks from disk are computed anew each time they are read.
-        """
-
-    @abstractmethod
     def subset(self, frames: NDArray) -> Self:
-        """
-        Return blocks of only some of the frames. These blocks must be arrays.
+        """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
+        length = max(self.lengths)
+        if self.cached:
+            array = self.joined(chosen_rows, frames)
+            return self.of_array(array, length, self.n_threads)
+        chosen = self.derive(chosen_rows, frames)
+        counts = [np.count_nonzero(frames[part]) for part in self.slices]
+        before = np.cumsum([0, *counts])
 
-        Parameters
-        ----------
-        frames : ndarray of bool, shape (n_frames,)
-            Which frames are kept, at least one.
+        def rows(part: slice) -> NDArray:
+            ends = [part.start, part.stop - 1]
+            first, last = np.searchsorted(before, ends, side="right") - 1
+            found = [chosen.read(number) for number in range(first, last + 1)]
+            start = part.start - before[first]
+            return np.concatenate(found)[start : start + part.stop - part.start]
 
-        Returns
-        -------
-        FrameBlocks
-            The kept frames, in the order of the table.
-        """
+        return self._read_later(rows, int(before[-1]), length)
 
     def joined(self, function: Callable[..., NDArray], *by_frame: NDArray) -> NDArray:
         """Return the arrays that a function makes of the blocks, concatenated."""
         return np.concatenate(list(self.map(function, *by_frame)))
 
     def take(self, frames: NDArray) -> NDArray:
-        """
-        Return some of the frames as one array. The blocks must be arrays.
-
-        Parameters
-        ----------
-        frames : ndarray of int, shape (n_chosen,)
-            Which frames, each at most once, in any order.
-
-        Returns
-        -------
-        ndarray of shape (n_chosen, ...)
-            The frames in this order.
-        """
+        """Return different frames (n_chosen,) in any order. Blocks are arrays."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        found = self.joined(chosen_rows, chosen)
-        # Here the frames increase. The order that was asked for is that of their ranks.
-        order = np.empty(len(frames), dtype=int)
-        order[np.argsort(frames)] = np.arange(len(frames))
-        return found[order]
+        order = np.argsort(np.argsort(frames))
+        return self.joined(chosen_rows, chosen)[order]
+
+    def whole(self) -> NDArray:
+        """Return all frames. Blocks are arrays."""
+        return self.joined(lambda block: block)
 
     def collect(
         self,
@@ -118,22 +145,10 @@ class FrameBlocks(ABC):
         dtype: Any,
     ) -> tuple[Any, ...]:
         """
-        Return the arrays that a function makes of the blocks, each for all frames.
+        Return several arrays that a function makes of the blocks, each for all frames.
 
-        Parameters
-        ----------
-        function : callable
-            Returns a tuple of arrays with a row for each frame of a block.
-        shapes : tuple of tuple of int
-            For each of these arrays, the shape of one row. It is needed where there are
-            no blocks, or where the arrays are not computed yet.
-        dtype : dtype
-            Type of the numbers of the arrays.
-
-        Returns
-        -------
-        tuple of ndarray
-            The arrays for all frames.
+        The shapes of their rows and the type of their numbers are needed where there
+        are no blocks, or where they are not computed yet.
         """
         parts = list(self.map(function))
         if len(parts) == 1:
@@ -146,31 +161,34 @@ class FrameBlocks(ABC):
         """Return an array (n_frames, ...) as one of the kind that `collect` returns."""
         return values
 
-    def whole(self) -> NDArray:
-        """Return all frames, of blocks that are arrays."""
-        return self.joined(_same)
-
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
         """
-        Return fewer and larger blocks. Blocks that are not in memory stay as they are.
+        Return fewer blocks of at most n_frames frames, joined from consecutive ones.
 
-        Parameters
-        ----------
-        join : callable
-            Makes one block of a list of consecutive ones.
-        n_frames : int
-            The most frames of a block.
-
-        Returns
-        -------
-        FrameBlocks
-            The same frames.
+        Blocks that are not in memory stay as they are.
         """
-        return self
+        if not self.cached:
+            return self
+        groups: list[list[int]] = [[]]
+        for number, length in enumerate(self.lengths):
+            size = sum(self.lengths[other] for other in groups[-1])
+            if groups[-1] and size + length > n_frames:
+                groups.append([])
+            groups[-1].append(number)
+        blocks = [join(list(map(self.read, group))) for group in groups]
+        lengths = [sum(self.lengths[number] for number in group) for group in groups]
+        return self.of_blocks(blocks, lengths, self.n_threads)
 
-    def parts(self, arrays: tuple[NDArray, ...], block: int) -> tuple[NDArray, ...]:
-        """Return the rows of arrays that belong to the frames of a block."""
-        return tuple(array[self.slices[block]] for array in arrays)
+    def _reader(
+        self, function: Callable[..., Any], by_frame: tuple[NDArray, ...]
+    ) -> Callable[[int], Any]:
+        """Return a function of the number of a block: the result for that block."""
+
+        def read(number: int) -> Any:
+            part = self.slices[number]
+            return function(self.read(number), *(array[part] for array in by_frame))
+
+        return read
 
 
 def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:
@@ -186,129 +204,3 @@ def read_rows(table: Any, rows: slice) -> NDArray:
     if mapped is not None and hasattr(mapped, "madvise") and table.mode != "c":
         mapped.madvise(mmap.MADV_DONTNEED)
     return found
-
-
-def _same(block: Any) -> Any:
-    """Return a block as it is."""
-    return block
-
-
-class MemoryBlocks(FrameBlocks):
-    """
-    Blocks in memory.
-
-    Parameters
-    ----------
-    blocks : sequence
-        The blocks.
-    lengths : sequence of int
-        How many frames each has.
-    n_threads : int, default=1
-        Threads that work on blocks at the same time.
-    """
-
-    def __init__(
-        self, blocks: Sequence[Any], lengths: Sequence[int], n_threads: int = 1
-    ):
-        super().__init__(lengths)
-        self.blocks = blocks
-        self.n_threads = n_threads
-
-    @classmethod
-    def from_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
-        """Return the blocks of an array (n_frames, ...), block_frames frames each."""
-        starts = range(0, len(array), block_frames)
-        blocks = [array[start : start + block_frames] for start in starts]
-        return cls(blocks, [len(block) for block in blocks], n_threads)
-
-    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
-        """Yield what a function makes of each block, in order."""
-
-        def run(number: int) -> Any:
-            return function(self.blocks[number], *self.parts(by_frame, number))
-
-        numbers = range(len(self.blocks))
-        if min(self.n_threads, len(self.blocks)) < 2:
-            yield from map(run, numbers)
-            return
-        with ThreadPoolExecutor(self.n_threads) as pool:
-            yield from pool.map(run, numbers)
-
-    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
-        """Return the blocks that a function makes of these."""
-        blocks = list(self.map(function, *by_frame))
-        return type(self)(blocks, self.lengths, self.n_threads)
-
-    def subset(self, frames: NDArray) -> Self:
-        """Return blocks of only some of the frames. These blocks must be arrays."""
-        array = self.joined(chosen_rows, frames)
-        return self.from_array(array, max(self.lengths), self.n_threads)
-
-    def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
-        """Return blocks of at most n_frames frames, each joined from as many as fit."""
-        groups: list[list[int]] = []
-        size = 0
-        for number, length in enumerate(self.lengths):
-            if not groups or size + length > n_frames:
-                groups.append([])
-                size = 0
-            groups[-1].append(number)
-            size += length
-        blocks = [join([self.blocks[number] for number in group]) for group in groups]
-        lengths = [sum(self.lengths[number] for number in group) for group in groups]
-        return type(self)(blocks, lengths, self.n_threads)
-
-
-class StoredBlocks(FrameBlocks):
-    """
-    Blocks that are read, and computed, whenever they are needed.
-
-    Parameters
-    ----------
-    read : callable
-        Returns a block, given the slice of its frames.
-    lengths : sequence of int
-        How many frames each block has.
-    """
-
-    def __init__(self, read: Callable[[slice], Any], lengths: Sequence[int]):
-        super().__init__(lengths)
-        self.read = read
-
-    @classmethod
-    def from_table(cls, table: Any, block_frames: int) -> Self:
-        """Return the blocks of a table that can be sliced, block_frames frames each."""
-        read = partial(read_rows, table)
-        return cls(read, _block_lengths(table.shape[0], block_frames))
-
-    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
-        """Yield what a function makes of each block, in order."""
-        for number, rows in enumerate(self.slices):
-            yield function(self.read(rows), *self.parts(by_frame, number))
-
-    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
-        """Return the blocks that a function makes of these when they are read."""
-
-        def read(rows: slice) -> Any:
-            return function(self.read(rows), *(array[rows] for array in by_frame))
-
-        return type(self)(read, self.lengths)
-
-    def subset(self, frames: NDArray) -> Self:
-        """Return blocks of only some of the frames. These blocks must be arrays."""
-        numbers, length = np.flatnonzero(frames), max(self.lengths)
-
-        def read(rows: slice) -> NDArray:
-            first, last = numbers[rows][[0, -1]]
-            # Few kept frames may be far apart: read one block's length at a time.
-            starts = range(int(first), int(last) + 1, length)
-            parts = [slice(s, min(s + length, int(last) + 1)) for s in starts]
-            return np.concatenate([self.read(part)[frames[part]] for part in parts])
-
-        return type(self)(read, _block_lengths(len(numbers), length))
-
-
-def _block_lengths(n_frames: int, block_frames: int) -> list[int]:
-    """Return the lengths of blocks of block_frames frames. The last may be shorter."""
-    starts = range(0, n_frames, block_frames)
-    return [min(block_frames, n_frames - start) for start in starts]

@@ -10,20 +10,13 @@ from sklearn import get_config
 from sklearn.utils import check_array
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.blocks import FrameBlocks, MemoryBlocks, StoredBlocks
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.dask_blocks import DaskBlocks
 
-# The most numbers, and the most frames, in a block of a table in memory. Products of
-# large matrices are fast.
-BLOCK_NUMBERS = 2**21
-BLOCK_FRAMES = 2048
-# A block that is read needs at most this many times its own memory, copies included.
-COPIES = 8
-MEGABYTE = 2**20
 # Range of the coordinates of a frame. Squares of larger and of smaller ones leave the
 # range of double precision; fits at both ends agree with those of sizes about one.
 LARGEST, SMALLEST = 2e153, 1e-150
-# What a table has to be, besides that its numbers are float32 or float64.
+# What `check_array` checks in a table.
 CHECKS: dict[str, Any] = {
     "dtype": [np.float64, np.float32],
     "ensure_all_finite": "allow-nan",
@@ -51,8 +44,9 @@ class Table(NamedTuple):
     @classmethod
     def in_memory(cls, X: NDArray, n_jobs: int | None = 1) -> "Table":
         """Return the table of an array (n_frames, 2 * n_points) in memory."""
-        length = min(max(BLOCK_NUMBERS // max(X.shape[1], 1), 1), BLOCK_FRAMES)
-        blocks = MemoryBlocks.from_array(X, length, effective_n_jobs(n_jobs))
+        # Blocks large enough that products of matrices are fast.
+        length = min(max(2**21 // max(X.shape[1], 1), 1), 2048)
+        blocks = FrameBlocks.of_array(X, length, effective_n_jobs(n_jobs))
         return cls(blocks, X.shape[1], X.dtype)
 
     @classmethod
@@ -61,21 +55,26 @@ class Table(NamedTuple):
         _check_dimensions(X)
         if working_memory is None:
             working_memory = get_config()["working_memory"]
-        numbers = MEGABYTE * working_memory / (np.dtype(float).itemsize * COPIES)
+        # A block needs at most eight times its own memory, copies included.
+        numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
         length = max(int(numbers // max(X.shape[1], 1)), 1)
-        blocks = StoredBlocks.from_table(X, length).derive(checked_rows)
-        return cls(blocks, X.shape[1], _floating(X.dtype))
+        return cls._of_rows(FrameBlocks.of_stored(X, length), X)
 
     @classmethod
     def on_dask(cls, X: Any) -> "Table":
         """Return the table of a dask array, whose chunks stay on dask's workers."""
         _check_dimensions(X)
-        blocks = DaskBlocks.from_table(X).derive(checked_rows)
-        return cls(blocks, X.shape[1], _floating(X.dtype))
+        return cls._of_rows(DaskBlocks.of_chunks(X), X)
+
+    @classmethod
+    def _of_rows(cls, blocks: FrameBlocks, X: Any) -> "Table":
+        """Return the table of blocks of the rows of X, which are not checked yet."""
+        dtype = np.dtype(np.float32 if X.dtype == np.float32 else np.float64)
+        return cls(blocks.derive(checked_rows), X.shape[1], dtype)
 
 
 def _check_dimensions(X: Any) -> None:
-    """Refuse what is not a table."""
+    """Refuse arrays that are not tables."""
     if X.ndim != 2:
         raise ValueError(
             f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
@@ -83,19 +82,13 @@ def _check_dimensions(X: Any) -> None:
         )
 
 
-def _floating(dtype: Any) -> np.dtype:
-    """Return float32 for a table of float32, and float64 for any other type."""
-    single = np.dtype(dtype) == np.float32
-    return np.dtype(np.float32 if single else np.float64)
-
-
 def is_stored(X: Any) -> bool:
-    """Tell whether a table is to be read block by block."""
+    """Return whether a table is to be read block by block."""
     return isinstance(X, np.memmap | StoredTable)
 
 
 def is_on_dask(X: Any) -> bool:
-    """Tell whether a table is a dask array."""
+    """Return whether a table is a dask array."""
     return type(X).__module__.startswith("dask.array")
 
 
@@ -107,19 +100,7 @@ def checked_rows(rows: Any) -> NDArray:
 
 
 def unmasked(X: Any) -> Any:
-    """
-    Return a masked array as one with NaN where it is masked, other tables as they are.
-
-    Parameters
-    ----------
-    X : object
-        A table.
-
-    Returns
-    -------
-    object
-        The table. Masked arrays of whole numbers become double precision.
-    """
+    """Return a masked array as one with NaN where it is masked, others unchanged."""
     if not isinstance(X, np.ma.MaskedArray):
         return X
     dtype = X.dtype if X.dtype.kind == "f" else np.float64
@@ -127,24 +108,7 @@ def unmasked(X: Any) -> Any:
 
 
 def checked_range(X: NDArray) -> NDArray:
-    """
-    Return a table whose squares are in the range of double precision.
-
-    Parameters
-    ----------
-    X : ndarray of shape (n_frames, n_columns)
-        The table, NaN where something is missing.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_columns)
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If the largest magnitude in a row is above 2e153, or below 1e-150 and not zero.
-    """
+    """Refuse a table with rows whose squares leave the range of double precision."""
     highest = np.fmax.reduce(X, axis=1, initial=0.0)
     lowest = np.fmin.reduce(X, axis=1, initial=0.0)
     largest = np.maximum(highest, -lowest).astype(np.float64)
