@@ -1,4 +1,6 @@
-"""Tables with known truth."""
+"""Generated tables: one contract over all makers, then what each of them makes."""
+
+from functools import partial
 
 import numpy as np
 import pytest
@@ -6,18 +8,33 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._tables.landmark_columns import names_layout
 from isa_nrsfm._tables.layout import table_to_tracks
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import (
+    make_body_tracks,
+    make_face_tracks,
+    make_hand_tracks,
+    make_nonrigid_tracks,
+)
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,
     deformations,
     mirror_points,
     neutral_shape,
 )
+from isa_nrsfm.skeletons import get_skeleton
 
-MAKERS = [make_nonrigid_tracks, make_face_tracks]
+BODIES = {
+    "hand-21": make_hand_tracks,
+    "coco-17": make_body_tracks,
+    "h36m-17": partial(make_body_tracks, scheme="h36m-17"),
+}
+LINEAR = {"random": make_nonrigid_tracks, "face": make_face_tracks}
+MAKERS = LINEAR | {kind: BODIES[kind] for kind in ("hand-21", "coco-17")}
 CAMERAS = ["weak_perspective", "affine", "orthographic"]
-SHAPES = ["mean_shape", "basis", "alpha", "shapes"]
-TRUTHS = [*SHAPES, "motion", "translation", "clean"]
+TRUTHS = "mean_shape", "shapes", "motion", "translation", "clean"
+
+every = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
+linear = pytest.mark.parametrize("make", LINEAR.values(), ids=LINEAR)
+people = pytest.mark.parametrize("kind", BODIES)
 
 
 def root_mean_square(values):
@@ -28,97 +45,61 @@ def centred(tracks):
     return tracks - tracks.mean(axis=1, keepdims=True)
 
 
-def model(tracks):
-    rows = [
-        (tracks.mean_shape + np.tensordot(alpha, tracks.basis, 1)) @ motion.T + shift
-        for alpha, motion, shift in zip(
-            tracks.alpha, tracks.motion, tracks.translation, strict=True
-        )
-    ]
-    return np.array(rows)
+def singular_values(tracks):
+    rows = centred(tracks).transpose(0, 2, 1).reshape(-1, tracks.shape[1])
+    return np.linalg.svd(rows, compute_uv=False)
 
 
-@pytest.mark.parametrize("make", MAKERS)
+@every
 class TestEveryMaker:
     @pytest.mark.parametrize("camera", CAMERAS)
     @pytest.mark.parametrize("layout", ["interleaved", "planar"])
-    @pytest.mark.parametrize("n_components", [0, 1, 5])
-    def test_follows_the_model_without_noise(self, make, camera, layout, n_components):
-        tracks = make(
-            40,
-            n_components=n_components,
-            camera=camera,
-            layout=layout,
-            noise=0.0,
-            random_state=0,
-        )
-        assert_allclose(table_to_tracks(tracks.data, layout), model(tracks), rtol=1e-12)
-        assert_array_equal(tracks.tracks, tracks.clean)
-        assert tracks.noise_variance == 0
-        assert tracks.basis.shape == (n_components, 68, 3)
-        assert tracks.alpha.shape == (40, n_components)
-        assert tracks.visible.all()
-
-    def test_shapes_follow_the_model(self, make):
-        tracks = make(40, n_components=3, random_state=1)
-        expected = tracks.mean_shape + np.einsum(
-            "ik,kjc->ijc", tracks.alpha, tracks.basis
-        )
-        assert_allclose(tracks.shapes, expected, atol=1e-10)
-
-    def test_conventions_of_the_truth(self, make):
-        tracks = make(40, n_components=3, random_state=1)
-        assert_allclose(tracks.alpha.mean(axis=0), 0, atol=1e-13)
-        assert_allclose(tracks.alpha.var(axis=0), 1)
-        assert_allclose(tracks.mean_shape.mean(axis=0), 0, atol=1e-13)
-        assert_allclose(tracks.basis.mean(axis=1), 0, atol=1e-13)
-        assert_allclose(tracks.shapes.mean(axis=0), tracks.mean_shape, atol=1e-12)
-        assert_allclose(tracks.clean.mean(axis=1), tracks.translation)
-
-    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
-    def test_feature_names_tell_the_layout(self, make, layout):
-        tracks = make(10, layout=layout, random_state=0)
-        assert names_layout(tracks.feature_names) == layout
-        assert len(tracks.feature_names) == tracks.data.shape[1]
-        assert tracks.feature_names[0] == "x_0"
-        column = tracks.feature_names.index("y_7")
-        assert_array_equal(tracks.data[:, column], tracks.tracks[:, 7, 1])
+    def test_tables_are_images_of_the_shapes(self, make, camera, layout):
+        options = {"camera": camera, "layout": layout, "random_state": 0}
+        scene = make(40, noise=0.0, **options)
+        images = scene.shapes @ scene.motion.mT + scene.translation[:, None]
+        assert_allclose(scene.clean, images, rtol=1e-12)
+        assert_array_equal(scene.tracks, scene.clean)
+        assert scene.noise_variance == 0
+        assert scene.visible.all()
+        assert_array_equal(table_to_tracks(scene.data, layout), scene.tracks)
+        assert names_layout(scene.feature_names) == layout
+        assert len(scene.feature_names) == scene.data.shape[1]
+        column = scene.feature_names.index("y_7")
+        assert_array_equal(scene.data[:, column], scene.tracks[:, 7, 1])
+        assert_allclose(scene.shapes.mean(axis=1), 0, atol=1e-12)
+        assert_allclose(scene.shapes.mean(axis=0), scene.mean_shape, atol=1e-11)
+        assert_allclose(scene.clean.mean(axis=1), scene.translation)
 
     def test_noise_is_relative_to_the_centred_tracks(self, make):
-        tracks = make(400, noise=0.05, random_state=2)
-        noise = tracks.tracks - tracks.clean
-        size = root_mean_square(centred(tracks.clean))
-        assert_allclose(root_mean_square(noise) / size, 0.05, rtol=0.02)
-        assert_allclose(np.sqrt(tracks.noise_variance) / size, 0.05)
+        scene = make(400, noise=0.05, random_state=2)
+        size = root_mean_square(centred(scene.clean))
+        noise = root_mean_square(scene.tracks - scene.clean)
+        assert_allclose(noise / size, 0.05, rtol=0.02)
+        assert_allclose(np.sqrt(scene.noise_variance) / size, 0.05)
 
     def test_missing_points_have_no_coordinates(self, make):
-        tracks = make(50, missing=0.3, noise=0.01, random_state=3)
-        assert_allclose(np.mean(~tracks.visible), 0.3, atol=0.5 / tracks.visible.size)
-        assert_array_equal(
-            np.isnan(tracks.tracks), np.repeat(~tracks.visible[..., None], 2, axis=2)
-        )
-        assert_array_equal(table_to_tracks(tracks.data), tracks.tracks)
-        assert np.isfinite(tracks.clean).all()
+        scene = make(50, missing=0.3, noise=0.01, random_state=3)
+        hidden = ~scene.visible
+        assert_allclose(np.mean(hidden), 0.3, atol=0.5 / hidden.size)
+        assert_array_equal(np.isnan(scene.tracks), np.stack([hidden] * 2, axis=2))
+        assert_array_equal(table_to_tracks(scene.data), scene.tracks)
+        assert np.isfinite(scene.clean).all()
 
-    def test_truth_does_not_depend_on_what_is_done_to_the_table(self, make):
-        plain = make(30, noise=0.0, random_state=4)
+    def test_random_state(self, make):
+        plain, same, other = (make(30, random_state=seed) for seed in (4, 4, 5))
+        assert_array_equal(plain.data, same.data)
+        assert not np.allclose(plain.data, other.data)
+        state = np.random.RandomState(4)
+        assert_array_equal(make(30, random_state=state).data, plain.data)
+        # Whatever is done to the table, the truth is the same.
         other = make(30, noise=0.1, missing=0.2, layout="planar", random_state=4)
         for name in TRUTHS:
             assert_array_equal(plain[name], other[name])
-
-    @pytest.mark.parametrize("camera", CAMERAS)
-    def test_shapes_do_not_depend_on_the_camera(self, make, camera):
-        plain = make(30, random_state=4)
-        other = make(30, camera=camera, random_state=4)
-        for name in [*SHAPES, "translation"]:
-            assert_array_equal(plain[name], other[name])
-
-    def test_random_state_determines_everything(self, make):
-        one, same, other = (make(20, noise=0.1, random_state=s) for s in (7, 7, 8))
-        assert_array_equal(one.data, same.data)
-        assert not np.allclose(one.data, other.data)
-        state = np.random.RandomState(7)
-        assert_array_equal(make(20, noise=0.1, random_state=state).data, one.data)
+        for camera in CAMERAS:
+            other = make(30, camera=camera, random_state=4)
+            for name in ("shapes", "translation"):
+                assert_array_equal(plain[name], other[name])
 
     def test_singular_values_of_the_cameras(self, make):
         values = {
@@ -128,23 +109,20 @@ class TestEveryMaker:
             for camera in CAMERAS
         }
         ratios = {camera: v[:, 1] / v[:, 0] for camera, v in values.items()}
-        assert_allclose(ratios["orthographic"], 1)
         assert_allclose(values["orthographic"], values["orthographic"][0, 0])
         assert_allclose(ratios["weak_perspective"], 1)
-        assert values["weak_perspective"].std() > 0.1
+        assert np.ptp(values["weak_perspective"]) > 0.1
         assert 0.5 <= ratios["affine"].min() < 0.55
         assert 0.95 < ratios["affine"].max() <= 1
         # The stretch leaves the area, and so the scale.
-        assert_allclose(
-            values["affine"].prod(axis=1), values["weak_perspective"].prod(axis=1)
-        )
+        areas = [values[c].prod(axis=1) for c in ("affine", "weak_perspective")]
+        assert_allclose(*areas)
 
     @pytest.mark.parametrize(
         ("parameter", "value"),
         [
             ("n_frames", 1),
             ("n_frames", 10.5),
-            ("n_components", -1),
             ("noise", -0.1),
             ("noise", np.nan),
             ("missing", 1.0),
@@ -160,100 +138,104 @@ class TestEveryMaker:
 
 
 @pytest.mark.parametrize(
-    ("parameter", "value"),
+    ("make", "parameter", "value"),
     [
-        ("n_points", 3),
-        ("amplitude", -1.0),
-        ("shapes", "sparse"),
-        ("coefficients", "uniform"),
+        (make_nonrigid_tracks, "n_points", 3),
+        (make_nonrigid_tracks, "amplitude", -1.0),
+        (make_nonrigid_tracks, "shapes", "sparse"),
+        (make_nonrigid_tracks, "coefficients", "uniform"),
+        (make_nonrigid_tracks, "n_components", -1),
+        (make_face_tracks, "n_components", 9),
+        (make_hand_tracks, "n_people", 0),
+        (make_body_tracks, "scheme", "body-25"),
     ],
 )
-def test_nonrigid_refuses_nonsense(parameter, value):
+def test_parameters_of_one_maker(make, parameter, value):
     with pytest.raises(ValueError, match=f"The '{parameter}' parameter"):
-        make_nonrigid_tracks(**{parameter: value})
+        make(**{parameter: value})
 
 
-@pytest.mark.parametrize("shapes", ["heavy_tailed", "gaussian"])
-@pytest.mark.parametrize("amplitude", [0.0, 0.3])
-def test_amplitude_is_the_relative_size_of_the_deformation(shapes, amplitude):
-    tracks = make_nonrigid_tracks(
-        n_frames=25, n_points=12, amplitude=amplitude, shapes=shapes, random_state=0
+@linear
+@pytest.mark.parametrize("n_components", [0, 1, 5])
+def test_linear_models(make, n_components):
+    scene = make(40, n_components=n_components, camera="affine", noise=0.0,
+                 random_state=1)  # fmt: skip
+    assert scene.basis.shape == (n_components, 68, 3)
+    assert scene.alpha.shape == (40, n_components)
+    expected = scene.mean_shape + np.einsum("ik,kjc->ijc", scene.alpha, scene.basis)
+    assert_allclose(scene.shapes, expected, atol=1e-10)
+    assert_allclose(scene.alpha.mean(axis=0), 0, atol=1e-13)
+    assert_allclose(scene.alpha.var(axis=0), 1)
+    assert_allclose(scene.basis.mean(axis=1), 0, atol=1e-13)
+    values = singular_values(scene.tracks)
+    rank = 3 * n_components + 3
+    assert values[rank - 1] > 1e-5 * values[0]
+    assert values[rank] < 1e-12 * values[0]
+
+
+class TestRandomTables:
+    @pytest.mark.parametrize("shapes", ["heavy_tailed", "gaussian"])
+    @pytest.mark.parametrize("amplitude", [0.0, 0.3])
+    def test_amplitude_is_the_relative_size_of_the_deformation(self, shapes, amplitude):
+        scene = make_nonrigid_tracks(
+            25, 12, amplitude=amplitude, shapes=shapes, random_state=0
+        )
+        # Root mean squares of coordinates and of lengths have the same ratio.
+        deformation = root_mean_square(scene.shapes - scene.mean_shape)
+        ratio = deformation / root_mean_square(scene.mean_shape)
+        assert_allclose(ratio, amplitude, atol=1e-13)
+        assert_allclose(np.mean(np.sum(scene.mean_shape**2, axis=1)), 1)
+        norms = np.linalg.norm(scene.basis, axis=(1, 2))
+        assert_allclose(norms, norms[0])
+
+    @pytest.mark.parametrize(
+        ("shapes", "expected"), [("gaussian", 5 / 3), ("heavy_tailed", 5.0)]
     )
-    deformation = tracks.shapes - tracks.mean_shape
-    # Root mean squares of coordinates and of lengths have the same ratio.
-    ratio = root_mean_square(deformation) / root_mean_square(tracks.mean_shape)
-    assert_allclose(ratio, amplitude, atol=1e-13)
-    assert_allclose(np.mean(np.sum(tracks.mean_shape**2, axis=1)), 1)
+    def test_tails_of_the_basis_shapes(self, shapes, expected):
+        # E r^4 / (E r^2)^2 of the radius: 15 / 9 for a Gaussian 3-vector, and 3 times
+        # that after the multiplication with a Gaussian number.
+        basis = make_nonrigid_tracks(2, 200_000, 1, shapes=shapes, random_state=0).basis
+        energy = np.sum(basis**2, axis=2)
+        assert_allclose(np.mean(energy**2) / np.mean(energy) ** 2, expected, rtol=0.05)
+        # Directions are uniform on the sphere.
+        directions = basis[0] / np.sqrt(energy[0])[:, None]
+        assert_allclose(np.cov(directions.T), np.eye(3) / 3, atol=0.005)
 
-
-def test_basis_shapes_have_the_same_norm():
-    basis = make_nonrigid_tracks(n_components=4, random_state=0).basis
-    norms = np.linalg.norm(basis, axis=(1, 2))
-    assert_allclose(norms, norms[0])
-
-
-@pytest.mark.parametrize(
-    ("shapes", "expected"), [("gaussian", 5 / 3), ("heavy_tailed", 5.0)]
-)
-def test_tails_of_the_basis_shapes(shapes, expected):
-    # E r^4 / (E r^2)^2 of the radius: 15 / 9 for a Gaussian 3-vector, and 3 times
-    # that after the multiplication with a Gaussian number.
-    basis = make_nonrigid_tracks(
-        n_frames=2, n_points=200_000, n_components=1, shapes=shapes, random_state=0
-    ).basis
-    energy = np.sum(basis**2, axis=2)
-    assert_allclose(np.mean(energy**2) / np.mean(energy) ** 2, expected, rtol=0.05)
-    # Directions are uniform on the sphere.
-    directions = basis[0] / np.sqrt(energy[0])[:, None]
-    assert_allclose(np.cov(directions.T), np.eye(3) / 3, atol=0.005)
-
-
-@pytest.mark.parametrize(
-    ("coefficients", "expected"), [("gaussian", 3.0), ("heavy_tailed", 6.0)]
-)
-def test_tails_of_the_coefficients(coefficients, expected):
-    alpha = make_nonrigid_tracks(
-        50_000, 4, 2, coefficients=coefficients, random_state=0
-    ).alpha
-    assert_allclose(np.mean(alpha**4, axis=0), expected, rtol=0.1)
-    assert_allclose(np.mean(alpha[:, 0] * alpha[:, 1]), 0, atol=0.02)
-
-
-def test_orientations_are_uniform():
-    motion = make_nonrigid_tracks(
-        20_000, 4, 0, camera="orthographic", random_state=0
-    ).motion
-    assert_allclose(motion.mean(axis=0), 0, atol=0.02)
-    axes = motion[:, 0]
-    assert_allclose(axes.T @ axes / len(axes), np.eye(3) / 3, atol=0.01)
-    assert_allclose(np.mean(axes**4, axis=0), 1 / 5, atol=0.01)
-
-
-def test_rank_of_the_table_is_that_of_the_model():
-    tracks = make_nonrigid_tracks(n_components=3, camera="affine", random_state=0)
-    values = np.linalg.svd(
-        centred(tracks.tracks).transpose(0, 2, 1).reshape(-1, 68), compute_uv=False
+    @pytest.mark.parametrize(
+        ("coefficients", "expected"), [("gaussian", 3.0), ("heavy_tailed", 6.0)]
     )
-    assert values[11] > 1e-3 * values[0]
-    assert values[12] < 1e-12 * values[0]
+    def test_tails_of_the_coefficients(self, coefficients, expected):
+        alpha = make_nonrigid_tracks(
+            50_000, 4, 2, coefficients=coefficients, random_state=0
+        ).alpha
+        assert_allclose(np.mean(alpha**4, axis=0), expected, rtol=0.1)
+        assert_allclose(np.mean(alpha[:, 0] * alpha[:, 1]), 0, atol=0.02)
+
+    def test_orientations_are_uniform(self):
+        scene = make_nonrigid_tracks(
+            20_000, 4, 0, camera="orthographic", random_state=0
+        )
+        assert_allclose(scene.motion.mean(axis=0), 0, atol=0.02)
+        axes = scene.motion[:, 0]
+        assert_allclose(axes.T @ axes / len(axes), np.eye(3) / 3, atol=0.01)
+        assert_allclose(np.mean(axes**4, axis=0), 1 / 5, atol=0.01)
 
 
 class TestFace:
     def test_every_point_is_given_and_mirrored(self):
         neutral, mirror = neutral_shape(), mirror_points()
-        assert_array_equal(np.sort(mirror), np.arange(68))
+        middle = [8, 27, 28, 29, 30, 33, 51, 57, 62, 66]
         assert_array_equal(mirror[mirror], np.arange(68))
         assert_array_equal(neutral[mirror] * (-1, 1, 1), neutral)
         # No point was left at zero, and points on the axis are their own images.
         assert np.abs(neutral).sum(axis=1).min() > 5
-        assert_array_equal(np.flatnonzero(neutral[:, 0] == 0), _middle())
-        assert_array_equal(np.flatnonzero(mirror == np.arange(68)), _middle())
+        assert_array_equal(np.flatnonzero(neutral[:, 0] == 0), middle)
+        assert_array_equal(np.flatnonzero(mirror == np.arange(68)), middle)
         spread = np.linalg.norm(neutral[:, None] - neutral, axis=2)
         assert spread[~np.eye(68, dtype=bool)].min() > 2
 
     def test_anatomy_in_image_coordinates(self):
-        face = make_face_tracks(random_state=0).neutral_shape
-        x, y, z = face.T
+        x, y, z = make_face_tracks(random_state=0).neutral_shape.T
         assert z.argmin() == 30  # tip of the nose in front
         assert set(z.argsort()[-2:]) == {0, 16}  # ears behind
         assert y.argmax() == 8  # chin lowest, y points down
@@ -278,9 +260,7 @@ class TestFace:
     def test_deformations_do_what_they_are_called(self):
         neutral = neutral_shape()
         change = dict(zip(COMPONENT_NAMES, deformations(8), strict=True))
-        assert len(change) == 8
         full = {name: neutral + shape for name, shape in change.items()}
-
         assert change["jaw open"][8, 1] > 20
         assert (full["jaw open"][66, 1] - full["jaw open"][62, 1]) > 20
         corners = change["smile"][[48, 54]]
@@ -289,32 +269,34 @@ class TestFace:
         assert corners[1, 0] > 8
         assert (change["brow raise"][17:27, 1] < -5).all()
         assert (change["brow lower"][17:27, 1] > 0).all()
-        opening = (
-            full["blink"][[41, 40, 47, 46], 1] - full["blink"][[37, 38, 44, 43], 1]
-        )
+        lids = full["blink"][:, 1]
+        opening = lids[[41, 40, 47, 46]] - lids[[37, 38, 44, 43]]
         assert_allclose(opening, 0, atol=0.5)  # the eyes are shut
         assert np.ptp(full["lip pucker"][48:, 0]) < 0.6 * np.ptp(neutral[48:, 0])
         assert (change["lip pucker"][48:, 2] < -5).all()
         assert (change["nose wrinkle"][31:36, 1] < -4).all()
         assert np.ptp(full["face width"][:17, 0]) > 1.05 * np.ptp(neutral[:17, 0])
 
-    def test_strengths_give_the_coefficients(self):
-        faces = make_face_tracks(300, n_components=8, random_state=0)
+    def test_strengths_labels_groups_and_time(self):
+        faces = make_face_tracks(20_000, n_components=8, random_state=0)
+        strength, alpha = faces.strength, faces.alpha
         assert faces.component_names == list(COMPONENT_NAMES)
-        assert faces.strength[:, :7].min() >= 0
-        assert faces.strength[:, 7].min() < -0.5
-        assert np.abs(faces.strength).max() <= 1
+        assert strength[:, :7].min() >= 0
+        assert strength[:, 7].min() < -0.5
+        assert np.abs(strength).max() <= 1
         full = deformations(8) - deformations(8).mean(axis=1, keepdims=True)
-        expected = faces.neutral_shape + np.tensordot(faces.strength, full, 1)
-        assert_allclose(faces.shapes, expected, atol=1e-10)
-
-    def test_strengths_are_skewed_and_independent(self):
-        alpha = make_face_tracks(20_000, n_components=8, random_state=0).alpha
+        expected = faces.neutral_shape + np.tensordot(strength[:9], full, 1)
+        assert_allclose(faces.shapes[:9], expected, atol=1e-10)
         # Beta(0.4, 2): skewness 2 * 1.6 * sqrt(3.4) / (4.4 * sqrt(0.8)).
         assert_allclose(np.mean(alpha[:, :7] ** 3, axis=0), 1.499, rtol=0.1)
         assert (np.mean(alpha[:, :7] ** 4, axis=0) > 3.5).all()
         assert_allclose(np.mean(alpha[:, 7] ** 3), 0, atol=0.05)
         assert_allclose(np.corrcoef(alpha.T), np.eye(8), atol=0.03)
+        strongest = strength[:, :7].argmax(axis=1)  # the width is no expression
+        assert_array_equal(faces.labels, np.array(COMPONENT_NAMES)[strongest])
+        assert not faces.groups.any()
+        assert_allclose(faces.time, np.arange(20_000) / 25)
+        assert set(make_face_tracks(5, n_components=0).labels.tolist()) == {"rest"}
 
     def test_angles_are_those_of_the_cameras(self):
         faces = make_face_tracks(500, camera="orthographic", random_state=0)
@@ -338,20 +320,68 @@ class TestFace:
         assert (faces.translation.max(axis=0) <= (960, 720)).all()
         assert 0.25 < np.sqrt(faces.noise_variance) < 0.75
 
-    @pytest.mark.parametrize("n_components", [1, 4, 8])
-    def test_singular_values_reveal_every_direction(self, n_components):
-        faces = make_face_tracks(n_components=n_components, noise=0.0, random_state=0)
-        values = np.linalg.svd(
-            centred(faces.tracks).transpose(0, 2, 1).reshape(-1, 68), compute_uv=False
-        )
-        rank = 3 * n_components + 3
-        assert values[rank - 1] > 1e-5 * values[0]
-        assert values[rank] < 1e-12 * values[0]
 
-    def test_too_many_components(self):
-        with pytest.raises(ValueError, match=r"'n_components'.*range \[0, 8\]"):
-            make_face_tracks(n_components=9)
+class TestPeople:
+    @people
+    def test_each_person_takes_all_poses_in_time(self, kind):
+        scene = BODIES[kind](400, n_people=3, random_state=1)
+        assert scene.point_names == list(get_skeleton(kind).point_names)
+        assert_array_equal(np.unique(scene.groups), range(3))
+        assert (np.diff(scene.groups) >= 0).all()
+        poses = ["fist", "open", "point"] if "hand" in kind else None
+        for person in range(3):
+            own = scene.groups == person
+            found = sorted(set(scene.labels[own].tolist()))
+            assert found == (poses or ["reach", "squat", "walk"])
+            assert_allclose(scene.time[own], np.arange(own.sum()) / 25)
+        # Smooth within a person: a frame is near the one before, relative to the size.
+        steps = np.linalg.norm(np.diff(scene.shapes, axis=0), axis=(1, 2))
+        same = np.diff(scene.groups) == 0
+        assert steps[same].max() < 0.3 * np.linalg.norm(scene.shapes[0])
+        assert np.abs(np.diff(scene.angles, axis=0))[same].max() < 10
 
+    @pytest.mark.parametrize("kind", ["hand-21", "coco-17"])
+    def test_bones_are_rigid_and_everybody_has_their_own(self, kind):
+        scene = MAKERS[kind](300, n_people=3, random_state=2)
+        edges = get_skeleton(kind).edges[:16]
+        if kind == "coco-17":
+            # Arms and legs; shoulders and hips keep their width, the trunk bends.
+            edges = [[5, 7], [7, 9], [6, 8], [11, 13], [13, 15], [5, 6], [11, 12]]
+        ends = scene.shapes[:, np.array(edges)]
+        lengths = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2)
+        of_people = [lengths[scene.groups == person] for person in range(3)]
+        for found in of_people:
+            assert_allclose(found, found[:1].repeat(len(found), axis=0), rtol=1e-6)
+        firsts = [found[0] for found in of_people]
+        assert np.ptp(firsts, axis=0).min() > 1e-3 * np.mean(firsts)
+        with pytest.raises(ValueError, match="at least 2 frames for each of 5 people"):
+            MAKERS[kind](9, n_people=5)
 
-def _middle():
-    return [8, 27, 28, 29, 30, 33, 51, 57, 62, 66]
+    def test_the_two_orders_of_bodies_are_of_the_same_bodies(self):
+        joints, labels = [], []
+        for kind in ("coco-17", "h36m-17"):
+            scene = BODIES[kind](50, random_state=0)
+            names = ("left_knee", "right_elbow", "left_wrist")
+            points = [scene.point_names.index(name) for name in names]
+            joints.append(np.diff(scene.shapes[:, points], axis=1))
+            labels.append(scene.labels)
+        assert_array_equal(*labels)
+        assert_allclose(*joints, atol=1e-9)
+
+    def test_poses_are_what_they_are_called(self):
+        hands = make_hand_tracks(400, random_state=0)
+        tips = np.linalg.norm(hands.shapes[:, [8, 12]] - hands.shapes[:, [0]], axis=2)
+        far = {
+            name: np.median(tips[hands.labels == name], axis=0)
+            for name in ("open", "fist", "point")
+        }
+        assert (far["fist"] < 0.7 * far["open"]).all()
+        assert far["point"][0] > 0.9 * far["open"][0]  # the index finger
+        assert far["point"][1] < 0.7 * far["open"][1]
+        bodies = make_body_tracks(400, random_state=0)
+        y = dict(zip(bodies.point_names, bodies.shapes[:, :, 1].T, strict=True))
+        height = np.ptp(bodies.shapes[:, :, 1], axis=1)
+        assert bodies.labels[height.argmin()] == "squat"
+        raised = y["right_wrist"] < y["nose"]
+        assert raised.any()
+        assert set(bodies.labels[raised].tolist()) <= {"reach"}

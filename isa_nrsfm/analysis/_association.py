@@ -307,7 +307,7 @@ def _dependent_frames(
     columns = _label_columns(labels, kind)
     columns = columns - columns.mean(axis=0)
     features = _unit_columns(features)
-    length = dependent_blocks(features[order.rows], columns[order.rows], order).length
+    length, _ = dependent_blocks(features[order.rows], columns[order.rows], order)
     if length == 1:
         return None
     blocks = np.empty(len(labels), dtype=int)

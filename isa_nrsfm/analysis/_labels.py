@@ -1,4 +1,4 @@
-"""What labels of frames are."""
+"""Kinds of labels of frames: classes or numbers."""
 
 from typing import Literal
 
@@ -11,26 +11,11 @@ Kind = Literal["classes", "number"]
 
 def kind_of(y: NDArray, kind: str) -> Kind:
     """
-    Return whether labels are classes or numbers.
+    Return whether labels (n_frames,) are classes or numbers.
 
-    Parameters
-    ----------
-    y : ndarray of shape (n_frames,)
-        Labels.
-    kind : {"auto", "classes", "number"}
-        "auto" takes names, truth values and whole numbers for classes, as scikit-learn
-        does.
-
-    Returns
-    -------
-    {"classes", "number"}
-        The kind.
-
-    Raises
-    ------
-    ValueError
-        If all labels are equal, if classes are all different, or if names shall be
-        numbers.
+    "auto" takes names, truth values and whole numbers for classes, as scikit-learn
+    does. Labels that are all equal, classes that are all different, and names that
+    should be numbers raise a ValueError.
     """
     if kind not in ("auto", "classes", "number"):
         raise ValueError(f"kind must be 'auto', 'classes' or 'number'; got {kind!r}")
@@ -51,23 +36,7 @@ def kind_of(y: NDArray, kind: str) -> Kind:
 
 
 def refuse_infinite(name: str, labels: NDArray, rows: NDArray) -> None:
-    """
-    Refuse labels that are infinite numbers.
-
-    Parameters
-    ----------
-    name : str
-        Name of the labels in the message.
-    labels : ndarray of shape (n_frames,)
-        Labels.
-    rows : ndarray of shape (n_frames,)
-        Numbers of their rows.
-
-    Raises
-    ------
-    ValueError
-        If a label is infinite.
-    """
+    """Refuse infinite numbers; `rows` are the numbers of their rows in the message."""
     infinite = rows[np.isinf(labels)] if labels.dtype.kind == "f" else rows[:0]
     if len(infinite):
         raise ValueError(

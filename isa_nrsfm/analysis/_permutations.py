@@ -16,35 +16,16 @@ from scipy.stats import norm
 
 from isa_nrsfm.analysis._within_groups import between_share
 
-# Blocks are so many autocorrelation times long. With 5 and with 10, 3 to 7 % of random
-# labels in blocks have p <= .05 (autoregressions of .3 to .98, 150 to 570 frames); the
-# power is larger with 5.
-BLOCKS = 5
-# Chance that independent frames count as dependent.
-LEVEL = 0.05
-# Largest share of a variance that cuts between blocks may take.
-MOST_LOSS = 0.5
 # Sum of squares, relative to that of the labels, that is due to rounding errors.
 ROUNDING = 1e-20
 
 
 class FrameOrder(NamedTuple):
-    """
-    Frames sorted by group, and by time within each group.
+    """Frames sorted by group, and by time within each group."""
 
-    Attributes
-    ----------
-    rows : ndarray of int, shape (n_frames,)
-        Numbers of the frames in this order.
-    groups : ndarray of int, shape (n_frames,)
-        Number of the group of each, ascending from zero.
-    sizes : ndarray of int, shape (n_groups,)
-        Number of frames of each group.
-    """
-
-    rows: NDArray
-    groups: NDArray
-    sizes: NDArray
+    rows: NDArray  # numbers of the frames in this order
+    groups: NDArray  # ascending number of the group of each frame
+    sizes: NDArray  # number of frames of each group
 
     @classmethod
     def of(cls, groups: NDArray | None, time: NDArray) -> "FrameOrder":
@@ -73,52 +54,31 @@ class FrameOrder(NamedTuple):
         )
 
 
-class Blocks(NamedTuple):
+def dependent_blocks(
+    alpha: NDArray, labels: NDArray, order: FrameOrder
+) -> tuple[int, NDArray]:
     """
-    Blocks of frames that stay together in permutations.
+    Return the length of blocks that are much longer than the autocorrelation of frames.
 
-    Attributes
-    ----------
-    length : int
-        Number of frames of a block, one for independent frames.
-    loss : ndarray of shape (n_components,)
-        Share of the variance of a covariance that is lost at the cuts between blocks.
-    """
-
-    length: int
-    loss: NDArray
-
-
-def dependent_blocks(alpha: NDArray, labels: NDArray, order: FrameOrder) -> Blocks:
-    """
-    Measure the autocorrelation of frames, and choose blocks that are much longer.
+    Also return the share of the variance of a covariance (n_components,) that is lost
+    at the cuts between blocks. Coefficients and labels are ordered, and relative to the
+    mean of their group; independent frames have the length one.
 
     The covariance of two unrelated series has ``1 + 2 sum_h r_h s_h`` times the
-    variance that independent frames would give, with the autocorrelations r and s of
-    the series (Bartlett, "Some aspects of the time-correlation problem", 1935). So
-    frames count as independent if the labels or the coefficients are independent.
-
-    Parameters
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Ordered coefficients relative to the mean of their group.
-    labels : ndarray of shape (n_frames, n_columns)
-        Ordered labels relative to the mean of their group.
-    order : FrameOrder
-        The order.
-
-    Returns
-    -------
-    Blocks
-        The blocks.
+    variance for independent frames, with the autocorrelations r and s of the series
+    (Bartlett, "Some aspects of the time-correlation problem", 1935). So frames count as
+    independent if the labels or the coefficients are independent.
     """
     n_frames, n_components = alpha.shape
-    independent = Blocks(1, np.zeros(n_components))
+    # With 5 and with 10 autocorrelation times a block, 3 to 7 % of random labels in
+    # blocks have p <= .05 (autoregressions of .3 to .98, 150 to 570 frames); the power
+    # is larger with 5.
+    n_times = 5
     # Neighbours of one class are alike because of the class: the rest is measured.
     rest = alpha - labels @ np.linalg.lstsq(labels, alpha)[0]
     energy, of_labels = np.sum(rest**2, axis=0), np.sum(labels**2)
     energy[energy <= ROUNDING * np.sum(alpha**2, axis=0)] = np.inf
-    least = norm.isf(LEVEL / n_components) / np.sqrt(n_frames)
+    least = norm.isf(0.05 / n_components) / np.sqrt(n_frames)
     time, straddling = np.ones(n_components), np.zeros(n_components)
     growing = np.ones(n_components, dtype=bool)
     for lag in range(1, int(order.sizes.max())):
@@ -129,44 +89,26 @@ def dependent_blocks(alpha: NDArray, labels: NDArray, order: FrameOrder) -> Bloc
         if lag == 1:
             growing = (r > least) & (s > least)
         growing &= (r > 0) & (s > 0)
-        if not growing.any() or BLOCKS * time.max() > order.sizes.max():
+        if not growing.any() or n_times * time.max() > order.sizes.max():
             break
         time[growing] += 2 * share * (r * s)[growing]
         straddling[growing] += 2 * lag * (r * s)[growing]
     if time.max() == 1:
-        return independent
-    length = int(np.ceil(BLOCKS * time.max()))
+        return 1, np.zeros(n_components)
+    length = int(np.ceil(n_times * time.max()))
     # Each cut separates `lag` pairs of frames for each lag.
     n_cuts = np.sum(np.where(order.sizes > 1, -(-order.sizes // length), 0))
-    return Blocks(
-        length, np.minimum(n_cuts * straddling / (n_frames * time), MOST_LOSS)
-    )
+    return length, np.minimum(n_cuts * straddling / (n_frames * time), 0.5)
 
 
 def permutations_within(
     order: FrameOrder, length: int, n_permutations: int, rng: np.random.RandomState
 ) -> Iterator[NDArray]:
     """
-    Yield permutations of ordered frames within their groups.
+    Yield permutations (n_frames,) of ordered frames within their groups.
 
-    Each group is shifted as a ring by a random number of frames, then cut into blocks,
-    and these are shuffled. A group that is no longer than a block is only shifted.
-
-    Parameters
-    ----------
-    order : FrameOrder
-        The order.
-    length : int
-        Number of frames of a block.
-    n_permutations : int
-        Number of permutations.
-    rng : RandomState
-        Random numbers.
-
-    Yields
-    ------
-    ndarray of int, shape (n_frames,)
-        Places of the frames whose labels are taken.
+    Groups are shifted circularly, cut into blocks, and these are shuffled. A group that
+    is no longer than a block is only shifted.
     """
     block = order.blocks(length)
     starts, lengths = np.flatnonzero(np.diff(block, prepend=-1)), np.bincount(block)
@@ -191,26 +133,9 @@ def permuted_energies(
     """
     Compute squared covariances of coefficients with labels, and with permuted labels.
 
-    Parameters
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    labels : ndarray of shape (n_frames, n_columns)
-        Labels as columns.
-    order : FrameOrder
-        Groups of the frames, and their order.
-    n_permutations : int
-        Number of permutations.
-    rng : RandomState
-        Random numbers.
-
-    Returns
-    -------
-    energies : ndarray of shape (n_permutations + 1, n_components)
-        First those of the labels as they are. The part between groups and that within
-        groups are summed, each divided by its mean over the permutations.
-    permuted : str
-        The units that are permuted.
+    Return them (n_permutations + 1, n_components), first those of the labels as given,
+    and the units that are permuted. The parts between groups and within groups are
+    summed, each divided by its mean over the permutations.
     """
     alpha, labels = alpha[order.rows], labels[order.rows]
     total = np.sum((labels - labels.mean(axis=0)) ** 2)

@@ -8,10 +8,6 @@ from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm.skeletons import SKELETONS, Skeleton
 
-# Two directions are parallel whose sine is below this.
-PARALLEL = 1e-6
-TO_THE_VIEWER = (0.0, 0.0, -1.0)
-
 
 class CanonicalPose(NamedTuple):
     """
@@ -121,7 +117,7 @@ def canonical_pose(
         up = pairs["up"] if up is None else up
         front = pairs["front"] if front is None else front
         if left_right is None and front is None:
-            front = TO_THE_VIEWER
+            front = (0.0, 0.0, -1.0)  # to the viewer
     right = None if left_right is None else _principal_direction(points, left_right)
     down = None if up is None else -_direction("up", points, up)
     away = None if front is None else -_direction("front", points, front)
@@ -149,7 +145,7 @@ def _frame(axes: list[NDArray | None]) -> NDArray:
     rotation[first] = axes[first]
     rest = axes[second] - (axes[second] @ rotation[first]) * rotation[first]
     size = np.linalg.norm(rest)
-    if size < PARALLEL:
+    if size < 1e-6:
         names = ("left_right", "up", "front")
         raise ValueError(
             f"{names[first]} and {names[second]} must not be parallel; the sine of "

@@ -1,6 +1,6 @@
 """Draw the tracks of bodies that walk, reach and squat."""
 
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import LAYOUTS, Layout
-from isa_nrsfm.datasets._performers import View, perform, wander
-from isa_nrsfm.datasets._scene import CAMERAS, Camera
+from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm.datasets._performers import perform, wander
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera
 from isa_nrsfm.skeletons import get_skeleton
 
 ACTIONS = ("walk", "reach", "squat")
-LAYOUT_NAMES = ("coco-17", "h36m-17")
 # Millimetres: lengths of bones; half widths; points of the head from the neck, in a
 # body that faces the camera: x to its left, y down, z away from the camera.
 LENGTHS = {
@@ -32,19 +31,13 @@ STEPS_A_SECOND, MOVES_A_SECOND = 0.9, 0.5
 # Standard deviation of the logarithms of a person's size and of single bones, and
 # radians by which joints are held off their poses.
 SIZES, BONES, HELD = 0.06, 0.05, 0.08
-VIEW = View(largest_angles=(80.0, 20.0, 8.0), scales=(0.2, 0.5))
 
 
 @checked_parameters(
     {
-        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        **PARAMETERS,
         "n_people": [Interval(Integral, 1, None, closed="left")],
-        "scheme": [StrOptions(set(LAYOUT_NAMES))],
-        "camera": [StrOptions(set(CAMERAS))],
-        "noise": [Interval(Real, 0, None, closed="left")],
-        "missing": [Interval(Real, 0, 1, closed="left")],
-        "layout": [StrOptions(set(LAYOUTS))],
-        "random_state": ["random_state"],
+        "scheme": [StrOptions({"coco-17", "h36m-17"})],
     }
 )
 def make_body_tracks(
@@ -163,13 +156,14 @@ def make_body_tracks(
         n_people,
         ACTIONS,
         build,
-        VIEW,
+        largest_angles=(80.0, 20.0, 8.0),
+        scales=(0.2, 0.5),
         camera=camera,
+        rng=check_random_state(random_state),
         noise=noise,
         missing=missing,
         layout=layout,
-        rng=check_random_state(random_state),
-        point_names=names,
+        point_names=list(names),
     )
 
 

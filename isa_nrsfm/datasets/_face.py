@@ -1,15 +1,14 @@
 """Draw the tracks of a face with expressions."""
 
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.random import RandomState
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
-from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import LAYOUTS, Layout
+from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
+from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,
     SIGNED_COMPONENTS,
@@ -17,8 +16,8 @@ from isa_nrsfm.datasets._face_model import (
     neutral_shape,
 )
 from isa_nrsfm.datasets._scene import (
-    CAMERAS,
     FRAMES_A_SECOND,
+    PARAMETERS,
     Camera,
     centre_shapes,
     draw_motion,
@@ -26,23 +25,11 @@ from isa_nrsfm.datasets._scene import (
     standardise,
 )
 
-# Largest yaw, pitch and roll in degrees.
-LARGEST_ANGLES = (45.0, 25.0, 20.0)
-# Pixels a millimetre.
-SCALES = (1.0, 4.0)
-# Left, top and right, bottom of the part of the image where the centre of a face lies.
-CENTRES = ((320.0, 240.0), (960.0, 720.0))
-
 
 @checked_parameters(
     {
-        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        **PARAMETERS,
         "n_components": [Interval(Integral, 0, len(COMPONENT_NAMES), closed="both")],
-        "camera": [StrOptions(set(CAMERAS))],
-        "noise": [Interval(Real, 0, None, closed="left")],
-        "missing": [Interval(Real, 0, 1, closed="left")],
-        "layout": [StrOptions(set(LAYOUTS))],
-        "random_state": ["random_state"],
     }
 )
 def make_face_tracks(
@@ -172,56 +159,40 @@ def make_face_tracks(
     ['jaw open', 'smile', 'brow raise', 'blink']
     """
     rng = check_random_state(random_state)
-    strength = _draw_strength(n_frames, n_components, rng)
+    names = COMPONENT_NAMES[:n_components]
+    strength = rng.beta(0.4, 2.0, (n_frames, n_components))
+    expressions = [k for k in range(n_components) if names[k] not in SIGNED_COMPONENTS]
+    for k in set(range(n_components)).difference(expressions):
+        strength[:, k] = 2 * rng.beta(2.0, 2.0, n_frames) - 1
+    labels = np.full(n_frames, "rest")
+    if expressions:
+        labels = np.array(names)[expressions][strength[:, expressions].argmax(axis=1)]
     alpha = standardise(strength)
     neutral = centre_shapes(neutral_shape())
     full = centre_shapes(deformations(n_components))
     mean_shape = neutral + np.tensordot(strength.mean(axis=0), full, 1)
     basis = full * strength.std(axis=0)[:, None, None]
 
-    angles = rng.uniform(-1.0, 1.0, (n_frames, 3)) * LARGEST_ANGLES
+    angles = rng.uniform(-1.0, 1.0, (n_frames, 3)) * (45.0, 25.0, 20.0)
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
-    motion = draw_motion(rotations, camera, SCALES, rng)
-    translation = rng.uniform(*CENTRES, size=(n_frames, 2))
+    motion = draw_motion(rotations, camera, (1.0, 4.0), rng)
+    translation = rng.uniform((320.0, 240.0), (960.0, 720.0), size=(n_frames, 2))
     return observe(
-        mean_shape,
-        basis,
-        alpha,
+        mean_shape + np.tensordot(alpha, basis, 1),
         motion,
         translation,
         noise=noise,
         missing=missing,
         layout=layout,
         rng=rng,
-        component_names=list(COMPONENT_NAMES[:n_components]),
+        mean_shape=mean_shape,
+        basis=basis,
+        alpha=alpha,
+        component_names=list(names),
         neutral_shape=neutral,
         strength=strength,
-        labels=_strongest(strength),
+        labels=labels,
         groups=np.zeros(n_frames, dtype=np.intp),
         time=np.arange(n_frames) / FRAMES_A_SECOND,
         angles=angles,
     )
-
-
-def _strongest(strength: NDArray) -> NDArray[np.str_]:
-    """Return the name of the strongest expression of each frame."""
-    expressions = [
-        k
-        for k, name in enumerate(COMPONENT_NAMES[: strength.shape[1]])
-        if name not in SIGNED_COMPONENTS
-    ]
-    if not expressions:
-        return np.full(len(strength), "rest")
-    names = np.array(COMPONENT_NAMES)[expressions]
-    return names[strength[:, expressions].argmax(axis=1)]
-
-
-def _draw_strength(
-    n_frames: int, n_components: int, rng: RandomState
-) -> NDArray[np.float64]:
-    """Return the strengths of the expressions, (n_frames, n_components)."""
-    strength = rng.beta(0.4, 2.0, (n_frames, n_components))
-    for k, name in enumerate(COMPONENT_NAMES[:n_components]):
-        if name in SIGNED_COMPONENTS:
-            strength[:, k] = 2 * rng.beta(2.0, 2.0, n_frames) - 1
-    return strength

@@ -1,16 +1,16 @@
 """Draw the tracks of hands that take poses."""
 
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 from sklearn.utils import Bunch, check_random_state
 
-from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import LAYOUTS, Layout
-from isa_nrsfm.datasets._performers import View, perform, wander
-from isa_nrsfm.datasets._scene import CAMERAS, Camera
+from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
+from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm.datasets._performers import perform, wander
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera
 from isa_nrsfm.skeletons import get_skeleton
 
 POSES = ("open", "fist", "point")
@@ -32,18 +32,12 @@ INTO_THE_PALM, ACROSS_THE_PALM = (0.0, 0.0, -1.0), (-0.75, -0.3, -0.6)
 # Standard deviation of the logarithms of a person's size and of single bones, and how
 # far fingers are held from their poses.
 SIZES, BONES, HELD = 0.06, 0.05, 0.12
-VIEW = View(largest_angles=(60.0, 35.0, 35.0), scales=(1.0, 3.0))
 
 
 @checked_parameters(
     {
-        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        **PARAMETERS,
         "n_people": [Interval(Integral, 1, None, closed="left")],
-        "camera": [StrOptions(set(CAMERAS))],
-        "noise": [Interval(Real, 0, None, closed="left")],
-        "missing": [Interval(Real, 0, 1, closed="left")],
-        "layout": [StrOptions(set(LAYOUTS))],
-        "random_state": ["random_state"],
     }
 )
 def make_hand_tracks(
@@ -153,13 +147,14 @@ def make_hand_tracks(
         n_people,
         POSES,
         _hand,
-        VIEW,
+        largest_angles=(60.0, 35.0, 35.0),
+        scales=(1.0, 3.0),
         camera=camera,
+        rng=check_random_state(random_state),
         noise=noise,
         missing=missing,
         layout=layout,
-        rng=check_random_state(random_state),
-        point_names=get_skeleton("hand-21").point_names or (),
+        point_names=list(get_skeleton("hand-21").point_names or ()),
     )
 
 

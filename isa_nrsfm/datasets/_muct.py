@@ -23,9 +23,6 @@ MUCT = RemoteFile(
     sha256="e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb",
 )
 
-# The bit of a tag that is set where glasses are worn.
-GLASSES = 0x2
-
 DESCR = f"""\
 MUCT landmarks
 
@@ -158,14 +155,16 @@ def fetch_muct(
     (3755, 136)
     """
     path = fetch_file(MUCT, data_home, download_if_missing)
-    faces = _read(path)
+    with path.open(encoding="ascii") as file:
+        names = file.readline().rstrip().split(",")[2:]
+    faces = _read(path, len(names))
     if not mirrored:
         faces = {name: column[~faces["mirrored"]] for name, column in faces.items()}
     bunch = Bunch(
         **faces,
         target=faces["subjects"],
         tracks=table_to_tracks(faces["data"]),
-        feature_names=_header(path)[2:],
+        feature_names=names,
         filename=str(path),
         DESCR=DESCR,
     )
@@ -174,18 +173,12 @@ def fetch_muct(
     return (bunch.data, bunch.target) if return_X_y else bunch
 
 
-def _header(path: Path) -> list[str]:
-    """Return the names of the columns: name, tag, x00, y00, x01, ...."""
-    with path.open(encoding="ascii") as file:
-        return file.readline().rstrip().split(",")
-
-
-def _read(path: Path) -> dict[str, NDArray]:
+def _read(path: Path, n_columns: int) -> dict[str, NDArray]:
     """Return all rows of the file, NaN where a point is at (0, 0), and their labels."""
     names, tags = np.loadtxt(
         path, dtype=np.str_, delimiter=",", skiprows=1, usecols=(0, 1), unpack=True
     )
-    columns = range(2, len(_header(path)))
+    columns = range(2, 2 + n_columns)
     data = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns)
     visible = table_to_tracks(data).any(axis=2)
     table_to_tracks(data)[~visible] = np.nan
@@ -201,7 +194,7 @@ def _read(path: Path) -> dict[str, NDArray]:
         "lighting": letters[:, 4],
         "camera": letters[:, 5],
         "sex": letters[:, 7],
-        "glasses": np.array([int(tag, 16) & GLASSES > 0 for tag in tags]),
+        "glasses": np.array([int(tag, 16) & 0x2 > 0 for tag in tags]),
         "mirrored": mirrored,
         "names": names,
         "tags": tags,
@@ -214,13 +207,8 @@ def _put_in_frames(faces: Bunch) -> None:
     faces.data = pd.DataFrame(faces.data, columns=faces.feature_names)
     faces.target = pd.Series(faces.subjects, name="subject")
     labels = {
-        "name": faces.names,
-        "tag": faces.tags,
-        "subject": faces.subjects,
-        "lighting": faces.lighting,
-        "camera": faces.camera,
-        "sex": faces.sex,
-        "glasses": faces.glasses,
-        "mirrored": faces.mirrored,
+        name: faces[name if name in faces else f"{name}s"]
+        for name in ("name", "tag", "subject", "lighting", "camera", "sex")
     }
+    labels |= {"glasses": faces.glasses, "mirrored": faces.mirrored}
     faces.frame = pd.concat([pd.DataFrame(labels), faces.data], axis=1)

@@ -6,41 +6,32 @@ from typing import Literal
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import LAYOUTS, Layout
+from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.datasets._scene import (
-    CAMERAS,
+    PARAMETERS,
     Camera,
     centre_shapes,
     draw_motion,
     observe,
     standardise,
-    uniform_rotations,
 )
 
 Distribution = Literal["heavy_tailed", "gaussian"]
-DISTRIBUTIONS: tuple[Distribution, ...] = ("heavy_tailed", "gaussian")
-
-# Extent of the mean shape along x, y and z, relative to one another.
-EXTENT = (1.0, 0.8, 0.6)
-SCALES = (2 / 3, 3 / 2)
+DISTRIBUTIONS = [StrOptions({"heavy_tailed", "gaussian"})]
 
 
 @checked_parameters(
     {
-        "n_frames": [Interval(Integral, 2, None, closed="left")],
+        **PARAMETERS,
         "n_points": [Interval(Integral, 4, None, closed="left")],
         "n_components": [Interval(Integral, 0, None, closed="left")],
         "amplitude": [Interval(Real, 0, None, closed="left")],
-        "noise": [Interval(Real, 0, None, closed="left")],
-        "camera": [StrOptions(set(CAMERAS))],
-        "shapes": [StrOptions(set(DISTRIBUTIONS))],
-        "coefficients": [StrOptions(set(DISTRIBUTIONS))],
-        "missing": [Interval(Real, 0, 1, closed="left")],
-        "layout": [StrOptions(set(LAYOUTS))],
-        "random_state": ["random_state"],
+        "shapes": DISTRIBUTIONS,
+        "coefficients": DISTRIBUTIONS,
     }
 )
 def make_nonrigid_tracks(
@@ -158,50 +149,34 @@ def make_nonrigid_tracks(
     (3, 30, 3)
     """
     rng = check_random_state(random_state)
-    mean_shape = centre_shapes(rng.standard_normal((n_points, 3)) * EXTENT)
+    mean_shape = centre_shapes(rng.standard_normal((n_points, 3)) * (1.0, 0.8, 0.6))
     mean_shape /= _root_mean_square_length(mean_shape)
-    basis = _draw_basis(n_components, n_points, shapes, rng)
-    alpha = _draw_coefficients(n_frames, n_components, coefficients, rng)
+    basis = rng.standard_normal((n_components, n_points, 3))
+    if shapes == "heavy_tailed":
+        basis *= rng.standard_normal((n_components, n_points, 1))
+    basis = centre_shapes(basis)
+    basis /= np.linalg.norm(basis, axis=(1, 2), keepdims=True)
+    draw = rng.laplace if coefficients == "heavy_tailed" else rng.standard_normal
+    alpha = standardise(draw(size=(n_frames, n_components)))
     if n_components:
         size = _root_mean_square_length(np.tensordot(alpha, basis, 1))
         basis *= amplitude / size
-    rotations = uniform_rotations(n_frames, rng)
-    motion = draw_motion(rotations, camera, SCALES, rng)
-    translation = rng.standard_normal((n_frames, 2))
+    rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
+    motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
     return observe(
-        mean_shape,
-        basis,
-        alpha,
+        mean_shape + np.tensordot(alpha, basis, 1),
         motion,
-        translation,
+        rng.standard_normal((n_frames, 2)),
         noise=noise,
         missing=missing,
         layout=layout,
         rng=rng,
+        mean_shape=mean_shape,
+        basis=basis,
+        alpha=alpha,
     )
 
 
 def _root_mean_square_length(vectors: NDArray) -> float:
     """Return the root mean square length of the vectors along the last axis."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=-1))))
-
-
-def _draw_basis(
-    n_components: int, n_points: int, distribution: Distribution, rng: RandomState
-) -> NDArray[np.float64]:
-    """Return basis shapes (n_components, n_points, 3), centred and of unit norm."""
-    basis = rng.standard_normal((n_components, n_points, 3))
-    if distribution == "heavy_tailed":
-        basis *= rng.standard_normal((n_components, n_points, 1))
-    basis = centre_shapes(basis)
-    return basis / np.linalg.norm(basis, axis=(1, 2), keepdims=True)
-
-
-def _draw_coefficients(
-    n_frames: int, n_components: int, distribution: Distribution, rng: RandomState
-) -> NDArray[np.float64]:
-    """Return standardised coefficients (n_frames, n_components)."""
-    size = (n_frames, n_components)
-    if distribution == "heavy_tailed":
-        return standardise(rng.laplace(size=size))
-    return standardise(rng.standard_normal(size))

@@ -1,7 +1,7 @@
 """People who do one thing after the other before a moving camera."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.random import RandomState
@@ -9,37 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch
 
-from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.datasets._scene import (
     FRAMES_A_SECOND,
     Camera,
     centre_shapes,
     draw_motion,
-    observe_shapes,
+    observe,
 )
-
-# Seconds that a pose lasts, and that it takes to go over to the next one.
-HOLD, CHANGE = 1.6, 0.6
-# Waves a second of what wanders: the camera, the way to hold a joint.
-SLOWEST, FASTEST = 0.08, 0.35
-# Centres of the people in pixels: middle of the image and largest distance from it.
-MIDDLE, AWAY = (640.0, 480.0), (160.0, 100.0)
-
-
-class View(NamedTuple):
-    """
-    How the camera moves.
-
-    Attributes
-    ----------
-    largest_angles : tuple of float
-        Largest yaw, pitch and roll in degrees.
-    scales : tuple of float
-        Smallest and largest number of pixels a millimetre.
-    """
-
-    largest_angles: tuple[float, float, float]
-    scales: tuple[float, float]
 
 
 def perform(
@@ -47,41 +23,20 @@ def perform(
     n_people: int,
     poses: tuple[str, ...],
     build: Callable[[NDArray, NDArray, RandomState], NDArray],
-    view: View,
     *,
+    largest_angles: tuple[float, float, float],
+    scales: tuple[float, float],
     camera: Camera,
-    noise: float,
-    missing: float,
-    layout: Layout,
     rng: RandomState,
-    point_names: tuple[str, ...],
+    **options: Any,
 ) -> Bunch:
     """
     Return the table of people who take poses in turn, with all truths.
 
-    Parameters
-    ----------
-    n_frames : int
-        Frames of all people, who come one after the other.
-    n_people : int
-        Number of people.
-    poses : tuple of str
-        Names of the poses.
-    build : callable
-        ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new
-        person, x to the right, y down, z away, at times (n,) and with weights (n,
-        n_poses) of the poses that add up to one.
-    view : View
-        How the camera moves.
-    camera, noise, missing, layout, rng
-        As of the public functions.
-    point_names : tuple of str
-        Names of the points.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two frames for each person.
+    ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new person, x
+    to the right, y down, z away, at times (n,) and with weights (n, n_poses) of the
+    poses that add up to one. `largest_angles` are yaw, pitch and roll in degrees,
+    `scales` the least and most pixels a millimetre, `options` those of `observe`.
     """
     if n_frames < 2 * n_people:
         raise ValueError(
@@ -89,7 +44,7 @@ def perform(
             f"{n_frames}"
         )
     parts = [len(part) for part in np.array_split(np.arange(n_frames), n_people)]
-    shapes, labels, groups, times, angles, scales, centres = ([] for _ in range(7))
+    shapes, labels, groups, times, angles, sizes, centres = ([] for _ in range(7))
     for person, length in enumerate(parts):
         time = np.arange(length) / FRAMES_A_SECOND
         weights = _take_turns(time, len(poses), rng)
@@ -97,38 +52,34 @@ def perform(
         labels.append(np.array(poses)[weights.argmax(axis=1)])
         groups.append(np.full(length, person))
         times.append(time)
-        angles.append(wander(time, 3, rng) * view.largest_angles)
-        shortest, longest = np.log(view.scales)
+        angles.append(wander(time, 3, rng) * largest_angles)
+        shortest, longest = np.log(scales)
         share = (1 + wander(time, 1, rng)[:, 0]) / 2
-        scales.append(np.exp(shortest + (longest - shortest) * share))
-        centres.append(MIDDLE + wander(time, 2, rng) * AWAY)
-    angle = np.concatenate(angles)
+        sizes.append(np.exp(shortest + (longest - shortest) * share))
+        centres.append((640.0, 480.0) + wander(time, 2, rng) * (160.0, 100.0))
+    angle, size = np.concatenate(angles), np.concatenate(sizes)
     rotations = Rotation.from_euler("yxz", angle, degrees=True).as_matrix()
     motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
-    scale = np.concatenate(scales)
     if camera == "orthographic":
-        scale = np.full(n_frames, np.sqrt(np.prod(view.scales)))
+        size = np.full(n_frames, np.sqrt(np.prod(scales)))
     all_shapes = np.concatenate(shapes)
-    return observe_shapes(
+    return observe(
         all_shapes,
-        scale[:, None, None] * motion,
+        size[:, None, None] * motion,
         np.concatenate(centres),
-        noise=noise,
-        missing=missing,
-        layout=layout,
         rng=rng,
         mean_shape=all_shapes.mean(axis=0),
         labels=np.concatenate(labels),
         groups=np.concatenate(groups),
         time=np.concatenate(times),
         angles=angle,
-        point_names=list(point_names),
+        **options,
     )
 
 
 def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:
     """Return n smooth functions of time, (len(time), n), between -1 and 1."""
-    frequency = rng.uniform(SLOWEST, FASTEST, (2, n))
+    frequency = rng.uniform(0.08, 0.35, (2, n))  # waves a second
     phase = rng.uniform(0, 2 * np.pi, (2, n))
     waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase)
     return 0.6 * waves[:, 0] + 0.4 * waves[:, 1]
@@ -137,11 +88,12 @@ def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:
 def _take_turns(time: NDArray, n_poses: int, rng: RandomState) -> NDArray[np.float64]:
     """Return the weights (len(time), n_poses) of poses that are taken in turn."""
     duration = len(time) / FRAMES_A_SECOND
-    n_turns = max(n_poses, round(duration / HOLD))
+    # A pose lasts 1.6 seconds, with a transition of 0.6 seconds to the next one.
+    n_turns = max(n_poses, round(duration / 1.6))
     rounds = [rng.permutation(n_poses) for _ in range(-(-n_turns // n_poses))]
     turns = np.concatenate(rounds)[:n_turns]
     length = duration / n_turns
-    change = min(CHANGE, length)
+    change = min(0.6, length)
     # From 0 to 1 round the beginning of each turn but the first.
     begins = length * np.arange(1, n_turns)
     passed = np.clip((time[:, None] - begins) / change + 0.5, 0.0, 1.0)

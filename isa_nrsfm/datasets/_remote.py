@@ -9,25 +9,11 @@ from sklearn.datasets import get_data_home
 
 from isa_nrsfm._compat.optional import import_optional
 
-# Subfolder of scikit-learn's data home for what this package downloads.
-FOLDER = "isa_nrsfm"
-
 DataHome = str | os.PathLike[str] | None
 
 
 class RemoteFile(NamedTuple):
-    """
-    A file of a public data set.
-
-    Attributes
-    ----------
-    name : str
-        Its name in the folder.
-    url : str
-        Where it is downloaded from.
-    sha256 : str
-        Checksum of its bytes, hexadecimal.
-    """
+    """A file of a public data set, with the hexadecimal checksum of its bytes."""
 
     name: str
     url: str
@@ -38,37 +24,14 @@ def fetch_file(
     remote: RemoteFile, data_home: DataHome = None, download_if_missing: bool = True
 ) -> Path:
     """
-    Return the path of a file of a public data set.
+    Return the path of a file of a public data set; download it if it is missing.
 
-    A file that is there is taken, without network and without pooch, if its bytes are
-    the right ones. It is never overwritten. One that is missing is downloaded by pooch;
-    nothing is left in the folder if that fails.
-
-    Parameters
-    ----------
-    remote : RemoteFile
-        The file.
-    data_home : str or path-like, optional
-        The folder that has the file or is to have it, the subfolder ``isa_nrsfm`` of
-        scikit-learn's data home by default.
-    download_if_missing : bool, default=True
-        Whether to download a file that is not there.
-
-    Returns
-    -------
-    Path
-        The file, which has the checksum that it should have.
-
-    Raises
-    ------
-    OSError
-        If the file is not there and cannot or must not be downloaded, or if it is
-        there with other contents.
-    ImportError
-        If the file is to be downloaded and pooch is not installed.
+    An existing file with the right checksum is used, without network and pooch; it is
+    never overwritten. A failed download leaves nothing in the folder, by default the
+    subfolder ``isa_nrsfm`` of scikit-learn's data home.
     """
     if data_home is None:
-        folder = Path(get_data_home(), FOLDER)
+        folder = Path(get_data_home(), "isa_nrsfm")
     else:
         folder = Path(data_home).expanduser()
     path = folder / remote.name

@@ -13,12 +13,7 @@ from isa_nrsfm.metrics._alignment import (
     unit_shapes,
     without_mean_shape,
 )
-from isa_nrsfm.metrics._checks import (
-    as_mean_shape,
-    as_shapes,
-    check_same_points,
-    check_same_shape,
-)
+from isa_nrsfm.metrics._checks import as_mean_shape, as_pair, as_shapes
 
 
 def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
@@ -78,16 +73,7 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     >>> round(affine_shape_error(S, np.broadcast_to(tracks.mean_shape, S.shape)), 2)
     0.18
     """
-    truth, shapes = as_shapes("S", S), as_shapes("X", X)
-    check_same_shape("S", truth, "X", shapes)
-    truth = unit_shapes(truth)
-    flat = np.flatnonzero(~truth.any(axis=(1, 2)))
-    if len(flat):
-        raise ValueError(
-            "each true shape must have at least two different points; all points are "
-            f"equal in {len(flat)} frame(s) of S, the first is {flat[0]}"
-        )
-    shapes = unit_shapes(shapes)
+    truth, shapes = as_pair(S, X, unit_shapes)
     images = shapes @ best_affinity(truth, shapes)
     scales = quotient(np.sum(truth * images, (1, 2)), np.sum(images**2, (1, 2)))
     residuals = truth - scales[:, None, None] * images
@@ -194,7 +180,11 @@ def basis_similarity(
     array([2, 0, 1])
     """
     truth, shapes = as_shapes("basis_true", basis_true), as_shapes("basis", basis)
-    check_same_points("basis_true", truth, "basis", shapes)
+    if truth.shape[1] != shapes.shape[1]:
+        raise ValueError(
+            "basis_true and basis must have the same points; got "
+            f"{truth.shape[1]} and {shapes.shape[1]}"
+        )
     truth, shapes = unit_shapes(truth), unit_shapes(shapes)
     if (mean_shape_true is None) != (mean_shape is None):
         raise ValueError("give both mean_shape_true and mean_shape, or none of them")

@@ -1,5 +1,7 @@
 """Check the arrays that the measures take."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -49,10 +51,17 @@ def check_same_shape(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
         )
 
 
-def check_same_points(name_a: str, a: NDArray, name_b: str, b: NDArray) -> None:
-    """Refuse shapes with different numbers of points."""
-    if a.shape[1] != b.shape[1]:
+def as_pair(
+    S: ArrayLike, X: ArrayLike, centre: Callable[[NDArray], NDArray]
+) -> tuple[NDArray, NDArray]:
+    """Return true shapes, none of them flat, and estimated shapes, both centred."""
+    truth, shapes = as_shapes("S", S), as_shapes("X", X)
+    check_same_shape("S", truth, "X", shapes)
+    truth = centre(truth)
+    flat = np.flatnonzero(~truth.any(axis=(1, 2)))
+    if len(flat):
         raise ValueError(
-            f"{name_a} and {name_b} must have the same points; got {a.shape[1]} and "
-            f"{b.shape[1]}"
+            "each true shape must have at least two different points; all points are "
+            f"equal in {len(flat)} frame(s) of S, the first is {flat[0]}"
         )
+    return truth, centre(shapes)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm.metrics._checks import as_shapes, check_same_shape
+from isa_nrsfm.metrics._checks import as_pair
 
 CONVENTIONS = ("sequence", "frame")
 
@@ -122,15 +122,7 @@ def mean_shape_error_3d(
     """
     if convention not in CONVENTIONS:
         raise ValueError(f"convention must be one of {CONVENTIONS}; got {convention!r}")
-    truth, shapes = as_shapes("S", S), as_shapes("X", X)
-    check_same_shape("S", truth, "X", shapes)
-    truth, shapes = _centred(truth), _centred(shapes)
-    flat = np.flatnonzero(~truth.any(axis=(1, 2)))
-    if len(flat):
-        raise ValueError(
-            "each true shape must have at least two different points; all points are "
-            f"equal in {len(flat)} frame(s) of S, the first is {flat[0]}"
-        )
+    truth, shapes = as_pair(S, X, _centred)
     if convention == "frame":
         rest = _rest(truth, shapes, scale is None or scale)
         size = np.linalg.norm(truth, axis=(1, 2))

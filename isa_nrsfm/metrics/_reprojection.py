@@ -80,16 +80,6 @@ def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return each frame's energy, that of its error, and the mask of seen points."""
-    truth, seen, fitted = _paired_tracks(X, X_hat, layout)
-    truth, fitted = _centre_seen(truth, seen), _centre_seen(fitted, seen)
-    energy = np.sum(truth**2, axis=(1, 2))
-    return energy, np.sum((truth - fitted) ** 2, axis=(1, 2)), seen
-
-
-def _paired_tracks(
-    X: ArrayLike, X_hat: ArrayLike, layout: Layout
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return the tracks of both tables, zero where not seen, and the mask of seen."""
     tables = [
         check_array(
             unmasked(table),
@@ -109,12 +99,14 @@ def _paired_tracks(
             f"X_hat is NaN at {lost.sum()} point(s) that are seen in X, the first in "
             f"row {row}"
         )
-    mask = seen[..., None]
-    return np.where(mask, truth, 0.0), seen, np.where(mask, fitted, 0.0)
+    truth, fitted = (_centre_seen(tracks, seen) for tracks in (truth, fitted))
+    energy = np.sum(truth**2, axis=(1, 2))
+    return energy, np.sum((truth - fitted) ** 2, axis=(1, 2)), seen
 
 
 def _centre_seen(tracks: NDArray, seen: NDArray) -> NDArray:
-    """Centre each frame over its seen points; the others stay zero."""
+    """Return frames centred over their seen points; the others are zero."""
+    tracks = np.where(seen[..., None], tracks, 0.0)
     n_seen = np.maximum(seen.sum(axis=1), 1)
     centroids = tracks.sum(axis=1) / n_seen[:, None]
     return (tracks - centroids[:, None]) * seen[..., None]
