@@ -5,7 +5,6 @@ import contextlib
 import errno
 import io
 import os
-import signal
 from pathlib import Path
 from unittest import mock
 
@@ -30,21 +29,16 @@ def interrupt(_path):
     raise KeyboardInterrupt
 
 
-def kill(_path):
-    """Do what kill -9 does."""
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-# By name: what happens, whether it goes on happening when more is written, and whether
-# it happens after the operation instead of before it.
+# By name: what happens, at which later operations it happens again, and whether it
+# happens after the operation instead of before it. A killed process does nothing more.
 STRIKES = {
-    "disk full": (disk_error(errno.ENOSPC), True, False),
-    "disk full for a moment": (disk_error(errno.ENOSPC), False, False),
-    "access denied": (disk_error(errno.EACCES), False, False),
-    "disk broken": (disk_error(errno.EIO), False, False),
-    "interrupted before": (interrupt, False, False),
-    "interrupted after": (interrupt, False, True),
-    "killed": (kill, False, False),
+    "disk full": (disk_error(errno.ENOSPC), "writes", False),
+    "disk full for a moment": (disk_error(errno.ENOSPC), "none", False),
+    "access denied": (disk_error(errno.EACCES), "none", False),
+    "disk broken": (disk_error(errno.EIO), "none", False),
+    "interrupted before": (interrupt, "none", False),
+    "interrupted after": (interrupt, "none", True),
+    "killed": (interrupt, "all", False),
 }
 
 
@@ -53,8 +47,8 @@ class Faults:
 
     def __init__(self, folder, strike, at):
         self.folder = os.path.realpath(folder)
-        self.strike, self.lasting, self.after = STRIKES[strike]
-        self.stops = "interrupted" in strike or strike == "killed"
+        self.strike, self.again, self.after = STRIKES[strike]
+        self.stops = self.strike is interrupt
         self.at, self.operations = at, []
 
     @property
@@ -74,7 +68,8 @@ class Faults:
         """Run an operation, or let it fail."""
         self.operations.append((name, *map(str, args[:2])))
         number = len(self.operations)
-        strikes = number == self.at or (self.lasting and full and number > self.at > 0)
+        again = self.again == "all" or (self.again == "writes" and full)
+        strikes = number == self.at or (again and number > self.at > 0)
         path = args[0] if args else None
         if strikes and not self.after:
             self.strike(path)
@@ -89,7 +84,7 @@ class Faults:
 @contextlib.contextmanager
 def disk_faults(folder, strike, at):
     """
-    Let one operation on the files of a folder fail, or the process end there.
+    Let one operation on the files of a folder fail, or stop the process there.
 
     Operations are opening for writing, each write that reaches the disk, bringing to
     the disk, closing, renaming, linking, making folders and changing permissions; and

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.whole_files import folder_for_writing, whole_file, whole_folder
+from isa_nrsfm._compat.whole_files import folder_for_writing, whole_file
 
 Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 
@@ -57,11 +57,10 @@ def kept_arrays(keep_frames: Any) -> Iterator[Keep]:
     def keep(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:
         """Return memory maps of arrays."""
         # Another fit that failed may have removed the empty folder.
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole_folder(folder / name) as new:
-            for part, array in arrays.items():
-                with whole_file(new / f"{part}.npy") as file:
-                    np.save(file, array)
+        (folder / name).mkdir(parents=True)
+        for part, array in arrays.items():
+            with whole_file(folder / name / f"{part}.npy") as file:
+                np.save(file, array)
         return {
             part: np.load(folder / name / f"{part}.npy", mmap_mode="r")
             for part in arrays

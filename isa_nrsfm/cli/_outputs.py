@@ -14,7 +14,7 @@ from isa_nrsfm import AffineNRSfM, Decomposition, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
-from isa_nrsfm._compat.whole_files import refuse_replacing, write_whole
+from isa_nrsfm._compat.whole_files import check_replaceable, write_whole
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._frames import Frames
 from isa_nrsfm.cli._progress import show_stage
@@ -78,7 +78,7 @@ def check_outputs(targets: Iterable[Path], inputs: Iterable[str]) -> None:
     for source in inputs:
         refuse_overwriting(source, targets)
     for target in targets:
-        refuse_replacing(target)
+        check_replaceable(target)
 
 
 def refuse_overwriting(source: str, targets: Iterable[Path]) -> None:

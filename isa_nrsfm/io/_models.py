@@ -331,6 +331,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
+    misfit, scale, points, total = entries["certainty"].tolist()
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -338,7 +339,5 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         loss=entries["loss"],
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
-        certainty=DepthCertainty(
-            *entries["certainty"].tolist(), turns=entries["turns"]
-        ),
+        certainty=DepthCertainty(misfit, scale, points, total, entries["turns"]),
     )

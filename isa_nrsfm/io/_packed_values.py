@@ -15,13 +15,6 @@ from sklearn.base import BaseEstimator
 from isa_nrsfm import isa
 
 Arrays = dict[str, NDArray]
-# Strategies and densities of which the parameters and all fitted attributes are stored.
-# Of others the name and the fitted arrays are.
-STORED: dict[str, type] = {
-    name: getattr(isa, name)
-    for name in isa.__all__
-    if hasattr(getattr(isa, name), "get_params")
-}
 # What the model of a frame implies.
 IMPLIED = ("camera_", "frames_scaled_")
 
@@ -49,6 +42,13 @@ class NamedStrategy(BaseEstimator):
     transform = log_density = derivatives = fit
 
 
+# Strategies and densities of which parameters and fitted attributes are stored.
+STORED: dict[str, Any] = {
+    "NamedStrategy": NamedStrategy,
+    **{name: getattr(isa, name) for name in isa.__all__},
+}
+
+
 def packed(value: Any, name: str, arrays: Arrays) -> Any:
     """Return the JSON value of a parameter or attribute; add its arrays to `arrays`."""
     if value is None or type(value) in (bool, int, float, str):
@@ -70,14 +70,11 @@ def packed(value: Any, name: str, arrays: Arrays) -> Any:
         parts = packed_parts(value, f"{name}.", arrays)
         return {"object": {"class": type(value).__name__, **parts}}
     elif name.rpartition(".")[2] in ("isa", "isa_", "density"):
-        own = value.name if isinstance(value, NamedStrategy) else full_name(type(value))
-        fitted = {
-            key: packed(item, f"{name}.{key}", arrays)
-            for key, item in fitted_attributes(value).items()
-            if isinstance(item, bool | int | float | np.ndarray | np.number)
-            and np.asarray(item).dtype.kind in "biuf"
-        }
-        return {"object": {"class": own, "parameters": {}, "attributes": fitted}}
+        named = NamedStrategy(full_name(type(value)))
+        for key, item in fitted_attributes(value).items():
+            if np.asarray(item).dtype.kind in "biuf" and not isinstance(item, list):
+                setattr(named, key, item)
+        return packed(named, name, arrays)
     raise ValueError(
         f"{name} is of type {full_name(type(value))}, which a model file cannot hold"
     )
@@ -116,26 +113,23 @@ def unpacked(value: Any, arrays: Arrays) -> Any:
                 random = np.random.RandomState()
                 random.set_state(("MT19937", key, position, has_gauss, gauss))
                 return random
-        case {"object": {"class": str(name), **parts}}:
-            if name in STORED:
-                return with_parts(STORED[name], parts, arrays)
-            return with_parts(NamedStrategy, parts, arrays, name=name)
+        case {"object": {"class": str(name), **parts}} if name in STORED:
+            return with_parts(STORED[name], parts, arrays)
     raise ValueError(f"its header has a value that is not known: {str(value)[:60]}")
 
 
-def with_parts(kind: type, parts: dict[str, Any], arrays: Arrays, **known: Any) -> Any:
+def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     """Return an object with the parameters and attributes of `packed_parts`."""
     parameters = {
         name: unpacked(value, arrays) for name, value in parts["parameters"].items()
     }
-    created = kind(**known)
-    check_names({**parameters, **known}, created.get_params(deep=False), "parameters")
-    created = kind(**parameters, **known)
+    check_names(parameters, kind().get_params(deep=False), "parameters")
+    created = kind(**parameters)
     for name, value in parts["attributes"].items():
         if name.startswith("_") or not name.endswith("_"):
             raise ValueError(f"it has an unknown attribute: {name}")
         setattr(created, name, unpacked(value, arrays))
-    if kind in STORED.values() and hasattr(created, "n_features_in_"):
+    if hasattr(created, "n_features_in_"):
         created._n_features_out = created.n_features_in_
     return created
 
@@ -144,7 +138,7 @@ def fitted_attributes(held: Any) -> dict[str, Any]:
     """Return the attributes of an object whose names end with one underscore."""
     return {
         name: value
-        for name, value in vars(held).items()
+        for name, value in getattr(held, "__dict__", {}).items()
         if name.endswith("_") and not name.startswith("_") and name not in IMPLIED
     }
 
