@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from cameras import lorentz_cameras
 from numpy.testing import assert_allclose
+from scenes import face_model, faces
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM, calibration
 from isa_nrsfm.calibration import (
     canonical_pose,
     deformation_metric,
@@ -14,7 +15,7 @@ from isa_nrsfm.calibration import (
     euclidean_shapes,
     metric_upgrade,
 )
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 CAMERAS = ["orthographic", "weak_perspective"]
@@ -64,14 +65,6 @@ class TestMetricUpgrade:
         assert upgrade.residual < 1e-8
         seen = upgrade.scales[:, None, None] * upgrade.rotations[:, :2]
         assert_allclose(motion @ upgrade.Q, seen, atol=1e-8 * np.abs(seen).max())
-
-    @both_cameras
-    def test_small_rotations_are_exact_too(self, camera):
-        motion, _, _, affinity = scene(0, camera, spread=0.05)
-        with warned_of(""):
-            upgrade = metric_upgrade(motion, camera)
-        metric = affinity @ upgrade.Q @ upgrade.Q.T @ affinity.T
-        assert_allclose(metric * 3 / np.trace(metric), np.eye(3), atol=1e-8)
 
     @both_cameras
     def test_which_of_the_equivalent_matrices(self, camera):
@@ -155,17 +148,6 @@ class TestMetricUpgrade:
         assert_allclose(two.scales, one.scales[order], rtol=1e-7)
         assert_allclose(two.rotations, roll @ one.rotations[order], atol=1e-7)
 
-    def test_scales_of_frames_do_not_matter_where_they_are_free(self):
-        motion, *_ = scene(6, "weak_perspective")
-        rng = np.random.default_rng(6)
-        motion += 0.1 * rng.standard_normal(motion.shape)
-        factors = rng.uniform(0.1, 10, 20)
-        one = metric_upgrade(motion)
-        two = metric_upgrade(factors[:, None, None] * motion)
-        ratio = two.Q / one.Q
-        assert_allclose(ratio, ratio[0, 0], rtol=1e-6)
-        assert_allclose(two.rotations, one.rotations, atol=1e-7)
-
     @both_cameras
     def test_leaves_out_frames_without_camera(self, camera):
         motion, *_ = scene(7, camera)
@@ -177,12 +159,6 @@ class TestMetricUpgrade:
             found = getattr(two, parts)
             assert_allclose(found[1:21], getattr(one, parts), rtol=1e-12)
             assert np.isnan(found[[0, 21, 22]]).all()
-
-    def test_three_orthographic_cameras_are_enough(self):
-        motion, _, _, affinity = scene(8, "orthographic", n_frames=3)
-        upgrade = metric_upgrade(motion, "orthographic")
-        metric = affinity @ upgrade.Q @ upgrade.Q.T @ affinity.T
-        assert_allclose(metric * 3 / np.trace(metric), np.eye(3), atol=1e-8)
 
 
 class TestDegenerateCameras:
@@ -232,15 +208,8 @@ class TestDegenerateCameras:
         assert np.isfinite(upgrade.Q).all()
 
     def test_no_scaled_rotations_in_any_metric(self):
-        # Rows that are orthonormal in the metric diag(1, 1, -1).
-        rng = np.random.default_rng(0)
-        boost, angle = 0.5 * rng.standard_normal(30), rng.uniform(0, 6, 30)
-        turn = Rotation.from_rotvec(angle[:, None] * [0, 0, 1]).as_matrix()
-        squeeze = np.tile(np.eye(3), (30, 1, 1))
-        squeeze[:, 0, 0] = squeeze[:, 2, 2] = np.cosh(boost)
-        squeeze[:, 0, 2] = squeeze[:, 2, 0] = np.sinh(boost)
         with warned_of(""):
-            upgrade = metric_upgrade((squeeze @ turn)[:, :2])
+            upgrade = metric_upgrade(lorentz_cameras(np.random.default_rng(0)))
         assert upgrade.residual > 0.1
         assert np.isfinite(upgrade.rotations).all()
 
@@ -354,15 +323,6 @@ class TestDeformationMetric:
         motion, alpha, _, strain, *_ = strained_scene(2, n_frames=400, noise=0.02)
         assert_allclose(deformation_metric(motion, alpha).strain, strain, atol=0.03)
 
-    def test_few_frames_lead_to_a_finite_metric(self):
-        # More unknowns than equations.
-        rng = np.random.default_rng(3)
-        motion, *_ = scene(3, "weak_perspective", n_frames=12)
-        motion += 0.3 * rng.standard_normal(motion.shape)
-        metric = deformation_metric(motion, rng.standard_normal((12, 6)))
-        assert np.abs(metric.strain).max() < 0.6
-        assert np.isfinite(metric.Q).all()
-
     def test_coefficients_that_are_zero_have_no_strain(self):
         motion, alpha, *_ = strained_scene(4)
         with_zeros = np.insert(alpha, 1, 0.0, axis=1)
@@ -390,11 +350,6 @@ class TestDeformationMetric:
         one, two = deformation_metric(motion, alpha), deformation_metric(more, with_nan)
         for a, b in zip(one, two, strict=True):
             assert_allclose(a, b, rtol=1e-12)
-
-    def test_warns_of_small_rotations(self):
-        motion, *_ = scene(7, "weak_perspective", spread=0.02)
-        with warned_of(""):
-            deformation_metric(motion, np.ones((20, 1)))
 
     def test_refuses(self):
         motion, alpha, *_ = strained_scene(0)
@@ -499,11 +454,6 @@ class TestEuclideanFrames:
             assert (seen > np.exp(-0.5) * least * (1 - 1e-9)).all()
             assert (seen < np.exp(0.5) * largest * (1 + 1e-9)).all()
 
-    def test_no_frames(self, fitted):
-        metric, motion, alpha, mean, basis = fitted
-        frames = euclidean_frames(metric, motion[:0], alpha[:0], mean, basis)
-        assert [part.shape for part in frames] == [(0, 9, 3), (0, 3, 3), (0,)]
-
     def test_what_cameras_absorb_comes_back(self):
         # Basis shapes B_k + V_k B_0 and cameras that hide it, to first order: what is
         # left is of second order in the deformation.
@@ -529,23 +479,10 @@ class TestEuclideanFrames:
             euclidean_frames(*arguments)
 
 
-def test_public_names():
-    assert all(hasattr(calibration, name) for name in calibration.__all__)
-
-
 @both_cameras
 class TestModelsWithCalibratedCameras:
-    @pytest.fixture
-    def faces(self, camera):
-        return make_face_tracks(
-            120, n_components=2, camera=camera, noise=0.005, random_state=0
-        )
-
-    @pytest.fixture
-    def model(self, faces, camera):
-        return AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
-
-    def test_the_metric_is_the_identity_up_to_scale(self, model, recwarn):
+    def test_the_metric_is_the_identity_up_to_scale(self, camera, recwarn):
+        model = face_model(camera=camera)
         metric = deformation_metric(model.motion_, model.alpha_)
         scale = np.trace(metric.Q) / 3
         assert_allclose(metric.Q, scale * np.eye(3), atol=1e-6 * scale)
@@ -553,20 +490,22 @@ class TestModelsWithCalibratedCameras:
         assert metric.residual < 1e-10
         assert len(recwarn) == 0
 
-    def test_the_upgrade_gives_the_shapes_of_the_model_turned(self, model, faces):
+    def test_the_upgrade_gives_the_shapes_of_the_model_turned(self, camera):
+        model = face_model(camera=camera)
         metric = deformation_metric(model.motion_, model.alpha_)
         frames = euclidean_frames(
             metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
         )
-        shapes = model.reconstruct(faces.data)
+        shapes = model.reconstruct(faces().data)
         assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6
 
-    def test_rotations_are_the_pose_of_the_head(self, model, faces):
+    def test_rotations_are_the_pose_of_the_head(self, camera):
+        model, truth = face_model(camera=camera), faces()
         turn = canonical_pose(model.mean_shape_, scheme="ibug-68").rotation
-        true = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
+        true = canonical_pose(truth.mean_shape, scheme="ibug-68").rotation
         mirror = np.diag([1.0, 1.0, np.linalg.det(turn)])
         found = Rotation.from_matrix(mirror @ model.rotations_ @ turn.T)
-        expected = Rotation.from_euler("yxz", faces.angles, degrees=True)
+        expected = Rotation.from_euler("yxz", truth.angles, degrees=True)
         expected *= Rotation.from_matrix(true).inv()
         apart = np.rad2deg((found * expected.inv()).magnitude())
         assert apart.mean() < 1.0

@@ -18,7 +18,7 @@ from scipy.io import savemat
 from isa_nrsfm._tables.landmark_columns import names_layout
 from isa_nrsfm.datasets import _muct, _shark, fetch_muct, fetch_shark
 from isa_nrsfm.datasets._remote import RemoteFile, fetch_file
-from isa_nrsfm.io import landmark_table, read_table
+from isa_nrsfm.io import landmark_table
 
 CONTENT = bytes(range(256)) * 100
 BY_HAND = "To put it there by hand, take it from {url}; its sha256 is {sha256}"
@@ -137,15 +137,6 @@ class TestFilesThatAreThere:
         path = put(tmp_path / "isa_nrsfm", remote, CONTENT)
         assert fetch_file(remote) == path
 
-    def test_may_be_below_the_home_of_the_user(
-        self, tmp_path, without_pooch, monkeypatch
-    ):
-        monkeypatch.setenv("HOME", str(tmp_path))
-        monkeypatch.setenv("USERPROFILE", str(tmp_path))
-        remote = described(CONTENT, "http://256.0.0.0/thing.bin")
-        path = put(tmp_path, remote, CONTENT)
-        assert fetch_file(remote, "~") == path
-
     def test_are_refused_and_kept_with_other_contents(self, tmp_path, server):
         server.answers["/thing.bin"] = CONTENT
         remote = described(CONTENT, f"{server.url}/thing.bin")
@@ -170,13 +161,6 @@ class TestDownloads:
         assert fetch_file(remote, folder) == path
         assert server.requests == ["/a/thing.bin?raw"]
         assert list(folder.iterdir()) == [path]
-
-    def test_go_to_the_home_of_scikit_learn(self, tmp_path, server, monkeypatch):
-        monkeypatch.setenv("SCIKIT_LEARN_DATA", str(tmp_path))
-        server.answers["/thing.bin"] = CONTENT
-        path = fetch_file(described(CONTENT, f"{server.url}/thing.bin"))
-        assert path == tmp_path / "isa_nrsfm" / "thing.bin"
-        assert path.read_bytes() == CONTENT
 
     @pytest.mark.parametrize(
         ("answer", "reason"),
@@ -345,14 +329,6 @@ class TestMuct:
         for labels in ("subjects", "lighting", "camera", "sex", "glasses"):
             assert faces[labels][3] == faces[labels][0]
 
-    def test_is_downloaded(self, tmp_path, server, muct_file, monkeypatch):
-        server.answers["/faces.csv"] = muct_file.content
-        remote = muct_file.remote._replace(url=f"{server.url}/faces.csv")
-        replace_file(monkeypatch, _muct, remote)
-        first, second = (fetch_muct(data_home=tmp_path) for _ in range(2))
-        assert server.requests == ["/faces.csv"]
-        assert_array_equal(first.data, second.data)
-
     def test_data_and_target_alone(self, folder):
         faces = fetch_muct(data_home=folder)
         X, y = fetch_muct(data_home=folder, return_X_y=True)
@@ -416,15 +392,6 @@ class TestMuct:
         hidden = ~faces.visible.all(axis=1)
         assert hidden.sum() == 840
         assert set(faces.camera[hidden]) == {"b", "c"}
-
-    def test_original_is_read_like_any_table(self, data_path):
-        pd = pytest.importorskip("pandas")
-        path = data_path("raw/muct76-opencv.csv")
-        faces = fetch_muct(data_home=path.parent, mirrored=True, as_frame=True)
-        points, other = landmark_table(read_table(path), missing="zeros")
-        pd.testing.assert_frame_equal(faces.data, points)
-        assert_array_equal(faces.names, other["name"])
-        assert_array_equal(faces.tags, other["tag"])
 
     def test_mirror_images_of_the_original(self, data_path):
         folder = data_path("raw/muct76-opencv.csv").parent

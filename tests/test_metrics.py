@@ -1,6 +1,5 @@
 """Measures that ignore what the images cannot determine, and nothing else."""
 
-import time
 from itertools import permutations
 
 import numpy as np
@@ -9,7 +8,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import check_grad, minimize
 from scipy.stats import ortho_group
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import (
@@ -77,21 +75,6 @@ class TestInverseSNR:
         rescaled = value(scales * tracks, scales * fitted)
         assert np.isclose(rescaled, expected) == scale_frames
 
-    def test_is_the_relative_noise_of_the_truth(self):
-        tracks = make_nonrigid_tracks(noise=0.1, random_state=0)
-        clean = tracks_to_table(tracks.clean)
-        # The centroids take one of 68 degrees of freedom from the noise.
-        assert_allclose(inverse_snr(clean, tracks.data), 0.01 * 67 / 68, rtol=0.02)
-
-    @pytest.mark.parametrize("scale_frames", [False, True])
-    def test_agrees_with_the_estimator(self, scale_frames):
-        X = make_nonrigid_tracks(noise=0.02, random_state=0).data
-        model = AffineNRSfM(
-            scale_frames=scale_frames, refinement="alternating", random_state=0
-        ).fit(X)
-        error = inverse_snr(X, model.reproject(X), scale_frames=scale_frames)
-        assert_allclose(error, model.inverse_snr_)
-
     @pytest.mark.parametrize("scale_frames", [False, True])
     def test_missing_points_are_left_out(self, rng, scale_frames):
         tracks = rng.standard_normal((4, 6, 2))
@@ -119,13 +102,6 @@ class TestInverseSNR:
         assert inverse_snr(
             np.vstack([X, empty]), np.vstack([X_hat, empty]), scale_frames=scale_frames
         ) == inverse_snr(X, X_hat, scale_frames=scale_frames)
-
-    def test_takes_dataframes_and_float32(self, rng):
-        pd = pytest.importorskip("pandas")
-        X, X_hat = rng.standard_normal((2, 3, 8)).astype(np.float32)
-        assert_allclose(
-            inverse_snr(pd.DataFrame(X), pd.DataFrame(X_hat)), inverse_snr(X, X_hat)
-        )
 
     @pytest.mark.parametrize(
         ("X", "X_hat", "message"),
@@ -261,28 +237,12 @@ class TestAffineShapeError:
         X[7] = 5.0
         assert_allclose(affine_shape_error(scene.shapes, X), 1 / 60, atol=1e-12)
 
-    def test_unrelated_shapes(self):
-        # Orthogonal to the truth: A cannot help, and nothing is divided by zero.
-        truth = np.zeros((1, 8, 3))
-        other = np.zeros((1, 8, 3))
-        truth[0, :2, 0] = 1, -1
-        other[0, 2:4, 0] = 1, -1
-        assert_allclose(affine_shape_error(truth, other), 1)
-
     def test_extreme_units(self, scene):
         X = scene.shapes + 0.1 * scene.shapes**2
         expected = affine_shape_error(scene.shapes, X)
         for unit in (1e-200, 1e200):
             assert_allclose(affine_shape_error(unit * scene.shapes, X), expected)
             assert_allclose(affine_shape_error(scene.shapes, unit * X), expected)
-
-    def test_many_frames_are_fast(self, rng):
-        S = rng.standard_normal((2500, 68, 3))
-        X = S + rng.standard_normal(S.shape)
-        start = time.perf_counter()
-        error = affine_shape_error(S, X)
-        assert time.perf_counter() - start < 10  # about 0.2 s
-        assert_allclose(error, np.sqrt(0.5), rtol=0.02)
 
     @pytest.mark.parametrize(
         ("S", "X", "message"),
@@ -361,23 +321,6 @@ class TestBasisSimilarity:
         free = basis_similarity(basis_true[:2], turned[::-1])
         assert np.sum(free**2) >= np.sum(np.cos(angles) ** 2)
 
-    def test_matching_is_not_greedy(self, rng):
-        # The best single pair, e0 and the first, would leave e1 with nothing.
-        e = orthonormal_shapes(rng, 4)
-        first, second = unit_shapes(
-            np.array([0.72 * e[0] + 0.65 * e[1], 0.6 * e[0] + 0.8 * e[3]])
-        )
-        mean = rng.standard_normal((10, 3))
-        similarity, matching = basis_similarity(
-            e[:2],
-            [first, second],
-            mean_shape_true=mean,
-            mean_shape=mean,
-            return_matching=True,
-        )
-        assert_array_equal(matching, [1, 0])
-        assert_allclose(similarity, [0.6, 0.65 / np.hypot(0.72, 0.65)])
-
     def test_matching_is_the_best_of_all(self, scene, rng):
         estimate = rng.standard_normal(scene.basis.shape)
         means = {"mean_shape_true": scene.mean_shape, "mean_shape": scene.mean_shape}
@@ -400,7 +343,7 @@ class TestBasisSimilarity:
 
     @pytest.mark.parametrize("n_components", [2, 3, 6])
     def test_affinity_may_be_far_from_the_unit_matrix(self, rng, n_components):
-        for seed in range(12):
+        for seed in range(4):
             basis = make_nonrigid_tracks(2, 40, n_components, random_state=seed).basis
             affinity = rng.standard_normal((3, 3))
             similarity = basis_similarity(basis, basis[::-1] @ affinity)
@@ -447,9 +390,6 @@ class TestBasisSimilarity:
         similarity = basis_similarity(*bases, mean_shape_true=mean, mean_shape=mean)
         assert_allclose(similarity, [1, 0, 1], atol=1e-12)
 
-    def test_only_zeros(self):
-        assert_array_equal(basis_similarity(np.zeros((2, 9, 3)), np.ones((2, 9, 3))), 0)
-
     def test_different_numbers_of_shapes(self, scene):
         similarity, matching = basis_similarity(
             scene.basis, scene.basis[[2, 1]], return_matching=True
@@ -487,17 +427,6 @@ class TestBasisSimilarity:
 
 
 class TestSubspaceDistance:
-    @pytest.mark.parametrize("degrees", [0.0, 1e-6, 30.0, 90.0])
-    def test_planes_at_a_known_angle(self, degrees):
-        # Both axes of the first plane turn by the angle into new directions.
-        angle = np.radians(degrees)
-        truth = np.eye(6)[:4]
-        turned = truth.copy()
-        turned[:2] = np.cos(angle) * np.eye(6)[:2] + np.sin(angle) * np.eye(6)[4:]
-        assert_allclose(
-            subspace_distance(truth, turned, 2), np.sin(angle), rtol=1e-7, atol=1e-15
-        )
-
     def test_root_mean_square_of_the_sines(self):
         angles = np.radians([10.0, 20.0, 60.0])[:, None]
         a = np.eye(6)[:3]
@@ -532,16 +461,6 @@ class TestSubspaceDistance:
         turned[[0, 3]] = turned[[3, 0]]  # two groups exchange one direction each
         assert_allclose(subspace_distance(np.eye(9), turned), np.sqrt(1 / 3))
 
-    def test_matching_is_not_greedy(self):
-        # Lines in the plane: the closest two are a0 and b0, which would leave a1 and
-        # b1 at right angles.
-        def lines(*degrees):
-            angles = np.radians(degrees)
-            return np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-        a, b = lines(0, 40), lines(15, -50)
-        assert_allclose(subspace_distance(a, b, 1), np.sin(np.radians(50)), atol=1e-12)
-
     def test_matching_is_the_best_of_all(self, rng):
         for _ in range(20):
             a, b = rng.standard_normal((2, 4, 2, 5))
@@ -558,22 +477,6 @@ class TestSubspaceDistance:
             direct = subspace_distance(a, c, 2)
             detour = subspace_distance(a, b, 2) + subspace_distance(b, c, 2)
             assert direct <= detour + 1e-12
-
-    def test_one_block_of_everything(self, rng):
-        a, b = rng.standard_normal((2, 3, 3))
-        assert subspace_distance(a, b) < 1e-12
-
-    def test_unmixing_of_whitened_signals(self, rng):
-        mixing = rng.standard_normal((6, 6))  # of white sources
-        values, axes = np.linalg.eigh(mixing @ mixing.T)
-        whitening = (axes / np.sqrt(values)).T
-        truth = np.linalg.inv(whitening @ mixing)
-        assert_allclose(truth @ truth.T, np.eye(6), atol=1e-10)
-        found = ortho_group.rvs(3, random_state=rng) @ truth.reshape(2, 3, 6)
-        found = found[::-1].reshape(6, 6)
-        assert subspace_distance(found, truth) < 1e-12
-        of_signals = found @ whitening  # the same, for signals that are not white
-        assert subspace_distance(of_signals @ np.linalg.inv(whitening), truth) < 1e-10
 
     @pytest.mark.parametrize(
         ("a", "b", "size", "message"),
