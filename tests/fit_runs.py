@@ -8,11 +8,12 @@ import pandas as pd
 from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
+MODEL = "model.npz"
 FIGURES = {"basis_shapes.png", "mode_covariance.png", "reprojection.png"}
 FILES = {
     "alpha.csv",
     "cameras.csv",
-    "model.npz",
+    MODEL,
     "report.html",
     "report.json",
     "shapes.npz",

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 from export_models import face_model, faces
 from exported_files import Read, content_of
+from fit_runs import MODEL
 from numpy.testing import assert_array_equal
 from scipy.io import loadmat
 
@@ -22,6 +23,7 @@ from isa_nrsfm.export import (
 from isa_nrsfm.io import save_model
 
 QUICK = [*"--n-components 1 --isa fast --n-init 2 --no-figures --output".split()]
+NAMED = f"named_{MODEL}"
 NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 
 
@@ -29,10 +31,10 @@ NAMES = [f"{axis}{j:02d}" for j in range(68) for axis in "xy"]
 def folder(tmp_path_factory):
     """Return a folder with a model and a table with labels and a row too few."""
     folder = tmp_path_factory.mktemp("export")
-    save_model(face_model(), folder / "model.npz")
+    save_model(face_model(), folder / MODEL)
     named = AffineNRSfM(2, random_state=0)
     named.fit(pd.DataFrame(faces().data[:50], columns=NAMES))
-    save_model(named, folder / "named.npz")
+    save_model(named, folder / NAMED)
     table = pd.DataFrame(faces().data[:9], columns=NAMES).round(3)
     table.insert(0, " mood", ["calm", "glad", "sad"] * 3)
     table.loc[4, NAMES[6:]] = np.nan
@@ -44,7 +46,7 @@ def folder(tmp_path_factory):
 def export(folder, tmp_path, capsys):
     """Return a function that exports a model: output file, report and errors."""
 
-    def run(name, *options, model="named.npz"):
+    def run(name, *options, model=NAMED):
         output = tmp_path / name
         options = [str(folder / o) if o == "table.csv" else str(o) for o in options]
         argv = ["export", str(folder / model), *options, "--output", str(output)]
@@ -58,23 +60,23 @@ def export(folder, tmp_path, capsys):
 
 
 def test_the_suffix_tells_what_is_written(export, tmp_path):
-    output, report, _ = export("face.glb", model="model.npz")
+    output, report, _ = export("face.glb", model=MODEL)
     write_glb(face_model(), tmp_path / "expected.glb")
     assert output.read_bytes() == (tmp_path / "expected.glb").read_bytes()
     assert f"{output.stat().st_size} bytes" in report
 
-    output, _, _ = export("face.HTML", model="model.npz")
+    output, _, _ = export("face.HTML", model=MODEL)
     write_viewer(face_model(), tmp_path / "expected.html")
     assert output.read_text() == (tmp_path / "expected.html").read_text()
 
-    output, report, _ = export("pdm.txt", model="model.npz")
+    output, report, _ = export("pdm.txt", model=MODEL)
     for read, computed in zip(
         read_pdm(output), point_distribution_model(face_model()), strict=True
     ):
         assert_array_equal(read, computed)
     assert "3 modes of 68 points" in report
 
-    output, _, _ = export("shapes.npz", model="model.npz")
+    output, _, _ = export("shapes.npz", model=MODEL)
     with np.load(output) as arrays:
         assert set(arrays) == set(ShapeArrays._fields)
         assert_array_equal(arrays["basis"], face_model().basis_)
@@ -88,7 +90,7 @@ def test_content_tells_a_point_distribution_model_from_shapes(export):
 
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
-    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model="model.npz")
+    output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model=MODEL)
     expected = point_distribution_model(
         face_model(), n_modes=1, camera=None, origin="lower", mirrored=True
     )
@@ -103,7 +105,7 @@ def test_options_reach_what_is_written(export):
 
 def test_edges_are_pairs_of_names_of_points(export, tmp_path):
     path = tmp_path / "edges.csv"
-    path.write_text("00,01\n 01, 02\n\n")
+    path.write_text("00,01\n 01, 02\n\n", encoding="utf-8-sig")
     read = Read(export("a.glb", "--edges", path)[0])
     assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1, 1, 2]
     path.write_text("36,39,27\n")
@@ -111,36 +113,21 @@ def test_edges_are_pairs_of_names_of_points(export, tmp_path):
     assert read.array(read.primitive(4)["indices"]).tolist() == [36, 39, 27]
 
 
-@pytest.mark.parametrize("text", ["00,1", "00", "00,01\n00,01,02", "00,01,02,03"])
-def test_other_edges_are_refused(export, tmp_path, text):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        *(
+            (text, r"edges\.csv, line \d: expected the names of two or three points")
+            for text in ("00,1", "00", "00,01\n00,01,02", "00,01,02,03")
+        ),
+        ("\n", "has no edges; use --edges none to draw only points"),
+        ("00,01\n", "cannot be read as a list of edges: its text is not in UTF-8"),
+    ],
+)
+def test_other_edges_are_refused(export, tmp_path, text, message):
     path = tmp_path / "edges.csv"
-    path.write_text(text)
-    _, _, error = export("a.glb", "--edges", path)
-    assert re.search(
-        r"edges\.csv, line \d: expected the names of two or three points .* such as "
-        r"00, 01; got '",
-        error,
-    )
-
-
-def test_edges_in_other_encodings_are_refused(export, tmp_path):
-    path = tmp_path / "edges.csv"
-    path.write_text("00,01\n", encoding="utf-8-sig")
-    read = Read(export("a.glb", "--edges", path)[0])
-    assert read.array(read.primitive(1)["indices"]).tolist() == [0, 1]
-    path.write_text("00,01\n", encoding="utf-16")
-    _, _, error = export("b.glb", "--edges", path)
-    expected = "edges.csv cannot be read as a list of edges: its text is not in UTF-8"
-    assert expected in error
-    path.write_text("00,01\n", encoding="utf-16-le")  # no byte order mark
-    _, _, error = export("b.glb", "--edges", path)
-    assert "edges.csv, line 1: expected the names of two or three points" in error
-
-
-def test_a_file_without_edges_is_refused(export, tmp_path):
-    (tmp_path / "edges.csv").write_text("\n")
-    _, _, error = export("a.glb", "--edges", tmp_path / "edges.csv")
-    assert "has no edges; for points alone say --edges none" in error
+    path.write_text(text, encoding="utf-16" if "UTF" in message else "utf-8")
+    assert re.search(message, export("a.glb", "--edges", path)[2])
 
 
 def test_the_viewer_shows_a_table_with_its_labels(export):
@@ -149,7 +136,7 @@ def test_the_viewer_shows_a_table_with_its_labels(export):
     assert content["categories"] == ["calm", "glad", "sad"]
     assert content["rows"] == ["0", "1", "2", "3", "5", "6", "7", "8"]
     assert content["labels"] == [0, 1, 2, 0, 2, 0, 1, 2]
-    assert "1 not shown: fewer than 4 points" in report
+    assert "1  not shown: fewer than 4 points" in report
     output, _, _ = export("b.html", "table.csv", "--skip-rows", "mood=^g")
     assert content_of(output)["rows"] == ["0", "2", "3", "5", "6", "8"]
     assert len(content_of(export("c.html", "--n-frames", "5")[0])["rows"]) == 5
@@ -159,13 +146,17 @@ def test_the_viewer_shows_a_table_with_its_labels(export):
     ("name", "options", "message"),
     [
         ("a.foo", [], "expected a file with one of the suffixes .html, .htm, .glb"),
-        ("a.txt", ["--content", "glb"], "--content glb is written to files .glb; got"),
-        ("a.mat", ["--n-modes", "2"], "--n-modes is for pdm; "),
-        ("a.glb", ["table.csv"], "TABLE is for viewer; "),
-        ("a.txt", ["--edges", "none"], "--edges is for viewer and glb; "),
+        ("a.txt", ["--content", "glb"], "--content glb needs a file .glb; got"),
+        ("a.mat", ["--n-modes", "2"], "--n-modes is an option of pdm; "),
+        ("a.glb", ["table.csv"], "TABLE is an option of viewer; "),
+        ("a.txt", ["--edges", "none"], "--edges is an option of viewer and glb; "),
         ("a.html", ["--label", "mood"], "--label needs a TABLE"),
         ("a.glb", ["--zeros-missing"], "--zeros-missing needs a TABLE"),
-        ("a.html", ["table.csv", "--label", "age"], "has no column 'age' beside its"),
+        (
+            "a.html",
+            ["table.csv", "--label", "age"],
+            "has no column 'age'; its",
+        ),
         ("a.glb", ["--names", "jaw"], "names must hold 2 names"),
         ("a.txt", ["--n-modes", "999"], "n_modes must be at most"),
     ],
@@ -185,23 +176,9 @@ def test_numbers_of_modes_are_checked(export, n_modes, capsys):
 
 def test_inputs_are_not_overwritten(folder, capsys):
     model = folder / "model.txt"
-    model.write_bytes((folder / "model.npz").read_bytes())
+    model.write_bytes((folder / MODEL).read_bytes())
     assert main(["export", str(model), "--output", str(model)]) == 1
     assert "would be overwritten by the results" in capsys.readouterr().err
-
-
-def test_a_fit_writes_a_viewer_of_its_rows(tmp_path, capsys):
-    table = pd.DataFrame(faces().data[:50], columns=NAMES)
-    table.loc[0, NAMES[6:]] = np.nan
-    table.to_csv(tmp_path / "table.csv", index=False)
-    results = tmp_path / "results"
-    assert main(["fit", str(tmp_path / "table.csv"), *QUICK, str(results)]) == 0
-    content = content_of(results / "viewer.html")
-    assert content["rows"] == [str(i) for i in range(1, 50)]
-    assert content["components"] == ["alpha_1"]
-    assert content["points"][:2] == ["00", "01"]
-    assert content["rotations"]
-    assert capsys.readouterr().err == ""
 
 
 def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys):
@@ -216,8 +193,8 @@ def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys):
     results = tmp_path / "results"
     assert main(["fit", str(tmp_path / "flat.csv"), *QUICK, str(results)]) == 0
     error = capsys.readouterr().err
-    told = "viewer.html has affine shapes, and cameras.csv no angles: a metric upgrade"
-    assert f"warning: {told} needs" in error
+    told = "viewer.html has affine shapes, and cameras.csv has no angles: a metric"
+    assert f"warning: {told}" in error
     content = content_of(results / "viewer.html")
     assert content["about"].startswith("Affine shapes")
     assert content["rotations"] == ""

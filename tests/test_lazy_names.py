@@ -172,7 +172,7 @@ def test_transform_loads_no_more_than_it_uses(tmp_path):
         "scipy.io",
         "sklearn.decomposition",
         "sklearn.model_selection",
-        "isa_nrsfm.cli._commands",
+        "isa_nrsfm.cli._fit",
         "isa_nrsfm.export._viewer",
         "isa_nrsfm.plotting._views",
     }

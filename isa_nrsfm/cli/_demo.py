@@ -1,5 +1,6 @@
-"""The command demo: an artificial table of faces, and how near the truth its fit is."""
+"""The command demo: fit an artificial table of faces and compare with the truth."""
 
+import shlex
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -8,37 +9,29 @@ import numpy as np
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.cli._commands import fit_table
-from isa_nrsfm.cli._drawing_options import drawing_options
-from isa_nrsfm.cli._outputs import component_names
+from isa_nrsfm.cli._drawing import drawing_options
+from isa_nrsfm.cli._fit import fit_table
 from isa_nrsfm.cli._parser import PROGRAM, build_parser
-from isa_nrsfm.cli._report import fit_text, lay_out
+from isa_nrsfm.cli._sections import fit_text, text_of
 from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
 
 if TYPE_CHECKING:
     from sklearn.utils import Bunch
 
-_N_FRAMES = 400
-_N_COMPONENTS = 3
-_TRIED = "1-5"
-# The cameras by which the faces are made.
 _CAMERA: Final = "weak_perspective"
-_SEED = 0
 
 
-def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
-    """
-    Fit a table of artificial faces, and return the report with the truth.
+def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
+    """Fit artificial faces with the numbers of basis shapes to try; return the report.
 
-    The numbers of basis shapes that are tried are as of ``--n-components``.
+    The report ends with the truth.
     """
     pd = import_optional("pandas", extra="io")
-    faces = make_face_tracks(
-        _N_FRAMES, n_components=_N_COMPONENTS, camera=_CAMERA, random_state=_SEED
-    )
+    faces = make_face_tracks(400, n_components=3, camera=_CAMERA, random_state=0)
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)
-    table.insert(0, "frame", [f"face{i:03d}" for i in range(_N_FRAMES)])
+    table.insert(0, "frame", [f"face{i:03d}" for i in range(len(table))])
     folder = Path(args.output)
     options = [
         *("fit", str(folder / "tracks.csv")),
@@ -48,18 +41,17 @@ def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
         *(["--no-figures"] if args.no_figures else []),
         *drawing_options(args),
     ]
+    started = Namespace(arguments=options, since=args.since)
     report = fit_table(
-        build_parser().parse_args(
-            options, Namespace(arguments=options, since=args.since)
-        ),
+        build_parser().parse_args(options, started),
         warned,
         table=table,
         truth=lambda estimator, X: _compare(faces, estimator, X),
     )
     truth = report["truth"]
     lines = [
-        f"the 3D shapes of the frames are off by {_percent(truth['shape_error'])} "
-        f"(the mean shape alone: {_percent(truth['mean_shape_error'])})"
+        f"the 3D shapes of the frames are off by {100 * truth['shape_error']:.1f} % "
+        f"(the mean shape alone: {100 * truth['mean_shape_error']:.1f} %)"
     ]
     width = max(map(len, faces.component_names))
     lines += [
@@ -68,9 +60,8 @@ def run_demo(args: Namespace, warned: list[str], tried: str = _TRIED) -> str:
         f"{row['correlation']:.2f}"
         for row in truth["basis"]
     ]
-    command = " ".join(f"'{word}'" if " " in word else word for word in options)
-    ending = {"Truth": lines, "Again": [f"{PROGRAM} {command}"]}
-    return f"{fit_text(report, folder)}\n\n{lay_out(ending)}"
+    ending = {"Truth": lines, "Again": [shlex.join([PROGRAM, *options])]}
+    return f"{fit_text(report, folder)}\n\n{text_of('', ending)}"
 
 
 def _compare(faces: "Bunch", estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
@@ -86,7 +77,7 @@ def _compare(faces: "Bunch", estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
         return_matching=True,
     )
     correlation = np.corrcoef(faces.alpha.T, estimator.alpha_.T)
-    names = component_names(len(estimator.basis_))
+    names = names_of_components(None, len(estimator.basis_))
     return {
         "shape_error": affine_shape_error(faces.shapes, shapes),
         "mean_shape_error": affine_shape_error(faces.shapes, rigid),
@@ -102,8 +93,3 @@ def _compare(faces: "Bunch", estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
             )
         ],
     }
-
-
-def _percent(fraction: float) -> str:
-    """Write a fraction in percent."""
-    return f"{100 * fraction:.1f} %"

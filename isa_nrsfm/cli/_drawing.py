@@ -1,6 +1,6 @@
-"""What the options --edges and --skeleton mean for the points of a table."""
+"""The lines between points that --edges and --skeleton ask for."""
 
-import argparse
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,30 +9,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm.cli._drawing_options import CONFIGURATIONS, NONE
+from isa_nrsfm._parameters.choices import SKELETON_NAMES
+from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
 from isa_nrsfm.skeletons import Skeleton, get_skeleton, read_skeleton
 
 
+def is_configuration(skeleton: str | None) -> bool:
+    """Return whether --skeleton is a configuration of DeepLabCut."""
+    return skeleton is not None and Path(skeleton).suffix.lower() in CONFIGURATIONS
+
+
+def drawing_options(args: Namespace) -> list[str]:
+    """Return the options of drawing that are given, as words of a command line."""
+    words = [
+        (f"--{name}", vars(args)[name]) for name in ("edges", "skeleton", "origin")
+    ]
+    return [word for pair in words if pair[1] is not None for word in pair]
+
+
+def drawing_files(args: Namespace) -> list[str]:
+    """Return the files that the options of drawing name."""
+    named = [args.edges, args.skeleton]
+    return [each for each in named if each not in (None, NONE, *SKELETON_NAMES)]
+
+
 def chosen_edges(
-    args: argparse.Namespace,
+    args: Namespace,
     names: Sequence[str],
     stored: Skeleton | None = None,
     *,
     surfaces: bool = False,
 ) -> Any:
-    """
-    Return what is to be drawn, as figures and exporters take it.
+    """Return the lines to draw, as figures and exporters take them.
 
-    Parameters
-    ----------
-    args : Namespace
-        The options.
-    names : sequence of str
-        The names of the points, in the order of the model.
-    stored : Skeleton, default=None
-        What the file of the table says, or the program that has written it.
-    surfaces : bool, default=False
-        Whether triangles are to stay what they are; otherwise their sides are drawn.
+    The skeleton stored in the table serves if no option is given. Triangles become
+    lines unless surfaces are drawn.
     """
     if args.edges == NONE:
         return None
@@ -42,10 +53,10 @@ def chosen_edges(
             return links
         sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         return np.unique(np.sort(sides, axis=1), axis=0)
-    # With --points the option is of all points, and the layout of the rest is stored.
+    # With --points, --skeleton is the layout of all points, and `stored` of the rest.
     some_points = stored is not None and getattr(args, "points", None) is not None
     if args.skeleton is not None and not some_points:
-        if Path(args.skeleton).suffix.lower() in CONFIGURATIONS:
+        if is_configuration(args.skeleton):
             return read_skeleton(args.skeleton, names)
         skeleton = get_skeleton(args.skeleton)
         if skeleton.n_points != len(names):
@@ -56,30 +67,27 @@ def chosen_edges(
         return skeleton
     if stored is None:
         return "auto"
-    if stored.point_names is None or stored.n_points != len(names):
-        return stored
-    return stored.reordered(names) if set(names) == set(stored.point_names) else stored
+    named = stored.point_names is not None and sorted(stored.point_names)
+    return stored.reordered(names) if named == sorted(names) else stored
 
 
-def _read_edges(path: str, point_names: Sequence[str]) -> NDArray[np.intp]:
-    """Read which points are joined."""
-    numbers = {name: j for j, name in enumerate(point_names)}
-    edges: list[list[int]] = []
+def _read_edges(path: str, names: Sequence[str]) -> NDArray[np.intp]:
+    """Read pairs or triples of points (n_edges, 2 or 3)."""
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    edges: list[list[str]] = []
     for number, line in enumerate(lines):
-        names = [name.strip() for name in line.split(",")]
         if not line.strip():
             continue
-        unknown = [name for name in names if name not in numbers]
-        size = len(edges[0]) if edges else len(names)
-        if unknown or len(names) != size or size not in (2, 3):
+        edges.append([name.strip() for name in line.split(",")])
+        sizes = {len(edge) for edge in edges}
+        if sizes not in ({2}, {3}) or not {*edges[-1]} <= {*names}:
             raise ValueError(
                 f"{path}, line {number + 1}: expected the names of two or three points "
-                f"with commas between them, such as {', '.join([*numbers][:2])}; got "
+                f"with commas between them, such as {', '.join(names[:2])}; got "
                 f"{line!r}"
             )
-        edges.append([numbers[name] for name in names])
     if not edges:
-        raise ValueError(f"{path} has no edges; for points alone say --edges none")
-    return np.array(edges)
+        raise ValueError(f"{path} has no edges; use --edges none to draw only points")
+    numbers = {name: j for j, name in enumerate(names)}
+    return np.array([[numbers[name] for name in edge] for edge in edges])

@@ -1,18 +1,16 @@
-"""The entry of the program: light, so that nearly all imports are inside it."""
+"""The entry of the program: nearly all imports are inside it."""
 
 import sys
 from collections.abc import Sequence
-
-INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """
     Run the command line.
 
-    The report goes to the standard output, and everything else (errors, warnings and
-    the progress) to the standard error. Characters that the encoding of
-    the standard output lacks are written with a backslash.
+    The report goes to the standard output; errors, warnings and the progress go to the
+    standard error. Characters that the encoding of the standard output lacks are
+    written with a backslash.
 
     Parameters
     ----------
@@ -38,4 +36,4 @@ def main(argv: Sequence[str] | None = None) -> int:
         return run(argv)
     except KeyboardInterrupt:
         print("isa-nrsfm: interrupted", file=sys.stderr, flush=True)
-        return INTERRUPTED
+        return 130

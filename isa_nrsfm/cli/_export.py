@@ -1,18 +1,17 @@
-"""The command export, from options to the text of its report."""
+"""The command export."""
 
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._tables.landmark_columns import names_of_points
-from isa_nrsfm.cli._drawing import chosen_edges
-from isa_nrsfm.cli._drawing_options import drawing_files
-from isa_nrsfm.cli._export_options import SUFFIXES
+from isa_nrsfm.cli._drawing import chosen_edges, drawing_files
+from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS
 from isa_nrsfm.cli._outputs import refuse_overwriting
-from isa_nrsfm.cli._reading import as_fitted, read_frames
-from isa_nrsfm.cli._report import lay_out, table_lines, table_report
+from isa_nrsfm.cli._reading import as_fitted, column_named, read_frames
+from isa_nrsfm.cli._report import table_report
 from isa_nrsfm.cli._runs import warn_of_mixed_runs
+from isa_nrsfm.cli._sections import table_section, text_of
 from isa_nrsfm.export import (
     point_distribution_model,
     write_glb,
@@ -21,46 +20,42 @@ from isa_nrsfm.export import (
     write_viewer,
 )
 from isa_nrsfm.io import load_model
-from isa_nrsfm.skeletons import Skeleton
 
-# The options that each content has.
+# The options of each content, besides those of the table.
 _POSE = ("camera", "origin", "mirrored")
 _OPTIONS = {
-    "viewer": ("edges", "skeleton", "names", "label", "n_frames", "table", *_POSE),
+    "viewer": ("table", "edges", "skeleton", "names", "label", "n_frames", *_POSE),
     "glb": ("edges", "skeleton", "names", *_POSE),
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
 }
-_TABLE_OPTIONS = (
-    "format",
-    "columns",
-    "skip_rows",
-    "zeros_missing",
-    "min_confidence",
-    "image_size",
-    "label",
-)
 
 
-def run_export(args: Namespace) -> str:
-    """Write what is asked for, and return the report."""
+def run(args: Namespace, warned: list[str]) -> str:
+    """Write a model for another program, and return the report."""
     output = Path(args.output)
     content = _content(output, args.content)
-    options = _options(args, content)
+    options = _given(args, content)
     estimator = load_model(args.model)
     warn_of_mixed_runs(args.model)
-    for source in filter(None, (args.model, args.table, *drawing_files(args))):
-        refuse_overwriting(source, [output])
+    sources = filter(None, (args.model, args.table, *drawing_files(args)))
+    refuse_overwriting(sources, [output])
     sections = {"Model": [args.model]}
     stored = None
     if args.table is not None:
-        of_table, stored = _table_options(args, estimator, sections)
-        options |= of_table
-    options.pop("skeleton", None)
+        frames = read_frames(args, estimator)
+        stored = frames.skeleton
+        table = table_report(args.table, args.format, frames)
+        sections["Table"] = table_section(table, unusable="not shown")
+        options["X"] = as_fitted(estimator, frames.X)
+        if args.label is not None:
+            labels = column_named(frames.other, args.label, "--label")
+            options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
-        names, surfaces = names_of_points(estimator), content == "glb"
-        options["edges"] = chosen_edges(args, names, stored, surfaces=surfaces)
-    if options.get("camera") == "none":
+        options["edges"] = chosen_edges(
+            args, names_of_points(estimator), stored, surfaces=content == "glb"
+        )
+    if options.get("camera") == NONE:
         options["camera"] = None
 
     lines = [str(output)]
@@ -75,7 +70,7 @@ def run_export(args: Namespace) -> str:
     else:
         write_shapes(estimator, output)
     lines.append(f"{output.stat().st_size} bytes")
-    return lay_out(sections | {"Output": lines})
+    return text_of("", sections | {"Output": lines})
 
 
 def _content(output: Path, content: str | None) -> str:
@@ -95,45 +90,30 @@ def _content(output: Path, content: str | None) -> str:
         suffixes += SUFFIXES["shapes"]
     if suffix not in suffixes:
         raise ValueError(
-            f"--content {content} is written to files {', '.join(suffixes)}; got "
-            f"{output}"
+            f"--content {content} needs a file {', '.join(suffixes)}; got {output}"
         )
     return content
 
 
-def _options(args: Namespace, content: str) -> dict[str, Any]:
-    """Return the options that are given, all of which the content must have."""
-    names = {name for own in _OPTIONS.values() for name in own}
-    given = {name: value for name, value in vars(args).items() if name in names}
-    given = {name: value for name, value in given.items() if value is not None}
+def _given(args: Namespace, content: str) -> dict[str, Any]:
+    """Return the options that are given; raise if the content does not have them."""
+    having: dict[str, list[str]] = {}
+    for kind, own in _OPTIONS.items():
+        for name in own:
+            having.setdefault(name, []).append(kind)
+    given = {name: getattr(args, name) for name in having}
+    given = {name: each for name, each in given.items() if each not in (None, False)}
     for name in given:
-        if name not in _OPTIONS[content]:
-            having = [kind for kind, own in _OPTIONS.items() if name in own]
+        if content not in having[name]:
             option = "TABLE" if name == "table" else f"--{name.replace('_', '-')}"
             raise ValueError(
-                f"{option} is for {' and '.join(having)}; {args.output} is {content}"
+                f"{option} is an option of {' and '.join(having[name])}; "
+                f"{args.output} is {content}"
             )
     if args.table is None:
-        for name in _TABLE_OPTIONS:
-            if getattr(args, name) not in (None, [], False, "auto"):
+        for name in (*TABLE_OPTIONS, "label"):
+            if getattr(args, name) not in (None, False, [], "auto"):
                 raise ValueError(f"--{name.replace('_', '-')} needs a TABLE")
-    return {name: given[name] for name in given if name not in ("table", "label")}
-
-
-def _table_options(
-    args: Namespace, estimator: AffineNRSfM, sections: dict[str, list[str]]
-) -> tuple[dict[str, Any], Skeleton | None]:
-    """Read the table that the viewer shows, its labels and its skeleton."""
-    frames = read_frames(args, estimator)
-    report = table_report(args.table, args.format, frames)
-    sections["Table"] = table_lines(report, unusable="not shown")
-    options = {"X": as_fitted(estimator, frames.points[frames.usable])}
-    if args.label is not None:
-        other = {str(name).strip(): name for name in frames.other.columns}
-        if args.label not in other:
-            raise ValueError(
-                f"--label: the table has no column {args.label!r} beside its "
-                f"landmarks; it has {', '.join(other) or 'none'}"
-            )
-        options["labels"] = frames.other.loc[frames.usable, other[args.label]]
-    return options, frames.skeleton
+    for name in ("table", "label", "skeleton"):
+        given.pop(name, None)
+    return given

@@ -1,201 +1,169 @@
-"""Read the table that a command is given, and take its landmark columns."""
+"""Read the table of a command: its landmarks, its other columns and unusable rows."""
 
-import warnings
 from argparse import Namespace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._tables.landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
+    landmark_sets,
     parse_coordinate,
     point_names,
 )
-from isa_nrsfm.cli._drawing_options import CONFIGURATIONS
-from isa_nrsfm.cli._frames import Frames, choose_frames
-from isa_nrsfm.cli._points import kept_points, layout_of_table, part_of_layout
+from isa_nrsfm._tables.visibility import (
+    FEWEST_POINTS,
+    report_frames,
+    seen_points,
+    usable_frames,
+)
+from isa_nrsfm.cli._drawing import is_configuration
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
-from isa_nrsfm.skeletons import read_skeleton
+from isa_nrsfm.io._tables import as_numbers
+from isa_nrsfm.skeletons import (
+    SKELETONS,
+    Skeleton,
+    find_skeleton,
+    get_skeleton,
+    read_skeleton,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from isa_nrsfm.skeletons import Skeleton
+INNER, WITHOUT = "inner", "without:"
 
-# Points and coordinates in the order of the columns.
-_SHAPES = {"interleaved": (-1, 2), "planar": (2, -1)}
+
+class Frames(NamedTuple):
+    """
+    The rows of a table as frames.
+
+    ``points`` and ``other`` are the landmarks and the other columns of the rows that
+    are not skipped; their index is the number of the row in the table. ``usable`` marks
+    the rows that can be fitted, ``seen`` their visible points. ``left_out`` has reason,
+    rows, and whether they were skipped on request. ``not_used`` has the number of
+    points of each set of coordinates that is not used.
+    """
+
+    points: "pd.DataFrame"
+    other: "pd.DataFrame"
+    usable: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+    columns: LandmarkColumns
+    not_used: dict[str, int]
+    n_rows: int
+    left_out: list[tuple[str, NDArray[np.intp], bool]]
+    skeleton: Skeleton | None
+
+    @property
+    def X(self) -> "pd.DataFrame":
+        """The landmarks of the usable rows."""
+        return self.points[self.usable]
 
 
 def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
     """Read the table and take its frames, for a model those with its points."""
     args.format = _format(args)
-    table, chosen, failed, skeleton = _read(args)
+    skeleton = failed = chosen = None
+    if args.format == "table":
+        table = read_table(args.table)
+        if args.columns is not None:
+            chosen = find_landmark_columns(table.columns, args.columns)
+    else:
+        pd = import_optional("pandas", extra="io")
+        options = {} if args.image_size is None else {"image_size": args.image_size}
+        found = read_landmarks(
+            args.table, args.format, min_confidence=args.min_confidence, **options
+        )
+        table = pd.concat([found.frames, found.points], axis=1)
+        x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
+        pattern = f"those of {args.format}"
+        chosen = LandmarkColumns(pattern, found.point_names, x, y, (), ())
+        failed, skeleton = found.failed, found.skeleton
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
         if chosen is not None and skeleton is not None:
             places = [chosen.x.index(name) for name in columns.x]
             if sorted(places) != list(range(len(chosen.x))):
-                skeleton = part_of_layout(skeleton, places)
-    else:
-        columns = chosen or find_landmark_columns(table.columns)
-        if args.points is not None:
-            return _some_points(args, table, columns, failed, skeleton)
-    frames = taken_frames(args, table, columns, failed)
-    return frames._replace(skeleton=skeleton)
-
-
-def _some_points(
-    args: Namespace,
-    table: "pd.DataFrame",
-    columns: LandmarkColumns,
-    failed: NDArray[np.bool_] | None,
-    skeleton: "Skeleton | None",
-) -> Frames:
-    """Take the frames with the points of --points; skeleton is that of all points."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the points that are kept warn again
-        whole = taken_frames(args, table, columns, failed)
-    tracks = whole.points[whole.usable].to_numpy().reshape(-1, len(columns.points), 2)
-    if args.skeleton is not None and Path(args.skeleton).suffix in CONFIGURATIONS:
-        skeleton = read_skeleton(args.skeleton, columns.points)
-    layout = layout_of_table(args.skeleton or skeleton, columns.points, tracks)
-    kept = kept_points(args.points, columns.points, layout)
+                skeleton = _part_of_layout(skeleton, places)
+        return take_frames(args, table, columns, failed, skeleton)
+    columns = chosen or find_landmark_columns(table.columns)
+    if args.points is None:
+        return take_frames(args, table, columns, failed, skeleton)
+    layout = _layout(args, table, columns, skeleton)
+    kept = _kept_points(args.points, columns.points, layout)
     names, x, y = (
         tuple(each[j] for j in kept) for each in (columns.points, columns.x, columns.y)
     )
-    some = columns._replace(points=names, x=x, y=y)
     out = [name for name in columns.interleaved if name not in {*x, *y}]
-    frames = taken_frames(args, table.drop(columns=out), some, failed)
+    frames = take_frames(
+        args,
+        table.drop(columns=out),
+        columns._replace(points=names, x=x, y=y),
+        failed,
+        _part_of_layout(layout, kept),
+    )
     not_used = frames.not_used | {f"--points {args.points}": len(out) // 2}
-    return frames._replace(skeleton=part_of_layout(layout, kept), not_used=not_used)
+    return frames._replace(not_used=not_used)
 
 
-def taken_frames(
+def take_frames(
     args: Namespace,
     table: "pd.DataFrame",
     columns: LandmarkColumns,
     failed: NDArray[np.bool_] | None = None,
+    skeleton: Skeleton | None = None,
 ) -> Frames:
-    """Take the frames out of a table, as the options ask for."""
-    frames = choose_frames(
-        table,
-        columns,
-        rules=args.skip_rows,
-        zeros_missing=args.zeros_missing,
-        failed=failed,
-    )
-    # A format says itself which of its columns are landmarks.
-    return frames if failed is None else frames._replace(not_used={})
-
-
-def _format(args: Namespace) -> str:
-    """Return the format of the table, and refuse options of another one."""
-    found = args.format
-    if found == "auto":
-        found = "table" if args.columns is not None else find_format(args.table)
-    if args.columns is not None and found != "table":
-        raise ValueError(f"--columns is for --format table; got --format {found}")
-    if args.image_size is not None and "image_size" not in FORMATS[found].options:
-        raise ValueError(
-            f"--image-size is for --format mediapipe; {args.table} is of format {found}"
-        )
-    if args.min_confidence is not None and found == "table":
-        raise ValueError(
-            f"--min-confidence: {args.table} is of format table, which has no "
-            "confidences"
-        )
-    return found
-
-
-def _read(
-    args: Namespace,
-) -> (
-    "tuple[pd.DataFrame, LandmarkColumns | None, NDArray[np.bool_] | None, "
-    "Skeleton | None]"
-):
-    """Return the table, its landmark columns, failed rows and skeleton, where known."""
-    if args.format == "table":
-        table = read_table(args.table)
-        if args.columns is None:
-            return table, None, None, None
-        return table, find_landmark_columns(table.columns, args.columns), None, None
+    """Take the frames of a table; failed marks rows in which tracking failed."""
     pd = import_optional("pandas", extra="io")
-    options = {} if args.image_size is None else {"image_size": args.image_size}
-    found = read_landmarks(
-        args.table, args.format, min_confidence=args.min_confidence, **options
-    )
-    table = pd.concat([found.frames, found.points], axis=1)
-    names = tuple(found.points)
-    columns = LandmarkColumns(
-        pattern=f"those of {args.format}",
-        points=found.point_names,
-        x=names[::2],
-        y=names[1::2],
-        z=(),
-        gaps=(),
-    )
-    return table, columns, found.failed, found.skeleton
-
-
-def _columns_of_model(
-    estimator: AffineNRSfM, table: "pd.DataFrame", chosen: LandmarkColumns | None
-) -> LandmarkColumns:
-    """Return the columns of the points that a model was fitted to.
-
-    ``chosen`` are the landmarks of the table where more than their names tells them.
-    """
-    fitted = getattr(estimator, "feature_names_in_", None)
-    n_points = len(estimator.mean_shape_)
-    if fitted is None:
-        found = chosen or find_landmark_columns(table.columns)
-        if len(found.points) != n_points:
-            raise ValueError(
-                f"the model has {n_points} points, the table has {len(found.points)} "
-                f"({found.pattern})"
-            )
-        return found
-    tracks = np.array([str(name).strip() for name in fitted]).reshape(
-        _SHAPES[estimator.layout]
-    )
-    x, y = tracks if estimator.layout == "planar" else tracks.T
-    wanted = {*x, *y}
-    in_table = {str(name).strip(): name for name in table.columns}
-    # Columns that are coordinates or, where there are such, the chosen ones.
-    candidates = (
-        [name for name in table.columns if parse_coordinate(name) is not None]
-        if chosen is None
-        else chosen.interleaved
-    )
-    coordinates = {str(name).strip(): name for name in candidates}
-    present = in_table if chosen is None else coordinates
-    absent = [name for point in zip(x, y, strict=True) for name in point]
-    absent = [name for name in absent if name not in present]
-    surplus = [name for name in coordinates if name not in wanted]
-    # Points after those of the model are of another layout. Others were left out of it.
-    first = [str(name).strip() for name in candidates[: len(wanted)]]
-    if absent or (surplus and chosen is not None and wanted == {*first}):
-        differences = [
-            f"{len(names)} columns are only in the {where} ({_shortened(names)})"
-            for names, where in ((absent, "model"), (surplus, "table"))
-            if names
-        ]
-        raise ValueError(
-            "the points of the table are not those of the model: "
-            + "; ".join(differences)
+    kept, left_out = _rows_to_keep(args, table)
+    rows, names = np.flatnonzero(kept), columns.interleaved
+    stripped = [name.strip() for name in names]
+    tracks = _tracks(args, table, columns, kept)
+    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    usable = usable_frames(tracks)
+    reasons = _reasons(tracks, usable, None if failed is None else failed[rows])
+    left_out += [(reason, rows[which], False) for reason, which in reasons]
+    at_origin = (tracks[usable] == 0).all(axis=2)
+    if at_origin.any():
+        warn_caller(
+            f"{np.count_nonzero(at_origin)} points in "
+            f"{np.count_nonzero(at_origin.any(axis=1))} rows are at exactly (0, 0). If "
+            "these points are missing, use --zeros-missing"
         )
-    return LandmarkColumns(
-        pattern="those of the model",
-        points=point_names(x),
-        x=tuple(in_table[name] for name in x),
-        y=tuple(in_table[name] for name in y),
-        z=(),
-        gaps=(),
+    # A format knows which of its columns are landmarks.
+    not_used = {} if failed is not None else _sets_not_used(table, columns)
+    values = tracks.reshape(len(rows), len(names))
+    return Frames(
+        points=pd.DataFrame(values, index=rows, columns=stripped),
+        other=table.loc[kept].drop(columns=names),
+        usable=usable,
+        seen=seen_points(tracks)[usable],
+        columns=columns,
+        not_used=not_used,
+        n_rows=len(table),
+        left_out=[out for out in left_out if len(out[1])],
+        skeleton=skeleton,
     )
+
+
+def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
+    """Return a column of a table, without regard to blanks around its name."""
+    by_name = {str(each).strip(): each for each in table.columns}
+    if name.strip() not in by_name:
+        names = [each for each in by_name if each]
+        raise ValueError(
+            f"{option}: the table has no column {name!r}; its columns are "
+            f"{_shortened(names, 8) or 'none'}"
+        )
+    return table[by_name[name.strip()]]
 
 
 def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
@@ -209,6 +177,212 @@ def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
     return in_order.set_axis(list(fitted), axis=1)
 
 
-def _shortened(names: list[str]) -> str:
+def _format(args: Namespace) -> str:
+    """Return the format of the table, and refuse options of another one."""
+    found = args.format
+    if found == "auto":
+        found = "table" if args.columns is not None else find_format(args.table)
+    if args.columns is not None and found != "table":
+        raise ValueError(f"--columns needs --format table; got --format {found}")
+    if args.image_size is not None and "image_size" not in FORMATS[found].options:
+        raise ValueError(
+            f"--image-size needs --format mediapipe; {args.table} has format {found}"
+        )
+    if args.min_confidence is not None and found == "table":
+        raise ValueError(
+            f"--min-confidence: {args.table} has format table, which has no confidences"
+        )
+    return found
+
+
+def _rows_to_keep(
+    args: Namespace, table: "pd.DataFrame"
+) -> tuple[NDArray[np.bool_], list[tuple[str, NDArray[np.intp], bool]]]:
+    """Return which rows no rule skips, and the rows that each rule skips."""
+    kept = np.ones(len(table), dtype=bool)
+    skipped = []
+    for column, expression in args.skip_rows:
+        cells = column_named(table, column, "--skip-rows")
+        texts = cells.astype(object).where(cells.notna(), "")
+        found = [expression.search(str(text)) is not None for text in texts]
+        matches = kept & np.array(found, dtype=bool)
+        reason = f"{column} matches {expression.pattern!r}"
+        skipped.append((reason, np.flatnonzero(matches), True))
+        kept &= ~matches
+    return kept, skipped
+
+
+def _tracks(
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    kept: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the points of all rows, so that messages name rows of the table.
+
+    NaN where a coordinate is missing, and in rows that are not kept.
+    """
+    cells = table.loc[kept, columns.interleaved]
+    tracks = np.full((len(table), len(columns.points), 2), np.nan)
+    values = np.stack([as_numbers(cells[name]) for name in cells], axis=1)
+    tracks[kept] = values.reshape(-1, *tracks.shape[1:])
+    if args.zeros_missing:
+        tracks[(tracks == 0).all(axis=2)] = np.nan
+    return tracks
+
+
+def _reasons(
+    tracks: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    failed: NDArray[np.bool_] | None,
+) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Return reasons why frames cannot be fitted, and the frames of each."""
+    report = report_frames(tracks)
+    n_seen = report.n_seen
+    few = n_seen < FEWEST_POINTS
+    in_one_place = report.in_one_place & ~few
+    none: list[tuple[str, NDArray[np.bool_]]] = [("all points missing", n_seen == 0)]
+    if failed is not None:
+        none = [
+            ("tracking failed", failed),
+            ("all points missing or uncertain", (n_seen == 0) & ~failed),
+        ]
+    return [
+        *none,
+        (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
+        ("all points in one place", in_one_place),
+        ("points on one line, others missing", ~usable & ~few & ~in_one_place),
+    ]
+
+
+def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, int]:
+    """Return patterns and numbers of points of the coordinates that are not used."""
+    chosen = {*found.x, *found.y}
+    not_used = landmark_sets([name for name in table.columns if name not in chosen])
+    if found.z:
+        not_used[f"{found.z[0].strip()}, ... (third coordinate)"] = len(found.z)
+    return not_used
+
+
+def _columns_of_model(
+    estimator: AffineNRSfM, table: "pd.DataFrame", chosen: LandmarkColumns | None
+) -> LandmarkColumns:
+    """Return the columns of a model's points; chosen are the landmarks, if known."""
+    fitted = getattr(estimator, "feature_names_in_", None)
+    n_points = len(estimator.mean_shape_)
+    if fitted is None:
+        found = chosen or find_landmark_columns(table.columns)
+        if len(found.points) != n_points:
+            raise ValueError(
+                f"the model has {n_points} points, the table has {len(found.points)} "
+                f"({found.pattern})"
+            )
+        return found
+    names = [str(name).strip() for name in fitted]
+    x, y = names[::2], names[1::2]
+    if estimator.layout == "planar":
+        x, y = names[:n_points], names[n_points:]
+    in_table = {str(name).strip(): name for name in table.columns}
+    candidates = (
+        [name for name in table.columns if parse_coordinate(name) is not None]
+        if chosen is None
+        else chosen.interleaved
+    )
+    coordinates = [str(name).strip() for name in candidates]
+    present = in_table if chosen is None else coordinates
+    absent = [name for pair in zip(x, y, strict=True) for name in pair]
+    absent = [name for name in absent if name not in present]
+    surplus = [name for name in coordinates if name not in names]
+    # Points after those of the model are of another layout. Others were left out of it.
+    first = {*coordinates[: len(names)]}
+    if absent or (surplus and chosen is not None and first == {*names}):
+        differences = [
+            f"{len(some)} columns are only in the {where} ({_shortened(some)})"
+            for some, where in ((absent, "model"), (surplus, "table"))
+            if some
+        ]
+        raise ValueError(
+            "the table does not have the points of the model: " + "; ".join(differences)
+        )
+    x_columns, y_columns = (tuple(in_table[name] for name in each) for each in (x, y))
+    return LandmarkColumns(
+        "those of the model", point_names(x), x_columns, y_columns, (), ()
+    )
+
+
+def _layout(
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    stored: Skeleton | None,
+) -> Skeleton | None:
+    """Return the layout of all points of a table: given, stored, or recognised."""
+    names = columns.points
+    if is_configuration(args.skeleton):
+        return read_skeleton(args.skeleton, names)
+    if args.skeleton is not None:
+        named = get_skeleton(args.skeleton)
+        return named if named.n_points == len(names) else None
+    if stored is not None:
+        return stored
+    tracks = _tracks(args, table, columns, _rows_to_keep(args, table)[0])
+    tracks = tracks[np.isfinite(tracks).all(axis=(1, 2))]
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    sizes = np.linalg.norm(centred, axis=(1, 2), keepdims=True)
+    alike = sizes[:, 0, 0] > 0
+    image = (centred / sizes)[alike].mean(axis=0) if alike.any() else None
+    return find_skeleton(len(names), names, shape=image)
+
+
+def _part_of_layout(layout: Skeleton | None, points: Sequence[int]) -> Skeleton | None:
+    """Return the layout of some of its points, a known one if there is one."""
+    if layout is None:
+        return None
+    part = layout.subset(points)
+    known = (s for s in SKELETONS.values() if s.n_points == part.n_points)
+    return next((s for s in known if s.curves == part.curves), part)
+
+
+def _kept_points(
+    text: str, names: Sequence[str], layout: Skeleton | None
+) -> Sequence[int]:
+    """Return the numbers of the points that --points keeps, in their order."""
+    if text == INNER:
+        if layout is None or not layout.contour:
+            known = ", ".join(s.name for s in SKELETONS.values() if s.contour)
+            found = "in no known layout" if layout is None else f"of {layout.name}"
+            raise ValueError(
+                "--points inner leaves out the visible outline of a face, but the "
+                f"{len(names)} points are {found}: name the points to keep, or give "
+                f"--skeleton ({known})"
+            )
+        return layout.inner.tolist()
+    numbers = {str(j): j for j in range(len(names))}
+    numbers |= {name: j for j, name in enumerate(names)}
+    named: set[int] = set()
+    for part in text.removeprefix(WITHOUT).split(","):
+        named.update(_range(part.strip(), numbers, names))
+    if text.startswith(WITHOUT):
+        return [j for j in range(len(names)) if j not in named]
+    return sorted(named)
+
+
+def _range(part: str, numbers: dict[str, int], names: Sequence[str]) -> range:
+    """Return the points of a name, a number, or two with a hyphen between them."""
+    if part in numbers:
+        return range(numbers[part], numbers[part] + 1)
+    for place in (i for i, letter in enumerate(part) if letter == "-"):
+        first = numbers.get(part[:place].strip())
+        last = numbers.get(part[place + 1 :].strip())
+        if first is not None and last is not None and first <= last:
+            return range(first, last + 1)
+    raise ValueError(
+        f"--points: there are no points {part!r}; the {len(names)} points are "
+        f"{', '.join(names[:4])}, ...; write inner, or names and ranges such as "
+        "17-67 or without:0-16"
+    )
+
+
+def _shortened(names: Sequence[str], most: int = 4) -> str:
     """List the first names."""
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return ", ".join(names[:most]) + ", ..." * (len(names) > most)

@@ -1,7 +1,6 @@
-"""Which run of the command fit the files of a folder are of.
+"""The run of the command fit that the files of a folder belong to.
 
-The report has the SHA-256 digests of the other files of its run, by which it knows them
-and their model.
+The report has the SHA-256 digests of the model and the other files of its run.
 """
 
 import hashlib

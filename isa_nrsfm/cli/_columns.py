@@ -1,0 +1,250 @@
+"""Labels, groups, times and distances: the other columns that a fit is asked about."""
+
+from argparse import Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.decomposition import PCA
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._dynamics.sequences import sequences_of
+from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
+from isa_nrsfm.analysis import (
+    AlignedFrames,
+    WithinGroups,
+    association,
+    between_share,
+    predictability,
+)
+from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
+from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._reading import Frames, column_named
+from isa_nrsfm.export import point_distances
+from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._poses import point_numbers
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+class Label(NamedTuple):
+    """A column with classes or numbers; values (n_known,), known (n_frames,)."""
+
+    name: str
+    kind: Literal["classes", "number"]
+    values: NDArray
+    known: NDArray[np.bool_]
+
+    def is_of_classes(self, most: int) -> bool:
+        """Return whether the label has at most so many classes."""
+        return self.kind == "classes" and len(np.unique(self.values)) <= most
+
+
+class Columns(NamedTuple):
+    """The columns that a fit is asked about, for its usable frames."""
+
+    labels: list[Label]
+    groups: NDArray | None
+    times: NDArray | None
+    distances: list[tuple[int, int]]
+    unit: tuple[int, int] | None
+
+
+def asked_columns(args: Namespace, frames: Frames) -> Columns:
+    """Return the columns that the options name; raise if they cannot be used."""
+    table = frames.other[frames.usable]
+    labels = [_label(table, text) for text in args.label]
+    groups = times = None
+    if args.group is not None:
+        column = _cells(table, args.group, "--group")
+        if column.isna().any():
+            raise ValueError(
+                f"--group: {column.isna().sum()} of {len(column)} frames have no "
+                f"{args.group!r}"
+            )
+        groups = column.to_numpy()
+    if args.time is not None:
+        times = _times(_cells(table, args.time, "--time"))
+    elif args.fps is not None:
+        times = np.asarray(frames.X.index) / args.fps
+    if times is not None:
+        n_frames = len(times)
+        try:
+            sequences_of(
+                checked_times(times, n_frames), group_numbers(groups, n_frames), 1
+            )
+        except ValueError as error:
+            hint = " (--group: the rows that belong together)" * (groups is None)
+            raise ValueError(f"--time {args.time}: {error}{hint}") from error
+    names = frames.columns.points
+    distances = [_numbered(pair, names, "--distance") for pair in args.distance]
+    unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
+    if unit is not None and not distances:
+        raise ValueError("--unit needs --distance")
+    return Columns(labels, groups, times, distances, unit)
+
+
+def column_results(
+    args: Namespace, asked: Columns, estimator: AffineNRSfM, X: "pd.DataFrame"
+) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
+    """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
+    pd = import_optional("pandas", extra="io")
+    alpha, names = estimator.alpha_, names_of_components(None, len(estimator.basis_))
+    report: dict[str, Any] = {}
+    columns: dict[str, NDArray] = {}
+    smooth = None
+    if asked.labels:
+        aligned = _aligned_pca(estimator, X)
+        report["labels"] = [
+            _label_report(label, alpha, aligned, asked, args.random_state)
+            for label in asked.labels
+        ]
+    if asked.groups is not None:
+        report["groups"] = {"column": args.group}
+        try:
+            report["groups"] |= between_share(alpha, asked.groups)._asdict()
+        except ValueError as error:  # one group, or groups of one frame
+            report["groups"]["not_divided"] = str(error)
+        within = WithinGroups().fit_transform(alpha, groups=asked.groups)
+        columns |= {f"{name}_within": within[:, k] for k, name in enumerate(names)}
+    if asked.times is not None and estimator.refinement == "joint":
+        show_stage("smoothing")
+        smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
+        report["time"] = {
+            "column": args.time or "seconds",
+            "time_scales": smooth.time_scales,
+            "changed_by": np.sqrt(np.nanmean((smooth.alpha - alpha) ** 2)),
+        }
+        found = smooth.alpha
+        columns |= {f"{name}_smooth": found[:, k] for k, name in enumerate(names)}
+    if asked.distances:
+        try:
+            found = point_distances(
+                estimator, asked.distances, unit=asked.unit, length=args.length
+            )
+            columns |= {
+                f"distance_{a}_{b}": found[:, i]
+                for i, (a, b) in enumerate(asked.distances)
+            }
+        except ValueError as error:
+            warn_caller(f"alpha.csv has no distances: {error}")
+    return report, pd.DataFrame(columns, index=X.index), smooth
+
+
+def class_means(label: Label, alpha: NDArray) -> NDArray:
+    """Return the mean coefficients of each class (n_classes, K), standardised."""
+    deviation = alpha.std(axis=0)
+    standard = np.zeros_like(alpha)
+    np.divide(alpha - alpha.mean(axis=0), deviation, where=deviation > 0, out=standard)
+    of_class = label.values == np.unique(label.values)[:, None]
+    return of_class @ standard[label.known] / of_class.sum(axis=1, keepdims=True)
+
+
+def _numbered(
+    pair: tuple[str, str], names: Sequence[str], option: str
+) -> tuple[int, int]:
+    """Return the numbers of two points."""
+    try:
+        return point_numbers(pair, names)
+    except ValueError as error:
+        raise ValueError(f"{option} {','.join(pair)}: {error}") from error
+
+
+def _label(table: "pd.DataFrame", text: str) -> Label:
+    """Return the label of COLUMN, COLUMN:classes or COLUMN:number."""
+    name, colon, kind = text.rpartition(":")
+    if not colon or kind not in ("classes", "number"):
+        name, kind = text, "auto"
+    column = _cells(table, name, "--label")
+    known = column.notna().to_numpy()
+    values = column[known].to_numpy()
+    if values.dtype.kind not in "biuf":
+        values = values.astype(str)
+    if not len(values):
+        raise ValueError(f"--label: no frame has a {name!r}")
+    refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
+    try:
+        return Label(name, kind_of(values, kind), values, known)
+    except ValueError as error:
+        raise ValueError(f"--label {text}: {error}") from error
+
+
+def _cells(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
+    """Return a column, as numbers if all cells are numbers; NA for empty cells."""
+    pd = import_optional("pandas", extra="io")
+    column = column_named(table, name, option)
+    if column.dtype == object or pd.api.types.is_string_dtype(column):
+        text = column.where(column.notna(), "").astype(str).str.strip()
+        column = column.where(text != "")
+        numbers = pd.to_numeric(text.where(text != ""), errors="coerce")
+        if (numbers.isna() == column.isna()).all():
+            return numbers
+    return column
+
+
+def _times(column: "pd.Series") -> NDArray:
+    """Return a column as numbers, or as dates if it has none."""
+    pd = import_optional("pandas", extra="io")
+    if pd.api.types.is_numeric_dtype(column):
+        return column.to_numpy(dtype=float, na_value=np.nan)
+    dates = pd.to_datetime(column, errors="coerce", format="mixed")
+    wrong = dates.isna() & column.notna()
+    if wrong.any():
+        raise ValueError(
+            f"--time: expected numbers or dates; {wrong.sum()} of {len(column)} frames "
+            f"have neither (first: row {wrong.idxmax()}, {column[wrong].iloc[0]!r})"
+        )
+    return np.asarray(dates.to_numpy())
+
+
+def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:
+    """Return principal components of the aligned table, missing points filled in."""
+    table = X.to_numpy(dtype=float)
+    missing = np.isnan(table)
+    if missing.any():
+        table = np.where(missing, estimator.reproject(X), table)
+    aligned = AlignedFrames().fit_transform(table)
+    most = min(len(estimator.basis_), *aligned.shape)
+    return np.asarray(PCA(most, random_state=0).fit_transform(aligned))
+
+
+def _label_report(
+    label: Label, alpha: NDArray, aligned: NDArray, asked: Columns, random_state: int
+) -> dict[str, Any]:
+    """Return the association of coefficients with a label."""
+    known, classes = label.known, label.kind == "classes"
+    options: dict[str, Any] = {
+        "y": label.values,
+        "groups": None if asked.groups is None else asked.groups[known],
+        "time": None if asked.times is None else asked.times[known],
+        "kind": label.kind,
+        "random_state": random_state,
+    }
+    found = association(alpha[known], **options)
+    report: dict[str, Any] = {
+        "column": label.name,
+        "kind": label.kind,
+        "n_frames": found.n_frames,
+        "n_without_label": int(np.sum(~known)),
+        "statistic": "eta_squared" if classes else "spearman",
+        "values": found.statistic,
+        "p_values": found.p_value,
+        "permuted": found.permuted,
+        "score": "accuracy" if classes else "r_squared",
+    }
+    if classes:
+        names, counts = np.unique(label.values, return_counts=True)
+        report["classes"] = {str(c): int(n) for c, n in zip(names, counts, strict=True)}
+        report["largest_class"] = counts.max() / len(label.values)
+        means = class_means(label, alpha)
+        report["class_means"] = dict(zip(report["classes"], means, strict=True))
+    try:
+        report["cross_validated"] = predictability(alpha[known], **options).mean()
+        report["cross_validated_pca"] = predictability(aligned[known], **options).mean()
+    except ValueError as error:  # too few frames of a class, or groups, for two folds
+        report["not_cross_validated"] = str(error)
+    return report

@@ -1,0 +1,164 @@
+"""The figures of a fit."""
+
+import contextlib
+import io
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm.cli._columns import Columns, Label, class_means
+from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.plotting import (
+    BasisShapeDisplay,
+    CoefficientsDisplay,
+    ComponentChoiceDisplay,
+    ModeCovarianceDisplay,
+    ReprojectionDisplay,
+)
+from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
+from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# The figures of every fit.
+ALWAYS = ("basis_shapes.png", "mode_covariance.png", "reprojection.png")
+
+
+class Fit(NamedTuple):
+    """A fit to draw: model, table, search, smoothed coefficients, lines to draw."""
+
+    estimator: AffineNRSfM
+    X: "pd.DataFrame"
+    search: AffineNRSfMCV | None
+    smooth: Any
+    drawn: dict[str, Any]
+
+
+Figures = dict[str, tuple[str, Callable[[Fit], Any]]]
+
+
+def figures_of(args: Namespace, asked: Columns) -> Figures:
+    """Return names of figures, their captions, and the functions that draw them."""
+    captions = (
+        "mean shape and basis shapes",
+        "covariance of the deformations in the images, 3x3 blocks",
+        "some frames: observed points and points of the model",
+    )
+    draw: tuple[Callable[[Fit], Any], ...] = (
+        lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
+        lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
+        lambda fit: ReprojectionDisplay.from_estimator(
+            fit.estimator, fit.X, random_state=args.random_state, **fit.drawn
+        ),
+    )
+    figures = dict(zip(ALWAYS, zip(captions, draw, strict=True), strict=True))
+    if len(args.n_components) > 1:
+        figures["choice.png"] = (
+            "held-out error by the number of basis shapes",
+            lambda fit: ComponentChoiceDisplay.from_estimator(fit.search),
+        )
+    for number, label in enumerate(asked.labels, 1):
+        figures[f"label_{number}.png"] = (
+            f"coefficients by {label.name}",
+            lambda fit, label=label: _by_label(fit, label),
+        )
+        if label.is_of_classes(12):
+            figures[f"label_{number}_shapes.png"] = (
+                f"mean shape of each {label.name}, and of all frames in grey",
+                lambda fit, label=label: _shapes_by_label(fit, label),
+            )
+    if asked.times is not None:
+        figures["time.png"] = (
+            "coefficients in time, with one standard deviation",
+            lambda fit: _in_time(fit, asked),
+        )
+    return figures
+
+
+def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
+    """Draw figures without a screen; return the captions of those that were drawn."""
+    import_optional("matplotlib", extra="plot").use("Agg")
+    plt = import_optional("matplotlib.pyplot", extra="plot")
+    drawn = {}
+    for name, (caption, draw) in figures.items():
+        show_stage(name)
+        with _shown_as_warning(name):
+            figure = draw(fit).figure_
+            image = io.BytesIO()
+            figure.savefig(image, format="png", dpi=150)
+            plt.close(figure)
+            write_whole(folder / name, image.getvalue())
+            drawn[name] = caption
+    return drawn
+
+
+@contextlib.contextmanager
+def _shown_as_warning(name: str) -> Iterator[None]:
+    """Warn if a figure cannot be drawn: results do not depend on it."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
+
+
+def _by_label(fit: Fit, label: Label) -> CoefficientsDisplay:
+    """Draw the coefficients by a label."""
+    alpha = fit.estimator.alpha_
+    return CoefficientsDisplay(
+        alpha=alpha[label.known],
+        y=label.values,
+        label=label.name,
+        component_names=names_of_components(None, alpha.shape[1]),
+    ).plot(kind=label.kind)
+
+
+def _in_time(fit: Fit, asked: Columns) -> CoefficientsDisplay:
+    """Draw the coefficients in time, smoothed ones if there are any."""
+    alpha = fit.estimator.alpha_
+    deviation = getattr(fit.estimator, "alpha_std_", None)
+    if fit.smooth is not None:
+        alpha, deviation, _ = fit.smooth
+    return CoefficientsDisplay(
+        alpha=alpha,
+        alpha_std=deviation,
+        time=asked.times,
+        groups=asked.groups,
+        component_names=names_of_components(None, alpha.shape[1]),
+    ).plot(kind="time")
+
+
+def _shapes_by_label(fit: Fit, label: Label) -> BasisShapeDisplay:
+    """Draw the mean shape of each class over that of all frames."""
+    whole = BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
+    import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
+    mean = whole.mean_shape
+    means = class_means(label, fit.estimator.alpha_)
+    shapes = mean + np.tensordot(means, whole.basis, 1)
+    (limits,), _ = block_limits([np.concatenate([mean[None], shapes])])
+    axes = new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)
+    classes, counts = np.unique(label.values, return_counts=True)
+    for shape, pair, name, count in zip(shapes, axes, classes, counts, strict=True):
+        for points, colour in ((mean, "0.8"), (shape, MEAN_COLOUR)):
+            display = BasisShapeDisplay(
+                mean_shape=points,
+                basis=np.empty((0, *points.shape)),
+                edges=whole.skeleton,
+                origin=whole.origin,
+            ).plot(pair, point_kw={"color": colour})
+        for axis, (x, y) in zip(pair, VIEWS, strict=True):
+            axis.set(xlim=limits[x], ylim=limits[y])
+            axis.yaxis.set_inverted(whole.origin == "upper")
+        title = wrap_title(f"{name} ({count} frames)", pair)
+        pair[0].set_title(title, loc="left", fontsize="small")
+    return display

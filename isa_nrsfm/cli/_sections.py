@@ -1,0 +1,413 @@
+"""The sections of a report, and how they become text and a page.
+
+A section has paragraphs (texts) and tables (`Cells`).
+"""
+
+import base64
+import math
+import shlex
+import textwrap
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._selection.choice import NO_SHAPE
+from isa_nrsfm.cli._options import AUTO
+from isa_nrsfm.cli._outputs import PAGE
+from isa_nrsfm.cli._parser import PROGRAM
+from isa_nrsfm.cli._report import MOST_LISTED
+from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.io import FORMATS
+
+_CAMERAS = {
+    "affine": "affine: shapes are known up to an affine transformation of space",
+    "weak_perspective": "weak-perspective: shapes have true proportions, up to a "
+    "mirror image",
+    "orthographic": "orthographic: shapes have true proportions, up to a mirror "
+    "image, in the units of the table",
+}
+
+
+class Cells(NamedTuple):
+    """A table: titles of the columns, if they have any, and rows."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def aligned(self) -> list[list[tuple[str, bool]]]:
+        """Return the rows, head first, and whether cells are aligned to the right."""
+        lines = [self.head, *self.rows] if self.head else self.rows
+        columns = zip(*self.rows, strict=True)
+        numbers = [
+            all(cell[:1] in "+-0123456789" for cell in column) and any(column)
+            for column in columns
+        ]
+        return [list(zip(line, numbers, strict=True)) for line in lines]
+
+
+Sections = Mapping[str, Sequence[str | Cells]]
+
+
+def fit_title(report: dict[str, Any]) -> str:
+    """Return the title of the report of a fit."""
+    table = report["table"]
+    return (
+        f"{_shapes(report['model'])} fitted to {table['n_frames']} frames of "
+        f"{table['n_points']} points"
+    )
+
+
+def fit_sections(report: dict[str, Any]) -> dict[str, list[str | Cells]]:
+    """Return the sections of the report of a fit, without the files."""
+    model = report["model"]
+    sections = {"Table": table_section(report["table"])}
+    if "choice" in report:
+        sections["Choice"] = _choice_section(report["choice"])
+    elif model["parameters"]["n_components"] == AUTO:
+        sections["Choice"] = [f"K = {model['n_components']}: determined by the table"]
+    sections["Fit"] = _fit_section(report)
+    sections["Cameras"] = _camera_section(model)
+    rows = [
+        [
+            row["name"],
+            f"{100 * row['energy_share']:.1f} %",
+            *(f"{row[key]:z.2f}" for key in ("mean", "std", "min", "max")),
+            _pose(row),
+        ]
+        for row in model["alpha"]
+    ]
+    head = ["", "energy", "mean", "std", "min", "max", "pose"]
+    sections["Alpha"] = [Cells(head, rows)]
+    if any(row[-1] for row in rows):
+        sections["Alpha"].append(
+            "pose: variance that yaw, pitch and roll predict, cross-validated"
+        )
+    if "labels" in report:
+        sections["Labels"] = [
+            part for label in report["labels"] for part in _label(label)
+        ]
+    if "groups" in report:
+        sections["Groups"] = _groups(report["groups"])
+    if "time" in report:
+        sections["Time"] = _time(report["time"])
+    return sections
+
+
+def table_section(
+    table: dict[str, Any], unusable: str = "left out"
+) -> list[str | Cells]:
+    """Return the rows and columns of a table that are used, and the others."""
+    first, last = table["first_columns"], table["last_columns"]
+    format = table["format"]
+    parts: list[str | Cells] = [
+        table["path"] + ("" if format == "table" else f" ({FORMATS[format].title})"),
+        f"{table['n_points']} points in the columns {', '.join(first)}, ..., "
+        + ", ".join(last),
+    ]
+    if table["absent_numbers"]:
+        absent = ", ".join(map(str, table["absent_numbers"][:MOST_LISTED]))
+        more = ", ..." if len(table["absent_numbers"]) > MOST_LISTED else ""
+        parts.append(f"the table has no points with the numbers {absent}{more}")
+    if table["coordinates_not_used"]:
+        not_used = table["coordinates_not_used"].items()
+        listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
+        parts.append(f"coordinates not used: {listed}")
+    rows = [[f"{table['n_rows']}", "rows"]]
+    for out in table["rows_left_out"]:
+        result = "left out" if out["skipped_on_request"] else unusable
+        rows.append([f"{out['n_rows']}", f"{result}: {out['reason']}"])
+    parts.append(Cells([], [*rows, [f"{table['n_frames']}", "used"]]))
+    n_missing = table["n_missing_points"]
+    if n_missing:
+        share = n_missing / (table["n_frames"] * table["n_points"])
+        parts.append(
+            f"{n_missing} points ({_percent(share)}) are missing in "
+            f"{table['n_frames_with_missing_points']} of these rows"
+        )
+    return parts
+
+
+def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
+    """Return the quality of a fit, with a remark on its inverse SNR."""
+    return [
+        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}",
+        f"held-out error {_percent(quality['held_out_error'])}: the same for points "
+        "predicted from the other points of their frame",
+        f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
+        "square, in the units of the table)",
+    ]
+
+
+def text_of(title: str, sections: Sections) -> str:
+    """Return a report as text, with the name of each section beside its lines."""
+    blocks = [title] if title else []
+    for name, parts in sections.items():
+        lines = [line for part in parts for line in _lines(part)]
+        labels = [name] + [""] * (len(lines) - 1)
+        beside = zip(labels, lines, strict=True)
+        blocks.append("\n".join(f"{name:11}{line}".rstrip() for name, line in beside))
+    return "\n\n".join(blocks)
+
+
+def fit_text(report: dict[str, Any], folder: Path) -> str:
+    """Return the report of a fit as text."""
+    described = [
+        [name, content.partition(";")[0].partition(": the image")[0]]
+        for name, content in report["files"].items()
+    ]
+    listed = {"Files": [f"in {folder}", Cells([], described)]}
+    return text_of(fit_title(report), fit_sections(report) | listed)
+
+
+def write_page(folder: Path, report: dict[str, Any]) -> None:
+    """Write the report of a fit as a page, with the figures of the folder in it.
+
+    All texts of the table, such as names of columns, stay text.
+    """
+    title = escape(fit_title(report))
+    about = f"{report['table']['path']}, {report['finished']}"
+    parts = [f"<h1>{title}</h1>", f'<p class="quiet">{escape(about)}</p>']
+    for warning in report["warnings"]:
+        parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
+    for name, content in report["files"].items():
+        if name.endswith(".png"):
+            image = base64.b64encode((folder / name).read_bytes()).decode()
+            caption = escape(content)
+            parts.append(
+                f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
+                f"<figcaption>{caption}</figcaption></figure>"
+            )
+    sections = fit_sections(report)
+    sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
+    found = report["versions"].items()
+    sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
+    sections["Files"] = [Cells([], [[*each] for each in report["files"].items()])]
+    for name, section in sections.items():
+        parts += [f"<h2>{name}</h2>", *map(_markup, section)]
+    template = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
+    page = template.replace("{{title}}", title)
+    page = page.replace("{{content}}", "\n".join(parts))
+    write_whole(folder / PAGE, page.encode(errors="replace"))
+
+
+def _lines(part: str | Cells) -> list[str]:
+    """Return the lines of a part: sentences, which end with a point, are wrapped."""
+    if isinstance(part, str):
+        return textwrap.wrap(part, 90) if part.endswith(".") else [part]
+    rows = part.aligned()
+    widths = [
+        max(len(cell) for cell, _ in column) for column in zip(*rows, strict=True)
+    ]
+    return [
+        "  ".join(
+            cell.rjust(width) if right else cell.ljust(width)
+            for (cell, right), width in zip(row, widths, strict=True)
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _markup(part: str | Cells) -> str:
+    """Return the HTML of a part."""
+    if isinstance(part, str):
+        return f"<p>{escape(part)}</p>"
+    rows = []
+    for i, row in enumerate(part.aligned()):
+        tag = "th" if part.head and not i else "td"
+        cells = (
+            f"<{tag}{' class=number' * right}>{escape(cell)}</{tag}>"
+            for cell, right in row
+        )
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
+    """Return the quality of the fit, its noise and its time."""
+    model = report["model"]
+    remark = ""
+    if model["parameters"]["loss"] != "linear":
+        remark = " (outliers count fully)"
+    elif model["rank_floor"] is not None:
+        floor = _percent(model["rank_floor"])
+        remark = f" (no model with {_shapes(model)} is below {floor})"
+    parts = quality_section(model, remark)
+    if model["noise_variance"] is not None:
+        noise = math.sqrt(model["noise_variance"])
+        size = f"{_percent(noise)} of the frame's size"
+        if not model["frames_scaled"]:
+            size = f"{noise:.3g} in the units of the table"
+        parts.append(f"noise {size} (standard deviation of a coordinate)")
+    if model["outliers"] is not None and model["outliers"]["message"]:
+        parts.append(_sentence(model["outliers"]["message"]))
+    seconds = report["seconds"]
+    fit = seconds["fit"] + seconds.get("choose", 0.0)
+    parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
+    if model["skeleton"] is not None:
+        parts.append(f"points recognised as {model['skeleton']}")
+    return parts
+
+
+def _camera_section(model: dict[str, Any]) -> list[str | Cells]:
+    """Return the camera model, the certainty of the depth, and what to try next."""
+    title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
+    if model["depth_advice"]:
+        title = (
+            f"{title.partition(':')[0]}: {model['depth_advice']}. cameras.csv has no "
+            "angles, and proportions in viewer.html are not true."
+        )
+    parts: list[str | Cells] = [title]
+    if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
+        parts.append(
+            f"depths are known to {100 * uncertainty:.2g} % (root mean square)"
+        )
+    # If the depth is not determined, the ratio of the noise means nothing.
+    meaning = "" if model["depth_advice"] else model["camera_meaning"]
+    remark = "; ".join(filter(None, (meaning, model["camera_advice"])))
+    return [*parts, _sentence(remark)] if remark else parts
+
+
+def _choice_section(choice: dict[str, Any]) -> list[str | Cells]:
+    """Return the held-out error of each number of basis shapes."""
+    rows = [
+        [
+            f"{k}",
+            f"{_digits(100 * error, 3)} %",
+            f"{_digits(100 * deviation, 2)} %",
+            "the least" * (k == choice["chosen"]),
+        ]
+        for k, error, deviation in zip(
+            choice["n_components"],
+            choice["held_out_error"],
+            choice["held_out_error_standard_error"],
+            strict=True,
+        )
+    ]
+    parts: list[str | Cells] = [
+        Cells(["K", "held-out error", "standard error", ""], rows)
+    ]
+    if min(choice["held_out_error"]) >= 1:
+        return [*parts, NO_SHAPE]
+    if choice["chosen"] == choice["n_components"][-1]:
+        parts.append("larger K may be better: this is the largest that was tried")
+    if "next" in choice:
+        following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
+        numbers = "-".join(map(str, sorted({following[0], following[-1]})))
+        parts.append(f"K = {numbers} would take about {seconds:.0f} s more")
+    return parts
+
+
+def _label(label: dict[str, Any]) -> list[str | Cells]:
+    """Return how coefficients depend on a label."""
+    title = f"{label['column']}: {label['n_frames']} frames"
+    if "classes" in label:
+        title += f" of {len(label['classes'])} classes"
+    if label["n_without_label"]:
+        title += f"; without a label and left out: {label['n_without_label']}"
+    names = names_of_components(None, len(label["values"]))
+    statistic = "eta squared" if label["statistic"] == "eta_squared" else "Spearman"
+    rows = [
+        [name, f"{value:z.2f}", f"{p:.3f}"]
+        for name, value, p in zip(
+            names, label["values"], label["p_values"], strict=True
+        )
+    ]
+    parts: list[str | Cells] = [title, Cells(["", statistic, "p"], rows)]
+    parts.append(f"p-values: permutations of {label['permuted']}")
+    means = _class_lines(label, names)
+    if means:
+        parts.append("mean of each class if p < 0.05, in standard deviations:")
+    parts += means
+    if "not_cross_validated" in label:
+        return [*parts, f"not cross-validated: {label['not_cross_validated']}"]
+    ours, pca = label["cross_validated"], label["cross_validated_pca"]
+    score = f"cross-validated R^2 {ours:.2f}; PCA of the aligned frames {pca:.2f}"
+    if label["score"] == "accuracy":
+        score = (
+            f"cross-validated accuracy {100 * ours:.1f} %; PCA of the aligned frames "
+            f"{100 * pca:.1f} %, largest class {100 * label['largest_class']:.1f} %"
+        )
+    return [*parts, score]
+
+
+def _class_lines(label: dict[str, Any], names: Sequence[str]) -> list[str]:
+    """Return the means of the classes of significant coefficients, largest first."""
+    lines = []
+    for k, (name, p) in enumerate(zip(names, label["p_values"], strict=True)):
+        means = {each: mean[k] for each, mean in label.get("class_means", {}).items()}
+        if means and p < 0.05:
+            order = sorted(means, key=lambda each: -abs(means[each]))
+            shown = [f"{each} {means[each]:+.1f}" for each in order[:4]]
+            lines.append(f"{name}: {', '.join(shown)}" + ", ..." * (len(order) > 4))
+    return lines
+
+
+def _groups(groups: dict[str, Any]) -> list[str | Cells]:
+    """Return how much coefficients differ between groups."""
+    if "not_divided" in groups:
+        return [f"{groups['column']}: {groups['not_divided']}"]
+    shares = np.transpose([groups["between"], groups["within"]])
+    rows = [
+        [name, *(f"{100 * share:.1f} %" for share in row)]
+        for name, row in zip(
+            names_of_components(None, len(shares)), shares, strict=True
+        )
+    ]
+    return [
+        f"{groups['column']}: variance between and within {groups['n_groups']} groups",
+        Cells(["", "between", "within"], rows),
+    ]
+
+
+def _time(time: dict[str, Any]) -> list[str | Cells]:
+    """Return the result of smoothing in time."""
+    scales = np.asarray(time["time_scales"], dtype=float)
+    if not len(scales):
+        return [f"{time['column']}: no dynamics found, coefficients are not smoothed"]
+    fading = scales[np.isfinite(scales)]
+    lasting = len(scales) - len(fading)
+    found = []
+    if len(fading):
+        listed = ", ".join(f"{each:.3g}" for each in fading[:4])
+        more = ", ..." * (len(fading) > 4)
+        found.append(f"changes of the shape fade within {listed}{more}")
+    if lasting:
+        found.append(f"changes last in {lasting} of {len(scales)} directions")
+    return [
+        f"{time['column']}: {'; '.join(found)}",
+        f"smoothed coefficients differ by {time['changed_by']:.2f} (root mean square)",
+    ]
+
+
+def _shapes(model: dict[str, Any]) -> str:
+    """Return how many basis shapes a model has."""
+    n_components = model["n_components"]
+    return f"{n_components} basis shape{'s' * (n_components != 1)}"
+
+
+def _pose(row: dict[str, Any]) -> str:
+    """Return the share of a coefficient that the pose predicts."""
+    share = row["pose_share"]
+    return "" if share is None or math.isnan(share) else f"{100 * max(share, 0):.0f} %"
+
+
+def _sentence(text: str) -> str:
+    """Return a text as a sentence; names of files stay as they are."""
+    if text.partition(" ")[0].isalpha():
+        text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def _digits(number: float, n_digits: int) -> str:
+    """Write a number with so many digits, zeros at the end included."""
+    return f"{number:#.{n_digits}g}".removesuffix(".")
+
+
+def _percent(fraction: float) -> str:
+    """Write a fraction in percent."""
+    return f"{100 * fraction:.3g} %"
