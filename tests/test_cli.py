@@ -584,7 +584,7 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
     output = ["-o", tmp_path / "alpha.csv"]
     absent, model = tmp_path / "absent.npz", fitted / MODEL
     assert f"{absent}: No such file" in fails("transform", absent, table, *output)
-    assert "is not a model file" in fails("transform", table, table, *output)
+    assert "cannot be read as a model" in fails("transform", table, table, *output)
     message = fails("transform", model, table, "-o", tmp_path / "a.txt")
     assert "a.txt: a table is a .csv, .tsv or .parquet file" in message
 
