@@ -43,17 +43,11 @@ ENTRIES = (
     *("format", "format_version", "package_version", "arrays", "digest"),
     *("parameters", "attributes", "set_output", "frames"),
 )
-# Of the model of a frame: those of all, of the joint refinement, and of the others.
-OF_TABLE = ("camera", "layout", "each_scaled", "unit", "sizes")
-OF_POSTERIOR = (
-    *("loss", "shapes", "noise_variance", "coefficient_starts"),
-    *("mixing", "space", "certainty", "turns"),
+NEEDED = (
+    *("mean_shape_", "basis_", "isa_", "inverse_snr_", "rank_floor_", "n_iter_"),
+    *("energy_share_", "mode_covariance_", "singular_values_", "n_features_in_"),
+    *("reference_motion_", "reference_translation_"),
 )
-OF_RIGID = ("mean_shape", "basis")
-# Not in every model. Names of columns may be missing, and what only some fits measure.
-OPTIONAL = ("feature_names_in_", "camera_noise_ratio_", "depth_uncertainty_", "turns")
-
-Shape = tuple[int | None, ...]
 
 
 def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
@@ -206,12 +200,10 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     entries = {
         name: unpacked(value, arrays) for name, value in header["frames"].items()
     }
-    joint = "loss" in entries
-    check_names(entries, (*OF_TABLE, *(OF_POSTERIOR if joint else OF_RIGID)), "entries")
     for name, choices in (("camera", CAMERAS), ("layout", LAYOUTS), ("loss", LOSSES)):
-        if (name in entries) and entries[name] not in choices:
+        if name in entries and entries[name] not in choices:
             raise ValueError(f"its {name} is not known: {entries[name]}")
-    _check_shapes(vars(estimator), entries)
+    _check_shapes({**vars(estimator), **entries})
     each_scaled = entries["each_scaled"] is True
     estimator._model = TableModel(
         _frame_model(entries),
@@ -230,76 +222,52 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
     return estimator
 
 
-def _check_shapes(held: dict[str, Any], entries: dict[str, Any]) -> None:
-    """Raise if numbers are missing or do not have the right shapes."""
-    _check_numbers(held.get("basis_"), (None, None, 3), "basis_")
-    K, P, _ = held["basis_"].shape
-    if not K or not P or "isa_" not in held:
-        raise ValueError("it lacks basis shapes or a strategy")
-    joint, kept = "loss" in entries, entries["sizes"] is not None
-    attributes: dict[str, Shape] = {
+def _check_shapes(values: dict[str, Any]) -> None:
+    """Raise if numbers of a model do not have the right shapes, or are missing."""
+    if missing := [name for name in NEEDED if values.get(name) is None]:
+        raise ValueError(f"it lacks attributes: {', '.join(missing)}")
+    K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
+    N = (*np.shape(values.get("sizes")), 0)[0]
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "basis_": (K, P, 3),
         "mean_shape_": (P, 3),
-        "inverse_snr_": (),
-        "rank_floor_": (),
         "energy_share_": (K,),
         "mode_covariance_": (3 * K, 3 * K),
         "singular_values_": (3 * K + 3,),
         "reference_motion_": (2, 3),
         "reference_translation_": (2,),
-        "n_iter_": (),
-        "n_features_in_": (),
-        "camera_noise_ratio_": (),
-        "depth_uncertainty_": (),
+        "reliability_": (K,),
+        "objective_history_": (None,),
         "feature_names_in_": (2 * P,),
+        # of frames
+        "motion_": (N, 2, 3),
+        "translation_": (N, 2),
+        "alpha_": (N, K),
+        "alpha_std_": (N, K),
+        "rotations_": (N, 3, 3),
+        "scales_": (N,),
+        "sizes": (N,),
+        # of the model of a frame
+        "mean_shape": (P, 3),
+        "basis": (K, P, 3),
+        "shapes": (K + 1, 3, P),
+        "coefficient_starts": (None, K),
+        "mixing": (K + 1, K + 1),
+        "space": (3, 3),
+        "certainty": (4,),
+        "turns": (K, 3, K, 3),
     }
-    of_frames: dict[str, Shape] = {"unit": ()}
-    if joint:
-        attributes |= {
-            "noise_variance_": (),
-            "reliability_": (K,),
-            "objective_history_": (None,),
-            "gradient_norm_": (),
-        }
-        of_frames |= {
-            "shapes": (K + 1, 3, P),
-            "noise_variance": (),
-            "coefficient_starts": (None, K),
-            "mixing": (K + 1, K + 1),
-            "space": (3, 3),
-            "certainty": (4,),
-            "turns": (K, 3, K, 3),
-        }
-    else:
-        of_frames |= {"mean_shape": (P, 3), "basis": (K, P, 3)}
-    if kept:
-        _check_numbers(entries["sizes"], (None,), "sizes")
-        N = len(entries["sizes"])
-        attributes |= {"motion_": (N, 2, 3), "translation_": (N, 2), "alpha_": (N, K)}
-        if joint:
-            attributes["alpha_std_"] = (N, K)
-        if entries["camera"] != "affine":
-            attributes |= {"rotations_": (N, 3, 3), "scales_": (N,)}
-    for values, shapes in ((held, attributes), (entries, of_frames)):
-        for name, shape in shapes.items():
-            if name not in OPTIONAL or values.get(name) is not None:
-                _check_numbers(values.get(name), shape, name)
-
-
-def _check_numbers(value: Any, shape: Shape, name: str) -> None:
-    """Raise if a value is no number or array of the given shape; None is any length."""
-    if value is None:
-        raise ValueError(f"it lacks {name}")
-    kinds = "O" if name == "feature_names_in_" else "iuf"
-    found = np.shape(value)
-    if (
-        isinstance(value, list | str)
-        or np.asarray(value).dtype.kind not in kinds
-        or len(found) != len(shape)
-        or any(n not in (None, m) for n, m in zip(shape, found, strict=True))
-    ):
-        raise ValueError(
-            f"{name} should be numbers of shape {shape}; got shape {found}"
+    single = ("noise_variance", "unit", "n_features_in_", "n_iter_", "inverse_snr_")
+    shapes |= dict.fromkeys(single, ())
+    for name, shape in shapes.items():
+        if (value := values.get(name)) is None:
+            continue
+        found, kinds = np.shape(value), "O" if name == "feature_names_in_" else "iuf"
+        fits = len(found) == len(shape) and all(
+            n in (None, m) for n, m in zip(shape, found, strict=True)
         )
+        if not fits or np.asarray(value).dtype.kind not in kinds:
+            raise ValueError(f"{name} should be of shape {shape}; it has {found}")
 
 
 def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
