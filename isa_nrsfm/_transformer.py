@@ -29,7 +29,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.layout import tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,

@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_array_equal
 from scipy.io import savemat
 
-from isa_nrsfm._tables.landmark_columns import names_layout
+from isa_nrsfm._tables.column_names import names_layout
 from isa_nrsfm.datasets import _muct, _shark, fetch_muct, fetch_shark
 from isa_nrsfm.datasets._remote import RemoteFile, fetch_file
 from isa_nrsfm.io import landmark_table

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from isa_nrsfm._tables.landmark_columns import (
+from isa_nrsfm._tables.column_names import names_layout, parse_coordinate, point_names
+from isa_nrsfm.io._landmark_columns import (
     MIN_POINTS,
     find_landmark_columns,
     landmark_sets,
-    names_layout,
-    parse_coordinate,
-    point_names,
 )
 
 N_POINTS = 9

@@ -9,7 +9,7 @@ from scipy.sparse import bmat, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.landmark_columns import names_layout, parse_coordinate
+from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
 from isa_nrsfm._tables.layout import (
     Layout,
     table_to_tracks,

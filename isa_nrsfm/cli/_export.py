@@ -4,7 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._drawing import chosen_edges, drawing_files
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS
 from isa_nrsfm.cli._outputs import refuse_overwriting

@@ -18,7 +18,6 @@ from isa_nrsfm._compat.whole_files import (
     files_together,
     folder_for_writing,
 )
-from isa_nrsfm._tables.landmark_columns import find_landmark_columns
 from isa_nrsfm.cli._choice import choice_report, choose_n_components
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
 from isa_nrsfm.cli._drawing import chosen_edges, drawing_files
@@ -37,6 +36,7 @@ from isa_nrsfm.cli._runs import REPORT, files_of_report, is_of_run
 from isa_nrsfm.cli._sections import fit_text, write_page
 from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
+from isa_nrsfm.io._landmark_columns import find_landmark_columns
 
 if TYPE_CHECKING:
     import pandas as pd

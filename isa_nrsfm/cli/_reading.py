@@ -11,13 +11,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._prepare.checks import clean_tracks
-from isa_nrsfm._tables.landmark_columns import (
-    LandmarkColumns,
-    find_landmark_columns,
-    landmark_sets,
-    parse_coordinate,
-    point_names,
-)
+from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm._tables.visibility import (
     FEWEST_POINTS,
     report_frames,
@@ -26,6 +20,11 @@ from isa_nrsfm._tables.visibility import (
 )
 from isa_nrsfm.cli._drawing import is_configuration
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
+from isa_nrsfm.io._landmark_columns import (
+    LandmarkColumns,
+    find_landmark_columns,
+    landmark_sets,
+)
 from isa_nrsfm.io._tables import as_numbers
 from isa_nrsfm.skeletons import (
     SKELETONS,

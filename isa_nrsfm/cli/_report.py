@@ -14,7 +14,7 @@ from isa_nrsfm._diagnostics import (
     camera_meaning,
     outlier_advice,
 )
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._outputs import fitted_frames, fitted_table
 from isa_nrsfm.cli._reading import Frames

@@ -7,7 +7,7 @@ from typing import Any
 
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._drawing import chosen_edges, drawing_files, drawing_options
 from isa_nrsfm.cli._outputs import (
     alpha_table,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._drawing import (
     Drawing,
     Links,

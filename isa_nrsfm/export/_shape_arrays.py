@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._names import names_of_components
 
 SUFFIXES = (".npz", ".mat")

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.frame_columns import checked_times
-from isa_nrsfm._tables.landmark_columns import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.export._drawing import Links, choose_drawing
 from isa_nrsfm.export._names import names_of_components

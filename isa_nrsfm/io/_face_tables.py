@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._tables.landmark_columns import (
+from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
     landmark_sets,

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._tables.landmark_columns import point_names
+from isa_nrsfm._tables.column_names import point_names
 from isa_nrsfm.io._annotation_files import is_pts, is_wflw, read_pts, read_wflw
 from isa_nrsfm.io._coco import is_coco, read_coco
 from isa_nrsfm.io._deeplabcut import is_deeplabcut, read_deeplabcut

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.landmark_columns import find_landmark_columns
 from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
+from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._landmarks import (
     Landmarks,
     assemble,

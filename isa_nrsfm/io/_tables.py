@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm._tables.landmark_columns import find_landmark_columns, parse_coordinate
+from isa_nrsfm._tables.column_names import parse_coordinate
+from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._separated_values import without_nulls
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.plotting._axes import (
     LEFT_COLOUR,
     MEAN_COLOUR,

@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics import inverse_snr

@@ -19,7 +19,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
-from isa_nrsfm._tables.landmark_columns import names_of_points
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.plotting._edges import choose_layout
 from isa_nrsfm.skeletons import Skeleton
 

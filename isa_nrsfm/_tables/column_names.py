@@ -1,0 +1,125 @@
+"""Names of the columns of landmarks.
+
+A landmark coordinate is named by an axis letter (``x``, ``y``, ``z``) and a point,
+which is a number or a word: ``x00``, ``x_0``, ``x-0``, ``0_x``, ``0x``, ``nose_x``,
+``nose.x``, ``x_nose``, ``eye_lmk_x_3``. Lower and upper case are different columns.
+Blanks around a name do not count.
+
+Names of the same form are a *set* of landmarks, written as a pattern in which ``#``
+stands for a number and ``*`` for any text: ``x_#,y_#``, ``eye_lmk_x_#,eye_lmk_y_#``,
+``*_x,*_y``. Coordinates with a numbered point and a word (``thumb_1_x``) belong to two
+sets, ``thumb_#_x`` and ``*_x``.
+"""
+
+import re
+from collections.abc import Hashable, Iterable
+from typing import Any, Literal, NamedTuple
+
+_SEPARATORS = r"[ _.\-]"
+# x0, x_0, eye_lmk_x_0. Words may hold line breaks, which a dot matches with DOTALL.
+_AXIS_NUMBER = re.compile(
+    rf"((?:.*{_SEPARATORS})?)([xyzXYZ])({_SEPARATORS}?)(\d+)", re.DOTALL
+)
+# 0x
+_NUMBER_AXIS = re.compile(r"(\d+)()([xyzXYZ])")
+# 0_x, nose_x, thumb_1_x
+_LABEL_AXIS = re.compile(rf"(.*[^ _.\-])({_SEPARATORS})([xyzXYZ])", re.DOTALL)
+# x_nose
+_AXIS_LABEL = re.compile(rf"([xyzXYZ])({_SEPARATORS})([^ _.\-].*)", re.DOTALL)
+_TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
+
+
+class Coordinate(NamedTuple):
+    """
+    The parts of the name of a landmark column.
+
+    ``axis`` is 0, 1 or 2 for x, y or z; ``point`` is the name without its axis letter
+    (``"3"``, ``"nose"``, ``"eye_lmk_3"``). ``memberships`` are the sets of the column,
+    the narrowest first, each with the key of the point in the set. A set is the text
+    before the axis letter, the three letters, and the text after it.
+    """
+
+    axis: int
+    point: str
+    memberships: tuple[tuple[tuple[str, str, str], int | str], ...]
+
+
+def parse_coordinate(name: Hashable) -> Coordinate | None:
+    """Read the name of a landmark coordinate; None for other names."""
+    if not isinstance(name, str) or not {",", "#", "*"}.isdisjoint(name):
+        return None
+    name = name.strip()
+    sets: list[tuple[str, str, int | str]] = []  # text before and after, key
+    if match := _AXIS_NUMBER.fullmatch(name):
+        prefix, axis, separator, digits = match.groups()
+        point = prefix + digits
+        sets.append((prefix, f"{separator}#", int(digits)))
+        if separator and not prefix:
+            sets.append(("", f"{separator}*", digits))
+    elif match := _NUMBER_AXIS.fullmatch(name) or _LABEL_AXIS.fullmatch(name):
+        point, separator, axis = match.groups()
+        if numbered := _TRAILING_NUMBER.fullmatch(point):
+            prefix, digits = numbered.groups()
+            sets.append((f"{prefix}#{separator}", "", int(digits)))
+        if separator:
+            sets.append((f"*{separator}", "", point))
+    elif match := _AXIS_LABEL.fullmatch(name):
+        axis, separator, point = match.groups()
+        sets.append(("", f"{separator}*", point))
+    else:
+        return None
+    axes = "XYZ" if axis.isupper() else "xyz"
+    memberships = [((before, axes, after), key) for before, after, key in sets]
+    return Coordinate(axes.index(axis), point, tuple(memberships))
+
+
+def names_layout(
+    names: Iterable[Hashable],
+) -> Literal["interleaved", "planar", "other"] | None:
+    """
+    Return the arrangement of a table's landmark columns.
+
+    "interleaved" is x0, y0, x1, y1, ..., "planar" x0, x1, ..., y0, y1, .... "other" is
+    another order, incomplete points, a third coordinate or other columns beside them.
+    None if there are not both x and y, or if the other columns are pairs that differ in
+    the letters x and y alone, such as lx1, ly1.
+    """
+    axes, points, rest = [], [], []
+    for name in names:
+        coordinate = parse_coordinate(name)
+        if coordinate is None:
+            rest.append(str(name).lower().replace("x", "y"))
+            continue
+        (before, _, after), key = coordinate.memberships[0]
+        axes.append(coordinate.axis)
+        points.append((before, after, key))
+    if 0 not in axes or 1 not in axes:
+        return None
+    if rest:
+        return None if rest[0::2] == rest[1::2] else "other"
+    n_points = len(set(points))
+    if axes == [0, 1] * n_points and points[0::2] == points[1::2]:
+        return "interleaved"
+    if axes == [0] * n_points + [1] * n_points and (
+        points[:n_points] == points[n_points:]
+    ):
+        return "planar"
+    return "other"
+
+
+def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
+    """Name points after their x columns, without the axis if that stays unique."""
+    x_columns = [name.strip() for name in x_columns]
+    coordinates = [parse_coordinate(name) for name in x_columns]
+    points = tuple(point.point for point in coordinates if point is not None)
+    return points if len(set(points)) == len(x_columns) else tuple(x_columns)
+
+
+def names_of_points(model: Any) -> tuple[str, ...]:
+    """Return the names of a model's points, or their numbers."""
+    n_points = len(model.mean_shape_)
+    columns = getattr(model, "feature_names_in_", None)
+    if columns is None:
+        return tuple(map(str, range(n_points)))
+    names = [str(name).strip() for name in columns]
+    return point_names(names[:n_points] if model.layout == "planar" else names[::2])

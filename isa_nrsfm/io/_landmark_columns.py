@@ -1,0 +1,276 @@
+"""Find the landmark columns of a table by their names, or by patterns.
+
+In patterns ``#`` is a number and ``*`` is any text.
+"""
+
+import re
+from collections.abc import Hashable, Iterable, Sequence
+from itertools import chain
+from typing import NamedTuple
+
+from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._tables.column_names import parse_coordinate, point_names
+
+# One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
+MIN_POINTS = 7
+
+
+class LandmarkColumns(NamedTuple):
+    """
+    The columns of one set of landmarks.
+
+    Attributes
+    ----------
+    pattern : str
+        The set, such as ``"x_#,y_#"``.
+    points : tuple of str, length n_points
+        Names of the points, without the axis letter if that is unambiguous.
+    x, y : tuple of str, length n_points
+        The column of each point's coordinate, named as in the table (with blanks).
+    z : tuple of str
+        Columns with a third coordinate of these points. They are not used.
+    gaps : tuple of int
+        Numbers that are absent between the first and the last numbered point.
+    """
+
+    pattern: str
+    points: tuple[str, ...]
+    x: tuple[str, ...]
+    y: tuple[str, ...]
+    z: tuple[str, ...]
+    gaps: tuple[int, ...]
+
+    @property
+    def interleaved(self) -> list[str]:
+        """The columns in the order x0, y0, x1, y1, ...."""
+        return list(chain.from_iterable(zip(self.x, self.y, strict=True)))
+
+
+def find_landmark_columns(
+    names: Iterable[Hashable], columns: str | Sequence[str] | None = None
+) -> LandmarkColumns:
+    """
+    Find the landmark columns among the columns of a table.
+
+    Parameters
+    ----------
+    names : iterable of str
+        All column names of the table.
+    columns : str or sequence of str, optional
+        Patterns of the x and the y columns in turn, such as ``"x_#,y_#"``. Several
+        pairs are put one after the other. Without it, the table must have exactly one
+        set of landmarks of at least `MIN_POINTS` points.
+
+    Returns
+    -------
+    LandmarkColumns
+        The points in the order of their numbers, or if they are named, in the order
+        of their x columns in the table.
+
+    Raises
+    ------
+    ValueError
+        If there is no set of landmarks or more than one, if a point has only one of
+        the two coordinates, or if two columns are named as the same coordinate.
+
+    Warns
+    -----
+    UserWarning
+        If patterns with wildcards match only a part of a set of landmarks.
+
+    Examples
+    --------
+    >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
+    >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
+    >>> find_landmark_columns(names).interleaved[:4]
+    ['x_0', 'y_0', 'x_1', 'y_1']
+    >>> find_landmark_columns(names, columns="x_#,y_#").pattern
+    'x_#,y_#'
+    """
+    names = list(names)
+    if columns is not None:
+        listed = columns.split(",") if isinstance(columns, str) else list(columns)
+        patterns = [pattern.strip() for pattern in listed]
+        if not patterns or len(patterns) % 2 or not all(patterns):
+            raise ValueError(
+                "columns must name x and y columns in turn, such as 'x_#,y_#'; "
+                f"got {columns!r}"
+            )
+        return _select(names, patterns)
+    sets = landmark_sets(names)
+    candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
+    if not candidates:
+        small = "; ".join(f"{pattern!r} ({n})" for pattern, n in sets.items())
+        small = f" (fewer than {MIN_POINTS} points: {small})" if small else ""
+        raise ValueError(
+            "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
+            f"{small}; {_first_columns(names)}. If they have other names, give columns "
+            "(command line: --columns), such as 'px_#,py_#'"
+        )
+    if len(candidates) > 1:
+        raise ValueError(_several_found(names, candidates))
+    (pattern,) = candidates
+    axis = pattern[0]
+    if pattern.startswith(f"{axis}.#") and axis in names:  # as pandas reads x, y, x, y
+        raise ValueError(
+            f"the columns '{axis}', '{axis}.1', ... come from a header that repeats "
+            "the same names: give every point a name of its own, such as x0, y0, x1, y1"
+        )
+    return _select(names, pattern.split(","))
+
+
+def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
+    """
+    Count the points of every set of landmarks by pattern, in table order.
+
+    A set needs at least one x and one y column (names such as ``x0, x1, x2`` alone are
+    those of any table). Sets too small for a basis shape are counted.
+    """
+    members: dict[tuple[str, str, str], list[set[int | str]]] = {}
+    for coordinate in map(parse_coordinate, names):
+        for columns, key in coordinate.memberships if coordinate else ():
+            keys = members.setdefault(columns, [set(), set(), set()])
+            keys[coordinate.axis].add(key)
+    sizes = {
+        (before + axes[0] + after, before + axes[1] + after): len(x | y)
+        for (before, axes, after), (x, y, _) in members.items()
+        if x and y
+    }
+    # Leave out a "*" set that has no more points than a "#" set inside it.
+    return {
+        ",".join(patterns): size
+        for patterns, size in sizes.items()
+        if "*" not in patterns[0]
+        or not any(
+            other_size == size
+            and "#" in other[0]
+            and _regular_expression(patterns[0]).fullmatch(other[0])
+            for other, other_size in sizes.items()
+        )
+    }
+
+
+def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:
+    """Return the columns that match pairs of patterns of x and y columns."""
+    x: list[str] = []
+    y: list[str] = []
+    gaps: list[int] = []
+    for x_pattern, y_pattern in zip(patterns[::2], patterns[1::2], strict=True):
+        x_by_key = _columns_matching(names, x_pattern)
+        y_by_key = _columns_matching(names, y_pattern)
+        for one, other, pattern in (
+            (x_by_key, y_by_key, y_pattern),
+            (y_by_key, x_by_key, x_pattern),
+        ):
+            if alone := [name for key, name in one.items() if key not in other]:
+                more = f" (nor have {len(alone) - 1} more)" if len(alone) > 1 else ""
+                raise ValueError(
+                    f"column {alone[0]!r} has no partner among the columns "
+                    f"{pattern!r}{more}: every point needs an x and a y"
+                )
+        keys = list(x_by_key) if "*" in x_pattern else sorted(x_by_key)
+        x += [x_by_key[key] for key in keys]
+        y += [y_by_key[key] for key in keys]
+        if x_pattern.count("#") == 1 and "*" not in x_pattern:
+            numbers = {number for key in keys for number in key}
+            gaps += sorted(set(range(min(numbers), max(numbers))) - numbers)
+    chosen, joined = x + y, ",".join(patterns)
+    if len(set(chosen)) < len(chosen):
+        twice = next(name for name in chosen if chosen.count(name) > 1)
+        raise ValueError(f"the patterns {joined} match {twice!r} twice")
+    if not {"#", "*"}.isdisjoint(joined):
+        _warn_of_left_out(names, chosen, joined)
+    return LandmarkColumns(
+        joined, point_names(x), tuple(x), tuple(y), _z_of(names, x), tuple(gaps)
+    )
+
+
+def _columns_matching(names: Sequence[Hashable], pattern: str) -> dict[tuple, str]:
+    """Return the columns that match a pattern, with keys from its wildcards.
+
+    A key is a tuple with one entry a wildcard: an int for ``#``, a text for ``*``. A
+    column whose name is the pattern itself is the only match, with the key ``()``.
+    """
+    texts = [name for name in names if isinstance(name, str)]
+    exact = [name for name in texts if name.strip() == pattern]
+    if len(exact) == 1:
+        return {(): exact[0]}
+    expression = _regular_expression(pattern)
+    wildcards = re.findall("[#*]", pattern)
+    found: dict[tuple, str] = {}
+    for name in texts:
+        match = expression.fullmatch(name.strip())
+        if match is None:
+            continue
+        key = tuple(
+            int(text) if wildcard == "#" else text
+            for text, wildcard in zip(match.groups(), wildcards, strict=True)
+        )
+        if key in found:
+            raise ValueError(
+                f"the columns {found[key]!r} and {name!r} name the same coordinate"
+            )
+        found[key] = str(name)
+    if not found:
+        raise ValueError(f"no column matches {pattern!r}; {_first_columns(names)}")
+    return found
+
+
+def _regular_expression(pattern: str) -> re.Pattern[str]:
+    """Translate a pattern into a regular expression with a group for each wildcard."""
+    wildcards = {"#": r"(\d+)", "*": "(.+)"}
+    parts = re.split(r"([#*])", pattern)
+    expression = "".join(wildcards.get(part, re.escape(part)) for part in parts)
+    return re.compile(expression, re.DOTALL)  # names may hold line breaks
+
+
+def _warn_of_left_out(
+    names: Sequence[Hashable], chosen: Sequence[str], pattern: str
+) -> None:
+    """Warn if patterns match only a part of a set of x and y columns."""
+    coordinates = {name: parse_coordinate(name) for name in names}
+    sets = {c.memberships[0][0] for name in chosen if (c := coordinates[name])}
+    left = [
+        name
+        for name in coordinates.keys() - chosen
+        if (c := coordinates[name]) and c.axis < 2 and c.memberships[0][0] in sets
+    ]
+    if left:
+        warn_caller(
+            f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
+            f"{len(left)} that are named alike; the first is "
+            f"{next(name for name in names if name in left)!r}"
+        )
+
+
+def _z_of(names: Sequence[Hashable], x_columns: Iterable[str]) -> tuple[str, ...]:
+    """Return the columns with the third coordinate of the points of x columns."""
+    found = [c.memberships[0] for name in x_columns if (c := parse_coordinate(name))]
+    points = set(found)
+    return tuple(
+        str(name)
+        for name in names
+        if (c := parse_coordinate(name)) and c.axis == 2 and c.memberships[0] in points
+    )
+
+
+def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
+    """List the sets of landmarks of a table, and how to choose one."""
+    listed = []
+    for pattern, n_points in candidates.items():
+        x = list(_columns_matching(names, pattern.split(",")[0]).values())
+        count = f"{n_points} points" + (", with a z each" if _z_of(names, x) else "")
+        listed.append(f"{pattern!r} ({count}: {x[0].strip()} to {x[-1].strip()})")
+    return (
+        "the table has more than one set of landmark columns: "
+        f"{'; '.join(listed)}. Choose with columns (command line: --columns), "
+        f"such as {max(candidates, key=lambda pattern: candidates[pattern])!r}"
+    )
+
+
+def _first_columns(names: Sequence[Hashable]) -> str:
+    """List the first columns of a table."""
+    listed = ", ".join(repr(name) for name in names[:4])
+    return f"the table's {len(names)} columns are {listed}" + (
+        ", ..." if len(names) > 4 else ""
+    )
