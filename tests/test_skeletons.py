@@ -337,7 +337,7 @@ def test_bad_questions():
     with pytest.raises(ValueError, match="needs 21 points; got 20"):
         canonical_pose(np.eye(20, 3), scheme="hand-21")
     pairs = skeleton_of_names([("a", "b")], ["a", "b"], name="ab", source="me")
-    with pytest.raises(ValueError, match="does not tell which way is up"):
+    with pytest.raises(ValueError, match="does not define which way is up"):
         canonical_pose(np.eye(2, 3), scheme=pairs)
     with pytest.raises(ValueError, match="scheme must be a Skeleton or its name"):
         canonical_pose(np.eye(2, 3), scheme=[[0, 1]])

@@ -1,4 +1,4 @@
-"""What coefficients say of labels, of people, and of differences between frames."""
+"""Relate coefficients to labels and people, and compare frames."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""How coefficients go with a label: a class or a number for each frame."""
+"""Association of coefficients with a label: a class or a number for each frame."""
 
 from numbers import Integral
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,20 +41,20 @@ RIDGES = np.logspace(-3, 3, 13)
 
 class Association(NamedTuple):
     """
-    How each coefficient goes with a label.
+    Association of each coefficient with a label.
 
     Attributes
     ----------
     kind : {"classes", "number"}
-        What the labels are.
+        Kind of the labels.
     statistic : ndarray of shape (n_components,)
         Eta squared for classes: the share of the variance of a coefficient that lies
         between the classes, from 0 to 1. Spearman's rank correlation for numbers, from
         -1 to 1.
     p_value : ndarray of shape (n_components,)
         Permutation p-values, corrected for the number of coefficients: the share of
-        permutations of the labels in which this coefficient, or any that goes with them
-        less, goes with them as much.
+        permutations in which this coefficient, or any weaker one, has at least the
+        observed statistic.
     n_frames : int
         Number of frames with coefficients.
     permuted : str
@@ -101,7 +101,7 @@ def association(
     random_state: Any = None,
 ) -> Association:
     """
-    Return how each coefficient goes with a label of the frames.
+    Test the association of each coefficient with a label of the frames.
 
     Parameters
     ----------
@@ -111,18 +111,18 @@ def association(
         A label for each frame: classes, such as expressions, or a number, such as an
         age.
     groups : array-like of shape (n_frames,), default=None
-        People, videos or other groups whose frames are alike. Means of labels over
+        People, videos or other groups with similar frames. Means of labels over
         groups are permuted among the groups, differences from them within each group.
     time : array-like of shape (n_frames,), default=None
-        Times of the frames; None for the order of the rows. Where neighbours in time
+        Times of the frames; None for the order of the rows. If neighbours in time
         depend on each other, blocks of frames are permuted.
     kind : {"auto", "classes", "number"}, default="auto"
-        What the labels are. "auto" takes names, truth values and whole numbers for
-        classes, as scikit-learn does.
+        Kind of the labels. "auto" treats names, booleans and whole numbers as classes,
+        as scikit-learn does.
     n_permutations : int, default=999
         Number of permutations. The least p-value is one over this number plus one.
     random_state : int, RandomState instance or None, default=None
-        Of the permutations.
+        Seed of the permutations.
 
     Returns
     -------
@@ -137,8 +137,8 @@ def association(
     Notes
     -----
     The p-values are those of step-down maximum statistics (Westfall, Young,
-    "Resampling-based multiple testing", 1993): the chance that any of them falls below
-    a level by chance is at most that level.
+    "Resampling-based multiple testing", 1993): without any association, the probability
+    that any of them falls below a level is at most that level.
 
     Labels that differ between groups and within them are tested as both together. Each
     part is divided by its mean over the permutations, and the parts are summed.
@@ -186,7 +186,7 @@ def predictability(
     random_state: Any = None,
 ) -> NDArray:
     """
-    Return how well features together tell a label, cross-validated.
+    Return the cross-validated prediction of a label from all features.
 
     Parameters
     ----------
@@ -197,14 +197,14 @@ def predictability(
     groups : array-like of shape (n_frames,), default=None
         People, videos or other groups. Frames of a group are in one fold.
     time : array-like of shape (n_frames,), default=None
-        As of `association`. Without groups, blocks of dependent frames are in one fold.
+        See `association`. Without groups, blocks of dependent frames are in one fold.
     kind : {"auto", "classes", "number"}, default="auto"
-        As of `association`.
+        See `association`.
     n_folds : int, default=5
         Number of folds; fewer where a class has fewer frames, or if there are fewer
         groups.
     random_state : int, RandomState instance or None, default=None
-        Of the folds.
+        Seed of the folds.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def predictability(
     Raises
     ------
     ValueError
-        As of `association`, or if a class or the table is too small for two folds.
+        As in `association`, or if a class or the table is too small for two folds.
     """
     check_scalar(n_folds, "n_folds", Integral, min_val=2)
     features, labels, numbers, order = _known_frames(features, y, groups, time)

@@ -18,9 +18,9 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     """
     Coefficients of frames relative to the mean of their group.
 
-    What a person looks like is in all of his or her frames; what is left when it is
-    taken away is what changes: expressions, gestures, poses. With `neutral` frames are
-    compared with the neutral frames of their group.
+    Subtracting the mean of a person removes the appearance of the person and leaves the
+    changes: expressions, gestures, poses. With `neutral`, frames are compared with the
+    neutral frames of their group.
 
     Groups are metadata: in a `Pipeline` they are routed to this step after
     ``sklearn.set_config(enable_metadata_routing=True)`` and
@@ -31,7 +31,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     groups_ : ndarray of shape (n_groups,)
         Names or numbers of the groups of the fit, sorted.
     means_ : ndarray of shape (n_groups, n_features)
-        What is subtracted from their frames.
+        Means that are subtracted from their frames.
     n_features_in_ : int
         Number of features.
 
@@ -211,7 +211,7 @@ def _warn_of_single_frames(names: NDArray) -> None:
 
 class BetweenShare(NamedTuple):
     """
-    How much of the variance of each coefficient lies between groups.
+    Share of the variance of each coefficient between groups.
 
     Attributes
     ----------
@@ -233,10 +233,10 @@ class BetweenShare(NamedTuple):
 
 def between_share(alpha: Any, groups: Any) -> BetweenShare:
     """
-    Return how much of the variance of each coefficient lies between groups.
+    Return the share of the variance of each coefficient between groups.
 
-    With people as groups, coefficients of identity have nearly all of their variance
-    between groups, and those of expression nearly all of it within.
+    With people as groups, coefficients of identity vary mainly between groups, and
+    coefficients of expression mainly within groups.
 
     Parameters
     ----------
@@ -260,9 +260,8 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
     -----
     The intraclass correlation ICC(1): the variance components of one-way random effects
     are estimated from the mean squares between and within groups (Searle, Casella,
-    McCulloch, "Variance components", 1992, section 3.6). So groups that differ by
-    chance only have a share of about zero, however few frames they have. Estimates
-    below zero count as zero.
+    McCulloch, "Variance components", 1992, section 3.6). Random groups have a share of
+    about zero, regardless of the number of frames. Negative estimates are set to zero.
     """
     X = check_array(alpha, dtype=np.float64, input_name="alpha", **CHECKS)
     known = np.isfinite(X).all(axis=1)

@@ -82,52 +82,52 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     """
     Block matrix method of non-rigid structure from motion.
 
-    Finds orthographic cameras R_i, then shapes S_i that are mixtures of few: those of
-    least nuclear norm ``||S||_*``, of the matrix S with one row a frame, that show what
-    the images do. Row i, reshaped to (n_points, 2), is modelled as::
+    The method finds orthographic cameras R_i, then shapes S_i that reproduce the images
+    and are mixtures of few shapes: their matrix S, one row a frame, has the least
+    nuclear norm ``||S||_*``. Row i, reshaped to (n_points, 2), is modelled as::
 
         shapes_[i] @ motion_[i].T + translation_[i]
 
     Parameters
     ----------
     n_components : int, default=3
-        K, the number of basis shapes besides the mean shape: in the literature, which
-        counts the mean shape, K is one more. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames.
+        K, the number of basis shapes without the mean shape; the literature counts the
+        mean shape as well. K needs at least 3K + 4 points and ``ceil(8 (K + 2) / 5)``
+        frames.
     layout : {"interleaved", "planar"}, default="interleaved"
-        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=False
-        Whether each centred frame is divided by the root mean square of its coordinates
-        before the fit; the scale is given back to `motion_`. False is for orthographic
-        cameras, as published; photos of any resolution need True.
+        Whether to divide each centred frame by the root mean square of its coordinates
+        before the fit; `motion_` includes the scale. False is for orthographic cameras,
+        as published. Use True for photos of different resolution.
     ordered : bool, default=False
-        Whether the rows are successive frames of a camera that turns little from one to
-        the next. Images do not tell the sign of a frame's camera and shape: with True
-        it is the sign with which the camera turns by the lesser angle from the one
-        before, with False the one with which the shapes resemble each other.
+        Whether the rows are successive frames of a slowly turning camera. Images do not
+        determine the sign of a frame's camera and shape. If True, the sign minimises
+        the rotation of the camera from the frame before; if False, signs are chosen to
+        make the shapes similar.
     accelerated : bool, default=True
-        Whether the steps have length one and the momentum of Nesterov, or length 0.2
-        without momentum, as published. The minimum is the same, and the first reach it
-        in far fewer steps.
+        Whether to use steps of length one with Nesterov's momentum instead of the
+        published steps of length 0.2 without momentum. The minimum is the same, with
+        far fewer steps.
     max_iter : int, default=10000
         The most steps for each price of the nuclear norm.
     tol : float or None, default=None
-        For each price the steps end when one changes the shapes by no more than this
-        share of their norm. None is 1e-4 with acceleration and 1e-6, as published,
-        without, which end in nearly the same place. Less takes more steps and explains
-        the images better; the 3D shapes do not get better.
+        Relative change of the shapes in a step that ends the steps, for each price.
+        None means 1e-4 with acceleration and 1e-6, as published, without; the results
+        are nearly the same. Smaller values need more steps and reduce the reprojection
+        error, but do not improve the 3D shapes.
 
     Attributes
     ----------
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
-        for image coordinates), z is depth; the mirror image fits as well.
+        for image coordinates), z is depth; the mirror image fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as `transform` returns them: of the model of
-        mean and principal components, with cameras as of `decompose`.
+        Coefficients of the fitted table, as returned by `transform`: those of the
+        principal components, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)
@@ -140,8 +140,8 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
         as in the fit, and What the image of `shapes_` in `motion_`.
     noise_variance_ : float
-        Mean square error of a coordinate when each shape is replaced by its projection
-        on the model; of frames of size one where frames are scaled.
+        Mean square error of a coordinate after projection of each shape on the model;
+        for scaled frames, relative to frames of size one.
     n_iter_ : int
         Steps for all prices together.
     n_features_in_ : int
@@ -152,7 +152,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     Warns
     -----
     ConvergenceWarning
-        If `max_iter` steps were not enough for one of the prices.
+        If `max_iter` steps did not suffice for one of the prices.
 
     See Also
     --------
@@ -167,14 +167,13 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     Beck and Teboulle 2009, O'Donoghue and Candes 2015). The shapes that are returned
     are the nearest mixtures of ``n_components + 1`` shapes.
 
-    The method factorises the table it is given and knows no other frames; what
-    `transform` and the methods beside it do, and what signs of frames mean, is said at
-    `PseudoInverseNRSfM`.
+    The method factorises the given table only. See `PseudoInverseNRSfM` for
+    `transform`, the related methods, and the signs of frames.
 
     Cameras are found by `isa_nrsfm.calibration.orthonormal_cameras` among the mixtures
     of the first ``3 (n_components + 1)`` left singular vectors of W, and made exactly
-    orthonormal. A flat object that does not deform does not determine them: `fit`
-    raises a ValueError, as it does for points that are missing.
+    orthonormal. A flat object that does not deform does not determine them, and `fit`
+    raises a ValueError, as for missing points.
 
     References
     ----------

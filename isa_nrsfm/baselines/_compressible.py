@@ -122,8 +122,8 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
     Parameters
     ----------
     n_components : int, default=3
-        K, the number of basis shapes besides the mean shape that `transform` and the
-        methods beside it use. K needs at least 3K + 4 points and
+        K, the number of basis shapes without the mean shape, for `transform` and the
+        related methods. K needs at least 3K + 4 points and
         ``ceil(8 (K + 2) / 5)`` frames.
     n_atoms : int, default=None
         Number of atoms, at most one for each frame. None means ``n_components + 1``,
@@ -145,32 +145,31 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         Relative change of the residual in a sweep below which one more is made, the
         last.
     layout : {"interleaved", "planar"}, default="interleaved"
-        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=False
-        Whether each centred frame is divided by the root mean square of its coordinates
-        before the fit; the scale is given back to `motion_`. False is for orthographic
-        cameras, as published; photos of any resolution need True.
+        Whether to divide each centred frame by the root mean square of its coordinates
+        before the fit; `motion_` includes the scale. False is for orthographic cameras,
+        as published. Use True for photos of different resolution.
     ordered : bool, default=False
-        Whether the rows are successive frames of a camera that turns little from one to
-        the next. Images do not tell the sign of a frame's camera and shape: with True
-        it is the sign with which the camera turns by the lesser angle from the one
-        before, with False the one with which the shapes resemble each other.
+        Whether the rows are successive frames of a slowly turning camera. Images do not
+        determine the sign of a frame's camera and shape. If True, the sign minimises
+        the rotation of the camera from the frame before; if False, signs are chosen to
+        make the shapes similar.
     random_state : int, RandomState instance or None, default=None
-        Draws the first atoms and, of more than 1000 frames, those that the relaxed
-        problem is solved for. The result depends on it: an int makes it the same in
-        every fit.
+        Draws the first atoms and, if there are more than 1000 frames, those of the
+        relaxed problem. The result depends on it; an int makes it reproducible.
 
     Attributes
     ----------
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
-        for image coordinates), z is depth; the mirror image fits as well.
+        for image coordinates), z is depth; the mirror image fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as `transform` returns them: of the model of
-        mean and principal components, with cameras as of `decompose`.
+        Coefficients of the fitted table, as returned by `transform`: those of the
+        principal components, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)
@@ -183,8 +182,8 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         as in the fit, and What the image of `shapes_` in `motion_`. It may exceed one,
         as the shapes are not fitted to the images again.
     noise_variance_ : float
-        Mean square error of a coordinate when each shape is replaced by its projection
-        on the model; of frames of size one where frames are scaled.
+        Mean square error of a coordinate after projection of each shape on the model;
+        for scaled frames, relative to frames of size one.
     dictionary_residual_ : float
         The same share as `inverse_snr_` of the factorisation into blocks and atoms,
         before the blocks are made cameras.
@@ -214,17 +213,16 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
     that are not positive definite, and that atoms which share fewer than ten frames
     with those before are aligned by their shapes.
 
-    The dictionary is unique only where shapes are truly sparse and the points are many:
-    `sparsity` atoms must not span what others do. Tables of low rank, as of a face with
-    few ways to deform, can be coded in many ways; the cameras then depend on
-    `random_state`. Try several, and compare `inverse_snr_`.
+    The dictionary is unique only if shapes are truly sparse and there are many points:
+    `sparsity` atoms must not span the same space as others. Tables of low rank, such as
+    a face with few deformations, have many codes, and the cameras then depend on
+    `random_state`. Try several seeds, and compare `inverse_snr_`.
 
-    The method factorises the table it is given and knows no other frames. `transform`
-    and the methods beside it therefore fit a model to each frame: the mean and the
-    first `n_components` principal components of `shapes_`, with coefficients drawn from
-    a normal distribution. For the rows of the fitted table too they return the shapes
-    of this model, which are near to `shapes_`, not equal to them. Points that are
-    missing are not possible.
+    The method factorises the given table only, without missing points. For other
+    frames, `transform` and the related methods fit a linear model: the mean and the
+    first `n_components` principal components of `shapes_`, with a normal prior of the
+    coefficients. For the fitted table they also return the shapes of this model, which
+    are close to `shapes_` but not equal.
 
     References
     ----------

@@ -47,42 +47,42 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
     """
     Pseudo-inverse method of non-rigid structure from motion.
 
-    Finds orthographic cameras R_i, then for each frame the shape of least norm that
-    shows exactly what the image does, ``S_i = R_i^+ W_i``, and takes the mixtures of
-    ``n_components + 1`` shapes that are nearest to these. Depth comes from the low rank
-    alone, and is too small. Row i, reshaped to (n_points, 2), is modelled as::
+    The method finds orthographic cameras R_i, then for each frame the shape of least
+    norm that reproduces the image exactly, ``S_i = R_i^+ W_i``. The result are the
+    nearest mixtures of ``n_components + 1`` shapes. Depth results from the low rank
+    alone and is too small. Row i, reshaped to (n_points, 2), is modelled as::
 
         shapes_[i] @ motion_[i].T + translation_[i]
 
     Parameters
     ----------
     n_components : int, default=3
-        K, the number of basis shapes besides the mean shape: in the literature, which
-        counts the mean shape, K is one more. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames.
+        K, the number of basis shapes without the mean shape; the literature counts the
+        mean shape as well. K needs at least 3K + 4 points and ``ceil(8 (K + 2) / 5)``
+        frames.
     layout : {"interleaved", "planar"}, default="interleaved"
-        Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+        Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=False
-        Whether each centred frame is divided by the root mean square of its coordinates
-        before the fit; the scale is given back to `motion_`. False is for orthographic
-        cameras, as published; photos of any resolution need True.
+        Whether to divide each centred frame by the root mean square of its coordinates
+        before the fit; `motion_` includes the scale. False is for orthographic cameras,
+        as published. Use True for photos of different resolution.
     ordered : bool, default=False
-        Whether the rows are successive frames of a camera that turns little from one to
-        the next. Images do not tell the sign of a frame's camera and shape: with True
-        it is the sign with which the camera turns by the lesser angle from the one
-        before, with False the one with which the shapes resemble each other.
+        Whether the rows are successive frames of a slowly turning camera. Images do not
+        determine the sign of a frame's camera and shape. If True, the sign minimises
+        the rotation of the camera from the frame before; if False, signs are chosen to
+        make the shapes similar.
 
     Attributes
     ----------
     mean_shape_ : ndarray of shape (n_points, 3)
         Mean of `shapes_`. x and y are the axes of the mean camera (so y points down
-        for image coordinates), z is depth; the mirror image fits as well.
+        for image coordinates), z is depth; the mirror image fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as `transform` returns them: of the model of
-        mean and principal components, with cameras as of `decompose`.
+        Coefficients of the fitted table, as returned by `transform`: those of the
+        principal components, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)
@@ -95,8 +95,8 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
         as in the fit, and What the image of `shapes_` in `motion_`.
     noise_variance_ : float
-        Mean square error of a coordinate when each shape is replaced by its projection
-        on the model; of frames of size one where frames are scaled.
+        Mean square error of a coordinate after projection of each shape on the model;
+        for scaled frames, relative to frames of size one.
     n_features_in_ : int
         Number of columns.
     feature_names_in_ : ndarray of shape (`n_features_in_`,)
@@ -109,21 +109,20 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
 
     Notes
     -----
-    The method factorises the table it is given and knows no other frames. `transform`
-    and the methods beside it therefore fit a model to each frame: the mean and the
-    first `n_components` principal components of `shapes_`, with coefficients drawn from
-    a normal distribution. For the rows of the fitted table too they return the shapes
-    of this model, not `shapes_`. The two differ the more, the less `shapes_` are those
-    of a mean shape that deforms, seen by orthographic cameras: they are close for
-    `BlockMatrixNRSfM`, less so for shapes that lack depth.
+    The method factorises the given table only. For other frames, `transform` and the
+    related methods fit a linear model: the mean and the first `n_components` principal
+    components of `shapes_`, with a normal prior of the coefficients. For the fitted
+    table they also return the shapes of this model, not `shapes_`. The difference is
+    small if `shapes_` are those of a deforming mean shape in orthographic cameras, as
+    for `BlockMatrixNRSfM`; it is larger for shapes that lack depth.
 
-    Neither the singular values of the matrix of shapes nor their images depend on the
-    signs of frames, so that `inverse_snr_` does not depend on `ordered`.
+    The singular values of the matrix of shapes and their images do not depend on the
+    signs of frames, so `inverse_snr_` does not depend on `ordered`.
 
     Cameras are found by `isa_nrsfm.calibration.orthonormal_cameras` among the mixtures
     of the first ``3 (n_components + 1)`` left singular vectors of W, and made exactly
-    orthonormal. A flat object that does not deform does not determine them: `fit`
-    raises a ValueError, as it does for points that are missing.
+    orthonormal. A flat object that does not deform does not determine them, and `fit`
+    raises a ValueError, as for missing points.
 
     References
     ----------

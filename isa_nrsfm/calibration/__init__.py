@@ -10,7 +10,7 @@ and cameras of other programs:
 
 - `metric_upgrade` finds the affinity from the cameras, `euclidean_shapes` applies it;
 - `deformation_metric` and `euclidean_frames` do the same for shapes that deform. They
-  find, too, what affine cameras hide of the deformation;
+  also recover the part of the deformation that affine cameras absorb;
 - `orthonormal_cameras` finds orthographic cameras directly in the motion factor of a
   deforming shape, mixtures of as many of its columns as it takes;
 - `canonical_pose` turns a shape upright and frontal, and `view_angles` says by how much

@@ -57,18 +57,18 @@ def canonical_pose(
     up : array-like, default=None
         A direction (3,) in the coordinates of the shape, or pairs of points (n_pairs,
         2), a lower one and one above it, whose mean difference is the direction. An
-        upright shape has it opposite to the y axis, as far as x allows.
+        upright shape has it opposite to the y axis, orthogonal to x.
     front : array-like, default=None
         Which way the object faces the viewer: a direction (3,), or pairs of points
         (n_pairs, 2), one behind and one in front of it, as for `up`. With both
-        `left_right` and `up` it decides on the mirror image: where it would point away
-        from the viewer, the sign of the depth is changed.
+        `left_right` and `up` it selects the mirror image: if it points away from the
+        viewer, the sign of the depth is changed.
     scheme : Skeleton or str, default=None
         The layout of the points, or its name in `isa_nrsfm.skeletons.SKELETONS`, which
-        fills in what is not given. For ``"ibug-68"`` that is all symmetric points as
-        `left_right`, from the chin to the root of the nose as `up`, and from the ends
-        of the jaw to the tip of the nose as `front`. A hand tells no more than `up`: it
-        keeps towards the viewer what it has there.
+        supplies the directions that are not given. For ``"ibug-68"``: all symmetric
+        points as `left_right`, from the chin to the root of the nose as `up`, and from
+        the ends of the jaw to the tip of the nose as `front`. Hands define only `up`:
+        the side that faces the viewer stays the same.
 
     Returns
     -------
@@ -80,8 +80,8 @@ def canonical_pose(
     ValueError
         If only one of the three directions is given, if two of them are parallel or
         one is zero, if points do not exist, if the scheme is not known, has another
-        number of points or tells no pose, or if the shape is not of the shape above or
-        not finite.
+        number of points or defines no pose, or if the shape is not of the shape above
+        or not finite.
 
     Notes
     -----
@@ -90,7 +90,7 @@ def canonical_pose(
     points, each the one that is nearest to it already: what is upright up to some
     tens of degrees stays so.
 
-    Affine cameras do not tell a shape from its mirror image in depth. Nothing is
+    Affine cameras do not distinguish a shape from its mirror image in depth. Nothing is
     mirrored here unless all three directions are given and contradict each other. Note
     that pairs of points with left and right confused do so as well.
 
@@ -214,7 +214,7 @@ def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:
 
 
 def _scheme_pairs(scheme: Any, n_points: int) -> dict[str, Any]:
-    """Return the pairs of points of a layout, None for those that it has not."""
+    """Return the pairs of points of a layout, None if undefined."""
     if isinstance(scheme, str):
         if scheme not in SKELETONS:
             raise ValueError(f"scheme must be one of {(*SKELETONS,)}; got {scheme!r}")
@@ -226,7 +226,7 @@ def _scheme_pairs(scheme: Any, n_points: int) -> dict[str, Any]:
             f"scheme={scheme.name!r} needs {scheme.n_points} points; got {n_points}"
         )
     if not scheme.up:
-        raise ValueError(f"scheme={scheme.name!r} does not tell which way is up")
+        raise ValueError(f"scheme={scheme.name!r} does not define which way is up")
     pairs = {
         "left_right": scheme.left_right,
         "up": np.array(scheme.up),

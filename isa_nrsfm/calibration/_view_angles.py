@@ -1,4 +1,4 @@
-"""Rotations as the three angles in which people tell a pose."""
+"""Rotations as yaw, pitch and roll."""
 
 from typing import NamedTuple
 
@@ -94,8 +94,8 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
         The angles of rotations R.
     covariance : array-like of shape (n_frames, 3, 3)
         Covariances, in radians squared, of the rotation vectors w by which the
-        rotations may be off, ``R exp(hat(w))``: w is in the axes of the object. As of
-        `AffineNRSfM.rotation_covariance`, turned to these axes.
+        rotations may be off, ``R exp(hat(w))``: w is in the axes of the object. See
+        `AffineNRSfM.rotation_covariance`, rotated to these axes.
 
     Returns
     -------

@@ -65,13 +65,12 @@ def make_body_tracks(
     n_people : int, default=4
         Number of people.
     scheme : {"coco-17", "h36m-17"}, default="coco-17"
-        Which points, and in which order: a layout of `isa_nrsfm.skeletons`.
+        Points and their order: a layout of `isa_nrsfm.skeletons`.
     camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
-        What the camera is. It goes round the person within 80, 20 and 8 degrees of yaw,
-        pitch and roll to either side, and all of it moves smoothly. Weak-perspective
-        and affine ones have 0.2 to 0.5 pixels a millimetre, orthographic ones
-        their geometric mean; affine ones moreover stretch each image, as of
-        `make_face_tracks`.
+        Camera model. The camera moves smoothly around the person within 80, 20 and 8
+        degrees of yaw, pitch and roll to either side. Weak-perspective and affine
+        cameras have 0.2 to 0.5 pixels a millimetre, orthographic cameras their
+        geometric mean. Affine cameras also stretch each image, see `make_face_tracks`.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
         divided by the root mean square of all coordinates of the tracks without
@@ -110,10 +109,9 @@ def make_body_tracks(
         translation : ndarray of shape (n_frames, 2)
             The centroids in pixels.
         angles : ndarray of shape (n_frames, 3)
-            Yaw, pitch and roll of the camera in degrees, as of `make_face_tracks`.
+            Yaw, pitch and roll of the camera in degrees, see `make_face_tracks`.
         labels : ndarray of shape (n_frames,), dtype=str
-            What the person does: "walk", "reach" or "squat"; between two the nearer
-            one.
+            The action: "walk", "reach" or "squat"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
             The number of the person, from 0. Each has lengths of bones of their own.
         time : ndarray of shape (n_frames,)

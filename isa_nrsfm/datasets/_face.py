@@ -64,7 +64,7 @@ def make_face_tracks(
         The head turns by yaw, pitch and roll (see `angles` below), uniform within
         45, 25 and 20 degrees to either side. Orthographic cameras have 2 pixels a
         millimetre, weak-perspective and affine ones 1 to 4, drawn log-uniformly for
-        each frame. Affine ones moreover stretch the image along a random axis; their
+        each frame. Affine ones also stretch the image along a random axis; their
         smaller singular value is 0.5 to 1 times the larger.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,

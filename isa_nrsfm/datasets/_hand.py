@@ -65,11 +65,10 @@ def make_hand_tracks(
     n_people : int, default=4
         Number of people.
     camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
-        What the camera is. It goes round the person within 60, 35 and 35 degrees of
-        yaw, pitch and roll to either side, and all of it moves smoothly.
-        Weak-perspective and affine ones have 1 to 3 pixels a millimetre, orthographic
-        ones their geometric mean; affine ones moreover stretch each image, as of
-        `make_face_tracks`.
+        Camera model. The camera moves smoothly around the person within 60, 35 and 35
+        degrees of yaw, pitch and roll to either side. Weak-perspective and affine
+        cameras have 1 to 3 pixels a millimetre, orthographic cameras their geometric
+        mean. Affine cameras also stretch each image, see `make_face_tracks`.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
         divided by the root mean square of all coordinates of the tracks without
@@ -108,9 +107,9 @@ def make_hand_tracks(
         translation : ndarray of shape (n_frames, 2)
             The centroids in pixels.
         angles : ndarray of shape (n_frames, 3)
-            Yaw, pitch and roll of the camera in degrees, as of `make_face_tracks`.
+            Yaw, pitch and roll of the camera in degrees, see `make_face_tracks`.
         labels : ndarray of shape (n_frames,), dtype=str
-            The pose: "open", "fist" or "point"; between two the nearer one.
+            The pose: "open", "fist" or "point"; in a transition the nearer one.
         groups : ndarray of shape (n_frames,), dtype=int
             The number of the person, from 0. Each has lengths of bones of their own.
         time : ndarray of shape (n_frames,)

@@ -80,7 +80,7 @@ def fetch_muct(
         Whether to download the file (4.2 MB) if it is not there. This needs pooch:
         ``pip install "isa-nrsfm[datasets]"``.
     mirrored : bool, default=False
-        Whether to keep the mirror images of the photos, too: 7510 frames instead of
+        Whether to include the mirror images of the photos: 7510 frames instead of
         3755. Their points are renumbered such that those on the left of a face are on
         its left again.
     return_X_y : bool, default=False

@@ -75,7 +75,7 @@ def make_nonrigid_tracks(
         The orientations are spread uniformly over all rotations. Orthographic cameras
         are the first two rows of the rotation. Weak-perspective ones are multiplied by
         a scale between 2/3 and 3/2, drawn log-uniformly for each frame. Affine ones
-        moreover stretch the image along a random axis; their smaller singular value
+        also stretch the image along a random axis; their smaller singular value
         is 0.5 to 1 times the larger.
     shapes : {"heavy_tailed", "gaussian"}, default="heavy_tailed"
         How the points of a basis shape are drawn, independently of each other and of

@@ -1,4 +1,4 @@
-"""Measures of a factorisation, blind to what the images cannot determine."""
+"""Measures of a factorisation, invariant to the ambiguities of images."""
 
 from typing import TYPE_CHECKING
 

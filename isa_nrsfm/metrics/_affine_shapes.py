@@ -1,4 +1,4 @@
-"""Measures of shapes up to an affinity of space, which affine images do not tell."""
+"""Measures of shapes up to an affinity of space, which images leave undetermined."""
 
 from typing import Literal, overload
 
@@ -53,7 +53,7 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     starts.
 
     The scales may be negative. An affine camera M sees in X what -M sees in -X, so
-    the images do not tell a shape from its reflection through the centroid, and the
+    a shape and its reflection through the centroid have the same images, and the
     sum of squares does not depend on the signs of the X_i. For estimates that resemble
     the truth all scales have the same sign.
 
@@ -139,7 +139,7 @@ def basis_similarity(
         the similarity is not reduced by this, with False it measures the shapes as
         they are.
     return_matching : bool, default=False
-        Whether to return the matching, too.
+        Whether to return the matching as well.
 
     Returns
     -------

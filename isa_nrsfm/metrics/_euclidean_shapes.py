@@ -53,14 +53,14 @@ def mean_shape_error_3d(
         Which error to compute. That of the sequence also counts rotations of the
         estimated shapes against each other; the other one does not.
     scale : bool, default=None
-        Whether to fit a scale, too: a common one for "sequence", one for each frame for
+        Whether to fit a scale: a common one for "sequence", one for each frame for
         "frame". By default that is False for "sequence", where shapes have to have the
         true size, and True for "frame".
 
     Returns
     -------
     float
-        The error, 0 for shapes that are right up to what is fitted. A shape whose
+        The error, 0 for shapes that are right after the alignment. A shape whose
         points are all equal has the errors 1 ("frame") and about 1.6 ("sequence").
 
     Raises
@@ -78,9 +78,9 @@ def mean_shape_error_3d(
     Notes
     -----
     The matrices and scales minimise the sum of squared distances (orthogonal
-    Procrustes analysis). They may be reflections: orthographic images do not tell a
-    shape from its mirror image. With "frame" that is granted to each frame, which
-    forgives frames that are mirror images of each other.
+    Procrustes analysis). They may be reflections, because a shape and its mirror image
+    have the same orthographic images. With "frame" this applies to each frame, so
+    frames that are mirror images of each other have no error.
 
     The program of Akhter et al. takes the orthogonal matrix that is nearest to the best
     affinity, which is not quite the best orthogonal matrix: for reconstructions of
