@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 from isa_nrsfm.skeletons import Skeleton
 
@@ -218,7 +218,7 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     """
     if len(alpha) < FEWEST_FOR_POSE:
         return np.full(alpha.shape[1], np.nan)
-    rows = polar(motion).rows
+    rows = polar(motion)[0]
     third = np.cross(rows[:, 0], rows[:, 1])
     predictors = np.hstack([rows.reshape(-1, 6), third])
     axes, sizes, _ = np.linalg.svd(predictors - predictors.mean(0), full_matrices=False)

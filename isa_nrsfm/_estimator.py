@@ -20,7 +20,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import (
     full_rotations,
 )
-from isa_nrsfm._frames.models import FrameFit
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CAMERA_NAMES,
@@ -534,8 +534,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             if self.camera == "affine":
                 del found["depth_uncertainty"]
         if self.keep_frames:
-            kept = FrameFit(**keep(fit.frames._asdict()))
-            kept = FrameFit(*map(source.blocks.as_collected, kept))
+            kept = Decomposition(**keep(fit.frames._asdict()))
+            kept = Decomposition(*map(source.blocks.as_collected, kept))
             found |= kept._asdict()
             if fit.numbers is None:
                 del found["alpha_std"]

@@ -31,7 +31,7 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
 from isa_nrsfm._gauge.canonical import (
@@ -96,7 +96,7 @@ class Refined(NamedTuple):
     ----------
     model : TableModel
         The fitted model, in the gauge.
-    frames : FrameFit
+    frames : Decomposition
         The fit of the frames of the table.
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
         As of `AffineNRSfM`.
@@ -109,7 +109,7 @@ class Refined(NamedTuple):
     """
 
     model: TableModel
-    frames: FrameFit
+    frames: Decomposition
     mode_covariance: NDArray
     n_iter: int
     converged: bool
@@ -126,7 +126,7 @@ class Fit(NamedTuple):
         The fitted model.
     unit : float
         The one size of all frames, 1 where each has its own.
-    frames : FrameFit
+    frames : Decomposition
         The fit of all rows of the table; NaN for rows that show nothing.
     frame_sizes : ndarray of shape (n_rows,)
         What the frames were divided by.
@@ -142,7 +142,7 @@ class Fit(NamedTuple):
 
     model: TableModel
     unit: float
-    frames: FrameFit
+    frames: Decomposition
     frame_sizes: NDArray
     isa: Any
     numbers: JointNumbers | None
@@ -266,11 +266,12 @@ def fit_ready_table(
     # 6. Measures of the fit; the gauge is taken at the end of the refinement
     cameras = refined.frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, refined.model.basis, refined.frames.alpha)
-    frames = refined.frames.astype(table.dtype)
     fit = Fit(
         model=refined.model,
         unit=unit,
-        frames=FrameFit(*map(table.of_all_rows, frames)),
+        frames=Decomposition(
+            *(table.of_all_rows(each.astype(table.dtype)) for each in refined.frames)
+        ),
         frame_sizes=table.of_all_rows(table.sizes),
         isa=isa,
         numbers=refined.numbers,
@@ -455,7 +456,7 @@ def _refined_by_paper(
     )
     return Refined(
         model(gauge.mean_shape, gauge.basis),
-        gauge.frames.astype(table.dtype),
+        gauge.frames,
         reorder_blocks(paper.mode_covariance, gauge.order),
         paper.n_iter,
         paper.converged,
@@ -526,7 +527,7 @@ def _refined_jointly(
     parts, *chance = zip(
         *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
     )
-    shown = FrameFit.from_blocks(parts)
+    shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
     cameras = shown.motion / table.sizes[:, None, None]
     return Refined(
         _model(

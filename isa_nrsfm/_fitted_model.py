@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.posterior import FramePosterior
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, project
+from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
@@ -82,7 +82,7 @@ class TableModel(NamedTuple):
     unit: float | None
 
     @one_blas_thread
-    def decompose(self, table: Table, deviations: bool = True) -> FrameFit:
+    def decompose(self, table: Table, deviations: bool = True) -> Decomposition:
         """
         Return cameras, positions and coefficients of the frames of a table.
 
@@ -91,7 +91,7 @@ class TableModel(NamedTuple):
         K = len(self.basis)
         shapes = ((2, 3), (2,), (K,), (K,))
         fit = partial(_fit, model=self, dtype=table.dtype, deviations=deviations)
-        return FrameFit(*table.blocks.collect(fit, shapes, table.dtype))
+        return Decomposition(*table.blocks.collect(fit, shapes, table.dtype))
 
     @one_blas_thread
     def posterior(self, table: Table) -> FramePosterior:
@@ -187,19 +187,21 @@ class TableModel(NamedTuple):
 
 def _fit(
     rows: NDArray, model: TableModel, dtype: Any, deviations: bool = False
-) -> FrameFit:
+) -> Decomposition:
     """Return the fit of some rows (n, 2 * n_points); NaN for those not usable."""
     ready = model.ready(model.tracks(rows))
-    whole = FrameFit.unknown(len(rows), len(model.basis))
-    if not ready.usable.any():
-        return whole.astype(dtype)
     fit = model.frames.fit(ready.centred, ready.sizes, deviations)
     fit = fit._replace(translation=fit.translation + ready.translation)
-    if not ready.usable.all():
-        for all_frames, of_usable in zip(whole, fit, strict=True):
-            all_frames[ready.usable] = of_usable
-        fit = whole
-    return fit.astype(dtype)
+    return Decomposition(*(_of_all(each, ready.usable).astype(dtype) for each in fit))
+
+
+def _of_all(values: NDArray, usable: NDArray) -> NDArray:
+    """Return values of the usable frames as values of all frames, NaN for others."""
+    if usable.all():
+        return values
+    whole = np.full((len(usable), *values.shape[1:]), np.nan)
+    whole[usable] = values
+    return whole
 
 
 def _posterior(rows: NDArray, model: TableModel) -> FramePosterior:
@@ -234,11 +236,8 @@ def _depth_deviations(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDA
     """Compute standard deviations of depths (n, n_points) in some rows."""
     assert isinstance(model.frames, PosteriorFrames)
     ready = model.ready(model.tracks(rows))
-    whole = np.full((len(rows), len(model.mean_shape)), np.nan)
-    if ready.usable.any():
-        found = model.frames.depth_deviations(ready.centred, ready.sizes)
-        whole[ready.usable] = found
-    return (whole.astype(dtype, copy=False),)
+    found = model.frames.depth_deviations(ready.centred, ready.sizes)
+    return (_of_all(found, ready.usable).astype(dtype, copy=False),)
 
 
 def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
@@ -254,9 +253,7 @@ def _distances(rows: NDArray, model: TableModel) -> NDArray:
     fit = model.frames.fit(ready.centred, ready.sizes, False)
     shapes = compose(model.mean_shape, model.basis, fit.alpha)
     off = ready.centred - project(shapes, fit.motion, fit.translation)
-    lengths = np.full((len(rows), off.shape[1]), np.nan)
-    lengths[ready.usable] = np.linalg.norm(off, axis=2) / ready.sizes[:, None]
-    return lengths
+    return _of_all(np.linalg.norm(off, axis=2) / ready.sizes[:, None], ready.usable)
 
 
 def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:

@@ -24,7 +24,7 @@ from isa_nrsfm._dynamics.smoothing import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import tilts
-from isa_nrsfm._frames.models import MIRROR, PosteriorFrames
+from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
@@ -41,29 +41,6 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm.skeletons import find_skeleton
-
-
-class Decomposition(NamedTuple):
-    """
-    Camera and coefficients of each frame of a table.
-
-    Attributes
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    translation : ndarray of shape (n_frames, 2)
-        Images of the shapes' centroid.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients of the basis shapes.
-    alpha_std : ndarray of shape (n_frames, n_components)
-        Their posterior standard deviations. NaN for models of the paper's refinement,
-        which have no noise variance.
-    """
-
-    motion: NDArray
-    translation: NDArray
-    alpha: NDArray
-    alpha_std: NDArray
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -185,7 +162,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             alpha_std (n_frames, n_components).
         """
         table = self._opened(X)
-        return Decomposition(*self._model.decompose(table))
+        return self._model.decompose(table)
 
     def smooth(
         self,

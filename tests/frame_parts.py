@@ -1,5 +1,7 @@
 """The parts of fits of frames, by their names."""
 
+from isa_nrsfm._frames.posterior import fit_tracks, frame_search
+
 # What a fitted model has of each frame.
 ATTRIBUTES_OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
 
@@ -15,5 +17,9 @@ def numbers_of(fits):
         *camera_and_alpha(fits),
         fits.covariance,
         fits.objective,
-        fits.residual,
     )
+
+
+def fit_posterior(tracks, shapes, noise, camera="affine", **given):
+    """Return the fit of frames by a new search."""
+    return fit_tracks(tracks, frame_search(camera, shapes), noise, **given)

@@ -12,7 +12,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.projection import compose
-from isa_nrsfm._linalg.polar import polar
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
@@ -649,7 +649,7 @@ class TestAlignment:
         assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
         others = [sign * random_rotation(k) for k in range(200) for sign in (1, -1)]
         others += [
-            polar(found + size * rng.normal(size=(3, 3))).rows
+            polar(found + size * rng.normal(size=(3, 3)))[0]
             for size in (1e-3, 1e-2)
             for _ in range(20)
         ]

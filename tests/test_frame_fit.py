@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frame_parts import fit_posterior
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames, RigidFrames
-from isa_nrsfm._frames.options import FRAME_OPTIONS
-from isa_nrsfm._frames.posterior import fit_posterior
+from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
 from isa_nrsfm._prepare.robust import distant_points, robust_weights
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
@@ -280,11 +279,6 @@ def posterior_frames(seed, loss="linear", gauge=None):
     return PosteriorFrames(shapes, NOISE**2, starts, loss, gauge), tracks
 
 
-def with_options(frames, **changed):
-    """Return the model with some other options of its fit."""
-    return replace(frames, options=FRAME_OPTIONS._replace(**changed))
-
-
 def mixing_gauge():
     """Return a map to other shapes: B_0 with B_k, B_k with B_0, and an affinity."""
     rng = np.random.default_rng(5)
@@ -385,20 +379,6 @@ class TestPosteriorFrames:
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
         assert_allclose(again.motion, fitted.motion, atol=1e-4)
 
-    def test_options_of_a_robust_loss(self):
-        frames, tracks = posterior_frames(0, "cauchy")
-        first = with_options(frames, reweightings=0).posterior(tracks)
-        linear = replace(frames, loss="linear").posterior(tracks)
-        assert_allclose(first.alpha, linear.alpha, atol=1e-9)
-        exact = with_options(frames, settled=1e-12).posterior(tracks).alpha
-        errors = [
-            np.abs(
-                with_options(frames, settled=s).posterior(tracks).alpha - exact
-            ).max()
-            for s in (0.1, 1e-3, 1e-6)
-        ]
-        assert errors[0] > errors[1] > errors[2] > 0
-
     @pytest.mark.parametrize("point", [0, 7, 12])
     @pytest.mark.parametrize("size", [2.0, 20.0])
     @pytest.mark.parametrize("loss", ["huber", "cauchy"])
@@ -471,13 +451,6 @@ class TestPosteriorFrames:
             flat = part.reshape(len(tracks), -1)
             assert np.isnan(flat[few]).all()
             assert np.isfinite(flat[~few]).all()
-
-    def test_unknown_is_nan(self):
-        for part, shape in zip(
-            FrameFit.unknown(5, 2), [(5, 2, 3), (5, 2), (5, 2), (5, 2)], strict=True
-        ):
-            assert part.shape == shape
-            assert np.isnan(part).all()
 
 
 class TestComposeAndProject:

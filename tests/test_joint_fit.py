@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from frame_parts import fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from scenes import measurements, rotate_frames
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.posterior import fit_posterior
 from isa_nrsfm._joint import problem as problem_module, reweighting
 from isa_nrsfm._joint.fit import (
     JointFit,

@@ -9,7 +9,7 @@ from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
+from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
 from isa_nrsfm._joint.likelihood import MarginalLikelihood, likelihood_of
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
@@ -502,7 +502,7 @@ class TestHeldCameras:
         likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
         start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
         result = refine_joint(
-            likelihood, start, HeldCameras(), max_iter=1000, tol=1e-10
+            likelihood, start, AffineCameras(held=True), max_iter=1000, tol=1e-10
         )
         assert result.converged
         assert_array_equal(result.state.motion, start.motion)
@@ -518,7 +518,9 @@ class TestHeldCameras:
         scene = random_scene(noise=0.0)
         likelihood = likelihood_of(scene.tracks, None, 0.0)
         start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
-        result = refine_joint(likelihood, start, HeldCameras(), max_iter=50, tol=1e-3)
+        result = refine_joint(
+            likelihood, start, AffineCameras(held=True), max_iter=50, tol=1e-3
+        )
         assert_array_equal(result.state.motion, start.motion)
         assert (np.diff(result.history) < 0).all()
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import permute_frames, rotate_frames
 
-from isa_nrsfm._frames.camera_models import CAMERAS, HeldCameras, nearest_calibrated
+from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likely_basis import likely_basis
 from isa_nrsfm._joint.options import JOINT_OPTIONS
@@ -290,7 +290,7 @@ class TestBestStarts:
             noise_variance = max(noise_variance, least_noise * energy / n_seen)
             start = JointState(shapes, motion, noise_variance)
             held = problem.refined(
-                start, HeldCameras(), least_noise, max_iter=held_steps
+                start, AffineCameras(held=True), least_noise, max_iter=held_steps
             )
             assert value < held.history[-1]
 

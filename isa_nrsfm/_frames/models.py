@@ -6,7 +6,6 @@ mean shape alone, and then coefficients of least squares. `PosteriorFrames`, tha
 joint refinement, takes the most probable camera and coefficients together.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -16,18 +15,12 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
-from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import NOT_MEASURED, DepthCertainty, depth_deviations
-from isa_nrsfm._frames.options import FRAME_OPTIONS, FrameOptions
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.posterior import (
-    SEARCHES,
-    FramePosterior,
-    fit_prepared,
-    fit_tracks,
-)
+from isa_nrsfm._frames.posterior import fit_frames, fit_tracks, frame_search
 from isa_nrsfm._frames.projection import distances
-from isa_nrsfm._frames.search import FrameSearch
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.layout import measurement_matrix
@@ -40,48 +33,27 @@ UNSEEN = 1e-28
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
-class FrameFit(NamedTuple):
+class Decomposition(NamedTuple):
     """
-    Cameras, positions and coefficients of frames; NaN where a frame shows too little.
+    Camera and coefficients of each frame of a table; NaN if too few points are seen.
 
     Attributes
     ----------
     motion : ndarray of shape (n_frames, 2, 3)
         Cameras, in the units of the table per unit of the shapes.
     translation : ndarray of shape (n_frames, 2)
-        Image of the origin, which is the centroid of the points of the mean shape.
+        Images of the shapes' centroid.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the basis shapes.
     alpha_std : ndarray of shape (n_frames, n_components)
-        Their posterior standard deviations. NaN for `RigidFrames`, which has no noise.
+        Their posterior standard deviations. NaN for models of the paper's refinement,
+        which have no noise variance.
     """
 
     motion: NDArray
     translation: NDArray
     alpha: NDArray
     alpha_std: NDArray
-
-    def astype(self, dtype: Any) -> "FrameFit":
-        """Return the fit in another type of numbers."""
-        return type(self)(*(part.astype(dtype, copy=False) for part in self))
-
-    @classmethod
-    def from_blocks(cls, parts: "Iterable[FrameFit]") -> "FrameFit":
-        """Return the fits of consecutive blocks of frames as one."""
-        parts = list(parts)
-        if len(parts) == 1:
-            return parts[0]
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
-
-    @classmethod
-    def unknown(cls, n_frames: int, n_components: int) -> "FrameFit":
-        """Return a fit of NaN, to be filled in."""
-        return cls(
-            np.full((n_frames, 2, 3), np.nan),
-            np.full((n_frames, 2), np.nan),
-            np.full((n_frames, n_components), np.nan),
-            np.full((n_frames, n_components), np.nan),
-        )
 
 
 class RigidFrames(NamedTuple):
@@ -116,7 +88,9 @@ class RigidFrames(NamedTuple):
             mean_shape=self.mean_shape * MIRROR, basis=self.basis * MIRROR
         )
 
-    def fit(self, tracks: NDArray, sizes: NDArray, deviations: bool = True) -> FrameFit:
+    def fit(
+        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+    ) -> Decomposition:
         """
         Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -131,18 +105,22 @@ class RigidFrames(NamedTuple):
 
         Returns
         -------
-        FrameFit
+        Decomposition
             ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or
             zero where camera i does not see basis shape k at all; the least squares
             solution of least norm otherwise.
         """
-        fit = FrameFit.unknown(len(tracks), len(self.basis))
+        n_frames, shape = len(tracks), (len(tracks), len(self.basis))
+        fit = np.empty((n_frames, 2, 3)), np.empty((n_frames, 2)), np.empty(shape)
         seen = seen_points(tracks)
         complete = np.asarray(seen.all(axis=1))
-        _fill(fit, complete, self._separately(tracks[complete]))
+        parts = [(complete, self._separately(tracks[complete]))]
         for i in np.flatnonzero(~complete):
-            _fill(fit, np.array([i]), self._together(tracks[i, seen[i]], seen[i]))
-        return fit
+            parts.append((i, self._together(tracks[i, seen[i]], seen[i])))
+        for frames, part in parts:
+            for whole, values in zip(fit, part, strict=True):
+                whole[frames] = values
+        return Decomposition(*fit, np.full(shape, np.nan))
 
     def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """
@@ -189,10 +167,7 @@ class RigidFrames(NamedTuple):
     def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) for W (2 n_frames, J) and a shape (J, 3)."""
         motion = rigid_cameras(W, mean_shape)
-        if self.camera == "affine":
-            return motion
-        rows, scales = nearest_calibrated(motion)
-        return rows if self.camera == "orthographic" else scales[:, None, None] * rows
+        return CAMERAS[self.camera].nearest(motion)
 
     def _together(
         self, points: NDArray, seen: NDArray
@@ -212,7 +187,7 @@ class RigidFrames(NamedTuple):
         rest = W.T - (self.mean_shape[seen] - centroid) @ motion[0].T
         alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
         translation = centre - motion[0] @ (centroid + alpha @ middles)
-        return motion, translation[None], alpha[None]
+        return motion[0], translation, alpha
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,8 +210,6 @@ class PosteriorFrames:
         Takes cameras and coefficients to those of the public shapes.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
         Model of the cameras. Orthographic ones have the scale one.
-    options : FrameOptions
-        What steers the fit.
     certainty : DepthCertainty
         Uncertainty of the fit of the shapes, with calibrated cameras.
     """
@@ -247,16 +220,12 @@ class PosteriorFrames:
     loss: str
     gauge: FrameMap
     camera: str = "affine"
-    options: FrameOptions = FRAME_OPTIONS
     certainty: DepthCertainty = NOT_MEASURED
 
     @cached_property
     def _search(self) -> FrameSearch:
-        """The search for frames. What it knows of the shapes serves all tables."""
-        known: dict[str, Any] = {"options": self.options}
-        if self.camera != "affine":
-            known["misfit"] = self.certainty.misfit
-        return SEARCHES[self.camera](self.shapes, **known)
+        """The search for frames. It serves all tables."""
+        return frame_search(self.camera, self.shapes, self.certainty.misfit)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes, without what is computed from them."""
@@ -287,7 +256,9 @@ class PosteriorFrames:
         shapes = self.shapes[:, :, kept]
         return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
-    def fit(self, tracks: NDArray, sizes: NDArray, deviations: bool = True) -> FrameFit:
+    def fit(
+        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+    ) -> Decomposition:
         """
         Return the most probable camera, position and coefficients.
 
@@ -302,14 +273,14 @@ class PosteriorFrames:
 
         Returns
         -------
-        FrameFit
-            That of `fit_posterior`, in the gauge. With a robust loss the weights are
+        Decomposition
+            That of `fit_tracks`, in the gauge. With a robust loss the weights are
             those of the residuals of the fit.
         """
         unit = tracks / sizes[:, None, None]
         return self.shown(self.posterior(unit, covariances=deviations), sizes)
 
-    def shown(self, posterior: FramePosterior, sizes: NDArray) -> FrameFit:
+    def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """
         Take a fit of frames of size one to the units of the table and to the gauge.
 
@@ -322,7 +293,7 @@ class PosteriorFrames:
 
         Returns
         -------
-        FrameFit
+        Decomposition
             The same fit.
         """
         covariance = posterior.covariance
@@ -332,7 +303,9 @@ class PosteriorFrames:
             covariance if covariance.shape[1] == len(self.shapes) - 1 else None,
         )
         translation = posterior.translation * sizes[:, None]
-        return FrameFit(motion * sizes[:, None, None], translation, alpha, deviation)
+        return Decomposition(
+            motion * sizes[:, None, None], translation, alpha, deviation
+        )
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """
@@ -349,9 +322,7 @@ class PosteriorFrames:
         FramePosterior
             The fit, that of `posterior`.
         """
-        return fit_prepared(
-            block, self._search, self.noise_variance, starts=self.starts
-        )
+        return fit_frames(block, self._search, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """
@@ -377,7 +348,7 @@ class PosteriorFrames:
             seen_points(tracks),
             self.noise_variance,
             self.certainty,
-            self.camera == "weak_perspective",
+            CAMERAS[self.camera].scaled,
         )
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
@@ -402,7 +373,7 @@ class PosteriorFrames:
         fitted = partial(
             fit_tracks,
             search=self._search,
-            noise_variance=self.noise_variance,
+            noise=self.noise_variance,
             covariances=covariances,
         )
         if self.loss == "linear":
@@ -419,13 +390,13 @@ class PosteriorFrames:
         deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
-        for _ in range(self.options.reweightings):
+        for _ in range(50):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
             distance = np.where(seen[changing], distance, np.inf)
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
             change = np.abs(new - weights[changing]).max(axis=1)
-            unsettled = change > self.options.settled
+            unsettled = change > 1e-4
             weights[changing] = new
             changing = in_lanes(np.unique(changing[unsettled]))
             if not len(changing):
@@ -441,9 +412,3 @@ class PosteriorFrames:
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
         return fit
-
-
-def _fill(fit: FrameFit, frames: NDArray, values: tuple[NDArray, ...]) -> None:
-    """Set motion, translation and alpha of some frames, but not alpha_std."""
-    for whole, part in zip(fit, values, strict=False):
-        whole[frames] = part

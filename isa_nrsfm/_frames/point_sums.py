@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
+    DIAGONAL,
     ROWS,
-    UNPACKED,
+    diagonal_of,
+    inverse3,
     pair_indices,
     unpack3,
     unpacked,
@@ -31,165 +33,69 @@ from isa_nrsfm._linalg.vectors import of_frames
 
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
-TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+TWICE = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 # Shapes are flat along a direction if they extend by less than this share of their
 # largest extent.
 FLAT = 1e-10
 # Frames whose points cover less than this share of the variance of the mean shape
 # along some direction do not determine a camera.
 LEAST_COVER = 1e-10
+# Ridge of ``S S^T``, as a share of the second moment of the shapes. It keeps cameras
+# finite for degenerate shapes, and is too small to change them for others.
+RIDGE = 1e-13
 
 
-def _pair_index(n_pairs: int) -> tuple[NDArray, NDArray]:
+class Gram:
     """
-    Return the position of each (k, l) among the pairs (n, n), and multiplicities.
-
-    The multiplicities (n_pairs,) are 2 for pairs with k < l, which stand for two.
-    """
-    index = unpacked(np.arange(n_pairs)).astype(np.intp)
-    first, second = pair_indices(len(index))
-    return index, np.where(first == second, 1.0, 2.0)
-
-
-class SharedGram:
-    """
-    The Gram matrix of shapes of which all frames see all points.
+    The Gram matrices of shapes: one for all frames that are complete, or one for each.
 
     Parameters
     ----------
-    pairs : ndarray of shape (n_pairs, 6)
+    pairs : ndarray of shape (n_pairs, 6) or (n_pairs, 6, n_frames)
         ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`. The fit
         depends only on this symmetric part.
     """
 
     def __init__(self, pairs: NDArray) -> None:
         self.pairs = pairs
-        index, multiplicity = _pair_index(len(pairs))
-        self._n_shapes = len(index)
-        self._moments = multiplicity * pairs.T
-        self._energies = pairs * TWICE
-        # Rows (k, ab) and columns l
-        full = 2.0 * pairs[index].transpose(0, 2, 1)  # (n, 6, n)
-        self._products = full.reshape(-1, self._n_shapes)
-        # Rows (k, a) and columns (l, b), for all shapes k but the mean
-        square = full[1:, UNPACKED].transpose(0, 1, 3, 2)  # (n - 1, 3, n, 3)
-        self._images = square.reshape(3 * len(square), 3 * len(full))
-
-    def products(self, c: NDArray) -> NDArray:
-        """
-        Return ``sum_l c_l (G_kl + G_kl^T)``, the products with the shapes of frames.
-
-        Parameters
-        ----------
-        c : ndarray of shape (n_shapes, n_frames)
-            Coefficients of all shapes.
-
-        Returns
-        -------
-        ndarray of shape (n_shapes, 6, n_frames)
-            ``B_k S_i^T + S_i B_k^T`` with ``S_i = sum_l c_il B_l``, packed.
-        """
-        return (self._products @ c).reshape(-1, 6, c.shape[-1])
-
-    def images(self, c: NDArray, products: NDArray, M: NDArray) -> NDArray:
-        """
-        Return the products with the basis shapes, seen by cameras.
-
-        Parameters
-        ----------
-        c : ndarray of shape (n_shapes, n_frames)
-            Coefficients of all shapes.
-        products : ndarray of shape (n_shapes, 6, n_frames)
-            `products` of c.
-        M : ndarray of shape (3, 2, n_frames)
-            Cameras, transposed.
-
-        Returns
-        -------
-        ndarray of shape (n_shapes - 1, 3, 2, n_frames)
-            ``(B_k S_i^T + S_i B_k^T) M_i^T``.
-        """
-        # One product of matrices: (B_k S^T + S B_k^T) M^T is linear in c (x) M.
-        seen = (c[:, None, None] * M).reshape(3 * self._n_shapes, -1)
-        return (self._images @ seen).reshape(self._n_shapes - 1, *M.shape)
-
-    def moments(self, C: NDArray) -> NDArray:
-        """
-        Return ``sum_kl C_kl G_kl``, the second moments of the shapes of frames.
-
-        Parameters
-        ----------
-        C : ndarray of shape (n_pairs, n_frames)
-            Symmetric matrices (moments of the coefficients), packed as `pair_indices`.
-
-        Returns
-        -------
-        ndarray of shape (6, n_frames)
-            Symmetric 3x3 matrices, packed.
-        """
-        return self._moments @ C
-
-    def energies(self, Q: NDArray) -> NDArray:
-        """
-        Return ``H_kl = <G_kl, Q>``, the inner products of the images of shapes.
-
-        Parameters
-        ----------
-        Q : ndarray of shape (6, n_frames)
-            ``M_i^T M_i``, packed.
-
-        Returns
-        -------
-        ndarray of shape (n_pairs, n_frames)
-            ``<M_i B_k, M_i B_l>`` for the pairs of `pair_indices`.
-        """
-        return self._energies @ Q
-
-    def take(self, frames: NDArray) -> Self:
-        """Return the Gram matrix of some of the frames: it is that of all."""
-        return self
-
-
-class FrameGram:
-    """
-    The Gram matrices of shapes over the weighted points of each frame.
-
-    The methods are those of `SharedGram`.
-
-    Parameters
-    ----------
-    pairs : ndarray of shape (n_pairs, 6, n_frames)
-        ``(G_i,kl + G_i,kl^T) / 2``, packed, for the pairs of `pair_indices`.
-    """
-
-    def __init__(self, pairs: NDArray) -> None:
-        self.pairs = pairs
-        self._index, self._multiplicity = _pair_index(len(pairs))
+        self._index = unpacked(np.arange(len(pairs)))  # (n_shapes, n_shapes)
+        # Pairs with k < l stand for two.
+        self._multiplicity = np.bincount(self._index.ravel())[:, None]
 
     @cached_property
     def _full(self) -> NDArray:
-        """The matrices for all k and l (n_shapes, n_shapes, 6, n_frames)."""
-        return np.take(self.pairs, self._index, axis=0)
+        """``2 G_kl`` (6 n_shapes, n_shapes, ...), rows (k, ab) and columns l."""
+        entries = 6 * self._index[:, None] + np.arange(6)[:, None]
+        flat = self.pairs.reshape(6 * len(self.pairs), *self.pairs.shape[2:])
+        return 2.0 * np.take(flat, entries.reshape(-1, len(entries)), axis=0)
 
     def products(self, c: NDArray) -> NDArray:
-        """Return ``sum_l c_l (G_kl + G_kl^T)``, packed."""
-        return np.einsum("klai,li->kai", self._full, 2.0 * c)
+        """Return ``B_k S_i^T + S_i B_k^T`` (n_shapes, 6, n), ``S_i = sum_l c_il B_l``.
 
-    def images(self, c: NDArray, products: NDArray, M: NDArray) -> NDArray:
-        """Return the products with the basis shapes, seen by cameras."""
-        return np.einsum("kabi,bri->kari", unpack3(products[1:]), M)
+        The coefficients c are (n_shapes, n); the products are packed.
+        """
+        return _times(self._full, c).reshape(len(c), 6, c.shape[1])
 
     def moments(self, C: NDArray) -> NDArray:
-        """Return ``sum_kl C_kl G_kl``."""
-        return np.einsum("pai,pi->ai", self.pairs, self._multiplicity[:, None] * C)
+        """Return ``sum_kl C_kl G_kl`` (6, n), packed; C (n_pairs, n) is packed."""
+        return _times(self.pairs.swapaxes(0, 1), self._multiplicity * C)
 
     def energies(self, Q: NDArray) -> NDArray:
-        """Return ``H_kl = <G_kl, Q>``."""
-        return np.einsum("pai,ai->pi", self.pairs, TWICE[:, None] * Q)
+        """Return ``H_kl = <G_kl, Q>`` (n_pairs, n), packed; Q (6, n) is packed."""
+        return _times(self.pairs, TWICE[:, None] * Q)
 
-    def take(self, frames: NDArray) -> "FrameGram":
+    def take(self, frames: NDArray) -> Self:
         """Return the Gram matrices of some of the frames."""
-        return FrameGram(of_frames(self.pairs, frames))
+        if self.pairs.ndim == 2:
+            return self
+        return type(self)(of_frames(self.pairs, frames))
+
+
+def _times(matrices: NDArray, vectors: NDArray) -> NDArray:
+    """Return the products of matrices (a, b) or (a, b, n) with vectors (b, n)."""
+    if matrices.ndim == 2:
+        return matrices @ vectors
+    return np.einsum("abi,bi->ai", matrices, vectors)
 
 
 class FrameTracks(NamedTuple):
@@ -226,11 +132,7 @@ class FrameTracks(NamedTuple):
     def take(self, frames: NDArray | slice) -> Self:
         """Return some of the frames."""
         return type(self)(
-            of_frames(self.weighted, frames),
-            None if self.weights is None else of_frames(self.weights, frames),
-            of_frames(self.centroid, frames),
-            self.weight[frames],
-            self.energy[frames],
+            *(None if each is None else of_frames(each, frames) for each in self)
         )
 
 
@@ -242,7 +144,7 @@ class FrameSums(NamedTuple):
     ----------
     cross : ndarray of shape (n_shapes, 3, 2, n_frames)
         ``P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T``.
-    gram : SharedGram or FrameGram
+    gram : Gram
         ``G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T``.
     shape_centroid : ndarray of shape (n_shapes, 3, n_frames)
         ``mean_ik``, weighted means of the points of the shapes.
@@ -251,7 +153,7 @@ class FrameSums(NamedTuple):
     """
 
     cross: NDArray
-    gram: SharedGram | FrameGram
+    gram: Gram
     shape_centroid: NDArray
     centroid: NDArray
     weight: NDArray
@@ -278,19 +180,44 @@ class FrameSums(NamedTuple):
 
     def take(self, frames: NDArray) -> Self:
         """Return the sums of some of the frames."""
-        return self._replace(
-            cross=of_frames(self.cross, frames),
-            gram=self.gram.take(frames),
-            shape_centroid=of_frames(self.shape_centroid, frames),
-            centroid=of_frames(self.centroid, frames),
-            weight=self.weight[frames],
-            energy=self.energy[frames],
+        cross, gram, *others = self
+        return type(self)(
+            of_frames(cross, frames),
+            gram.take(frames),
+            *(of_frames(each, frames) for each in others),
         )
 
 
 def with_one(alpha: NDArray) -> NDArray:
     """Return ``c = (1, alpha)`` (n_components + 1, n) of alpha (n_components, n)."""
     return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
+
+
+def affine_cameras(
+    products: FrameSums, c: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """
+    Return the affine cameras of least squares for coefficients c (n_shapes, n).
+
+    Returned are ``T_k = B_k S^T + S B_k^T`` (n_shapes, 6, n), packed, the inverse of
+    ``A = S S^T`` (3, 3, n), the cameras ``M = Y A^-1`` (2, 3, n) and ``<M, Y>`` (n,).
+    """
+    T = products.gram.products(c)
+    A = np.einsum("ki,kpi->pi", 0.5 * c, T)
+    # A ridge, relative to the moments of all shapes, for flat ones
+    moments = products.gram.pairs[diagonal_of(products.gram.pairs)][:, DIAGONAL]
+    A[DIAGONAL] += RIDGE * moments.sum(axis=0).mean(axis=0)
+    inverse = inverse3(A)
+    Y = np.einsum("ki,kari->rai", c, products.cross)
+    M = np.einsum("rbi,bai->rai", Y, inverse)
+    return T, inverse, M, np.einsum("rai,rai->i", M, Y)
+
+
+def seen_changes(cross: NDArray, T: NDArray, M: NDArray) -> NDArray:
+    """Return ``F_k = M T_k - P_k^T`` (K, 2, 3, n) of the basis shapes."""
+    F = np.einsum("rbi,kbai->krai", M, unpack3(T[1:]))
+    F -= cross[1:].swapaxes(1, 2)
+    return F
 
 
 def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks:
@@ -333,13 +260,9 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
     """Return frames of several blocks, all with weights or none, as one block."""
     if len(parts) == 1:
         return parts[0]
-    weighted, weights, centroid, weight, energy = zip(*parts, strict=True)
+    fields = zip(*parts, strict=True)
     return FrameTracks(
-        np.concatenate(weighted, axis=-1),
-        None if weights[0] is None else np.concatenate(weights, axis=-1),
-        np.concatenate(centroid, axis=-1),
-        np.concatenate(weight),
-        np.concatenate(energy),
+        *(None if each[0] is None else np.concatenate(each, axis=-1) for each in fields)
     )
 
 
@@ -372,12 +295,9 @@ class ShapeProducts:
         return self.shapes.reshape(-1, self.shapes.shape[-1])
 
     @cached_property
-    def gram(self) -> SharedGram:
+    def gram(self) -> Gram:
         """The Gram matrix of the shapes."""
-        n_shapes = len(self.shapes)
-        blocks = (self.rows @ self.rows.T).reshape(n_shapes, 3, n_shapes, 3)
-        pairs = blocks.transpose(0, 2, 1, 3)[pair_indices(n_shapes)]
-        return SharedGram(0.5 * (pairs[:, ROWS, COLUMNS] + pairs[:, COLUMNS, ROWS]))
+        return Gram(self.pairs.sum(axis=1).reshape(-1, 6))
 
     @cached_property
     def pairs(self) -> NDArray:
@@ -399,7 +319,7 @@ def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
     Returns
     -------
     FrameSums
-        With a `SharedGram` where all weights are 1, a `FrameGram` otherwise.
+        With one Gram matrix for all frames where all weights are 1.
     """
     weighted, W, centroid, weight, energy = tracks
     n_shapes, _, n_points = shapes.shapes.shape
@@ -413,7 +333,7 @@ def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
     # G = sum_j w b b^T - weight mean mean^T. As the rows are centred over all points
     # the second term is small: no cancellation.
     pairs -= _pair_products(means * np.sqrt(weight))
-    return FrameSums(cross, FrameGram(pairs), means, centroid, weight, energy)
+    return FrameSums(cross, Gram(pairs), means, centroid, weight, energy)
 
 
 def _pair_products(rows: NDArray) -> NDArray:
@@ -463,7 +383,7 @@ def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     Parameters
     ----------
     products : FrameSums
-        Sums of the frames for `whitened` shapes, with a `FrameGram`.
+        Sums of the frames for `whitened` shapes, each with its own Gram matrix.
     mean_shape : ndarray of shape (3, n_points)
         B_0 of these shapes.
 

@@ -1,89 +1,330 @@
-"""What the searches for camera and coefficients of frames have in common."""
+"""Newton's method for cameras and coefficients of many frames at once.
 
-from typing import NamedTuple, Protocol
+Each frame has an objective of its own. The frame is the last index of all arrays. A
+step is damped where the Hessian is not positive definite or a step has raised the
+objective, so that this never rises, up to rounding. A frame leaves the problem when it
+has ended: the others go on without it.
+"""
 
+from typing import NamedTuple, Self
+
+import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.options import FrameOptions
 from isa_nrsfm._frames.point_sums import FrameSums, ShapeProducts
+from isa_nrsfm._linalg.packed_symmetric import invert_positive, solve_positive, unpacked
+from isa_nrsfm._linalg.rounding import OF_STEPS
+from isa_nrsfm._linalg.vectors import frames_first, in_lanes, of_frames
+
+# Largest number of steps of a search.
+MAX_STEPS = 60
+# With so much damping a step no longer moves, and the search of the frame ends.
+LARGEST_DAMPING = 1e8
+# The least noise variance, as a share of the energy of a frame.
+LEAST_NOISE = 1e-13
 
 
-class FoundFrames(NamedTuple):
+class FramePosterior(NamedTuple):
     """
-    Minima that the search for cameras and coefficients has reached.
+    Fits of frames; NaN for frames whose points do not determine a camera.
 
     Attributes
     ----------
     motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
+        Cameras, in the units of the tracks per unit of the shapes.
+    translation : ndarray of shape (n_frames, 2)
+        Image of the origin of the shapes.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients.
     covariance : ndarray of shape (n_frames, n_components, n_components)
-        Posterior covariance of the coefficients. It contains the uncertainty of the
-        camera. Of shape (n_frames, 0, 0) where covariances are not wanted.
+        Posterior covariance of alpha in the normal approximation at the optimum
+        (Laplace), with the uncertainty of camera and position. Of shape (n_frames, 0,
+        0) where covariances are not wanted.
     turn_covariance : ndarray of shape (n_frames, 3, 3)
         Posterior covariance of the rotation vectors w of ``M exp(hat(w))``, in radians
-        squared. NaN for affine cameras, and where covariances are not wanted.
+        squared, with the uncertainty of the coefficients. NaN for affine cameras, and
+        where covariances are not wanted.
     objective : ndarray of shape (n_frames,)
-        ``||W - M S||^2 + s2 |a|^2``.
-    residual : ndarray of shape (n_frames,)
-        ``||W - M S||^2``.
+        ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2`` at the optimum. Its error is
+        below 1e-12 of the energy of the centred frame.
     converged : ndarray of bool, shape (n_frames,)
-        Whether the search has converged.
+        Whether the last Newton step was below the convergence tolerance.
     """
 
     motion: NDArray
+    translation: NDArray
     alpha: NDArray
     covariance: NDArray
     turn_covariance: NDArray
     objective: NDArray
-    residual: NDArray
     converged: NDArray
 
+    @classmethod
+    def unknown(
+        cls, n_frames: int, n_components: int, covariances: bool = True
+    ) -> Self:
+        """Return fits of NaN, to be filled in, with or without covariances."""
+        size = n_components if covariances else 0
+        shapes = (2, 3), (2,), (n_components,), (size, size), (3, 3), ()
+        numbers = (np.full((n_frames, *shape), np.nan) for shape in shapes)
+        return cls(*numbers, np.zeros(n_frames, dtype=bool))
 
-class FrameSearch(Protocol):
+    def take(self, frames: NDArray) -> Self:
+        """Return the fits of some of the frames."""
+        return type(self)(*(each[frames] for each in self))
+
+    def put(self, frames: NDArray, others: Self) -> None:
+        """Set the fits of some of the frames."""
+        for each, other in zip(self, others, strict=True):
+            each[frames] = other
+
+
+class FrameProblem(NamedTuple):
+    """Frames, given by their sums for the shapes, and their noise variances (n,)."""
+
+    products: FrameSums
+    noise: NDArray
+
+    @property
+    def energy(self) -> NDArray:
+        """``||W||^2 + s2`` (n,): gains and rounding errors are compared with it."""
+        return self.products.energy + self.noise
+
+    def take(self, frames: NDArray) -> Self:
+        """Return some of the frames."""
+        return type(self)(self.products.take(frames), self.noise[frames])
+
+
+class State(NamedTuple):
     """
-    A search for the cameras of one model that see given shapes.
+    The objectives of frames at some positions, and their derivatives.
 
     Attributes
     ----------
-    shared : ShapeProducts
-        The shapes (n_components + 1, 3, n_points) in the coordinates of the search,
-        and their products.
-    options : FrameOptions
-        What steers the search.
+    position : ndarray of shape (..., n_frames)
+        Coefficients or cameras.
+    value : ndarray of shape (n_frames,)
+        The objectives, up to a constant of each frame.
+    slope : ndarray of shape (n_parameters, n_frames)
+        Minus half the gradient.
+    definite : ndarray of shape (n_pairs, n_frames)
+        A positive semidefinite part of the Hessian, packed: steps are damped by it.
+    hessian : ndarray of shape (n_pairs, n_frames)
+        Half the Hessian, packed.
+    """
+
+    position: NDArray
+    value: NDArray
+    slope: NDArray
+    definite: NDArray
+    hessian: NDArray
+
+    def take(self, frames: NDArray) -> Self:
+        """Return the state of some of the frames."""
+        return type(self)(*(of_frames(each, frames) for each in self))
+
+    def newton_step(self, damping: NDArray) -> tuple[NDArray, NDArray]:
+        """Return damped steps (p, n), and where the matrix is positive definite."""
+        matrix = self.hessian
+        if damping.any():
+            matrix = matrix + damping * self.definite
+        return solve_positive(matrix, self.slope)
+
+    def inverse(self) -> NDArray:
+        """Return inverse Hessians (p, p, n), where indefinite those of `definite`."""
+        inverse, positive = invert_positive(self.hessian)
+        bad = in_lanes(np.flatnonzero(~positive))
+        if len(bad):
+            inverse[:, bad] = invert_positive(self.definite[:, bad])[0]
+        return unpacked(inverse)
+
+
+class FrameSearch:
+    """
+    A search for cameras of one model that see given shapes, frame by frame.
+
+    Parameters
+    ----------
+    shapes : ndarray of shape (n_components + 1, 3, n_points)
+        Mean shape and basis shapes in the coordinates of the search, rows centred.
+    space : ndarray of shape (3, 3)
+        Takes the original shapes to these coordinates.
+
+    Attributes
+    ----------
     first_steps : int
         Largest number of steps of a first round, block by block. Frames that have not
         converged then are collected from all blocks for a second round.
+    rough_steps : int
+        Largest number of steps for rough cameras.
     """
 
-    shared: ShapeProducts
-    options: FrameOptions
-    first_steps: int
+    first_steps = MAX_STEPS
+    rough_steps = 3
 
-    def cameras(self, motion: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) of the search for the original shapes."""
-
-    def turns(self, covariance: NDArray) -> NDArray:
-        """Return covariances of rotation vectors (n, 3, 3) for the original shapes."""
+    def __init__(self, shapes: NDArray, space: NDArray):
+        self.shared, self.space = ShapeProducts(shapes), space
 
     def fit(
         self,
         products: FrameSums,
         variance: NDArray,
-        n_points: float,
         initial: NDArray,
         max_steps: int,
         covariances: bool = True,
-    ) -> FoundFrames:
+        rough: bool = False,
+    ) -> FramePosterior:
         """
         Return the minima that frames reach from given coefficients.
 
-        The noise variances are (n_frames,), the coefficients initial (n_frames,
-        n_components). Covariances may be left out.
-        """
+        Parameters
+        ----------
+        products : FrameSums
+            Sums of the frames for the shapes in `shared`.
+        variance : ndarray of shape (n_frames,)
+            Noise variances.
+        initial : ndarray of shape (n_frames, n_components)
+            Coefficients to start from.
+        max_steps : int
+            The most steps.
+        covariances : bool, default=True
+            Whether covariances are wanted.
+        rough : bool, default=False
+            Whether cameras need not be those of the lowest minimum.
 
-    def rough_cameras(
-        self, products: FrameSums, variance: NDArray, n_points: float
-    ) -> NDArray:
-        """Return cameras (n_frames, 2, 3) that are close to those of a fit."""
+        Returns
+        -------
+        FramePosterior
+            The minima, for the original shapes.
+        """
+        raise NotImplementedError
+
+    def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
+        """Return the objectives and their derivatives."""
+        raise NotImplementedError
+
+    def moved(self, position: NDArray, step: NDArray) -> NDArray:
+        """Return the positions after steps (n_parameters, n)."""
+        return position + step
+
+    def limited(self, step: NDArray) -> NDArray:
+        """Return steps (n_parameters, n), each shortened to the largest allowed one."""
+        return step
+
+    def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
+        """Return frames with noise variances (n,) that are not zero."""
+        noise = np.maximum(variance, LEAST_NOISE * products.energy)
+        return FrameProblem(products, np.where(noise > 0, noise, 1.0))
+
+    def posterior(
+        self,
+        products: FrameSums,
+        M: NDArray,
+        alpha: NDArray,
+        covariance: NDArray | None,
+        turns: NDArray | None,
+        objective: NDArray,
+        converged: NDArray,
+    ) -> FramePosterior:
+        """Return fits from cameras (2, 3, n), alpha (K, n), covariances (k, k, n)."""
+        motion, n = frames_first(M), M.shape[-1]
+        position = products.positions(motion, alpha.T)
+        spread, turn = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
+        if covariance is not None:
+            spread = frames_first(covariance)
+        if turns is not None:
+            turn = self.space.T @ frames_first(turns) @ self.space
+        motion = motion @ self.space
+        return FramePosterior(
+            motion, position, alpha.T, spread, turn, objective, converged
+        )
+
+    def descend(
+        self,
+        problem: FrameProblem,
+        state: State,
+        max_steps: int,
+        limit: NDArray | None = None,
+    ) -> tuple[NDArray, NDArray]:
+        """
+        Minimise the objectives of frames.
+
+        Parameters
+        ----------
+        problem : FrameProblem
+            The frames.
+        state : State
+            Where the search starts.
+        max_steps : int
+            The most steps.
+        limit : ndarray of shape (n_frames,), optional
+            The search of a frame is given up where the predicted gain is so small that
+            its objective will not fall below its limit.
+
+        Returns
+        -------
+        position : ndarray of shape (..., n_frames)
+            The last iterates.
+        converged : ndarray of bool, shape (n_frames,)
+            Whether they have converged.
+        """
+        n_frames = len(state.value)
+        found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
+        running, damping = np.arange(n_frames), np.zeros(n_frames)
+        limit = np.full(n_frames, np.inf) if limit is None else limit
+        for n_left in range(max_steps, -1, -1):
+            # Next step, and convergence test by the decrease that it predicts.
+            # Convergence is quadratic: the step after it would gain far less.
+            step, damping = self.step(state, damping)
+            gain = np.einsum("pi,pi->i", state.slope, step)
+            small = (damping == 0) & (gain <= 1e-12 * problem.energy)
+            leaving = small | (damping >= LARGEST_DAMPING)
+            leaving |= state.value - 10.0 * gain > limit
+            # Frames that have ended leave the problem, converged ones with a last step.
+            if leaving.any():
+                last = self.moved(state.position, np.where(small, step, 0.0))
+                found[..., running[leaving]] = last[..., leaving]
+                converged[running[leaving]] = small[leaving]
+                if leaving.all():
+                    return found, converged
+                left = in_lanes(np.flatnonzero(~leaving))
+                running, limit, damping = running[left], limit[left], damping[left]
+                step, problem = of_frames(step, left), problem.take(left)
+                state = state.take(left)
+            if not n_left:
+                break
+            # Trial step, refused where the objective rises. Less damping after a good
+            # step, more after a refused one.
+            trial = self.evaluate(problem, self.moved(state.position, step))
+            highest = state.value + OF_STEPS * problem.energy
+            worse = np.flatnonzero(~(trial.value <= highest))
+            eased = np.where(damping > 0.02, 0.1 * damping, 0.0)
+            if len(worse):
+                eased[worse] = raised(damping[worse])
+                for new, old in zip(trial, state, strict=True):
+                    new[..., worse] = old[..., worse]
+            state, damping = trial, eased
+        found[..., running] = state.position
+        return found, converged
+
+    def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
+        """
+        Return damped Newton steps (p, n), and the damping (n,).
+
+        It is raised until the damped matrix is positive definite.
+        """
+        damping = damping.copy()
+        step, positive = state.newton_step(damping)
+        failing = in_lanes(np.flatnonzero(~positive))
+        while len(failing):
+            damping[failing] = raised(damping[failing])
+            part = state.take(failing)
+            step[:, failing], positive = part.newton_step(damping[failing])
+            still = ~positive & (damping[failing] < LARGEST_DAMPING)
+            failing = in_lanes(np.unique(failing[still]))
+        return self.limited(step), damping
+
+
+def raised(damping: NDArray) -> NDArray:
+    """Return more damping (n,)."""
+    return np.maximum(6.0 * damping, 0.2)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.models import FrameFit
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._gauge.canonical import (
     canonical_gauge,
     canonical_space,
@@ -32,21 +32,21 @@ class RigidGauge(NamedTuple):
         Basis shapes.
     order : ndarray of int, shape (n_components,)
         Index of each basis shape in the given basis.
-    frames : FrameFit
+    frames : Decomposition
         The fit.
     """
 
     mean_shape: NDArray
     basis: NDArray
     order: NDArray
-    frames: FrameFit
+    frames: Decomposition
 
 
 def rigid_gauge(
     mean_shape: NDArray,
     basis: NDArray,
     sizes: NDArray,
-    fitted: Callable[[NDArray, NDArray], FrameFit],
+    fitted: Callable[[NDArray, NDArray], Decomposition],
     *,
     camera: str,
     dtype: Any,

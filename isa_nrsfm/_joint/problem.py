@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._frames.posterior import approximate_cameras
+from isa_nrsfm._frames.posterior import fit_frames, frame_search
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
@@ -214,4 +214,5 @@ def _aligned_cameras(
     block: FrameTracks, shapes: NDArray, noise: float, camera: str
 ) -> NDArray:
     """Return nearly optimal cameras (n_frames, 2, 3) for shapes (n_shapes, 3, n)."""
-    return approximate_cameras(block, shapes, noise, camera=camera)
+    search = frame_search(camera, shapes)
+    return fit_frames(block, search, noise, covariances=False, rough=True).motion

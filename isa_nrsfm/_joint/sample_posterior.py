@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
-from isa_nrsfm._frames.models import FrameFit, PosteriorFrames
-from isa_nrsfm._frames.posterior import FramePosterior
+from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import distances, stacked_motion
+from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.options import JOINT_OPTIONS
@@ -116,7 +116,7 @@ def shown_frames(
     n_seen: NDArray,
     frames: PosteriorFrames,
     uncertainty: NDArray,
-) -> tuple[FrameFit, NDArray, float]:
+) -> tuple[Decomposition, NDArray, float]:
     """
     Return fits in the gauge, and how far their noise enters their own coefficients.
 
@@ -139,7 +139,7 @@ def shown_frames(
 
     Returns
     -------
-    shown : FrameFit
+    shown : Decomposition
         Cameras and coefficients in the gauge.
     moments : ndarray of shape (n_components, n_components)
         Sum over the frames of ``alpha_i`` times that shift times s2.

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
+    AffineCameras,
     CameraModel,
-    HeldCameras,
     nearest_calibrated,
 )
 from isa_nrsfm._joint.likely_basis import likely_basis
@@ -335,7 +335,7 @@ def _trial(
     """
     state = _first_state(part, rows[few], motion[few], shapes)
     held_steps = part.options.starts.held_steps
-    result = part.refined(state, HeldCameras(), max_iter=held_steps)
+    result = part.refined(state, AffineCameras(held=True), max_iter=held_steps)
     return _Trial(result.history[-1], result.state, motion)
 
 

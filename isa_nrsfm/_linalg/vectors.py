@@ -116,3 +116,25 @@ def orientations(rows: NDArray) -> NDArray:
     decisive = np.abs(moment) > 1e-9 * np.sum(np.abs(scaled) ** 3, axis=1)
     extreme = scaled[np.arange(len(rows)), np.abs(scaled).argmax(axis=1)]
     return np.where(np.where(decisive, moment, extreme) < 0, -1.0, 1.0)
+
+
+def polar(matrices: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """
+    Return the polar decompositions ``A = P O`` of matrices.
+
+    Parameters
+    ----------
+    matrices : ndarray of shape (..., m, d)
+        Matrices A with ``m <= d``.
+
+    Returns
+    -------
+    rows : ndarray of shape (..., m, d)
+        O, the matrices with orthonormal rows that are nearest to A.
+    values : ndarray of shape (..., m)
+        Singular values of A, the eigenvalues of P.
+    axes : ndarray of shape (..., m, m)
+        Eigenvectors of P, in the columns.
+    """
+    U, values, Vt = np.linalg.svd(matrices, full_matrices=False)
+    return U @ Vt, values, U

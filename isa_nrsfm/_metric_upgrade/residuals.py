@@ -20,7 +20,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, eigh3
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.vectors import frames_last
 
@@ -234,7 +233,8 @@ def _linearised(
     # eigenvectors of E are `axes`, and `seen` is M_i Q in these axes.
     grown = MQ
     if len(strain):
-        stretch, axes = eigh3(strain[:, ROWS, COLUMNS].T @ alpha)
+        values, vectors = np.linalg.eigh(np.tensordot(alpha.T, strain, 1))
+        stretch, axes = values.T, frames_last(vectors)
         seen = np.einsum("abn,pan->pbn", axes, MQ)
         grown = np.einsum("abn,pbn->pan", axes, np.exp(stretch) * seen)
     gram = np.einsum("pan,qan->pqn", grown, MQ)

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,

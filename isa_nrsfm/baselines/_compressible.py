@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
     conformal_equations,
@@ -59,10 +59,10 @@ def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
     """
     products = np.einsum("irc,ird->icd", blocks, cameras).reshape(-1, 9)
     start = np.linalg.eigh(products.T @ products)[1][:, -1]
-    O = polar(start.reshape(3, 3)).rows  # noqa: E741
+    O = polar(start.reshape(3, 3))[0]  # noqa: E741
     for _ in range(100):
         before = O
-        O = polar((products @ O.ravel() @ products).reshape(3, 3)).rows  # noqa: E741
+        O = polar((products @ O.ravel() @ products).reshape(3, 3))[0]  # noqa: E741
         if np.abs(O - before).max() < 1e-12:
             break
     return O
@@ -99,9 +99,9 @@ def chain_atoms(
             G = G @ align_blocks(motion, cameras[users[shared]])
         elif atom != first:
             shape = np.linalg.pinv(G) @ atoms[atom]
-            G = G @ polar(shape @ shapes[first].T).rows
+            G = G @ polar(shape @ shapes[first].T)[0]
         motion = blocks[users, atom] @ G
-        cameras[users[~shared]] = polar(motion[~shared]).rows
+        cameras[users[~shared]] = polar(motion[~shared])[0]
         seen[users] = True
         coefficients[users, atom] = np.einsum("irc,irc->i", motion, cameras[users]) / 2
         shapes[atom] = np.linalg.pinv(G) @ atoms[atom]

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.projection import compose
-from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_SUMS
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._tables.layout import measurement_matrix
 
 # CROSS[a] @ s is the cross product of axis a and s.
@@ -102,7 +102,7 @@ def _descend(
         active = active[~done & (damping[active] < 1e9)]
         if not len(active):
             break
-    return polar(cameras).rows, alpha, cost
+    return polar(cameras)[0], alpha, cost
 
 
 def _cost(

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.polar import polar
 from isa_nrsfm._linalg.rounding import OF_RANKS
+from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormal_cameras,
 )
@@ -29,7 +29,7 @@ def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
     n_left = (len(W) - 3 * rank) * (W.shape[1] - 1 - 3 * rank)
     noise_variance = rest / n_left if n_left > 0 else 0.0
     motion = W @ Vt[:n_columns].T
-    return polar(orthonormal_cameras(motion, noise_variance).cameras).rows
+    return polar(orthonormal_cameras(motion, noise_variance).cameras)[0]
 
 
 def least_norm_shapes(W: NDArray, cameras: NDArray) -> NDArray:
