@@ -258,7 +258,7 @@ class TestLargestLength:
 class TestHeldCameras:
     def test_stay(self):
         M, cameras = random_cameras(), AffineCameras(held=True)
-        assert cameras.n_parameters == 0
+        assert (cameras.name, cameras.n_parameters) == ("held", 0)
         nothing = cameras.gradient(M, np.ones_like(M))
         assert nothing.shape == (0, N)
         assert cameras.tangents(M).shape == (0, 2, 3, N)

@@ -215,7 +215,7 @@ class TestPenalties:
             weighted = root * shapes[1:]
             prior = np.einsum("k,kaj,kbj->ab", self.PRICES, weighted, weighted)
             without = scene.at().motion_curvature[:, i]
-            xx, yy, zz, xy, xz, yz = got[:, i] - without
+            xx, xy, xz, yy, yz, zz = got[:, i] - without
             A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             assert_allclose(A, NOISE * prior, atol=1e-10)
 
@@ -287,7 +287,7 @@ class TestCurvature:
         ):
             weighted = root * shapes
             A = np.einsum("kl,kaj,lbj->ab", E, weighted, weighted)
-            packed = [A[0, 0], A[1, 1], A[2, 2], A[0, 1], A[0, 2], A[1, 2]]
+            packed = A[np.triu_indices(3)]
             assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
 
     @PENALTIES

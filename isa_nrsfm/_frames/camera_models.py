@@ -46,7 +46,7 @@ class AffineCameras:
     Attributes
     ----------
     name : str
-        The value of the parameter `camera`.
+        The value of the parameter `camera`, or held.
     n_parameters : int
         Number of parameters p of a step of one camera; zero for cameras that are held.
     calibrated : bool
@@ -55,11 +55,11 @@ class AffineCameras:
         Whether each camera has a scale of its own.
     """
 
-    name = "affine"
     calibrated = False
     scaled = True
 
     def __init__(self, held: bool = False):
+        self.name = "held" if held else "affine"
         self.n_parameters = 0 if held else 6
 
     def moved(self, M: NDArray, step: NDArray) -> NDArray:

@@ -298,7 +298,7 @@ class FrameSearch:
             trial = self.evaluate(problem, self.moved(state.position, step))
             highest = state.value + OF_STEPS * problem.energy
             worse = np.flatnonzero(~(trial.value <= highest))
-            eased = np.where(damping > 0.02, 0.1 * damping, 0.0)
+            eased = np.where(damping > 0.01, 0.1 * damping, 0.0)
             if len(worse):
                 eased[worse] = raised(damping[worse])
                 for new, old in zip(trial, state, strict=True):
@@ -327,4 +327,4 @@ class FrameSearch:
 
 def raised(damping: NDArray) -> NDArray:
     """Return more damping (n,)."""
-    return np.maximum(6.0 * damping, 0.2)
+    return np.maximum(8.0 * damping, 0.1)
