@@ -33,8 +33,9 @@ if TYPE_CHECKING:
         skeletons as skeletons,
     )
     from isa_nrsfm._estimator import AffineNRSfM
+    from isa_nrsfm._frames.models import Decomposition
     from isa_nrsfm._selection.estimator import AffineNRSfMCV
-    from isa_nrsfm._transformer import Decomposition, SmoothedCoefficients
+    from isa_nrsfm._transformer import SmoothedCoefficients
     from isa_nrsfm.analysis import WithinGroups, association
     from isa_nrsfm.isa import FastISA, PooledFastICA
 else:
@@ -43,7 +44,8 @@ else:
         {
             "isa_nrsfm._estimator": ["AffineNRSfM"],
             "isa_nrsfm._selection.estimator": ["AffineNRSfMCV"],
-            "isa_nrsfm._transformer": ["Decomposition", "SmoothedCoefficients"],
+            "isa_nrsfm._frames.models": ["Decomposition"],
+            "isa_nrsfm._transformer": ["SmoothedCoefficients"],
             "isa_nrsfm.analysis": ["WithinGroups", "association"],
             "isa_nrsfm.isa": ["FastISA", "PooledFastICA"],
         },

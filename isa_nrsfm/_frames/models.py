@@ -114,7 +114,7 @@ class RigidFrames(NamedTuple):
         fit = np.empty((n_frames, 2, 3)), np.empty((n_frames, 2)), np.empty(shape)
         seen = seen_points(tracks)
         complete = np.asarray(seen.all(axis=1))
-        parts = [(complete, self._separately(tracks[complete]))]
+        parts: list[tuple[Any, Any]] = [(complete, self._separately(tracks[complete]))]
         for i in np.flatnonzero(~complete):
             parts.append((i, self._together(tracks[i, seen[i]], seen[i])))
         for frames, part in parts:

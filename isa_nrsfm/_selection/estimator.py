@@ -34,6 +34,7 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._selection.choice import (
     SELECTIONS,
     line,
@@ -44,7 +45,7 @@ from isa_nrsfm._selection.choice import (
 )
 from isa_nrsfm._selection.path import Split, ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._transformer import CoefficientNamesMixin, Decomposition
+from isa_nrsfm._transformer import CoefficientNamesMixin
 
 # Blocks of rows that are held out in turn by default. More cost more, and hardly change
 # the choice: neighbours are alike, and large blocks keep them together.

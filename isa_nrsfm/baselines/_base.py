@@ -19,6 +19,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names, check_size
@@ -33,7 +34,6 @@ from isa_nrsfm._tables.layout import (
     weighting_sizes,
 )
 from isa_nrsfm._tables.sources import checked_range, unmasked
-from isa_nrsfm._transformer import Decomposition
 from isa_nrsfm.baselines._orthographic_frames import fit_orthographic
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
