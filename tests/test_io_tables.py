@@ -75,8 +75,8 @@ def test_unnamed_index_column_is_kept(write):
         ("x0,y0\n", "a header but no rows"),
         ("x0,y0\n1,2\n3\n", "line 3 has 1 values, but the header has 2 names"),
         ("x0,y0\n\n1,2,3\n", "line 3 has 3 values, but the header has 2 names"),
-        ("x0,x0\n1,2\n", "more than one column called 'x0'"),
-        ("x0, x0\n1,2\n", "more than one column called 'x0'"),
+        ("x0,x0\n1,2\n", "more than one column is called 'x0'"),
+        ("x0, x0\n1,2\n", "more than one column is called 'x0'"),
         ("x0;y0\n1;2\n", "separated by semicolons; commas are needed"),
         ("x0\ty0\n1\t2\n", "separated by tabs"),
         ("x0,y0\n1\x002,3\n", "line 2 has a null character"),
@@ -197,7 +197,7 @@ def test_other_input_is_refused(frame):
     with pytest.raises(ValueError, match="no landmark columns"):
         landmark_table(frame[["id"]])
     doubled = pd.concat([frame, frame[["id"]]], axis=1)
-    with pytest.raises(ValueError, match="more than one column called 'id'"):
+    with pytest.raises(ValueError, match="more than one column is called 'id'"):
         landmark_table(doubled)
 
 

@@ -19,7 +19,7 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
     SKELETON_NAMES,
 )
-from isa_nrsfm.io._format_names import FORMAT_NAMES, TABLE
+from isa_nrsfm.io._formats import FORMATS, TABLE
 
 # The number of basis shapes that the table determines.
 AUTO = "auto"
@@ -194,11 +194,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "format": _option(
         "the program that wrote the table: "
-        f"{', '.join(name for name in FORMAT_NAMES if name != TABLE)}, or {TABLE} for "
+        f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for "
         "any table with named columns (default: auto, recognised by the beginning of "
         "the file)",
         "FORMAT",
-        choices=["auto", *FORMAT_NAMES],
+        choices=["auto", *FORMATS],
         default="auto",
     ),
     "columns": _option(

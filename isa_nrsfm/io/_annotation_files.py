@@ -2,18 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
-from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
+from isa_nrsfm.io._landmarks import Landmarks, assemble
 from isa_nrsfm.io._separated_values import first_lines
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _PTS = re.compile(
     r"\s*version\s*:\s*\S+\s+n_points\s*:\s*(?P<n_points>\d+)\s*"
@@ -22,12 +17,8 @@ _PTS = re.compile(
 _N_WFLW = 98
 _WFLW_BOX = ("x_min", "y_min", "x_max", "y_max")
 _WFLW_ATTRIBUTES = (
-    "pose",
-    "expression",
-    "illumination",
-    "make_up",
-    "occlusion",
-    "blur",
+    *("pose", "expression", "illumination"),
+    *("make_up", "occlusion", "blur"),
 )
 # Points and the image, without and with the box and the attributes.
 _WFLW_LENGTHS = (
@@ -52,7 +43,6 @@ def read_pts(path: Path) -> Landmarks:
     images, and folders in it do not count. Coordinates are as they are written; iBUG
     counts pixels from 1.
     """
-    pd = import_optional("pandas", extra="io")
     files = [path]
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if _is_pts_name(file))
@@ -69,11 +59,8 @@ def read_pts(path: Path) -> Landmarks:
                 f"{files[0].name} has {len(tracks[0])} points, {file.name} has "
                 f"{len(tracks[-1])}: all files must have the same number"
             )
-    return _numbered(
-        np.stack(tracks),
-        pd.DataFrame({"file": [as_utf8(file.name) for file in files]}),
-        "pts",
-    )
+    names = {"file": [as_utf8(file.name) for file in files]}
+    return assemble(np.stack(tracks), None, names, format="pts")
 
 
 def is_wflw(path: Path) -> bool:
@@ -97,9 +84,9 @@ def read_wflw(path: Path) -> Landmarks:
     make-up, occlusion, blur) and the name of the image. Lists without box and
     attributes are read, too.
     """
-    pd = import_optional("pandas", extra="io")
-    rows, images = [], []
-    n_fields = None
+    rows: list[NDArray[np.float64]] = []
+    images: list[str] = []
+    n_fields = 0
     with path.open(encoding="utf-8-sig") as file:
         for number, line in enumerate(file, start=1):
             fields = line.split()
@@ -119,15 +106,15 @@ def read_wflw(path: Path) -> Landmarks:
     if not rows:
         raise ValueError("there are no lines in it")
     values = np.stack(rows)
-    frames = pd.DataFrame({"image": images})
+    frames: dict[str, object] = {"image": images}
     points, rest = values[:, : 2 * _N_WFLW], values[:, 2 * _N_WFLW :]
     if n_fields == _WFLW_LENGTHS[1]:
         box, attributes = rest[:, : len(_WFLW_BOX)], rest[:, len(_WFLW_BOX) :]
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")
-        frames[list(_WFLW_BOX)] = box
-        frames[list(_WFLW_ATTRIBUTES)] = attributes.astype(int)
-    return _numbered(points.reshape(-1, _N_WFLW, 2), frames, "wflw")
+        frames |= zip(_WFLW_BOX, box.T, strict=True)
+        frames |= zip(_WFLW_ATTRIBUTES, attributes.T.astype(int), strict=True)
+    return assemble(points.reshape(-1, _N_WFLW, 2), None, frames, format="wflw")
 
 
 def _is_pts_name(file: Path) -> bool:
@@ -163,17 +150,3 @@ def _floats(fields: list[str]) -> NDArray[np.float64]:
         infinite = fields[int(np.isinf(numbers).argmax())]
         raise ValueError(f"a coordinate should be finite; got {infinite!r}")
     return numbers
-
-
-def _numbered(
-    tracks: NDArray[np.float64], frames: "pd.DataFrame", format: str
-) -> Landmarks:
-    """Return landmarks whose points have numbers only."""
-    n_points = tracks.shape[1]
-    return assemble(
-        tracks,
-        [str(j) for j in range(n_points)],
-        frames,
-        format=format,
-        columns=numbered_columns(n_points),
-    )

@@ -3,27 +3,16 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._landmarks import Landmarks, assemble, numbered_columns
+from isa_nrsfm.io._landmarks import Landmarks, assemble
 
-# What is said of an instance, beside its image and its points.
-_OF_INSTANCE = ("id", "score", "iscrowd", "area")
+# Entries of an instance beside its image and its points.
+_OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
 _OF_IMAGE = ("file_name", "width", "height")
-
-
-class _Instances(NamedTuple):
-    """Objects with keypoints (n_instances, n_points, 3), and images without any."""
-
-    entries: list[dict[str, Any]]
-    values: NDArray[np.float64]
-    point_names: tuple[str, ...] | None
-    images: dict[Any, dict[str, Any]]
-    empty_images: list[Any]
 
 
 def is_coco(path: Path) -> bool:
@@ -43,7 +32,6 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
     instance has a row, and each image without any has one without points. Of several
     categories with different keypoints, ``category`` names the one to read.
     """
-    pd = import_optional("pandas", extra="io")
     try:
         with path.open(encoding="utf-8-sig") as file:
             content = json.load(file)
@@ -52,32 +40,12 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
     if isinstance(content, list):
         if category is not None:
             raise ValueError("results of a detector do not name their categories")
-        found = _results(content)
-    else:
-        found = _annotations(content, category)
-    third = found.values[:, :, 2]
-    tracks = found.values[:, :, :2].copy()
-    # Detectors that find no point write zeros, as annotators do.
-    unseen = third == 0 if found.point_names else (found.values == 0).all(axis=2)
-    tracks[unseen] = np.nan
-    n_empty = len(found.empty_images)
-    tracks = np.concatenate([tracks, np.full((n_empty, *tracks.shape[1:]), np.nan)])
-    confidence = None
-    if found.point_names is None:
-        confidence = third
-    n_points = tracks.shape[1]
-    return assemble(
-        tracks,
-        found.point_names or [str(j) for j in range(n_points)],
-        pd.DataFrame(_descriptions(found)),
-        format="coco",
-        columns=None if found.point_names else numbered_columns(n_points),
-        confidence=confidence,
-    )
+        return _results(content)
+    return _annotations(content, category)
 
 
-def _results(entries: list[Any]) -> _Instances:
-    """Return what a list of results holds."""
+def _results(entries: list[Any]) -> Landmarks:
+    """Return the landmarks of a list of results."""
     _refuse_non_objects(entries, "results")
     if not all(isinstance(entry.get("image_id", 0), int | str) for entry in entries):
         raise ValueError("the image_id of a result must be a number or a text")
@@ -87,20 +55,29 @@ def _results(entries: list[Any]) -> _Instances:
             "the results are of more than one category_id: "
             f"{', '.join(sorted(categories))}"
         )
-    return _Instances(entries, _keypoints(entries, "result"), None, {}, [])
+    values = _keypoints(entries, "result")
+    # Detectors that find no point write zeros, as annotators do.
+    tracks = np.where((values == 0).all(axis=2, keepdims=True), np.nan, values)
+    return assemble(
+        tracks[..., :2],
+        None,
+        _columns(entries, {}),
+        format="coco",
+        confidence=values[..., 2],
+    )
 
 
-def _annotations(content: Any, category: str | None) -> _Instances:
-    """Return what an object with annotations holds."""
+def _annotations(content: Any, category: str | None) -> Landmarks:
+    """Return the landmarks of an object with annotations."""
+    lists = ("images", "annotations", "categories")
     if not isinstance(content, dict) or not all(
-        isinstance(content.get(part), list)
-        for part in ("images", "annotations", "categories")
+        isinstance(content.get(part), list) for part in lists
     ):
         raise ValueError(
             "expected an object with the lists images, annotations and categories, or "
             "a list of results"
         )
-    for part in ("images", "annotations", "categories"):
+    for part in lists:
         _refuse_non_objects(content[part], part)
     chosen, point_names = _chosen_categories(content["categories"], category)
     images = {}
@@ -109,23 +86,28 @@ def _annotations(content: Any, category: str | None) -> _Instances:
             raise ValueError("each of the images needs an id")
         images[image["id"]] = image
     entries = []
-    shown = set()
     for entry in content["annotations"]:
-        where = entry.get("image_id")
+        where, of = entry.get("image_id"), entry.get("category_id")
         if not isinstance(where, int | str) or where not in images:
             raise ValueError(
                 f"annotation {entry.get('id')!r} is of image {where!r}, which is not "
                 "among the images"
             )
-        of = entry.get("category_id")
         if isinstance(of, int | str) and of in chosen and "keypoints" in entry:
             entries.append({**entry, "category": chosen[of]})
-            shown.add(where)
     order = {image: i for i, image in enumerate(images)}
     entries.sort(key=lambda entry: order[entry["image_id"]])
     values = _keypoints(entries, "annotation", len(point_names))
-    empty = [image for image in images if image not in shown]
-    return _Instances(entries, values, point_names, images, empty)
+    tracks = np.where(values[..., 2:] == 0, np.nan, values)[..., :2]
+    shown = {entry["image_id"] for entry in entries}
+    empty = [{"image_id": image} for image in images if image not in shown]
+    gaps = np.full((len(empty), *tracks.shape[1:]), np.nan)
+    return assemble(
+        np.concatenate([tracks, gaps]),
+        point_names,
+        _columns([*entries, *empty], images),
+        format="coco",
+    )
 
 
 def _chosen_categories(
@@ -184,24 +166,18 @@ def _keypoints(
     return values.reshape(len(entries), n_points or 0, 3)
 
 
-def _descriptions(found: _Instances) -> dict[str, list[Any]]:
-    """Return what is known of each row: image, instance and its scores."""
-    rows = [
-        *found.entries,
-        *({"image_id": image} for image in found.empty_images),
-    ]
-    of_image = [found.images.get(row.get("image_id"), {}) for row in rows]
+def _columns(
+    rows: list[dict[str, Any]], images: dict[Any, dict[str, Any]]
+) -> dict[str, list[Any]]:
+    """Return the columns of rows: image, instance and its scores."""
+    of_image = [images.get(row.get("image_id"), {}) for row in rows]
     columns = {"image_id": [row.get("image_id") for row in rows]}
-    columns |= {
-        name: [image.get(name) for image in of_image]
-        for name in _OF_IMAGE
-        if any(name in image for image in of_image)
-    }
-    return columns | {
-        "annotation_id" if name == "id" else name: [row.get(name) for row in rows]
-        for name in (*_OF_INSTANCE, "category")
-        if any(name in row for row in found.entries)
-    }
+    for names, sources in ((_OF_IMAGE, of_image), (_OF_INSTANCE, rows)):
+        for name in names:
+            if any(name in source for source in sources):
+                column = "annotation_id" if name == "id" else name
+                columns[column] = [source.get(name) for source in sources]
+    return columns
 
 
 def _refuse_non_objects(entries: list[Any], what: str) -> None:

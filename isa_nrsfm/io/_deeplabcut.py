@@ -7,14 +7,8 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
-from isa_nrsfm.io._landmarks import (
-    Landmarks,
-    assemble,
-    each_individual,
-    name_individuals,
-)
+from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
 from isa_nrsfm.io._separated_values import header_rows, read_columns
 from isa_nrsfm.io._stored_frames import StoredFrame, read_stored_frame
 
@@ -44,30 +38,27 @@ def read_deeplabcut(path: Path) -> Landmarks:
     image. The individual "single", to which DeepLabCut gives points that belong to no
     animal, is left out with a warning where there are others.
     """
-    pd = import_optional("pandas", extra="io")
     table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
     scorers = {column[0] for column in table.columns}
     if len(scorers) > 1:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
     places = _places(table.columns)
-    bodyparts = _common_bodyparts(places)
-    individuals = list(places)
-    where = np.array([[places[i][b] for b in bodyparts] for i in individuals])
+    individuals, bodyparts = _common_bodyparts(places)
+    where = np.array([[places[i, b] for b in bodyparts] for i in individuals])
     # A column of NaN stands for likelihoods that are not there.
     values = np.column_stack([table.values, np.full(len(table.values), np.nan)])
     found = values[:, where]
-    confidence = found[..., 2] if (where[..., 2] >= 0).any() else None
-    rows = each_individual(found[..., :2], confidence)
-    frames = _index_columns(table.labels)
-    frames = {name: [column[i] for i in rows.frame] for name, column in frames.items()}
-    if len(table.columns[0]) == len(_LEVELS_OF_MANY):
-        frames["individual"] = name_individuals(rows.individual, individuals)
-    return assemble(
-        rows.tracks,
+    try:
+        frames: dict[str, list[Any]] = {"frame": [int(label) for label in table.labels]}
+    except (TypeError, ValueError):
+        frames = {"image": [str(label) for label in table.labels]}
+    return assemble_individuals(
+        found[..., :2],
+        individuals if len(table.columns[0]) == len(_LEVELS_OF_MANY) else None,
         bodyparts,
-        pd.DataFrame(frames),
+        frames,
         format="deeplabcut",
-        confidence=rows.confidence,
+        confidence=found[..., 2] if (where[..., 2] >= 0).any() else None,
     )
 
 
@@ -127,15 +118,15 @@ def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
 
 def _places(
     columns: Sequence[tuple[str, ...]],
-) -> dict[str, dict[str, tuple[int, int, int]]]:
-    """Return the numbers of the x, y and likelihood columns of each point.
+) -> dict[tuple[str, str], tuple[int, int, int]]:
+    """Return the places of x, y and likelihood by individual and bodypart.
 
-    The number is -1 where there is no likelihood.
+    The place is -1 if there is no likelihood.
     """
-    numbers: dict[str, dict[str, dict[str, int]]] = {}
+    places: dict[tuple[str, str], dict[str, int]] = {}
     for number, column in enumerate(columns):
         *individual, bodypart, coord = column[1:]
-        of_point = numbers.setdefault("".join(individual), {}).setdefault(bodypart, {})
+        of_point = places.setdefault(("".join(individual), bodypart), {})
         if coord == "z":
             raise ValueError(
                 f"{bodypart!r} has a z: these are points in space, not in an image"
@@ -143,44 +134,34 @@ def _places(
         if coord in of_point:
             raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
         of_point[coord] = number
-    if not numbers:
+    if not places:
         raise ValueError("it has no columns x and y")
-    found: dict[str, dict[str, tuple[int, int, int]]] = {}
-    for name, points in numbers.items():
-        found[name] = {}
-        for bodypart, of_point in points.items():
-            if not {"x", "y"}.issubset(of_point):
-                raise ValueError(f"{bodypart!r} has no x or no y")
-            found[name][bodypart] = (
-                of_point["x"],
-                of_point["y"],
-                of_point.get("likelihood", -1),
-            )
-    return found
+    for (_, bodypart), of_point in places.items():
+        if not {"x", "y"}.issubset(of_point):
+            raise ValueError(f"{bodypart!r} has no x or no y")
+    return {
+        point: (of_point["x"], of_point["y"], of_point.get("likelihood", -1))
+        for point, of_point in places.items()
+    }
 
 
-def _common_bodyparts(places: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the bodyparts that all individuals have; leave unique ones out."""
-    if len(places) > 1 and _UNIQUE in places:
-        others = next(points for name, points in places.items() if name != _UNIQUE)
-        if set(places[_UNIQUE]) != set(others):
-            warn_caller(
-                f"the points {', '.join(places[_UNIQUE])} belong to no animal "
-                f"(individual {_UNIQUE!r}) and are left out",
-            )
-            del places[_UNIQUE]
-    first, points = next(iter(places.items()))
-    for name, other in places.items():
-        if set(other) != set(points):
+def _common_bodyparts(
+    places: dict[tuple[str, str], tuple[int, int, int]],
+) -> tuple[list[str], list[str]]:
+    """Return the individuals and the bodyparts that all have; leave unique ones out."""
+    parts: dict[str, list[str]] = {}
+    for individual, bodypart in places:
+        parts.setdefault(individual, []).append(bodypart)
+    others = [name for name in parts if name != _UNIQUE]
+    if others and _UNIQUE in parts and set(parts[_UNIQUE]) != set(parts[others[0]]):
+        warn_caller(
+            f"the points {', '.join(parts.pop(_UNIQUE))} belong to no animal "
+            f"(individual {_UNIQUE!r}) and are left out",
+        )
+    first, *rest = parts
+    for name in rest:
+        if set(parts[name]) != set(parts[first]):
             raise ValueError(
                 f"the individuals {first!r} and {name!r} have different bodyparts"
             )
-    return list(points)
-
-
-def _index_columns(index: list[Any]) -> dict[str, list[Any]]:
-    """Name the index: numbers of frames, or paths of images."""
-    try:
-        return {"frame": [int(label) for label in index]}
-    except (TypeError, ValueError):
-        return {"image": [str(label) for label in index]}
+    return list(parts), parts[first]

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,25 +19,21 @@ from isa_nrsfm.io._separated_values import header_names, read_columns
 if TYPE_CHECKING:
     import pandas as pd
 
-# Points of MediaPipe's face mesh, without and with those of the irises.
-_MESH_SIZES = (468, 478)
-# OpenFace names what lies in space, in millimetres, by capital letters.
+# OpenFace names points in space, in millimetres, by capital letters.
 _OPENFACE_NOT_READ = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")
-_OPENFACE_GROUPS = ("x_0", "pose_Rx", "gaze_0_x", "AU01_r")
-# The vector that tells faces apart, and the mesh beside the 68 points.
+# The vector that identifies faces, and the mesh beside the 68 points.
 _PYFEAT_NOT_READ = re.compile(r"Identity_\d+|mesh_[xyz]_\d+|z_\d+")
 _PYFEAT_BOX = ("FaceRectX", "FaceRectY", "FaceRectWidth", "FaceRectHeight")
-_IMAGE_SIZE_COLUMNS = ("image_width", "image_height")
-# Pixels of a face reach beyond this, and shares of the image's size do not.
-_LARGEST_SHARE = 2.0
 
 
 def is_openface(path: Path) -> bool:
-    """Tell whether the header is one of OpenFace."""
-    names = _stripped_header(path)
+    """Return whether the header is one of OpenFace."""
+    names = header_names(path)
     of_video = {"frame", "timestamp", "confidence", "success"}.issubset(names)
-    of_images = names[:2] == ["face", "confidence"]
-    return (of_video or of_images) and not set(_OPENFACE_GROUPS).isdisjoint(names)
+    groups = {"x_0", "pose_Rx", "gaze_0_x", "AU01_r"}
+    return (of_video or names[:2] == ["face", "confidence"]) and not (
+        groups.isdisjoint(names)
+    )
 
 
 def read_openface(path: Path) -> Landmarks:
@@ -48,43 +44,32 @@ def read_openface(path: Path) -> Landmarks:
     confidence, success`` (``face, confidence`` for images) and, as far as they were
     asked for, gaze, eyes, pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has
     no ``face_id``, and blanks before the names. Rows in which ``success`` is 0 hold
-    numbers, too, but not of a face.
+    numbers that are not of a face.
     """
-    names = _stripped_header(path)
+    names = header_names(path)
     if "x_0" not in names:
         raise ValueError(
             "it has no 2D landmarks x_0, ..., y_0, ...: run OpenFace with -2Dfp"
         )
-    of_image = names[:1] == ["face"]
-    scores = ["confidence"] if of_image else ["confidence", "success"]
+    of_video = names[:1] != ["face"]
+    scores = ["confidence", "success"] if of_video else ["confidence"]
     _need(names, scores)
     found = find_landmark_columns(names, "x_#,y_#")
     table = read_columns(
-        path,
-        leave_out=_OPENFACE_NOT_READ,
-        numbers=[*found.interleaved, *scores],
+        path, leave_out=_OPENFACE_NOT_READ, numbers=[*found.interleaved, *scores]
     )
     failed = None
-    if not of_image:
-        success = table["success"].to_numpy()
-        if not np.isin(success, (0, 1)).all():
+    if of_video:
+        if not table["success"].isin((0, 1)).all():
             raise ValueError("the column success must hold 0 and 1 only")
-        failed = success == 0
         table["success"] = table["success"].astype(int)
-    return _with_other_columns(
-        _tracks(table, found),
-        table,
-        found,
-        format="openface",
-        confidence=_of_all_points(table["confidence"], found),
-        failed=failed,
-    )
+        failed = table["success"].to_numpy() == 0
+    return _assembled(table, found, "openface", score="confidence", failed=failed)
 
 
 def is_pyfeat(path: Path) -> bool:
-    """Tell whether the header is one of py-feat."""
-    names = _stripped_header(path)
-    return set(_PYFEAT_BOX).issubset(names) and "x_0" in names
+    """Return whether the header is one of py-feat."""
+    return {*_PYFEAT_BOX, "x_0"}.issubset(header_names(path))
 
 
 def read_pyfeat(path: Path) -> Landmarks:
@@ -95,37 +80,31 @@ def read_pyfeat(path: Path) -> Landmarks:
     mesh of 478 points beside them; ``MPDetector`` writes 478 points ``x_0, y_0, z_0,
     x_1, ...``. ``FaceScore`` is the confidence of the face detector.
     """
-    names = _stripped_header(path)
+    names = header_names(path)
     _need(names, _PYFEAT_BOX)
     found = find_landmark_columns(names, "x_#,y_#")
-    scored = ["FaceScore"] if "FaceScore" in names else []
+    score = "FaceScore" if "FaceScore" in names else None
     table = read_columns(
         path,
         leave_out=_PYFEAT_NOT_READ,
-        numbers=[*found.interleaved, *scored],
+        numbers=[*found.interleaved, *([score] if score else [])],
         text=("input",),
     )
-    return _with_other_columns(
-        _tracks(table, found),
-        table,
-        found,
-        format="pyfeat",
-        confidence=_of_all_points(table["FaceScore"], found) if scored else None,
-    )
+    return _assembled(table, found, "pyfeat", score=score)
 
 
-def is_mesh_table(path: Path) -> bool:
-    """Tell whether the header has as many points as MediaPipe's face mesh."""
-    names = _stripped_header(path)
-    sizes = [size for size in landmark_sets(names).values() if size in _MESH_SIZES]
-    return len(sizes) > 0 and not is_pyfeat(path)
+def is_mediapipe(path: Path) -> bool:
+    """Return whether the header has as many points as MediaPipe's face mesh."""
+    # Without and with the points of the irises
+    sizes = {468, 478}.intersection(landmark_sets(header_names(path)).values())
+    return bool(sizes) and not is_pyfeat(path)
 
 
-def read_mesh_table(
+def read_mediapipe(
     path: Path, image_size: tuple[float, float] | None = None
 ) -> Landmarks:
     """
-    Read a csv file with the points that MediaPipe finds.
+    Read a csv file with the points of MediaPipe.
 
     MediaPipe divides x by the width of the image and y by its height. Coordinates of
     this kind are multiplied with ``image_size`` (width, height), or else with the
@@ -134,9 +113,9 @@ def read_mesh_table(
     """
     if image_size is not None:
         image_size = _checked_size(image_size)
-    names = _stripped_header(path)
+    names = header_names(path)
     found = find_landmark_columns(names)
-    sizes = [name for name in _IMAGE_SIZE_COLUMNS if name in names]
+    sizes = [name for name in ("image_width", "image_height") if name in names]
     landmarks = {*found.interleaved, *found.z, *sizes}
     table = read_columns(
         path,
@@ -144,11 +123,11 @@ def read_mesh_table(
         numbers=[*found.interleaved, *sizes],
         text=[name for name in names if name not in landmarks],
     )
-    tracks = _tracks(table, found)
-    of_table = len(sizes) == 2
+    tracks = points_of(table, found.interleaved)
     known = np.abs(tracks[~np.isnan(tracks)])
-    if known.size and np.median(known) <= _LARGEST_SHARE:
-        if image_size is None and not of_table:
+    # Pixels of a face reach beyond this, and shares of the image's size do not.
+    if known.size and np.median(known) <= 2.0:
+        if image_size is None and len(sizes) < 2:
             raise ValueError(
                 "its coordinates are shares of the image's width and height: give "
                 "image_size=(width, height) in pixels (command line: --image-size "
@@ -157,7 +136,7 @@ def read_mesh_table(
         scale = (
             table[sizes].to_numpy(float) if image_size is None else np.array(image_size)
         )
-        with np.errstate(over="ignore"):  # what is infinite is refused below
+        with np.errstate(over="ignore"):  # `assemble` refuses infinite numbers
             tracks = tracks * scale.reshape(-1, 1, 2)
     elif image_size is not None:
         raise ValueError(
@@ -166,7 +145,37 @@ def read_mesh_table(
             if known.size
             else "image_size is given, but there are no points"
         )
-    return _with_other_columns(tracks, table, found, format="mediapipe")
+    return _assembled(table, found, "mediapipe", tracks=tracks)
+
+
+def points_of(table: "pd.DataFrame", columns: list[str]) -> NDArray[np.float64]:
+    """Return the points (n_frames, n_points, 2) of columns x0, y0, x1, y1, ...."""
+    return table[columns].to_numpy(dtype=np.float64).reshape(len(table), -1, 2)
+
+
+def _assembled(
+    table: "pd.DataFrame",
+    found: LandmarkColumns,
+    format: str,
+    *,
+    tracks: NDArray[np.float64] | None = None,
+    score: str | None = None,
+    failed: NDArray[np.bool_] | None = None,
+) -> Landmarks:
+    """Return points under the names of their columns, with the score of their frame."""
+    confidence = None
+    if score is not None:
+        of_frames = table[score].to_numpy(dtype=np.float64)
+        confidence = np.tile(of_frames[:, None], (1, len(found.points)))
+    return assemble(
+        points_of(table, found.interleaved) if tracks is None else tracks,
+        found.points,
+        table.drop(columns=found.interleaved),
+        format=format,
+        columns=found.interleaved,
+        confidence=confidence,
+        failed=failed,
+    )
 
 
 def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
@@ -184,43 +193,7 @@ def _checked_size(image_size: tuple[float, float]) -> tuple[float, float]:
 
 
 def _need(names: list[str], needed: Iterable[str]) -> None:
-    """Raise if one of the columns that are needed is not there."""
+    """Raise if a column is missing."""
     absent = [name for name in needed if name not in names]
     if absent:
         raise ValueError(f"it has no column {', '.join(absent)}")
-
-
-def _stripped_header(path: Path) -> list[str]:
-    """Return the names of the columns without blanks around them."""
-    return [name.strip() for name in header_names(path)]
-
-
-def _tracks(table: "pd.DataFrame", found: LandmarkColumns) -> NDArray[np.float64]:
-    """Return the points (n_frames, n_points, 2) of a table."""
-    return (
-        table[found.interleaved].to_numpy(dtype=np.float64).reshape(len(table), -1, 2)
-    )
-
-
-def _with_other_columns(
-    tracks: NDArray[np.float64],
-    table: "pd.DataFrame",
-    found: LandmarkColumns,
-    **known: Any,
-) -> Landmarks:
-    """Return points under the names of their columns, and the columns beside them."""
-    return assemble(
-        tracks,
-        found.points,
-        table.drop(columns=found.interleaved),
-        columns=found.interleaved,
-        **known,
-    )
-
-
-def _of_all_points(
-    of_frames: "pd.Series", found: LandmarkColumns
-) -> NDArray[np.float64]:
-    """Give each point the confidence of its frame."""
-    shape = len(of_frames), len(found.points)
-    return np.broadcast_to(of_frames.to_numpy(dtype=np.float64)[:, None], shape)

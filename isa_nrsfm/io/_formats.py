@@ -1,32 +1,25 @@
-"""The formats of landmark files, and reading them."""
+"""The formats of landmark files, and reading them.
+
+This module imports no reader before a file is read: the command line has the names of
+the formats in its help, which must not wait.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._tables.column_names import point_names
-from isa_nrsfm.io._annotation_files import is_pts, is_wflw, read_pts, read_wflw
-from isa_nrsfm.io._coco import is_coco, read_coco
-from isa_nrsfm.io._deeplabcut import is_deeplabcut, read_deeplabcut
-from isa_nrsfm.io._face_tables import (
-    is_mesh_table,
-    is_openface,
-    is_pyfeat,
-    read_mesh_table,
-    read_openface,
-    read_pyfeat,
-)
-from isa_nrsfm.io._format_names import TABLE
-from isa_nrsfm.io._landmarks import Landmarks, assemble, drop_unsure_points
-from isa_nrsfm.io._sleap import is_sleap, read_sleap
-from isa_nrsfm.io._tables import TABLE_SUFFIXES, landmark_table, parse_table
 
 if TYPE_CHECKING:
     import os
 
+    from isa_nrsfm.io._landmarks import Landmarks
+
+# A table with named columns, which any program may have written.
+TABLE = "table"
 # Stands for a folder where others have the suffix of a file.
 _FOLDER = "/"
 
@@ -46,11 +39,10 @@ class LandmarkFormat:
         What such a file must have.
     suffixes : tuple of str
         Suffixes of its files in lower case; "/" for a folder of files.
-    recognise : callable
-        Tells from the beginning of a file whether it is of the format.
-    parse : callable
-        Reads a file and returns its `Landmarks`, or raises a ValueError that says what
-        is wrong. What libraries raise for damaged content, `read` turns into one.
+    reader : str
+        Module and name of its two functions, such as ``_coco.coco``. ``is_coco`` takes
+        the path and returns whether the file begins like this format. ``read_coco``
+        returns its `Landmarks`, or raises a ValueError without the path.
     options : tuple of str
         Names of the options that `read` takes.
     """
@@ -59,8 +51,7 @@ class LandmarkFormat:
     title: str
     expected: str
     suffixes: tuple[str, ...]
-    recognise: Callable[[Path], bool] = field(repr=False)
-    parse: Callable[..., Landmarks] = field(repr=False)
+    reader: str = field(repr=False)
     options: tuple[str, ...] = ()
 
     def matches(self, path: "str | os.PathLike[str]") -> bool:
@@ -85,9 +76,15 @@ class LandmarkFormat:
             If the file cannot be opened.
         """
         path = Path(path)
-        return _suffix(path) in self.suffixes and self.recognise(path)
+        return _suffix(path) in self.suffixes and self._function("is")(path)
 
-    def read(self, path: "str | os.PathLike[str]", **options: Any) -> Landmarks:
+    def _function(self, kind: str) -> Callable[..., Any]:
+        """Return the function of the reader that begins with "is" or "read"."""
+        module, _, name = self.reader.partition(".")
+        found = getattr(import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}")
+        return found  # type: ignore[no-any-return]
+
+    def read(self, path: "str | os.PathLike[str]", **options: Any) -> "Landmarks":
         """
         Read a file of this format.
 
@@ -125,7 +122,8 @@ class LandmarkFormat:
                 f"{self.expected}, in {_listed(self.suffixes)}"
             )
         with reading(path, f"{self.name} ({self.title})", self.expected):
-            return self.parse(path, **options)
+            found: Landmarks = self._function("read")(path, **options)
+            return found
 
 
 def read_landmarks(
@@ -134,7 +132,7 @@ def read_landmarks(
     *,
     min_confidence: float | None = None,
     **options: Any,
-) -> Landmarks:
+) -> "Landmarks":
     r"""
     Read landmarks from a file of one of several formats.
 
@@ -205,7 +203,7 @@ def read_landmarks(
     if min_confidence is None:
         return landmarks
     try:
-        return drop_unsure_points(landmarks, min_confidence)
+        return landmarks.without_unsure_points(min_confidence)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -256,20 +254,6 @@ def find_format(path: "str | os.PathLike[str]") -> str:
     )
 
 
-def _read_named_columns(
-    path: Path, columns: str | None = None, missing: Any = None
-) -> Landmarks:
-    """Read a table whose landmark columns are recognised by their names."""
-    points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
-    return assemble(
-        points.to_numpy().reshape(len(points), -1, 2),
-        point_names(points.columns[::2]),
-        other,
-        format=TABLE,
-        columns=list(points.columns),
-    )
-
-
 def _suffix(path: Path) -> str:
     """Return the suffix of a file in lower case, or what stands for a folder."""
     return _FOLDER if path.is_dir() else path.suffix.lower()
@@ -295,8 +279,7 @@ _ALL = (
         "the columns frame, timestamp, confidence, success (face, confidence for an "
         "image), x_0, ... and y_0, ...",
         (".csv",),
-        is_openface,
-        read_openface,
+        "_face_tables.openface",
     ),
     LandmarkFormat(
         "pyfeat",
@@ -304,16 +287,14 @@ _ALL = (
         "the columns FaceRectX, FaceRectY, FaceRectWidth, FaceRectHeight, x_0, ... and "
         "y_0, ...",
         (".csv",),
-        is_pyfeat,
-        read_pyfeat,
+        "_face_tables.pyfeat",
     ),
     LandmarkFormat(
         "mediapipe",
         "MediaPipe",
         "named columns x and y of each point (468 or 478, where it is recognised)",
         (".csv",),
-        is_mesh_table,
-        read_mesh_table,
+        "_face_tables.mediapipe",
         ("image_size",),
     ),
     LandmarkFormat(
@@ -321,24 +302,21 @@ _ALL = (
         "iBUG, 300-W",
         "'version: 1', 'n_points: N' and N lines 'x y' between braces",
         (".pts", _FOLDER),
-        is_pts,
-        read_pts,
+        "_annotation_files.pts",
     ),
     LandmarkFormat(
         "wflw",
         "WFLW lists",
         "lines of 196 coordinates, 4 of a box, 6 attributes and the image",
         (".txt",),
-        is_wflw,
-        read_wflw,
+        "_annotation_files.wflw",
     ),
     LandmarkFormat(
         "deeplabcut",
         "DeepLabCut, Lightning Pose",
         "columns of the levels scorer, (individuals,) bodyparts, coords",
         (".csv", ".h5", ".hdf5"),
-        is_deeplabcut,
-        read_deeplabcut,
+        "_deeplabcut.deeplabcut",
     ),
     LandmarkFormat(
         "sleap",
@@ -346,25 +324,22 @@ _ALL = (
         "the datasets tracks, node_names and track_names, or the columns track, "
         "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
         (".h5", ".hdf5", ".csv"),
-        is_sleap,
-        read_sleap,
+        "_sleap.sleap",
     ),
     LandmarkFormat(
         "coco",
         "COCO keypoints",
         "images, annotations and categories with keypoints, or a list of results",
         (".json",),
-        is_coco,
-        read_coco,
+        "_coco.coco",
         ("category",),
     ),
     LandmarkFormat(
         TABLE,
         "a table with named columns",
         "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
-        TABLE_SUFFIXES,
-        lambda path: True,
-        _read_named_columns,
+        (".csv", ".tsv", ".parquet"),
+        "_tables.named_columns",
         ("columns", "missing"),
     ),
 )

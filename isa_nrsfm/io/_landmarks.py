@@ -3,8 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,25 +55,42 @@ class Landmarks:
     point_names: tuple[str, ...]
     skeleton: Skeleton | None = None
 
+    def without_unsure_points(self, min_confidence: float) -> "Landmarks":
+        """
+        Return the landmarks with points of low confidence as NaN.
 
-class IndividualRows(NamedTuple):
-    """
-    Points of several individuals, a row each.
+        Parameters
+        ----------
+        min_confidence : float
+            Points with a lower confidence become NaN. Those without one are kept.
 
-    ``frame`` and ``individual`` are the numbers of both; the latter is -1 in the row of
-    a frame in which nobody is seen.
-    """
+        Returns
+        -------
+        Landmarks
+            The same, with fewer points. `failed` stays as it is.
 
-    tracks: NDArray[np.float64]
-    confidence: NDArray[np.float64] | None
-    frame: NDArray[np.intp]
-    individual: NDArray[np.intp]
+        Raises
+        ------
+        ValueError
+            If there are no confidences, or the threshold is not a finite number.
+        """
+        if isinstance(min_confidence, bool | str) or not math.isfinite(min_confidence):
+            raise ValueError(
+                f"min_confidence must be a finite number; got {min_confidence!r}"
+            )
+        if self.confidence is None:
+            raise ValueError(
+                f"min_confidence is given, but these landmarks ({self.format}) have "
+                "no confidences"
+            )
+        unsure = np.repeat(self.confidence.to_numpy() < min_confidence, 2, axis=1)
+        return replace(self, points=self.points.mask(unsure))
 
 
 def assemble(
     tracks: NDArray[np.float64],
-    point_names: Sequence[str],
-    frames: "pd.DataFrame",
+    point_names: Sequence[str] | None,
+    frames: "pd.DataFrame | dict[str, Any]",
     *,
     format: str,
     columns: Sequence[str] | None = None,
@@ -89,10 +105,10 @@ def assemble(
     ----------
     tracks : ndarray of shape (n_frames, n_points, 2)
         The points, NaN where missing.
-    point_names : sequence of str, length n_points
-        Names of the points.
-    frames : DataFrame of shape (n_frames, n_other)
-        What is known of each frame. Its index is replaced.
+    point_names : sequence of str, length n_points, or None
+        Names of the points. None for numbers from 0, with columns ``x_0, y_0``, ....
+    frames : DataFrame of shape (n_frames, n_other), or dict of columns
+        Further columns of each frame. An index is replaced.
     format : str
         Name of the format.
     columns : sequence of str, length 2 * n_points, optional
@@ -100,15 +116,15 @@ def assemble(
     confidence : ndarray of shape (n_frames, n_points), optional
         Confidences of the points.
     failed : ndarray of bool, shape (n_frames,), optional
-        Frames for which the source says that tracking failed.
+        Frames in which tracking failed. Frames without points are added.
     skeleton : Skeleton, optional
-        What joins the points. By default the layout that the format and the names of
-        the points tell, if they tell one.
+        Edges between the points. By default those of the layout that the format or
+        the names of the points determine.
 
     Returns
     -------
     Landmarks
-        The landmarks. Failed frames are those of ``failed`` and those without points.
+        The landmarks.
 
     Raises
     ------
@@ -119,7 +135,10 @@ def assemble(
     n_frames, n_points, _ = tracks.shape
     if n_frames == 0:
         raise ValueError("there are no frames in it")
-    if columns is None:
+    if point_names is None:
+        point_names = [str(j) for j in range(n_points)]
+        columns = [f"{axis}_{j}" for j in point_names for axis in "xy"]
+    elif columns is None:
         columns = [f"{name}_{axis}" for name in point_names for axis in "xy"]
     lost = np.asarray(np.isnan(tracks).all(axis=(1, 2)))
     if failed is not None:
@@ -131,10 +150,10 @@ def assemble(
         raise ValueError(
             f"{columns[2 * point + axis]} is infinite in row {frame} (counted from 0)"
         )
-    names = [*map(str, frames.columns), *columns]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"two columns are called {twice!r}")
+    frames = pd.DataFrame(frames)
+    refuse_same_names([*map(str, frames.columns), *columns])
+    if skeleton is None and (format in LAYOUTS_OF_READERS or not numbered(point_names)):
+        skeleton = find_skeleton(n_points, point_names, format)
     return Landmarks(
         points=pd.DataFrame(
             tracks.reshape(n_frames, 2 * n_points), columns=list(columns)
@@ -147,96 +166,77 @@ def assemble(
         failed=lost,
         format=format,
         point_names=tuple(point_names),
-        skeleton=skeleton or _told(format, point_names),
+        skeleton=skeleton,
     )
 
 
-def _told(format: str, point_names: Sequence[str]) -> Skeleton | None:
-    """Return the layout of a format or of names; mere numbers of points tell none."""
-    if format not in LAYOUTS_OF_READERS and numbered(point_names):
-        return None
-    return find_skeleton(len(point_names), point_names, format)
-
-
-def numbered_columns(n_points: int) -> list[str]:
-    """Name the columns of points that have numbers only, counted from 0."""
-    return list(chain.from_iterable((f"x_{j}", f"y_{j}") for j in range(n_points)))
-
-
-def each_individual(
-    tracks: NDArray[np.float64], confidence: NDArray[np.float64] | None
-) -> IndividualRows:
+def assemble_individuals(
+    tracks: NDArray[np.float64],
+    names: Sequence[Any] | None,
+    point_names: Sequence[str],
+    frames: dict[str, Sequence[Any]],
+    *,
+    confidence: NDArray[np.float64] | None = None,
+    of_instances: dict[str, NDArray[np.float64]] | None = None,
+    **known: Any,
+) -> Landmarks:
     """
     Give each individual that a frame shows a row of its own.
+
+    A single individual has a row in every frame. Of several, those without a visible
+    point have none. A frame in which nobody is seen has one row without points.
 
     Parameters
     ----------
     tracks : ndarray of shape (n_frames, n_individuals, n_points, 2)
         The points, NaN where missing.
-    confidence : ndarray of shape (n_frames, n_individuals, n_points) or None
-        Their confidences.
-
-    Returns
-    -------
-    IndividualRows
-        The rows by frames, in a frame by individuals. A single individual has a row in
-        every frame. Of several, those of which the frame shows no point have none; a
-        frame in which nobody is seen has one row without points.
-    """
-    if tracks.shape[1] == 0:
-        raise ValueError("expected points of one individual or more; got none")
-    shown = np.asarray(~np.isnan(tracks).all(axis=(2, 3)))
-    if shown.shape[1] == 1:
-        rows = np.ones_like(shown)
-    else:
-        rows = shown.copy()
-        rows[~shown.any(axis=1), 0] = True
-    frame, individual = np.nonzero(rows)
-    absent = ~shown[frame, individual] & (shown.shape[1] > 1)
-    return IndividualRows(
-        tracks=tracks[frame, individual],
-        confidence=None if confidence is None else confidence[frame, individual],
-        frame=frame,
-        individual=np.where(absent, -1, individual),
-    )
-
-
-def name_individuals(individual: NDArray[np.intp], names: Sequence[Any]) -> list[Any]:
-    """Return the name of each row's individual, None where there is none."""
-    return [None if i < 0 else names[i] for i in individual]
-
-
-def drop_unsure_points(landmarks: Landmarks, min_confidence: float) -> Landmarks:
-    """
-    Make points NaN that the source is not sure of.
-
-    Parameters
-    ----------
-    landmarks : Landmarks
-        The landmarks.
-    min_confidence : float
-        Points with a lower confidence become NaN. Those without one are kept.
+    names : sequence or None
+        Names of the individuals. None for a table without the column ``individual``.
+    point_names : sequence of str, length n_points
+        Names of the points.
+    frames : dict of sequence, length n_frames
+        Columns that describe frames.
+    confidence : ndarray of shape (n_frames, n_individuals, n_points), optional
+        Confidences of the points.
+    of_instances : dict of ndarray of shape (n_frames, n_individuals), optional
+        Columns that describe individuals in frames.
+    **known : object
+        Parameters of `assemble`.
 
     Returns
     -------
     Landmarks
-        The same, with fewer points. `failed` stays as it is.
-
-    Raises
-    ------
-    ValueError
-        If the landmarks have no confidences, or the threshold is not a finite number.
+        The rows by frames, in a frame by individuals.
     """
-    if isinstance(min_confidence, bool | str) or not math.isfinite(min_confidence):
-        raise ValueError(
-            f"min_confidence must be a finite number; got {min_confidence!r}"
-        )
-    if landmarks.confidence is None:
-        raise ValueError(
-            f"min_confidence is given, but these landmarks ({landmarks.format}) have "
-            "no confidences"
-        )
-    unsure = landmarks.confidence.to_numpy() < min_confidence
-    return replace(
-        landmarks, points=landmarks.points.mask(np.repeat(unsure, 2, axis=1))
+    if tracks.shape[1] == 0:
+        raise ValueError("expected points of one individual or more; got none")
+    shown = np.asarray(~np.isnan(tracks).all(axis=(2, 3)))
+    several = shown.shape[1] > 1
+    rows = shown.copy() if several else np.ones_like(shown)
+    rows[~shown.any(axis=1), 0] = True
+    frame, individual = np.nonzero(rows)
+    nobody = several & ~shown[frame, individual]
+    columns = {name: [values[i] for i in frame] for name, values in frames.items()}
+    if names is not None:
+        columns["individual"] = [
+            None if absent else names[i]
+            for i, absent in zip(individual, nobody, strict=True)
+        ]
+    for name, of_each in (of_instances or {}).items():
+        columns[name] = np.where(nobody, np.nan, of_each[frame, individual])
+    return assemble(
+        tracks[frame, individual],
+        point_names,
+        columns,
+        confidence=None if confidence is None else confidence[frame, individual],
+        **known,
     )
+
+
+def refuse_same_names(names: Sequence[str]) -> None:
+    """Raise if two columns have the same name."""
+    seen: set[str] = set()
+    for name in map(str.strip, names):
+        if name and name in seen:
+            raise ValueError(f"more than one column is called {name!r}")
+        seen.add(name)

@@ -7,13 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.io._landmarks import (
-    Landmarks,
-    assemble,
-    each_individual,
-    name_individuals,
-    numbered_columns,
-)
+from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
 
 _MEDIAPIPE_PARTS = ("face_landmarks", "hand_landmarks", "pose_landmarks")
 # movement named the axes keypoints and individuals in its earlier versions.
@@ -70,47 +64,38 @@ def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
     if len(parts) > 1:
         raise ValueError(f"the results are of more than one kind: {sorted(parts)}")
     sizes = _image_sizes(image_sizes, len(results))
-    tracks, visibility, frame, individual = [], [], [], []
+    # A row is (number of the result, individual or None, points, visibility or NaN).
+    rows: list[tuple[int, int | None, Any, Any]] = []
+    n_points = 0
     for number, result in enumerate(results):
         found = getattr(result, *parts)
         for i, landmarks in enumerate(found):
             points = _shares(landmarks, f"result {number} (counted from 0)")
-            tracks.append(points * sizes[number])
-            visibility.append([getattr(p, "visibility", None) for p in landmarks])
-            frame.append(number)
-            individual.append(i)
-            if len(points) != len(tracks[0]):
+            n_points = n_points or len(points)
+            if len(points) != n_points:
                 raise ValueError(
-                    f"the first result has {len(tracks[0])} points, result {number} "
+                    f"the first result has {n_points} points, result {number} "
                     f"(counted from 0) has {len(points)}"
                 )
+            visible = [getattr(p, "visibility", None) for p in landmarks]
+            rows.append((number, i, points * sizes[number], visible))
         if not found:
-            frame.append(number)
-            individual.append(-1)
-    if not tracks:
+            rows.append((number, None, np.nan, np.nan))
+    if not n_points:
         raise ValueError(f"none of the {len(results)} results has any landmarks")
-    n_points = len(tracks[0])
-    missing = np.array(individual) < 0
-    values = np.full((len(frame), n_points, 2), np.nan)
-    values[~missing] = tracks
     confidence = None
-    # Faces and hands have no visibility, though some versions say it is zero.
-    if parts == {"pose_landmarks"} and None not in visibility[0]:
-        confidence = np.full(values.shape[:2], np.nan)
-        confidence[~missing] = np.array(visibility, dtype=np.float64)
+    # Faces and hands have no visibility, though some versions set it to zero.
+    seen = next(visible for _, i, _, visible in rows if i is not None)
+    if parts == {"pose_landmarks"} and None not in seen:
+        confidence = np.array(
+            [np.broadcast_to(visible, n_points) for *_, visible in rows], dtype=float
+        )
+    frame, individual = [row[0] for row in rows], [row[1] for row in rows]
     return assemble(
-        values,
-        [str(j) for j in range(n_points)],
-        pd.DataFrame(
-            {
-                "frame": frame,
-                "individual": pd.array(
-                    [None if i < 0 else i for i in individual], dtype="Int64"
-                ),
-            }
-        ),
+        np.array([np.broadcast_to(row[2], (n_points, 2)) for row in rows]),
+        None,
+        {"frame": frame, "individual": pd.array(individual, dtype="Int64")},
         format="mediapipe",
-        columns=numbered_columns(n_points),
         confidence=confidence,
     )
 
@@ -149,7 +134,6 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
     ...     "SLEAP_three-mice_Aeon_proofread.analysis.h5")
     >>> from_movement(dataset).points              # doctest: +SKIP
     """
-    pd = import_optional("pandas", extra="io")
     axes = ("time", "individual", "keypoint", "space")
     position = _by_axes(dataset, "position", axes)
     space = _names(position, "space")
@@ -173,19 +157,13 @@ def from_movement(dataset: Any, individual: str | None = None) -> Landmarks:
         chosen = [names.index(individual)]
         tracks, names = tracks[:, chosen], [individual]
         confidence = None if confidence is None else confidence[:, chosen]
-    rows = each_individual(tracks, confidence)
-    return assemble(
-        rows.tracks,
+    return assemble_individuals(
+        tracks,
+        names,
         _names(position, "keypoint"),
-        pd.DataFrame(
-            {
-                "frame": rows.frame,
-                "time": np.asarray(position.coords["time"].values)[rows.frame],
-                "individual": name_individuals(rows.individual, names),
-            }
-        ),
+        {"frame": range(len(tracks)), "time": position.coords["time"].values},
         format="movement",
-        confidence=rows.confidence,
+        confidence=confidence,
     )
 
 

@@ -8,14 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.io._face_tables import points_of
 from isa_nrsfm.io._hdf5 import content_of, is_hdf5, numbers_of, root_groups
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
-from isa_nrsfm.io._landmarks import (
-    Landmarks,
-    assemble,
-    each_individual,
-    name_individuals,
-)
+from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
 from isa_nrsfm.io._separated_values import header_names, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
@@ -64,7 +60,7 @@ def _read_csv(path: Path) -> Landmarks:
         text=("track",),
     )
     return assemble(
-        table[found.interleaved].to_numpy(np.float64).reshape(len(table), -1, 2),
+        points_of(table, found.interleaved),
         nodes,
         table[_CSV_COLUMNS].set_axis(["individual", "frame", "instance_score"], axis=1),
         format="sleap",
@@ -74,7 +70,6 @@ def _read_csv(path: Path) -> Landmarks:
 
 def _read_h5(path: Path) -> Landmarks:
     """Read an h5 file."""
-    pd = import_optional("pandas", extra="io")
     h5py = import_optional("h5py", extra="h5")
     with h5py.File(path, "r") as file:
         absent = _NEEDED.difference(file)
@@ -83,29 +78,22 @@ def _read_h5(path: Path) -> Landmarks:
         nodes = _texts(content_of(file, "node_names"))
         names = _texts(content_of(file, "track_names"))
         stored, dims = _stored(file, len(nodes))
-        tracks = _ordered(stored, dims, _DIMS)
+        tracks = stored.transpose([dims.index(dim) for dim in _DIMS])
         scores = _scores(file, "point_scores", dims, tracks.shape[:3])
         skeleton = _skeleton(file, nodes)
         of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
-    rows = each_individual(tracks, scores)
-    frames: dict[str, Any] = {"frame": rows.frame}
-    if names:
-        if len(names) != tracks.shape[1]:
-            raise ValueError(
-                f"tracks holds {tracks.shape[1]} tracks, track_names {len(names)}"
-            )
-        frames["individual"] = name_individuals(rows.individual, names)
-    elif tracks.shape[1] > 1:
-        frames["individual"] = name_individuals(rows.individual, range(tracks.shape[1]))
-    if of_instances is not None and not np.isnan(of_instances).all():
-        score = of_instances[rows.frame, np.maximum(rows.individual, 0)]
-        frames["instance_score"] = np.where(rows.individual < 0, np.nan, score)
-    return assemble(
-        rows.tracks,
+    n_tracks = tracks.shape[1]
+    if names and len(names) != n_tracks:
+        raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
+    scored = of_instances is not None and not np.isnan(of_instances).all()
+    return assemble_individuals(
+        tracks,
+        names or (range(n_tracks) if n_tracks > 1 else None),
         nodes,
-        pd.DataFrame(frames),
+        {"frame": range(len(tracks))},
+        of_instances={"instance_score": of_instances} if scored else None,
         format="sleap",
-        confidence=rows.confidence,
+        confidence=scores,
         skeleton=skeleton,
     )
 
@@ -143,13 +131,6 @@ def _named_dims(dataset: Any) -> tuple[str, ...] | None:
     return tuple(named)
 
 
-def _ordered(
-    stored: NDArray, dims: tuple[str, ...], wanted: tuple[str, ...]
-) -> NDArray[np.float64]:
-    """Return an array with its axes in the order that is wanted."""
-    return stored.transpose([dims.index(dim) for dim in wanted])
-
-
 def _scores(
     file: Any, name: str, dims_of_tracks: tuple[str, ...], shape: tuple[int, ...]
 ) -> NDArray[np.float64] | None:
@@ -160,7 +141,7 @@ def _scores(
     wanted = _DIMS[: len(shape)]
     dims = _named_dims(file[name]) or tuple(d for d in dims_of_tracks if d in wanted)
     if sorted(dims) == sorted(wanted) and stored.ndim == len(shape):
-        scores = _ordered(stored, dims, wanted)
+        scores = stored.transpose([dims.index(dim) for dim in wanted])
         if scores.shape == shape:
             return scores
     raise ValueError(

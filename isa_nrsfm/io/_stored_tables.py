@@ -78,7 +78,13 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
     if len(files) == 1:
         return arrays[0]
     _same_shape(files, [array.dtype for array in arrays], "numbers of type")
-    parts = [(len(array), _rows_of(array)) for array in arrays]
+    parts = [
+        (
+            len(array),
+            lambda first, last, array=array: read_rows(array, slice(first, last)),
+        )
+        for array in arrays
+    ]
     return StoredTable(parts, arrays[0].shape[1], arrays[0].dtype)
 
 
@@ -92,15 +98,6 @@ def _mapped(file: Path) -> NDArray:
             f"an array of shape {array.shape} and type {array.dtype}"
         )
     return array
-
-
-def _rows_of(array: NDArray) -> Callable[[int, int], NDArray]:
-    """Return what reads rows of an array."""
-
-    def read(first: int, last: int) -> NDArray:
-        return read_rows(array, slice(first, last))
-
-    return read
 
 
 def _same_shape(files: list[Path], values: list[Any], what: str) -> None:

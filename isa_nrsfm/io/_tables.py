@@ -1,9 +1,8 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +10,10 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
-from isa_nrsfm._tables.column_names import parse_coordinate
+from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
-from isa_nrsfm.io._separated_values import without_nulls
+from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
+from isa_nrsfm.io._separated_values import checked_rows
 
 if TYPE_CHECKING:
     import os
@@ -190,7 +190,7 @@ def landmark_table(
         raise ValueError(f'missing must be None or "zeros"; got {missing!r}')
     found = find_landmark_columns(frame.columns, columns)
     names = found.interleaved
-    _refuse_same_names([str(name) for name in frame.columns], "the table")
+    refuse_same_names([str(name) for name in frame.columns])
     values = np.column_stack([as_numbers(frame[name]) for name in names])
     points = values.reshape(len(frame), len(names) // 2, 2)
     if missing == "zeros":
@@ -198,6 +198,25 @@ def landmark_table(
     return LandmarkTable(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
+    )
+
+
+def is_named_columns(_path: Path) -> bool:
+    """Return True: the format is chosen by its suffix."""
+    return True
+
+
+def read_named_columns(
+    path: Path, columns: str | None = None, missing: Literal["zeros"] | None = None
+) -> Landmarks:
+    """Read a table whose landmark columns are recognised by their names."""
+    points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
+    return assemble(
+        points.to_numpy().reshape(len(points), -1, 2),
+        point_names(points.columns[::2]),
+        other,
+        format="table",
+        columns=list(points.columns),
     )
 
 
@@ -214,9 +233,19 @@ def table_suffix(path: "str | os.PathLike[str]") -> str:
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
     pd = import_optional("pandas", extra="io")
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = csv.reader(without_nulls(file, "\0"), delimiter=separator)
-        header = _check_lines(lines)
+    rows = checked_rows(path, separator)
+    header = next(rows, None)
+    if header is None:
+        raise ValueError("it is empty; a first line with column names is needed")
+    for other, word in ((";", "semicolons"), ("\t", "tabs"), (",", "commas")):
+        if len(header) == 1 and other in header[0]:
+            raise ValueError(
+                f"its columns are separated by {word}; commas are needed in a .csv "
+                "file and tabs in a .tsv file"
+            )
+    for _ in rows:  # checks them
+        pass
+    refuse_same_names(header)
     frame = pd.read_csv(
         path,
         sep=separator,
@@ -234,45 +263,6 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     return frame
 
 
-def _check_lines(lines: Any) -> list[str]:
-    """
-    Return the header of a file, or raise if its lines do not make a table.
-
-    pandas fills short lines up, cuts long ones or renames equal columns.
-    """
-    header = next((line for line in lines if line), None)
-    if header is None:
-        raise ValueError("it is empty; a first line with column names is needed")
-    if len(header) == 1:
-        for separator, word in ((";", "semicolons"), ("\t", "tabs"), (",", "commas")):
-            if separator in header[0]:
-                raise ValueError(
-                    f"its columns are separated by {word}; commas are needed in a "
-                    ".csv file and tabs in a .tsv file"
-                )
-    n_lines = 0
-    for line in lines:
-        if line and len(line) != len(header):
-            raise ValueError(
-                f"line {lines.line_num} has {len(line)} values, but the header has "
-                f"{len(header)} names"
-            )
-        n_lines += bool(line)
-    if n_lines == 0:
-        raise ValueError("it has a header but no rows")
-    _refuse_same_names(header, "it")
-    return header
-
-
-def _refuse_same_names(names: Sequence[str], where: str) -> None:
-    """Raise if two columns have the same name."""
-    seen: set[str] = set()
-    for name in map(str.strip, names):
-        if name and name in seen:
-            raise ValueError(f"{where} has more than one column called {name!r}")
-        seen.add(name)
-
-
 def _read_parquet(path: Path) -> "pd.DataFrame":
     """Read a parquet file."""
     pd = import_optional("pandas", extra="io")
@@ -286,7 +276,7 @@ def _read_parquet(path: Path) -> "pd.DataFrame":
     if len(unnamed) == frame.index.nlevels:
         return frame.reset_index(drop=True)
     index = frame.index.droplevel(unnamed)
-    _refuse_same_names([str(name) for name in (*index.names, *frame)], "it")
+    refuse_same_names([str(name) for name in (*index.names, *frame)])
     return frame.set_axis(index).reset_index()
 
 
