@@ -132,7 +132,7 @@ def test_folders_of_the_package_need_no_import_of_their_own():
 @pytest.mark.subprocess
 def test_all_names_are_imported_at_once_where_that_is_asked_for():
     loaded = loaded_by("import isa_nrsfm", EAGER_IMPORT="1")
-    assert {"isa_nrsfm._estimator", "isa_nrsfm.io._sleap", "sklearn"} <= loaded
+    assert {"isa_nrsfm._estimator", "isa_nrsfm.io._tables", "sklearn"} <= loaded
 
 
 @pytest.mark.subprocess
