@@ -227,7 +227,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
     if missing := [name for name in NEEDED if values.get(name) is None]:
         raise ValueError(f"it lacks attributes: {', '.join(missing)}")
     K, P = (*np.shape(values["basis_"]), 0, 0)[:2]
-    N = (*np.shape(values.get("sizes")), 0)[0]
+    N = (*np.shape(values.get("sizes", ())), 0)[0]
     shapes: dict[str, tuple[int | None, ...]] = {
         "basis_": (K, P, 3),
         "mean_shape_": (P, 3),

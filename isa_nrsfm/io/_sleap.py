@@ -85,13 +85,15 @@ def _read_h5(path: Path) -> Landmarks:
     n_tracks = tracks.shape[1]
     if names and len(names) != n_tracks:
         raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
-    scored = of_instances is not None and not np.isnan(of_instances).all()
+    scored = {}
+    if of_instances is not None and not np.isnan(of_instances).all():
+        scored["instance_score"] = of_instances
     return assemble_individuals(
         tracks,
         names or (range(n_tracks) if n_tracks > 1 else None),
         nodes,
         {"frame": range(len(tracks))},
-        of_instances={"instance_score": of_instances} if scored else None,
+        of_instances=scored,
         format="sleap",
         confidence=scores,
         skeleton=skeleton,
