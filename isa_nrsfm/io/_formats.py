@@ -81,8 +81,10 @@ class LandmarkFormat:
     def _function(self, kind: str) -> Callable[..., Any]:
         """Return the function of the reader that begins with "is" or "read"."""
         module, _, name = self.reader.partition(".")
-        found = getattr(import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}")
-        return found  # type: ignore[no-any-return]
+        found: Callable[..., Any] = getattr(
+            import_module(f"isa_nrsfm.io.{module}"), f"{kind}_{name}"
+        )
+        return found
 
     def read(self, path: "str | os.PathLike[str]", **options: Any) -> "Landmarks":
         """

@@ -127,8 +127,9 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
     those of any table). Sets too small for a basis shape are counted.
     """
     members: dict[tuple[str, str, str], list[set[int | str]]] = {}
-    for coordinate in map(parse_coordinate, names):
-        for columns, key in coordinate.memberships if coordinate else ():
+    coordinates = [found for name in names if (found := parse_coordinate(name))]
+    for coordinate in coordinates:
+        for columns, key in coordinate.memberships:
             keys = members.setdefault(columns, [set(), set(), set()])
             keys[coordinate.axis].add(key)
     sizes = {

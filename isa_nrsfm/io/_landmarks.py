@@ -1,7 +1,7 @@
 """What every reader of landmark formats returns."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -174,7 +174,7 @@ def assemble_individuals(
     tracks: NDArray[np.float64],
     names: Sequence[Any] | None,
     point_names: Sequence[str],
-    frames: dict[str, Sequence[Any]],
+    frames: Mapping[str, Sequence[Any]],
     *,
     confidence: NDArray[np.float64] | None = None,
     of_instances: dict[str, NDArray[np.float64]] | None = None,
@@ -216,11 +216,13 @@ def assemble_individuals(
     rows[~shown.any(axis=1), 0] = True
     frame, individual = np.nonzero(rows)
     nobody = several & ~shown[frame, individual]
-    columns = {name: [values[i] for i in frame] for name, values in frames.items()}
+    columns: dict[str, Any] = {
+        name: [values[i] for i in frame.tolist()] for name, values in frames.items()
+    }
     if names is not None:
         columns["individual"] = [
             None if absent else names[i]
-            for i, absent in zip(individual, nobody, strict=True)
+            for i, absent in zip(individual.tolist(), nobody, strict=True)
         ]
     for name, of_each in (of_instances or {}).items():
         columns[name] = np.where(nobody, np.nan, of_each[frame, individual])
