@@ -190,16 +190,6 @@ class TestDownloads:
         server.answers["/thing.bin"] = CONTENT
         assert fetch_file(remote, tmp_path).read_bytes() == CONTENT
 
-    def test_offline(self, tmp_path, nowhere):
-        pytest.importorskip("pooch")
-        remote = described(CONTENT, nowhere)
-        with pytest.raises(OSError, match="it could not be downloaded") as caught:
-            fetch_file(remote, tmp_path)
-        assert str(tmp_path) in str(caught.value)
-        assert BY_HAND.format(**remote._asdict()) in str(caught.value)
-        put(tmp_path, remote, CONTENT)
-        assert fetch_file(remote, tmp_path) == tmp_path / "thing.bin"
-
     def test_need_pooch(self, tmp_path, nowhere, without_pooch):
         remote = described(CONTENT, nowhere)
         extra = re.escape('pip install "isa-nrsfm[datasets]"')
@@ -270,15 +260,6 @@ class TestShark:
             assert shark[name].flags.c_contiguous
             assert shark[name].flags.writeable
 
-    def test_is_downloaded(self, tmp_path, server, shark_file, monkeypatch):
-        server.answers["/jaws.mat"] = shark_file.content
-        remote = shark_file.remote._replace(url=f"{server.url}/jaws.mat")
-        replace_file(monkeypatch, _shark, remote)
-        first, second = (fetch_shark(data_home=tmp_path) for _ in range(2))
-        assert server.requests == ["/jaws.mat"]
-        assert_array_equal(first.data, second.data)
-        assert first.filename == str(tmp_path / "jaws.mat")
-
     def test_original(self, data_path, load_data, without_pooch):
         folder = data_path("raw/jaws.mat").parent
         shark = fetch_shark(data_home=folder, download_if_missing=False)
@@ -328,12 +309,6 @@ class TestMuct:
         assert_array_equal(faces.data[3], muct_file.values[3])
         for labels in ("subjects", "lighting", "camera", "sex", "glasses"):
             assert faces[labels][3] == faces[labels][0]
-
-    def test_data_and_target_alone(self, folder):
-        faces = fetch_muct(data_home=folder)
-        X, y = fetch_muct(data_home=folder, return_X_y=True)
-        assert_array_equal(X, faces.data)
-        assert_array_equal(y, faces.target)
 
     def test_frames_of_pandas(self, folder):
         pd = pytest.importorskip("pandas")
@@ -392,12 +367,3 @@ class TestMuct:
         hidden = ~faces.visible.all(axis=1)
         assert hidden.sum() == 840
         assert set(faces.camera[hidden]) == {"b", "c"}
-
-    def test_mirror_images_of_the_original(self, data_path):
-        folder = data_path("raw/muct76-opencv.csv").parent
-        faces = fetch_muct(data_home=folder, mirrored=True)
-        photos, mirrored = faces.tracks[~faces.mirrored], faces.tracks[faces.mirrored]
-        # The jaw from left to right; the images are 480 pixels wide.
-        jaw = photos[:, 14::-1]
-        reflected = np.stack([479 - jaw[..., 0], jaw[..., 1]], axis=2)
-        np.testing.assert_allclose(mirrored[:, :15], reflected, atol=0.11)

@@ -133,35 +133,6 @@ class TestInverseSNR:
 
 
 class TestAffineShapeError:
-    @pytest.mark.parametrize("affinity", AFFINITIES)
-    def test_zero_for_equivalent_shapes(self, scene, rng, affinity):
-        scales = np.exp(rng.standard_normal((60, 1, 1)))
-        shifts = rng.standard_normal((60, 1, 3))
-        assert affine_shape_error(scene.shapes, scene.shapes) < 1e-13
-        moved = scales * scene.shapes @ affinity.T + shifts
-        assert affine_shape_error(scene.shapes, moved) < 1e-12
-
-    @pytest.mark.parametrize("affinity", AFFINITIES)
-    @pytest.mark.parametrize("noise", [0.01, 0.3, 3.0])
-    def test_invariance(self, scene, rng, affinity, noise):
-        shapes = scene.shapes
-        X = shapes + noise * rng.standard_normal(shapes.shape)
-        expected = affine_shape_error(shapes, X)
-        scales = rng.standard_normal((60, 1, 1))  # of both signs
-        shifts = rng.standard_normal((2, 60, 1, 3))
-        moved = scales * X @ affinity.T + shifts[0]
-        assert_allclose(affine_shape_error(shapes, moved), expected, atol=1e-10)
-        # The truth may be moved, scaled frame by frame, and rotated.
-        rotation = ortho_group.rvs(3, random_state=rng)
-        truth = np.exp(scales) * shapes @ rotation + shifts[1]
-        assert_allclose(affine_shape_error(truth, X), expected, atol=1e-10)
-        frames, points = rng.permutation(60), rng.permutation(30)
-        assert_allclose(
-            affine_shape_error(shapes[frames][:, points], X[frames][:, points]),
-            expected,
-            atol=1e-10,
-        )
-
     def test_hand_computed_value(self):
         # Axis-aligned pairs of points. The estimate misses the third pair in one
         # frame and is exact in the other.
@@ -236,13 +207,6 @@ class TestAffineShapeError:
         X = scene.shapes.copy()
         X[7] = 5.0
         assert_allclose(affine_shape_error(scene.shapes, X), 1 / 60, atol=1e-12)
-
-    def test_extreme_units(self, scene):
-        X = scene.shapes + 0.1 * scene.shapes**2
-        expected = affine_shape_error(scene.shapes, X)
-        for unit in (1e-200, 1e200):
-            assert_allclose(affine_shape_error(unit * scene.shapes, X), expected)
-            assert_allclose(affine_shape_error(scene.shapes, unit * X), expected)
 
     @pytest.mark.parametrize(
         ("S", "X", "message"),
