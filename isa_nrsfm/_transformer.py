@@ -20,7 +20,7 @@ from isa_nrsfm._diagnostics import (
     outlier_advice,
     warn_of_coefficients,
 )
-from isa_nrsfm._dynamics.smoothing import smoothed_posterior
+from isa_nrsfm._dynamics import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import tilts

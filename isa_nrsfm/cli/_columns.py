@@ -11,7 +11,7 @@ from sklearn.decomposition import PCA
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._dynamics.sequences import sequences_of
+from isa_nrsfm._dynamics import sequences_of
 from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 from isa_nrsfm.analysis import (
     AlignedFrames,

@@ -1,4 +1,4 @@
-"""Dynamics of coefficients: Kalman filter, smoother, expectation maximisation.
+"""Coefficients in time: Kalman filter, smoother, expectation maximisation.
 
 The coefficients x_t of the frames of a sequence follow a first-order autoregression ::
 
@@ -21,12 +21,14 @@ using the EM algorithm", 1982; MacKay, "Bayesian interpolation", 1992 (evidence)
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
+
+from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 
 # Least logarithm of the evidence for dynamics over that for none: a Bayes factor of 20,
 # "strong" (Kass, Raftery, "Bayes factors", 1995). Motion capture has hundreds, the same
@@ -35,34 +37,14 @@ STRONG_EVIDENCE = 3.0
 
 
 class Observations(NamedTuple):
-    """
-    What the frames of one sequence tell of their coefficients, in order of time.
-
-    Attributes
-    ----------
-    precision : ndarray of shape (n_steps, K, K)
-        L_t.
-    information : ndarray of shape (n_steps, K)
-        h_t.
-    """
+    """L_t (n_steps, K, K) and h_t (n_steps, K) of the frames of a sequence."""
 
     precision: NDArray
     information: NDArray
 
 
 class Dynamics(NamedTuple):
-    """
-    A first-order autoregression.
-
-    Attributes
-    ----------
-    transition : ndarray of shape (K, K)
-        F.
-    innovation : ndarray of shape (K, K)
-        Q.
-    first : ndarray of shape (K, K)
-        Covariance of the first state of a sequence.
-    """
+    """F, Q and the covariance of the first state of a sequence, (K, K) each."""
 
     transition: NDArray
     innovation: NDArray
@@ -81,32 +63,138 @@ class Smoothed(NamedTuple):
         Posterior covariances.
     lagged : ndarray of shape (n_steps - 1, K, K)
         Posterior covariances of x_t+1 and x_t.
-    log_likelihood : ndarray of shape (n_steps,)
-        Logarithms of the likelihoods of the frames given those before, up to constants
-        of the frames.
+    log_likelihood : float
+        Logarithm of the likelihood of the frames, up to a constant of each frame.
     """
 
     mean: NDArray
     covariance: NDArray
     lagged: NDArray
-    log_likelihood: NDArray
+    log_likelihood: float
 
 
-def observations(mean: NDArray, covariance: NDArray) -> Observations:
+def smoothed_posterior(
+    mean: NDArray,
+    covariance: NDArray,
+    time: Any,
+    groups: Any,
+    *,
+    max_gap: int,
+    max_iter: int,
+    tol: float,
+) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return what frames tell of their coefficients without the prior N(0, I).
+    Return the posterior of the coefficients, given all frames of their sequences.
 
     Parameters
     ----------
     mean : ndarray of shape (n_frames, K)
-        Posterior means of the frames by themselves; NaN for frames without a fit.
+        Posterior means of the frames by themselves, with the prior N(0, I). NaN for
+        frames without a fit.
     covariance : ndarray of shape (n_frames, K, K)
         Posterior covariances.
+    time, groups
+        As in `checked_times` and `group_numbers`.
+    max_gap : int
+        As in `sequences_of`.
+    max_iter, tol
+        As in `estimated_dynamics`.
 
     Returns
     -------
-    Observations
-        The frames; those without a fit tell nothing.
+    mean : ndarray of shape (n_frames, K)
+        Posterior means. Those that came, if the frames show no dynamics.
+    covariance : ndarray of shape (n_frames, K, K)
+        Posterior covariances.
+    time_scales : ndarray of shape (K,) or (0,)
+        ``-1 / log |l|`` of the eigenvalues l of the transition, in units of time, the
+        longest first; infinite where |l| is one or more. Empty without dynamics.
+    """
+    times, numbers = checked_times(time, len(mean)), group_numbers(groups, len(mean))
+    sequences, unit = sequences_of(times, numbers, max_gap)
+    # Differences between groups are no dynamics.
+    intercepts = numbers is not None and bool(numbers.any())
+    K, size = mean.shape[1], mean.shape[1] * (1 + intercepts)
+    precision, information = observations(mean, covariance)
+    filled = []
+    for rows, steps in sequences:
+        n_steps = steps[-1] + 1
+        L, h = np.zeros((n_steps, size, size)), np.zeros((n_steps, size))
+        L[steps, :K, :K], h[steps, :K] = precision[rows], information[rows]
+        filled.append(Observations(L, h))
+    dynamics = estimated_dynamics(filled, max_iter, tol, intercepts)
+    if dynamics is None:
+        return mean, covariance, np.empty(0)
+    mean, covariance = mean.copy(), covariance.copy()
+    for (rows, steps), each in zip(sequences, filled, strict=True):
+        result = smoothed(each, dynamics)
+        mean[rows] = result.mean[steps, :K]
+        covariance[rows] = result.covariance[steps, :K, :K]
+    moduli = np.sort(np.abs(np.linalg.eigvals(dynamics.transition[:K, :K])))[::-1]
+    with np.errstate(divide="ignore"):
+        scales = np.where(moduli < 1, -unit / np.log(np.minimum(moduli, 1)), np.inf)
+    return mean, covariance, scales
+
+
+def sequences_of(
+    time: NDArray, groups: NDArray | None, max_gap: int
+) -> tuple[list[tuple[NDArray, NDArray]], float]:
+    """
+    Return the sequences of a table.
+
+    Parameters
+    ----------
+    time : ndarray of shape (n_rows,)
+        Times of the rows. Within a group they rise from row to row.
+    groups : ndarray of int, shape (n_rows,), or None
+        Numbers of the groups; None for one. No sequence goes from one to another.
+    max_gap : int
+        After a gap of more steps a new sequence begins.
+
+    Returns
+    -------
+    sequences : list of (ndarray of int, ndarray of int), shape (n,) each
+        Numbers of the rows of each sequence, in order of time, and the step of time of
+        each row, from zero. Steps without a row are gaps.
+    unit : float
+        The time of a step: the median time between rows.
+
+    Raises
+    ------
+    ValueError
+        If times do not rise, or no group has two rows.
+    """
+    if groups is None:
+        groups = np.zeros(len(time), dtype=int)
+    rows_of = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
+    for rows in rows_of:
+        falling = np.flatnonzero(np.diff(time[rows]) <= 0)
+        if len(falling):
+            first, second = rows[falling[0]], rows[falling[0] + 1]
+            raise ValueError(
+                f"times must rise from row to row of a group; row {second} has "
+                f"{time[second]:g} after {time[first]:g} of row {first}"
+            )
+    differences = np.concatenate([np.diff(time[rows]) for rows in rows_of])
+    if not len(differences):
+        raise ValueError("no group has two rows, so that there is no sequence")
+    unit = float(np.median(differences))
+    found = []
+    for rows in rows_of:
+        lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
+        for part in np.split(
+            np.arange(len(rows)), np.flatnonzero(lengths > max_gap) + 1
+        ):
+            steps = np.cumsum(np.append(0, lengths[part[:-1]]))
+            found.append((rows[part], steps))
+    return found, unit
+
+
+def observations(mean: NDArray, covariance: NDArray) -> Observations:
+    """
+    Return what frames show of their coefficients without the prior N(0, I).
+
+    Means are (n_frames, K), covariances (n_frames, K, K). Frames of NaN show nothing.
     """
     n_frames, K = mean.shape
     precision, information = np.zeros((n_frames, K, K)), np.zeros((n_frames, K))
@@ -114,47 +202,31 @@ def observations(mean: NDArray, covariance: NDArray) -> Observations:
     inverse = np.linalg.inv(covariance[known])
     # A posterior is no wider than its prior: less than zero are rounding errors.
     values, axes = np.linalg.eigh(inverse - np.eye(K))
-    axes_of = axes.swapaxes(1, 2)
-    precision[known] = (axes * np.maximum(values, 0.0)[:, None]) @ axes_of
+    scaled = axes * np.maximum(values, 0.0)[:, None]
+    precision[known] = scaled @ axes.swapaxes(1, 2)
     information[known] = (inverse @ mean[known][..., None])[..., 0]
     return Observations(precision, information)
 
 
 def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
-    """
-    Return the posterior of a sequence: Kalman filter and Rauch-Tung-Striebel smoother.
-
-    Parameters
-    ----------
-    observed : Observations
-        The sequence.
-    dynamics : Dynamics
-        F and Q.
-
-    Returns
-    -------
-    Smoothed
-        Means, covariances and lag-one covariances.
-    """
+    """Return the posterior of a sequence: Kalman filter and smoother."""
     F, Q, first = dynamics
     n_steps, K = observed.information.shape
     predicted = np.zeros((n_steps, K)), np.empty((n_steps, K, K))
     mean, covariance = np.empty((n_steps, K)), np.empty((n_steps, K, K))
-    m, P = np.zeros(K), first
-    growth, square = np.empty((n_steps, K, K)), np.empty(n_steps)
+    m, P, log_likelihood = np.zeros(K), first, 0.0
     # Filter: prediction, then update in the information form, P <- (P^-1 + L)^-1
-    for t in range(n_steps):
+    for t, (L, h) in enumerate(zip(*observed, strict=True)):
         if t:
             m, P = F @ m, F @ P @ F.T + Q
         predicted[0][t], predicted[1][t] = m, P
-        L, h = observed.precision[t], observed.information[t]
-        growth[t] = np.eye(K) + P @ L
-        P, off = _symmetric(np.linalg.solve(growth[t], P)), h - L @ m
-        square[t] = m @ (h + off) + off @ P @ off
+        growth = np.eye(K) + P @ L
+        P, off = _symmetric(np.linalg.solve(growth, P)), h - L @ m
+        # Integral of exp(h^T x - x^T L x / 2) over the predicted density
+        square = m @ (h + off) + off @ P @ off
+        log_likelihood += 0.5 * float(square - np.linalg.slogdet(growth)[1])
         m = m + P @ off
         mean[t], covariance[t] = m, P
-    # Integrals of exp(h^T x - x^T L x / 2) over the predicted densities
-    log_likelihood = 0.5 * (square - np.linalg.slogdet(growth)[1])
     # Smoother, from the last frame to the first: gain J = P F^T P_predicted^-1
     lagged = np.empty((max(n_steps - 1, 0), K, K))
     for t in range(n_steps - 2, -1, -1):
@@ -175,7 +247,8 @@ def estimated_dynamics(
     Parameters
     ----------
     sequences : sequence of Observations
-        Sequences that follow the same autoregression, `with_intercept` or all without.
+        Sequences that follow the same autoregression, of states (x_t, u) with
+        intercepts.
     max_iter : int
         Largest number of iterations.
     tol : float
@@ -197,14 +270,12 @@ def estimated_dynamics(
     # Intercepts and a slow autoregression are alike in short sequences.
     still = _most_likely(np.zeros((K, K)), *options)
     assert still is not None
-    # Frame by frame: their constants are large where noise is small.
-    gains = [
-        smoothed(each, found).log_likelihood - smoothed(each, still).log_likelihood
-        for each in sequences
-    ]
+    gain = 0.0
+    for each in sequences:
+        gain += smoothed(each, found).log_likelihood
+        gain -= smoothed(each, still).log_likelihood
     # Akaike's criterion: F has K^2 numbers.
-    enough = np.concatenate(gains).sum() > K**2 + STRONG_EVIDENCE
-    return found if enough else None
+    return found if gain > K**2 + STRONG_EVIDENCE else None
 
 
 def _most_likely(
@@ -219,8 +290,8 @@ def _most_likely(
     moves, one = F.any(), np.eye(K) / (1 + intercepts)
     # From the state to what follows the autoregression, x_t - u
     relative = np.hstack([np.eye(K), -np.eye(K)][: 1 + intercepts])
-    moving, between = Dynamics(F, one - F @ one @ F.T, one), one
-    dynamics = _joined(moving, between) if intercepts else moving
+    moving = Dynamics(F, one - F @ one @ F.T, one)
+    dynamics = _joined(moving, one) if intercepts else moving
     before = None
     for _ in range(max_iter):
         # Expectation: second moments of x_t and x_t+1, summed over all pairs
@@ -237,8 +308,10 @@ def _most_likely(
         dynamics = moving = Dynamics(F, _symmetric(Q) / n_pairs, moving.first)
         if intercepts:
             moving = moving._replace(first=_symmetric(early + late) / (2 * n_pairs))
-            starts = [_second_moments(each)[0, K:, K:] for each in ends]
-            dynamics = _joined(moving, np.mean(starts, axis=0))
+            starts = [
+                each.covariance[0] + np.outer(*each.mean[[0, 0]]) for each in ends
+            ]
+            dynamics = _joined(moving, np.mean(starts, axis=0)[K:, K:])
         # Convergence test
         mean = np.concatenate([each.mean for each in ends])
         if before is not None and np.abs(mean - before).max() < tol:
@@ -247,26 +320,12 @@ def _most_likely(
     return dynamics
 
 
-def with_intercept(observed: Observations) -> Observations:
-    """
-    Return the observations of states (x_t, u), of which frames show x_t.
-
-    Parameters
-    ----------
-    observed : Observations
-        Observations of K coefficients.
-
-    Returns
-    -------
-    Observations
-        Those of 2 K numbers.
-    """
-    precision, information = observed
-    more = (0, information.shape[1])
-    none = (0, 0)
-    return Observations(
-        np.pad(precision, (none, more, more)), np.pad(information, (none, more))
-    )
+def _pair_moments(ends: Smoothed) -> NDArray:
+    """Return ``sum_t E x_t x_t^T``, the same of x_t+1, and ``sum_t E x_t+1 x_t^T``."""
+    mean, covariance, lagged, _ = ends
+    moments = covariance + mean[:, :, None] * mean[:, None]
+    across = lagged.sum(axis=0) + mean[1:].T @ mean[:-1]
+    return np.stack([moments[:-1].sum(axis=0), moments[1:].sum(axis=0), across])
 
 
 def _joined(moving: Dynamics, between: NDArray) -> Dynamics:
@@ -286,21 +345,8 @@ def _shrunk_regression(across: NDArray, early: NDArray, Q: NDArray) -> NDArray:
 
     The rows of ``Q^-1/2 F`` have the prior ``N(0, I / ridge)``. The ridge maximises the
     evidence, a sum over the eigenvectors of the moments. Where that is hardly greater
-    than the evidence for zero the transition is zero: there are no dynamics.
-
-    Parameters
-    ----------
-    across : ndarray of shape (K, K)
-        ``sum_t E x_t+1 x_t^T``.
-    early : ndarray of shape (K, K)
-        ``sum_t E x_t x_t^T``.
-    Q : ndarray of shape (K, K)
-        Covariance of the innovations.
-
-    Returns
-    -------
-    ndarray of shape (K, K)
-        F.
+    than the evidence for zero the transition is zero: there are no dynamics. The
+    moments are ``sum_t E x_t+1 x_t^T`` and ``sum_t E x_t x_t^T``.
     """
     K = len(Q)
     values, axes = np.linalg.eigh(early)
@@ -313,30 +359,13 @@ def _shrunk_regression(across: NDArray, early: NDArray, Q: NDArray) -> NDArray:
         return float(0.5 * gain.sum())
 
     # One minimum between ridges that are nothing and everything beside the moments
-    middle = np.log(values.max())
-    grid = middle + np.linspace(-20.0, 20.0, 81)
-    best = int(np.argmin([minus_log_evidence(each) for each in grid]))
-    if minus_log_evidence(grid[best]) > -STRONG_EVIDENCE:
+    grid = np.log(values.max()) + np.linspace(-20.0, 20.0, 81)
+    best = min(grid, key=minus_log_evidence)
+    if minus_log_evidence(best) > -STRONG_EVIDENCE:
         return np.zeros_like(Q)
-    width = grid[1] - grid[0]
-    found = minimize_scalar(
-        minus_log_evidence,
-        bounds=(grid[best] - width, grid[best] + width),
-        method="bounded",
-    )
+    bounds = best - 0.5, best + 0.5
+    found = minimize_scalar(minus_log_evidence, bounds=bounds, method="bounded")
     return np.asarray(across @ np.linalg.inv(early + np.exp(found.x) * np.eye(K)))
-
-
-def _second_moments(ends: Smoothed) -> NDArray:
-    """Return ``E x_t x_t^T`` (n_steps, K, K)."""
-    return np.asarray(ends.covariance + ends.mean[:, :, None] * ends.mean[:, None])
-
-
-def _pair_moments(ends: Smoothed) -> NDArray:
-    """Return ``sum_t E x_t x_t^T``, the same of x_t+1, and ``sum_t E x_t+1 x_t^T``."""
-    moments, mean = _second_moments(ends), ends.mean
-    across = ends.lagged.sum(axis=0) + mean[1:].T @ mean[:-1]
-    return np.stack([moments[:-1].sum(axis=0), moments[1:].sum(axis=0), across])
 
 
 def _symmetric(matrix: NDArray) -> NDArray:

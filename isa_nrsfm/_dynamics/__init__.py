@@ -1,1 +1,0 @@
-"""Coefficients of frames in order of time."""
