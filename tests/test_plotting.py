@@ -1,10 +1,96 @@
+"""The contract of all displays: axes, refusals, styles; and their common helpers."""
+
 import subprocess
 import sys
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.exceptions import NotFittedError
 
-from isa_nrsfm import plotting
+from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, plotting
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_hand_tracks
+from isa_nrsfm.plotting import (
+    BasisShapeDisplay,
+    CoefficientsDisplay,
+    ComponentChoiceDisplay,
+    ModeCovarianceDisplay,
+    ReprojectionDisplay,
+)
+from isa_nrsfm.plotting._axes import (
+    check_names,
+    draw_points,
+    percent,
+    row_width,
+    wrap_title,
+)
+from isa_nrsfm.plotting._edges import (
+    choose_layout,
+    choose_origin,
+    choose_skeleton,
+    upright_turn,
+)
+from isa_nrsfm.plotting._page import (
+    PAGE_WIDTH,
+    block_limits,
+    choose_n_columns,
+    new_page,
+)
+from isa_nrsfm.skeletons import get_skeleton
+
+RNG = np.random.default_rng(0)
+POINTS = RNG.standard_normal((6, 10, 2))
+SCORES = np.array([[-0.020, -0.030, -0.025], [-0.002, -0.003, -0.004]])
+# Of each display: arguments, the number of its axes, and arguments of styles.
+DISPLAYS = {
+    BasisShapeDisplay: (
+        {
+            "mean_shape": RNG.standard_normal((20, 3)),
+            "basis": 0.1 * RNG.standard_normal((3, 20, 3)),
+            "edges": [[0, 1], [1, 2]],
+            "component_names": ["a name of some length " * 3] * 3,
+            "energy_share": [0.5, 0.3, 0.2],
+        },
+        8,
+        {
+            "point_kw": {"s": 11},
+            "edge_kw": {"linewidths": 3},
+            "arrow_kw": {"zorder": 9},
+        },
+    ),
+    CoefficientsDisplay: ({"alpha": RNG.standard_normal((30, 2))}, 2, {}),
+    ComponentChoiceDisplay: (
+        {"n_components": [2, 4], "scores": SCORES, "chosen": 4},
+        1,
+        {"errorbar_kw": {"color": "red"}},
+    ),
+    ModeCovarianceDisplay: (
+        {"mode_covariance": np.eye(6)},
+        1,
+        {"im_kw": {"cmap": "PuOr"}},
+    ),
+    ReprojectionDisplay: (
+        {"observed": POINTS, "reprojected": 1.1 * POINTS, "edges": [[0, 1]]},
+        6,
+        {
+            "observed_kw": {"s": 21},
+            "reprojected_kw": {"s": 22},
+            "edge_kw": {"linewidths": 4},
+        },
+    ),
+}
+EACH = pytest.mark.parametrize("kind", DISPLAYS, ids=lambda kind: kind.__name__)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def test_the_list_of_displays_is_complete():
+    assert [kind.__name__ for kind in DISPLAYS] == plotting.__all__
 
 
 @pytest.mark.subprocess
@@ -16,32 +102,282 @@ def test_matplotlib_is_imported_only_to_draw():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize(
-    "display",
-    [
-        plotting.BasisShapeDisplay(mean_shape=np.eye(3), basis=np.ones((1, 3, 3))),
-        plotting.ComponentChoiceDisplay(n_components=[1], scores=[[-0.1]]),
-        plotting.ModeCovarianceDisplay(mode_covariance=np.eye(3)),
-        plotting.ReprojectionDisplay(
-            observed=[[[0.0, 0.0], [1.0, 1.0]]], reprojected=[[[0.0, 0.0], [1.0, 1.0]]]
-        ),
-    ],
-    ids=lambda display: type(display).__name__,
-)
-def test_without_matplotlib_the_extra_is_named(monkeypatch, display):
-    for name in [
-        name for name in sys.modules if name.partition(".")[0] == "matplotlib"
-    ]:
+@EACH
+def test_without_matplotlib_the_extra_is_named(monkeypatch, kind):
+    display = kind(**DISPLAYS[kind][0])
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=r"isa-nrsfm\[plot\]"):
         display.plot()
 
 
-def test_public_names():
-    assert plotting.__all__ == [
-        "BasisShapeDisplay",
-        "CoefficientsDisplay",
-        "ComponentChoiceDisplay",
-        "ModeCovarianceDisplay",
-        "ReprojectionDisplay",
+@EACH
+def test_displays_draw_on_a_new_figure_or_given_axes(kind):
+    arguments, n_axes, styles = DISPLAYS[kind]
+    display = kind(**arguments)
+    assert display.plot(**styles) is display
+    assert plt.get_fignums() == [display.figure_.number]
+    # Titles, labels and legends are on the page, and do not cover each other.
+    figure = display.figure_
+    figure.canvas.draw()
+    boxes = [legend.get_window_extent() for legend in figure.legends]
+    for ax in figure.axes:
+        titles = (title for title in (ax.title, ax._left_title) if title.get_text())
+        boxes += [title.get_window_extent() for title in titles]
+    for i, box in enumerate(boxes):
+        assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 <= box.y1 <= figure.bbox.y1
+        assert not any(box.overlaps(other) for other in boxes[i + 1 :])
+    figure, axes = plt.subplots(n_axes)
+    display.plot(axes)
+    assert display.figure_ is figure
+    assert not figure.legends
+    with pytest.raises(ValueError, match=f"ax must hold {n_axes} axes, .*; got 9"):
+        display.plot(plt.subplots(9)[1])
+
+
+@EACH
+def test_displays_take_keywords_and_fitted_estimators(kind):
+    arguments = DISPLAYS[kind][0]
+    with pytest.raises(TypeError):
+        kind(*list(arguments.values())[:2])
+    choice = kind is ComponentChoiceDisplay
+    table = [np.zeros((3, 4))] if kind is ReprojectionDisplay else []
+    with pytest.raises(NotFittedError):
+        kind.from_estimator(AffineNRSfMCV() if choice else AffineNRSfM(), *table)
+    assert plt.get_fignums() == []
+
+
+def test_styles_can_be_changed():
+    drawn = [
+        kind(**arguments).plot(**styles)
+        for kind, (arguments, _, styles) in DISPLAYS.items()
     ]
+    shapes, _, choice, covariance, frames = drawn
+    assert shapes.plus_[0].get_sizes() == [11]
+    assert shapes.axes_[1, 0].collections[0].get_linewidths() == [3]
+    assert shapes.arrows_[0].get_zorder() == 9
+    assert choice.errorbar_.lines[0].get_color() == "red"
+    assert covariance.im_.get_cmap().name == "PuOr"
+    assert frames.observed_[0].get_sizes() == [21]
+    assert frames.reprojected_[0].get_sizes() == [22]
+    assert frames.edges_[0].get_linewidths() == [4]
+
+
+@pytest.mark.parametrize(
+    ("kind", "changed", "message"),
+    [
+        (BasisShapeDisplay, {"mean_shape": np.zeros((4, 2))}, r"got \(4, 2\) and"),
+        (BasisShapeDisplay, {"basis": np.zeros((2, 5, 3))}, r"and \(2, 5, 3\)"),
+        (BasisShapeDisplay, {"energy_share": [1.0]}, r"3 numbers.*got shape \(1,\)"),
+        (BasisShapeDisplay, {"component_names": ["a"]}, "must hold 3 names.*got 1"),
+        (BasisShapeDisplay, {"edges": [[0, 20]]}, "points 0 to 19; got 0 to 20"),
+        (BasisShapeDisplay, {"origin": "left"}, "got 'left'"),
+        (CoefficientsDisplay, {"alpha": [1.0, 2.0]}, r"got shape \(2,\)"),
+        (CoefficientsDisplay, {"alpha_std": np.eye(3)}, r"of alpha; got \(3, 3\)"),
+        (CoefficientsDisplay, {"y": ["a"]}, "y must have one entry for each of the 30"),
+        (CoefficientsDisplay, {"component_names": ["a"]}, "must hold 2 names"),
+        (ComponentChoiceDisplay, {"scores": SCORES[0]}, "one row for each"),
+        (ComponentChoiceDisplay, {"n_components": [1, 2, 3]}, "one row for each"),
+        (ComponentChoiceDisplay, {"chosen": 3}, "chosen must be one of n_components"),
+        *(
+            (ModeCovarianceDisplay, {"mode_covariance": np.zeros(shape)}, "a square")
+            for shape in ((4, 4), (3, 6), (0, 0), (3,))
+        ),
+        (ModeCovarianceDisplay, {"component_names": ["one"]}, "must hold 2 names"),
+        (ReprojectionDisplay, {"reprojected": POINTS[:, 1:]}, r"\(6, 9, 2\)"),
+        (ReprojectionDisplay, {"observed": np.zeros((2, 9))}, r"got \(2, 9\) and"),
+        (ReprojectionDisplay, {"frames": [1]}, r"the 6 frames; got shape \(1,\)"),
+        (ReprojectionDisplay, {"frame_names": ["a"]}, "must hold 6 names"),
+        (ReprojectionDisplay, {"edges": [[0, 10]]}, "points 0 to 9"),
+        (ReprojectionDisplay, {"origin": "down"}, "got 'down'"),
+        (ReprojectionDisplay, {"observed": 0 * POINTS}, "X has no energy"),
+    ],
+)
+def test_bad_arguments_are_refused(kind, changed, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**(DISPLAYS[kind][0] | changed))
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (BasisShapeDisplay, {"n_std": [1, 2]}, "one for each basis shape.*got shape"),
+        *(
+            (BasisShapeDisplay, {"components": each}, "basis shapes, from 0 to 2")
+            for each in ([3], [-1], [], 0, [0.0])
+        ),
+        (CoefficientsDisplay, {"kind": "classes"}, "kind='classes' needs y"),
+        (ModeCovarianceDisplay, {"scale": "log"}, "got 'log'"),
+    ],
+)
+def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**DISPLAYS[kind][0]).plot(**arguments)
+
+
+def test_names_are_counted():
+    assert check_names(None, 2) == ["1", "2"]
+    assert check_names(("a", "b"), 2) == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("fraction", "text"),
+    [
+        (0.0, "0 %"),
+        (1.0, "100 %"),
+        (0.434, "43 %"),
+        (0.0996, "10 %"),
+        (0.996, "100 %"),
+        (1.234, "123 %"),
+        (0.000996, "0.10 %"),
+        (3.2e-5, "0.0032 %"),
+        (4.1e-32, "4.1e-30 %"),
+    ],
+)
+def test_percent(fraction, text):
+    assert percent(fraction) == text
+
+
+def test_many_points_are_small_and_rasterized():
+    _, ax = plt.subplots()
+    few, many = (draw_points(ax, np.zeros((n_points, 2))) for n_points in (400, 401))
+    assert not few.get_rasterized()
+    assert many.get_rasterized()
+    assert many.get_sizes()[0] < few.get_sizes()[0]
+
+
+@pytest.mark.parametrize("layout", [None, "constrained"])
+def test_the_width_of_a_row(layout):
+    figure, axes = plt.subplots(2, 4, width_ratios=[1, 3, 1, 3], layout=layout)
+    figure.set_size_inches(8, 3)
+    for ax in figure.axes:
+        ax.set(xticks=[], yticks=[])
+    pair, alone = row_width(axes[0, :2]), row_width(axes[0, 1:2])
+    assert alone < pair <= 4.0
+    figure.canvas.draw()
+    boxes = [ax.get_position() for ax in axes[0, :2]]
+    assert pair == pytest.approx(8 * (boxes[1].x1 - boxes[0].x0), rel=0.1)
+    # One above the other: the width of the first.
+    assert row_width(axes[::-1, 0]) == pytest.approx(row_width(axes[:1, 0]), rel=0.2)
+
+
+def test_long_titles_are_broken():
+    figure, axes = plt.subplots(1, 2)
+    figure.set_size_inches(2, 2)
+    title = wrap_title("Basis shape 12 (43 % of energy)", axes)
+    assert title == "Basis shape 12\n(43 % of energy)"
+    figure.set_size_inches(7, 2)
+    assert wrap_title("Basis shape 12 (43 %)", axes) == "Basis shape 12 (43 %)"
+
+
+def test_shapes_are_inside_limits_of_one_scale():
+    rng = np.random.default_rng(0)
+    mean = rng.standard_normal((20, 3)) * [2, 1, 0.5]
+    blocks = [mean[None]]
+    for size in (0.1, 0.2, 0.1, 30.0):
+        drift = size * rng.standard_normal((20, 3))
+        blocks.append(np.stack([mean, mean + drift, mean - drift]))
+    limits, reduction = block_limits(blocks)
+    for block, (low, high) in zip(blocks, np.moveaxis(limits, 2, 1), strict=True):
+        assert (block > low).all()
+        assert (block < high).all()
+    # One scale and one window, but for the basis shape out of all proportion.
+    assert_array_equal(reduction[:4], 1)
+    assert_array_equal(limits[1:4], limits[[0, 0, 0]])
+    assert reduction[4] > 10
+    extent = np.ptp(limits, axis=2)
+    assert_allclose(extent[4], reduction[4] * extent[0])
+    # One of two is reduced. Large drifts alone are no reason for another scale.
+    line = np.array([[[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]])
+    _, reduction = block_limits([line, 1.1 * line, 30 * line])
+    assert_array_equal(reduction[:2], 1)
+    assert reduction[2] == pytest.approx(30 / 1.1, rel=0.05)
+    drifts = [5 * rng.standard_normal((20, 3)) for _ in range(3)]
+    blocks = [mean[None], *(np.stack([mean + d, mean - d]) for d in drifts)]
+    assert_array_equal(block_limits(blocks)[1], 1)
+    limits, reduction = block_limits([np.ones((1, 5, 3)), np.ones((3, 5, 3))])
+    assert (np.ptp(limits, axis=2) > 0).all()
+    assert_array_equal(reduction, 1)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.6, 6.0])
+@pytest.mark.parametrize("n_shapes", [2, 3, 10])
+def test_shapes_fit_on_a_page(n_shapes, aspect):
+    n_columns = choose_n_columns(n_shapes, aspect)
+    assert 1 <= n_columns <= n_shapes
+    axes = new_page(n_shapes, np.array([aspect / 2, 1, aspect / 2]), None)
+    figure = axes[0].figure
+    assert figure.axes == list(axes)
+    assert len(axes) == 2 * n_shapes
+    assert figure.get_figwidth() == PAGE_WIDTH
+    assert figure.get_figheight() <= 7.6
+    assert axes[0].get_subplotspec().get_gridspec().ncols == 2 * n_columns
+    grid = new_page(5, np.array([1.0, 2.0, 3.0]), 2)[0].get_subplotspec().get_gridspec()
+    assert (grid.nrows, grid.ncols) == (3, 4)
+    assert grid.get_width_ratios() == [1.0, 3.0, 1.0, 3.0]
+
+
+FACE = make_face_tracks(n_frames=2, random_state=0).mean_shape
+HAND = make_hand_tracks(n_frames=60, random_state=0).mean_shape
+BODY = make_body_tracks(n_frames=60, random_state=0).mean_shape
+IBUG, COCO, HAND_21 = map(get_skeleton, ("ibug-68", "coco-17", "hand-21"))
+
+
+def test_layouts_are_recognised_named_or_given():
+    assert choose_skeleton("auto", FACE) is IBUG
+    assert choose_skeleton("auto", HAND) is HAND_21
+    assert choose_skeleton("auto", BODY) is None
+    assert choose_skeleton("auto", BODY, COCO.point_names) == COCO
+    assert choose_skeleton("coco-17", BODY) is COCO
+    assert choose_skeleton(COCO, BODY) is COCO
+    assert choose_skeleton(None, BODY) is None
+    found = choose_skeleton([(0, 1), (4, 2)], BODY)
+    assert_array_equal(found.edges, [[0, 1], [4, 2]])
+    assert not found.sides.any()
+    # The layout is known whatever is drawn.
+    for edges in (None, [[0, 1]]):
+        assert choose_layout(edges, FACE) is IBUG
+        assert choose_layout(edges, BODY) is None
+
+
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        ("tree", "edges must be .* Skeleton or the name of one .*; got 'tree'"),
+        ("hand-21", "'hand-21' has 21 points, the shape 5"),
+        ([0, 1], r"shape \(n_edges, 2\).* got shape \(2,\)"),
+        ([[0.0, 1.0]], "must be integers"),
+        ([[0, 1, 2]], "got shape"),
+        ([[0, 5]], "points 0 to 4; got 0 to 5"),
+        ([[-1, 0]], "points 0 to 4; got -1 to 0"),
+    ],
+)
+def test_bad_edges(edges, message):
+    with pytest.raises(ValueError, match=message):
+        choose_skeleton(edges, np.zeros((5, 3)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "layout"), [(FACE, IBUG), (BODY, COCO), (HAND, HAND_21)]
+)
+def test_layouts_determine_which_way_is_up(shape, layout):
+    flipped = shape * [1, -1, 1]
+    assert choose_origin("auto", shape, layout) == "upper"
+    # Hands are in any direction.
+    auto = "upper" if layout is HAND_21 else "lower"
+    assert choose_origin("auto", flipped, layout) == auto
+    assert choose_origin("auto", flipped, None) == "upper"
+    assert choose_origin("lower", shape, layout) == "lower"
+    with pytest.raises(ValueError, match="got 'top'"):
+        choose_origin("top", shape, layout)
+    for origin in ("upper", "lower"):
+        seen = shape if origin == "upper" else shape * [1, -1, -1]
+        tilt = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+        turned = seen @ tilt.T @ upright_turn(seen @ tilt.T, layout, origin).T
+        expected = seen @ upright_turn(seen, layout, origin).T
+        assert_allclose(turned, expected, atol=1e-9 * np.abs(shape).max())
+        below, above = turned[np.array(layout.up), 1].mean(axis=0)
+        assert (above < below) == (origin == "upper")
+    for unknown in (None, choose_skeleton([[0, 1]], shape)):
+        assert_array_equal(upright_turn(shape, unknown, "upper"), np.eye(3))

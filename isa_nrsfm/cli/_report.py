@@ -69,12 +69,12 @@ def model_report(
     estimator: AffineNRSfM, X: Any, frames: Frames, edges: Any = "auto"
 ) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
-    from isa_nrsfm.plotting._views import layout_of  # not needed by transform
+    from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
 
     names = names_of_components(None, len(estimator.basis_))
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     certainty = frames_of(estimator).certainty
-    layout = layout_of(estimator, edges)
+    _, layout, _, _ = view_and_layout(estimator, edges)
     found = estimator.diagnostics(X) if estimator.refinement == "joint" else None
     report = {
         "n_components": len(names),

@@ -15,24 +15,9 @@ MEAN_COLOUR = "0.55"
 LEFT_COLOUR = "#009E73"
 RIGHT_COLOUR = "#CC79A7"
 
-# Shapes of more points than this are drawn as clouds of small points, without arrows.
-MOST_SPARSE_POINTS = 400
-# Their points have this area together, each at least the smallest (square points).
-DENSE_AREA, SMALLEST_POINT = 2000.0, 0.15
-
 
 def check_axes(ax: Any, n_axes: int, content: str) -> NDArray:
-    """Return the given axes as a flat array of the wanted length.
-
-    Parameters
-    ----------
-    ax : matplotlib Axes or array-like of Axes
-        The axes that the caller wants to draw on.
-    n_axes : int
-        How many are needed.
-    content : str
-        What is drawn on them, for the message.
-    """
+    """Return the given axes as a flat array of the wanted length, or raise."""
     axes = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
     if len(axes) != n_axes:
         raise ValueError(f"ax must hold {n_axes} axes, {content}; got {len(axes)}")
@@ -46,8 +31,8 @@ def check_names(names: Any, n_components: int) -> list[str]:
     names = [str(name) for name in names]
     if len(names) != n_components:
         raise ValueError(
-            f"component_names must hold {n_components} names, one a basis shape; "
-            f"got {len(names)}"
+            f"component_names must hold {n_components} names, one for each basis "
+            f"shape; got {len(names)}"
         )
     return names
 
@@ -59,16 +44,15 @@ def hide_frame(ax: Any) -> None:
 
 
 def is_dense(points: NDArray) -> bool:
-    """Tell whether there are too many points to look at them one by one."""
-    return len(points) > MOST_SPARSE_POINTS
+    """Return whether there are too many points to draw each with an arrow."""
+    return len(points) > 400
 
 
 def draw_points(ax: Any, points: NDArray, **kw: Any) -> Any:
     """Draw points as a scatter; many of them small, and as pixels in vector files."""
     style: dict[str, Any] = {"s": 6.0, "linewidths": 0}
-    if is_dense(points):
-        size = max(DENSE_AREA / len(points), SMALLEST_POINT)
-        style |= {"s": size, "rasterized": True}
+    if is_dense(points):  # 2,000 square points of area together
+        style |= {"s": max(2000 / len(points), 0.15), "rasterized": True}
     return ax.scatter(points[:, 0], points[:, 1], **(style | kw))
 
 
@@ -84,6 +68,13 @@ def side_colours(sides: NDArray, middle: str) -> list[str]:
     """Return the colour of each point or edge by its side: 0, 1 left or 2 right."""
     colours = (middle, LEFT_COLOUR, RIGHT_COLOUR)
     return [colours[side] for side in sides]
+
+
+def side_entries(skeleton: Any) -> list[tuple[str, str]]:
+    """Return name and colour of the sides of a skeleton, if it has any."""
+    if skeleton is None or not skeleton.left:
+        return []
+    return [("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)]
 
 
 def percent(fraction: float) -> str:

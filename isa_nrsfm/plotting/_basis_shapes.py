@@ -9,13 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.plotting._axes import (
-    LEFT_COLOUR,
     MEAN_COLOUR,
     MINUS_COLOUR,
     PLUS_COLOUR,
-    RIGHT_COLOUR,
     check_axes,
     check_names,
     draw_points,
@@ -24,6 +21,7 @@ from isa_nrsfm.plotting._axes import (
     is_dense,
     percent,
     side_colours,
+    side_entries,
     wrap_title,
 )
 from isa_nrsfm.plotting._edges import (
@@ -34,22 +32,21 @@ from isa_nrsfm.plotting._edges import (
     choose_skeleton,
     upright_turn,
 )
-from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
-from isa_nrsfm.plotting._views import view_of
+from isa_nrsfm.plotting._page import (
+    VIEWS,
+    add_legend,
+    block_limits,
+    chosen_numbers,
+    new_page,
+    show_view,
+)
+from isa_nrsfm.plotting._views import view_and_layout
 
 # Arrows that end where their points go, and are of the same width in all axes.
 ARROW_STYLE = {
-    "angles": "xy",
-    "scale_units": "xy",
-    "scale": 1.0,
-    "units": "inches",
-    "width": 0.008,
-    "headwidth": 3.8,
-    "headlength": 4.2,
-    "headaxislength": 3.8,
-    "minlength": 0.5,
-    "color": "0.15",
-    "zorder": 3,
+    **{"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"},
+    **{"width": 0.008, "headwidth": 3.8, "headlength": 4.2, "headaxislength": 3.8},
+    **{"minlength": 0.5, "color": "0.15", "zorder": 3},
 }
 
 
@@ -184,7 +181,7 @@ class BasisShapeDisplay:
                     f"shape; got shape {self.energy_share.shape}"
                 )
         self.component_names = check_names(component_names, n_components)
-        layout = choose_layout(edges, self.mean_shape, None)
+        layout = choose_layout(edges, self.mean_shape)
         self.skeleton = choose_skeleton(edges, self.mean_shape)
         self.edges = None if self.skeleton is None else self.skeleton.edges
         self.origin = choose_origin(origin, self.mean_shape, layout)
@@ -238,19 +235,17 @@ class BasisShapeDisplay:
             axes is not that of the shapes.
         """
         check_is_fitted(estimator, "mean_shape_")
-        view = view_of(estimator)
-        shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
-        layout = choose_layout(edges, shape, names)
-        chosen = choose_origin(origin, shape, layout)
-        view = upright_turn(shape, layout, chosen) @ view
+        view, layout, skeleton, origin = view_and_layout(estimator, edges, origin)
+        shape = estimator.mean_shape_ @ view.T
+        view = upright_turn(shape, layout, origin) @ view
         deviation = np.nanstd(estimator.alpha_, axis=0)[:, None, None]
         display = cls(
             mean_shape=estimator.mean_shape_ @ view.T,
             basis=deviation * (estimator.basis_ @ view.T),
             energy_share=estimator.energy_share_,
             component_names=component_names,
-            edges=choose_skeleton(edges, shape, names),
-            origin=chosen,
+            edges=skeleton,
+            origin=origin,
         )
         return display.plot(ax, **kw)
 
@@ -300,7 +295,12 @@ class BasisShapeDisplay:
             does not exist, or `n_std` is not one number or one a basis shape.
         """
         import_optional("matplotlib", extra="plot")
-        self.components_ = self._check_components(components)
+        n_components = len(self.basis)
+        self.components_ = np.arange(n_components)
+        if components is not None:
+            self.components_ = chosen_numbers(
+                components, "components", n_components, "numbers of basis shapes"
+            )
         n_drawn = len(self.components_)
         amplitudes = np.asarray(n_std, dtype=float)
         if amplitudes.shape not in ((), (n_drawn,)):
@@ -308,23 +308,20 @@ class BasisShapeDisplay:
                 f"n_std must be a number or {n_drawn} numbers, one for each basis "
                 f"shape that is drawn; got shape {amplitudes.shape}"
             )
-        drift = (
-            np.broadcast_to(amplitudes, n_drawn)[:, None, None]
-            * self.basis[self.components_]
-        )
-        mean = self.mean_shape
+        sizes = np.broadcast_to(amplitudes, n_drawn)[:, None, None]
+        drift, mean = sizes * self.basis[self.components_], self.mean_shape
         limits, reduction = block_limits(
             [mean[None], *(np.stack([mean, mean + d, mean - d]) for d in drift)]
         )
         axes = ax
         if ax is None:
             axes = new_page(1 + n_drawn, np.ptp(limits[0], axis=1), n_columns)
-        self.axes_ = check_axes(axes, 2 + 2 * n_drawn, "two views a shape")
+        self.axes_ = check_axes(axes, 2 + 2 * n_drawn, "two views for each shape")
         self.axes_ = self.axes_.reshape(-1, 2)
         self.figure_ = self.axes_[0, 0].figure
 
-        labels = drift_labels(amplitudes)
-        point_kw, edge_kw = point_kw or {}, edge_kw or {}
+        below, above = drift_labels(amplitudes)
+        points, edges = point_kw or {}, edge_kw or {}
         arrow_kw = ARROW_STYLE | (arrow_kw or {})
         self.mean_: list[Any] = []
         self.minus_: list[Any] = []
@@ -332,46 +329,29 @@ class BasisShapeDisplay:
         self.arrows_: list[Any] = []
         for block, pair in enumerate(self.axes_):
             for view, axis in zip(VIEWS, pair, strict=True):
-                start = mean[:, view]
-                style = {"color": MEAN_COLOUR, "label": "mean shape"} | point_kw
-                sided = block == 0
-                self.mean_.append(self._draw(axis, start, style, edge_kw, sided=sided))
-                if block > 0:
-                    offset = drift[block - 1][:, view]
-                    style = {"color": MINUS_COLOUR, "label": labels[0]} | point_kw
-                    self.minus_.append(self._draw(axis, start - offset, style, edge_kw))
-                    style = {"color": PLUS_COLOUR, "label": labels[1]} | point_kw
-                    self.plus_.append(self._draw(axis, start + offset, style, edge_kw))
-                    if not is_dense(mean):
-                        arrows = axis.quiver(*start.T, *offset.T, **arrow_kw)
-                        self.arrows_.append(arrows)
+                shapes = [(self.mean_, 0.0 * mean, MEAN_COLOUR, "mean shape")]
+                if block:
+                    shapes += [
+                        (self.minus_, -drift[block - 1], MINUS_COLOUR, below),
+                        (self.plus_, drift[block - 1], PLUS_COLOUR, above),
+                    ]
+                for artists, offset, colour, label in shapes:
+                    style = {"color": colour, "label": label} | points
+                    shape = (mean + offset)[:, view]
+                    artists.append(
+                        self._draw(axis, shape, style, edges, sided=not block)
+                    )
+                if block and not is_dense(mean):
+                    start, offset = mean[:, view], drift[block - 1][:, view]
+                    arrows = axis.quiver(*start.T, *offset.T, **arrow_kw)
+                    self.arrows_.append(arrows)
                 hide_frame(axis)
-                x_limits, y_limits = limits[block, view]
-                axis.set(xlim=x_limits, ylim=y_limits, aspect=1.0, anchor="N")
-                axis.yaxis.set_inverted(self.origin == "upper")
+                show_view(axis, view, limits[block], self.origin)
             title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
             pair[0].set_title(title, loc="left", fontsize="small")
         if ax is None:
             self._add_legend()
         return self
-
-    def _check_components(self, components: ArrayLike | None) -> NDArray[np.intp]:
-        """Return the numbers of the basis shapes to draw."""
-        n_components = len(self.basis)
-        if components is None:
-            return np.arange(n_components)
-        chosen = np.asarray(components)
-        if (
-            chosen.ndim != 1
-            or not chosen.size
-            or chosen.dtype.kind not in "iu"
-            or np.any((chosen < 0) | (chosen >= n_components))
-        ):
-            raise ValueError(
-                "components must be a list of numbers of basis shapes, from 0 to "
-                f"{n_components - 1}; got {components!r}"
-            )
-        return chosen.astype(np.intp)
 
     def _draw(
         self,
@@ -380,17 +360,16 @@ class BasisShapeDisplay:
         style: dict[str, Any],
         edge_kw: dict[str, Any],
         *,
-        sided: bool = False,
+        sided: bool,
     ) -> Any:
-        """Draw one shape in one view, perhaps its sides apart; joined points small."""
+        """Draw one shape in one view, the mean shape with colours of the sides."""
         if self.skeleton is not None:
-            colour = style["color"]
-            line_style = {"colors": colour} | edge_kw
+            colours = colour = style["color"]
             if sided and colour == MEAN_COLOUR:
                 colours = side_colours(self.skeleton.edge_sides, colour)
-                line_style = {"colors": colours} | edge_kw
                 style = style | {"color": side_colours(self.skeleton.sides, colour)}
-            draw_segments(axis, points[self.skeleton.edges], **line_style)
+            segments = points[self.skeleton.edges]
+            draw_segments(axis, segments, **({"colors": colours} | edge_kw))
             style = {"s": 2.0} | style
         return draw_points(axis, points, **style)
 
@@ -411,29 +390,20 @@ class BasisShapeDisplay:
         return f"{title} ({', '.join(notes)})" if notes else title
 
     def _add_legend(self) -> None:
-        """Say below the figure which colour is which end of the drift."""
+        """Add the colours of the ends of the drift, and of the sides, below."""
         from matplotlib.lines import Line2D
 
-        dots = {"marker": "o", "linestyle": "none", "markersize": 3}
         shown = [artists[-1] for artists in (self.mean_, self.minus_, self.plus_)]
         entries = [(points.get_label(), points.get_facecolor()[0]) for points in shown]
-        if self.skeleton is not None and self.skeleton.left:
-            entries += [("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)]
-        self.figure_.legend(
-            handles=[
-                Line2D(
-                    [],
-                    [],
-                    color=colour,
-                    label=label,
-                    **(dots if self.edges is None else {"linewidth": 1.5}),
-                )
-                for label, colour in entries
+        style: dict[str, Any] = {"linewidth": 1.5}
+        if self.edges is None:
+            style = {"marker": "o", "linestyle": "none", "markersize": 3}
+        add_legend(
+            self.figure_,
+            [
+                Line2D([], [], color=colour, label=label, **style)
+                for label, colour in [*entries, *side_entries(self.skeleton)]
             ],
-            loc="outside lower center",
-            ncols=len(entries),
-            frameon=False,
-            fontsize="small",
         )
 
 

@@ -17,18 +17,13 @@ from isa_nrsfm.plotting._axes import (
     check_axes,
     check_names,
 )
-from isa_nrsfm.plotting._page import PAGE_WIDTH
+from isa_nrsfm.plotting._page import PAGE_WIDTH, grid
 
 Kind = Literal["classes", "number", "time"]
-# Inches: the height of a panel, and of the labels below the last one.
-PANEL_HEIGHT, LABEL_HEIGHT = 1.3, 0.5
-# Curves stop where the time between frames is more than this many times the median.
-BREAK = 3.0
+THIN = {"linewidth": 0.7}
 # Groups or classes that are drawn: more of them cover each other, and a figure of eight
 # basis shapes and 1,000 classes takes 47 s.
 MOST_GROUPS = 50
-# Half the width of the band in which the frames of a class are scattered.
-JITTER = 0.18
 
 
 class CoefficientsDisplay:
@@ -209,17 +204,12 @@ class CoefficientsDisplay:
         ValueError
             If `ax` has not one axes for each basis shape, or if `kind` needs `y`.
         """
-        plt = import_optional("matplotlib.pyplot", extra="plot")
+        import_optional("matplotlib", extra="plot")
         found = self._kind(kind)
         n_components = self.alpha.shape[1]
         if ax is None:
-            height = PANEL_HEIGHT * n_components + LABEL_HEIGHT
-            _, ax = plt.subplots(
-                n_components,
-                sharex=True,
-                figsize=(PAGE_WIDTH, height),
-                layout="constrained",
-            )
+            size = (PAGE_WIDTH, 1.3 * n_components + 0.5)  # inches
+            ax = grid(n_components, 1, sharex=True, figsize=size)
         self.axes_ = check_axes(ax, n_components, "one for each basis shape")
         self.figure_ = self.axes_[0].figure
         draw = {
@@ -257,14 +247,10 @@ class CoefficientsDisplay:
         known = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
         rng = np.random.default_rng(0)  # where points lie sideways means nothing
         places = np.repeat(np.arange(len(classes)), [len(rows) for rows in known])
-        axes.scatter(
-            places + JITTER * rng.uniform(-1, 1, len(places)),
+        _scatter(
+            axes,
+            places + 0.18 * rng.uniform(-1, 1, len(places)),
             self.alpha[np.concatenate(known), k],
-            s=4,
-            color=MINUS_COLOUR,
-            alpha=0.4,
-            linewidths=0,
-            rasterized=True,
         )
         axes.boxplot(
             [self.alpha[rows, k] for rows in known],
@@ -272,9 +258,7 @@ class CoefficientsDisplay:
             widths=0.6,
             showfliers=False,
             medianprops={"color": OBSERVED_COLOUR, "linewidth": 1.4},
-            boxprops={"linewidth": 0.7},
-            whiskerprops={"linewidth": 0.7},
-            capprops={"linewidth": 0.7},
+            **dict.fromkeys(("boxprops", "whiskerprops", "capprops"), THIN),
         )
         names = [str(each) for each in classes]
         slanted = max(map(len, names)) * len(names) > 60
@@ -282,15 +266,7 @@ class CoefficientsDisplay:
 
     def _draw_number(self, axes: Any, k: int) -> None:
         """Draw the frames as points against their number."""
-        axes.scatter(
-            self.y,
-            self.alpha[:, k],
-            s=5,
-            color=MINUS_COLOUR,
-            alpha=0.5,
-            linewidths=0,
-            rasterized=True,
-        )
+        _scatter(axes, self.y, self.alpha[:, k])
 
     def _draw_time(self, axes: Any, k: int) -> None:
         """Draw a curve, broken at gaps and groups, with a band of one deviation."""
@@ -323,7 +299,8 @@ class CoefficientsDisplay:
         for rows in _rows_of_largest(groups)[1]:
             apart = np.diff(time[rows])
             typical = np.median(apart) if len(apart) else apart.sum()
-            cuts = np.flatnonzero((apart > BREAK * typical) | (apart < 0 * typical))
+            # Curves stop at gaps of three times the median.
+            cuts = np.flatnonzero((apart > 3 * typical) | (apart < 0 * typical))
             pieces += np.split(rows, cuts + 1)
         return pieces
 
@@ -334,3 +311,9 @@ def _rows_of_largest(groups: NDArray) -> tuple[NDArray, list[NDArray]]:
     rows = np.split(np.argsort(numbers, kind="stable"), np.cumsum(counts)[:-1])
     largest = np.sort(np.argsort(-counts, kind="stable")[:MOST_GROUPS])
     return names[largest], [rows[group] for group in largest]
+
+
+def _scatter(axes: Any, x: NDArray, y: NDArray) -> None:
+    """Draw frames as faint points."""
+    style = {"color": MINUS_COLOUR, "alpha": 0.5, "linewidths": 0}
+    axes.scatter(x, y, s=5, rasterized=True, **style)

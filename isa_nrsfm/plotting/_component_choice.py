@@ -11,9 +11,6 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.plotting._axes import MINUS_COLOUR, PLUS_COLOUR, check_axes
 
-# An axis of errors is logarithmic where they differ by more than this factor.
-WIDE = 5.0
-
 
 class ComponentChoiceDisplay:
     """
@@ -189,7 +186,7 @@ class ComponentChoiceDisplay:
         label = "held-out error, %" if self.held_out_error else "score"
         self.ax_.set(xlabel="number of basis shapes", ylabel=label)
         self.ax_.xaxis.get_major_locator().set_params(integer=True)
-        if self.held_out_error and mean.min() > 0 and mean.max() > WIDE * mean.min():
+        if self.held_out_error and mean.min() > 0 and mean.max() > 5 * mean.min():
             self.ax_.set_yscale("log")
         self.ax_.legend(frameon=False, fontsize="small")
         return self

@@ -18,68 +18,44 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 def choose_skeleton(
     edges: Edges, shape: NDArray, names: tuple[str, ...] | None = None
 ) -> Skeleton | None:
-    """Return what to draw of a shape, or None for points alone.
+    """Return the lines to draw of a shape (n_points, 2 or 3), None for only points."""
+    if edges is None or isinstance(edges, str | Skeleton):
+        return None if edges is None else choose_layout(edges, shape, names)
+    pairs = checked_links(edges, len(shape)).tolist()
+    return Skeleton("edges", "other", len(shape), tuple(map(tuple, pairs)), "the user")
 
-    Parameters
-    ----------
-    edges : "auto", str, Skeleton, None or array-like of shape (n_edges, 2)
-        "auto" is the layout that `find_skeleton` recognises; other texts are names of
-        layouts. Pairs of points become a skeleton of their own.
-    shape : ndarray of shape (n_points, 2) or (n_points, 3)
-        The points to be joined, in a frame with meaningful distances.
-    names : tuple of str, default=None
-        Names of the points.
-    """
-    if edges is None:
-        return None
-    if isinstance(edges, str):
-        if edges == "auto":
-            return find_skeleton(len(shape), names, shape=shape)
+
+def choose_layout(
+    edges: Any, shape: NDArray, names: tuple[str, ...] | None = None
+) -> Skeleton | None:
+    """Return the layout of points that `edges` is or names, or that is recognised."""
+    if isinstance(edges, str) and edges != "auto":
         if edges not in SKELETONS:
             raise ValueError(
                 f'edges must be "auto", None, an array of pairs of points, a Skeleton '
                 f"or the name of one ({', '.join(SKELETONS)}); got {edges!r}"
             )
         edges = SKELETONS[edges]
-    if isinstance(edges, Skeleton):
-        if edges.n_points != len(shape):
-            raise ValueError(
-                f"the skeleton {edges.name!r} has {edges.n_points} points, the shape "
-                f"{len(shape)}"
-            )
-        return edges
-    pairs = checked_links(edges, len(shape)).tolist()
-    return Skeleton("edges", "other", len(shape), tuple(map(tuple, pairs)), "the user")
-
-
-def choose_layout(
-    edges: Any, shape: NDArray, names: tuple[str, ...] | None
-) -> Skeleton | None:
-    """Return the layout of the points of a shape, whatever is drawn of it.
-
-    Parameters
-    ----------
-    edges : "auto", str, Skeleton, None or array-like
-        A layout or its name; everything else is recognised.
-    shape : ndarray of shape (n_points, 3)
-        The points, in a frame with meaningful distances.
-    names : tuple of str or None
-        Names of the points.
-    """
-    told = isinstance(edges, str | Skeleton)
-    return choose_skeleton(edges if told else "auto", shape, names)
+    if not isinstance(edges, Skeleton):
+        return find_skeleton(len(shape), names, shape=shape)
+    if edges.n_points != len(shape):
+        raise ValueError(
+            f"the skeleton {edges.name!r} has {edges.n_points} points, the shape "
+            f"{len(shape)}"
+        )
+    return edges
 
 
 def checked_links(
     edges: Any, n_points: int, *, triangles: bool = False
 ) -> NDArray[np.intp]:
-    """Return pairs of points, or triangles where these may be, or raise."""
+    """Return pairs of points, or triangles if these are allowed, or raise."""
     links = np.asarray(edges)
     widths = (2, 3) if triangles else (2,)
     if links.ndim != 2 or links.shape[1] not in widths or links.dtype.kind not in "iu":
-        other = ", or (n_triangles, 3)" if triangles else ""
+        other = ", or (n_triangles, 3)" * triangles
         raise ValueError(
-            "edges must be integers of shape (n_edges, 2), a pair of points an "
+            "edges must be integers of shape (n_edges, 2), a pair of points per "
             f"edge{other}; got shape {links.shape} and dtype {links.dtype}"
         )
     if links.size and (links.min() < 0 or links.max() >= n_points):
@@ -93,17 +69,9 @@ def checked_links(
 def choose_origin(
     origin: Origin, shape: NDArray, layout: Skeleton | None
 ) -> Literal["upper", "lower"]:
-    """Return where y is zero: "upper" if it points down in the image, else "lower".
+    """Return whether y points down in the image of a shape ("upper") or up ("lower").
 
-    Parameters
-    ----------
-    origin : {"auto", "upper", "lower"}
-        "auto" is "lower" where a face or a body would stand on its head otherwise.
-        Hands are held in any direction and do not tell.
-    shape : ndarray of shape (n_points, 2) or (n_points, 3)
-        The points, with the image's x and y in the first two columns.
-    layout : Skeleton or None
-        The layout of the points.
+    Hands can be in any direction, which determines nothing.
     """
     if origin == "auto":
         if layout is None or not layout.up or layout.kind == "hand":
@@ -118,16 +86,9 @@ def choose_origin(
 def upright_turn(
     shape: NDArray, layout: Skeleton | None, origin: Literal["upper", "lower"]
 ) -> NDArray:
-    """Return the orthogonal matrix that makes a shape stand upright and face us.
+    """Return the orthogonal matrix that makes a shape (n_points, 3) stand upright.
 
-    Parameters
-    ----------
-    shape : ndarray of shape (n_points, 3)
-        The shape as the mean camera sees it: x points right, y along the image's y.
-    layout : Skeleton or None
-        The layout of its points. Without one that tells what is up, the shape stays.
-    origin : {"upper", "lower"}
-        Where y is zero. The y of the turned shape has the same direction.
+    The y of the turned shape has the same direction. A shape without a layout stays.
     """
     if layout is None or not layout.up:
         return np.eye(3)

@@ -1,51 +1,46 @@
-"""How shapes in two views are laid out on a page."""
+"""The pages of figures: grids of axes, and shapes in two views."""
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.optional import import_optional
 
 # The two coordinates that the front view and the side view show.
 VIEWS = ([0, 1], [2, 1])
-MARGIN = 0.02  # around the shapes, relative to the largest extent of the mean shape
-# A shape that is more than so many times as large as is usual is drawn smaller.
-MOST_DRIFT = 2.0
+# Inches: the width of a page, the heights of a title and of a legend.
+PAGE_WIDTH, TITLE_HEIGHT, LEGEND_HEIGHT = 7.2, 0.27, 0.3
 
-# Inches: the width of a page, the most that the figure and a shape should be high.
-PAGE_WIDTH, MOST_HEIGHT, MOST_SHAPE_HEIGHT = 7.2, 7.6, 2.8
-TITLE_HEIGHT, LEGEND_HEIGHT = 0.27, 0.3
+
+def grid(n_axes: int, n_columns: int, **options: Any) -> NDArray[Any]:
+    """Return the axes of a new figure with a number of columns."""
+    plt = import_optional("matplotlib.pyplot", extra="plot")
+    n_rows = -(-n_axes // n_columns)
+    figure, axes = plt.subplots(
+        n_rows, n_columns, squeeze=False, layout="constrained", **options
+    )
+    for unused in axes.ravel()[n_axes:]:
+        figure.delaxes(unused)
+    return axes.ravel()[:n_axes]
 
 
 def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
-    """
-    Return what part of space to draw each block of shapes in, and how much smaller.
+    """Return the part of space to draw each block of shapes in, and its reduction.
 
-    All blocks are drawn to one scale, except those whose extent, relative to that of
-    the first one, is more than twice the median.
-
-    Parameters
-    ----------
-    blocks : list of n_blocks ndarrays of shape (n_shapes, n_points, 3)
-        The shapes that are drawn over each other; the mean shape alone comes first.
-
-    Returns
-    -------
-    limits : ndarray of shape (n_blocks, 3, 2)
-        The least and the largest x, y and z of each block. Their extents have the same
-        proportions in all blocks.
-    reduction : ndarray of shape (n_blocks,)
-        How many times smaller than the others a block is drawn, at least 1.
+    Blocks are (n_shapes, n_points, 3), the mean shape alone comes first. Limits
+    (n_blocks, 3, 2) have the same proportions in all blocks and one scale, except for
+    blocks whose extent, relative to that of the first one, is more than twice the
+    median: reduction (n_blocks,) tells how many times smaller they are drawn.
     """
     low = np.array([block.min(axis=(0, 1)) for block in blocks])
     high = np.array([block.max(axis=(0, 1)) for block in blocks])
     # All points may be equal: axes must not have limits that coincide.
-    margin = MARGIN * ((high - low)[0].max() or 1.0)
+    margin = 0.02 * ((high - low)[0].max() or 1.0)
     low, high = low - margin, high + margin
     extent = high - low
     size = np.max(extent / extent[0], axis=1)
-    common = size <= MOST_DRIFT * np.median(size)
+    common = size <= 2 * np.median(size)
     low[common], high[common] = low[common].min(axis=0), high[common].max(axis=0)
     frame = (high - low)[0]
     reduction = np.maximum(np.max((high - low) / frame, axis=1), 1.0)
@@ -59,40 +54,53 @@ def choose_n_columns(n_shapes: int, aspect: float) -> int:
     for n_columns in range(1, n_shapes):
         height = PAGE_WIDTH / n_columns / aspect
         n_rows = -(-n_shapes // n_columns)
-        fits = n_rows * (height + TITLE_HEIGHT) + LEGEND_HEIGHT <= MOST_HEIGHT
-        if fits and height <= MOST_SHAPE_HEIGHT:
+        whole = n_rows * (height + TITLE_HEIGHT) + LEGEND_HEIGHT
+        if whole <= 7.6 and height <= 2.8:  # inches
             return n_columns
     return n_shapes
 
 
 def new_page(n_shapes: int, extent: NDArray, n_columns: int | None) -> NDArray[Any]:
-    """Return the axes of a new figure, two views side by side for each shape.
-
-    Parameters
-    ----------
-    n_shapes : int
-        How many shapes are drawn.
-    extent : ndarray of shape (3,)
-        The extents of x, y and z, in the same proportions for all shapes.
-    n_columns : int or None
-        How many shapes to draw side by side, None for as few as fit on a page.
-    """
-    plt = import_optional("matplotlib.pyplot", extra="plot")
+    """Return new axes, two views side by side for each shape of an extent (3,)."""
     widths = [float(extent[horizontal]) for horizontal, _ in VIEWS]
     aspect = sum(widths) / extent[1]
     if n_columns is None:
         n_columns = choose_n_columns(n_shapes, aspect)
+    height = min(PAGE_WIDTH / n_columns / aspect, 2.8) + TITLE_HEIGHT
     n_rows = -(-n_shapes // n_columns)
-    height = min(PAGE_WIDTH / n_columns / aspect, MOST_SHAPE_HEIGHT) + TITLE_HEIGHT
-    figure, axes = plt.subplots(
-        n_rows,
+    return grid(
+        2 * n_shapes,
         2 * n_columns,
-        squeeze=False,
         figsize=(PAGE_WIDTH, n_rows * height + LEGEND_HEIGHT),
         width_ratios=widths * n_columns,
-        layout="constrained",
     )
-    axes = axes.ravel()
-    for unused in axes[2 * n_shapes :]:
-        figure.delaxes(unused)
-    return axes[: 2 * n_shapes]
+
+
+def show_view(axis: Any, view: list[int], limits: NDArray, origin: str) -> None:
+    """Set the limits (3, 2) of the view of a shape, with y up or down."""
+    x, y = limits[view]
+    axis.set(xlim=x, ylim=y, aspect=1.0, anchor="N")
+    axis.yaxis.set_inverted(origin == "upper")
+
+
+def add_legend(figure: Any, entries: Any, **options: Any) -> None:
+    """Add a legend below a figure."""
+    style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
+    figure.legend(handles=entries, ncols=len(entries), **(style | options))
+
+
+def chosen_numbers(
+    values: ArrayLike, name: str, most: int, content: str
+) -> NDArray[np.intp]:
+    """Return a list of numbers from 0 to one below `most`, or raise."""
+    numbers = np.asarray(values)
+    if (
+        numbers.ndim != 1
+        or not numbers.size
+        or numbers.dtype.kind not in "iu"
+        or np.any((numbers < 0) | (numbers >= most))
+    ):
+        raise ValueError(
+            f"{name} must be a list of {content}, from 0 to {most - 1}; got {values!r}"
+        )
+    return numbers.astype(np.intp)

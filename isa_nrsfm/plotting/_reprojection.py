@@ -11,15 +11,12 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
-from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
-    LEFT_COLOUR,
     OBSERVED_COLOUR,
     PLUS_COLOUR,
-    RIGHT_COLOUR,
     check_axes,
     draw_points,
     draw_segments,
@@ -27,6 +24,7 @@ from isa_nrsfm.plotting._axes import (
     is_dense,
     percent,
     side_colours,
+    side_entries,
 )
 from isa_nrsfm.plotting._edges import (
     Edges,
@@ -35,10 +33,8 @@ from isa_nrsfm.plotting._edges import (
     choose_origin,
     choose_skeleton,
 )
-from isa_nrsfm.plotting._views import view_of
-
-MOST_FRAMES = 6  # unless asked for
-PANEL_WIDTH, TITLE_HEIGHT, LEGEND_HEIGHT = 2.3, 0.4, 0.3  # inches
+from isa_nrsfm.plotting._page import LEGEND_HEIGHT, add_legend, chosen_numbers, grid
+from isa_nrsfm.plotting._views import view_and_layout
 
 
 def choose_frames(
@@ -46,25 +42,18 @@ def choose_frames(
 ) -> NDArray[np.intp]:
     """Return the rows to draw: the given ones, or random ones in ascending order."""
     if frames is not None:
-        rows = np.asarray(frames)
-        if rows.ndim != 1 or not rows.size or rows.dtype.kind not in "iu":
-            raise ValueError(
-                f"frames must be a list of row numbers of X; got {frames!r}"
-            )
-        if rows.min() < 0 or rows.max() >= n_rows:
-            raise ValueError(
-                f"frames must be rows 0 to {n_rows - 1} of X; "
-                f"got {rows.min()} to {rows.max()}"
-            )
-        return rows.astype(np.intp)
+        return chosen_numbers(frames, "frames", n_rows, "row numbers of X")
     if n_frames is None:
-        n_frames = min(MOST_FRAMES, n_rows)
+        n_frames = min(6, n_rows)
     if not 1 <= n_frames <= n_rows:
         raise ValueError(
             f"n_frames must be between 1 and the {n_rows} rows of X; got {n_frames}"
         )
     rng = check_random_state(random_state)
     return np.sort(rng.choice(n_rows, size=n_frames, replace=False))
+
+
+PANEL_WIDTH = 2.3  # inches
 
 
 class ReprojectionDisplay:
@@ -254,21 +243,19 @@ class ReprojectionDisplay:
         check_is_fitted(estimator, "mean_shape_")
         rows = choose_frames(len(X), n_frames, frames, random_state)
         table = taken_rows(X, rows)
-        view = view_of(estimator)
-        mean_shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
-        layout = estimator.layout
+        _, _, skeleton, origin = view_and_layout(estimator, edges, origin)
+        observed, reprojected = (
+            table_to_tracks(np.asarray(each, dtype=float), estimator.layout)
+            for each in (unmasked(table), estimator.reproject(table))
+        )
         labelled = hasattr(X, "iloc")  # pandas: rows have names
         display = cls(
-            observed=table_to_tracks(np.asarray(unmasked(table), dtype=float), layout),
-            reprojected=table_to_tracks(
-                np.asarray(estimator.reproject(table), dtype=float), layout
-            ),
+            observed=observed,
+            reprojected=reprojected,
             frames=rows,
             frame_names=[str(name) for name in X.index[rows]] if labelled else None,
-            edges=choose_skeleton(edges, mean_shape, names),
-            origin=choose_origin(
-                origin, mean_shape, choose_layout(edges, mean_shape, names)
-            ),
+            edges=skeleton,
+            origin=origin,
         )
         return display.plot(ax, **kw)
 
@@ -307,24 +294,15 @@ class ReprojectionDisplay:
         ValueError
             If there are not as many axes as frames.
         """
-        plt = import_optional("matplotlib.pyplot", extra="plot")
+        import_optional("matplotlib", extra="plot")
         n_frames = len(self.frames)
         new_figure = ax is None
         if new_figure:
             n_columns = min(3, n_frames) if n_columns is None else n_columns
-            n_rows = -(-n_frames // n_columns)
-            height = self._panel_height() + TITLE_HEIGHT
-            figure, ax = plt.subplots(
-                n_rows,
-                n_columns,
-                squeeze=False,
-                figsize=(PANEL_WIDTH * n_columns, height * n_rows + LEGEND_HEIGHT),
-                layout="constrained",
-            )
-            for unused in ax.ravel()[n_frames:]:
-                figure.delaxes(unused)
-            ax = ax.ravel()[:n_frames]
-        self.axes_ = check_axes(ax, n_frames, "one a frame")
+            height = (self._panel_height() + 0.4) * -(-n_frames // n_columns)
+            size = (PANEL_WIDTH * n_columns, height + LEGEND_HEIGHT)
+            ax = grid(n_frames, n_columns, figsize=size)
+        self.axes_ = check_axes(ax, n_frames, "one for each frame")
         self.figure_ = self.axes_[0].figure
         self.observed_: list[Any] = []
         self.reprojected_: list[Any] = []
@@ -335,24 +313,18 @@ class ReprojectionDisplay:
                 axes, i, observed_kw or {}, reprojected_kw or {}, edge_kw or {}
             )
         if new_figure:
-            self.figure_.legend(
-                handles=[self.observed_[0], self.reprojected_[0], *self._side_lines()],
-                loc="outside lower center",
-                ncols=4,
-                frameon=False,
-                fontsize="small",
+            from matplotlib.lines import Line2D
+
+            sides = [
+                Line2D([], [], color=colour, label=side, lw=1.5)
+                for side, colour in side_entries(self.skeleton)
+            ]
+            add_legend(
+                self.figure_,
+                [self.observed_[0], self.reprojected_[0], *sides],
                 markerscale=4.0 if is_dense(self.observed[0]) else 1.0,
             )
         return self
-
-    def _side_lines(self) -> list[Any]:
-        """Return lines for the legend in the colours of the sides, where there are."""
-        from matplotlib.lines import Line2D
-
-        if self.skeleton is None or not self.skeleton.left:
-            return []
-        sides = (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))
-        return [Line2D([], [], color=c, label=side, lw=1.5) for side, c in sides]
 
     def _panel_height(self) -> float:
         """Return the height of panels that suits most frames, in inches."""

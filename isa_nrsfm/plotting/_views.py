@@ -7,7 +7,7 @@ the affinity under which the cameras are as nearly as possible scaled orthograph
 calibrated cameras have true proportions as they are, and are only turned.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,30 +20,22 @@ from isa_nrsfm._metric_upgrade.quadric import (
     unit_cameras,
 )
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.plotting._edges import choose_layout
+from isa_nrsfm.plotting._edges import (
+    Origin,
+    choose_layout,
+    choose_origin,
+    choose_skeleton,
+)
 from isa_nrsfm.skeletons import Skeleton
 
 
 def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
-    """
-    Return the directions of space that the front view shows to the right and down.
+    """Return the directions of space (2, 3) that the front view shows right and down.
 
-    Parameters
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras of unit norm.
-    reference : ndarray of shape (2, 3)
-        The camera that sees the front view.
-    spread : ndarray of shape (3, 3)
-        Covariance of the points of the object.
-
-    Returns
-    -------
-    ndarray of shape (2, 3)
-        The pair of orthonormal rows that is nearest to the reference camera. Cameras
-        that go round the object have no common view, but see the axis they turn about
-        in one direction of the image: it stays in that direction then, and the object
-        is turned to where it looks broadest.
+    They are nearest to the reference camera (2, 3). Unit cameras (n_frames, 2, 3) that
+    go round the object have no common view, but one direction of their axis in the
+    images: it is kept, and the object, with the covariance `spread` of its points, is
+    turned to where it is broadest.
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
@@ -57,46 +49,28 @@ def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray
 
 
 def view_of(estimator: Any) -> NDArray:
-    """
-    Return the transform of the space of a fitted model into the viewing frame.
+    """Return the transform (3, 3) from the space of a model to the viewing frame.
 
-    Parameters
-    ----------
-    estimator : AffineNRSfM
-        A fitted model that has kept its frames.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        That of `viewing_transform`, or with calibrated cameras `euclidean_axes` times
-        the median scale of the cameras.
+    With calibrated cameras it is a rotation times the median scale of the cameras.
     """
     if not hasattr(estimator, "rotations_"):
         return viewing_transform(estimator.motion_, estimator.reference_motion_)
-    scales = np.asarray(estimator.scales_)
-    return np.nanmedian(scales) * euclidean_axes(estimator)
+    return np.nanmedian(np.asarray(estimator.scales_)) * euclidean_axes(estimator)
 
 
-def layout_of(estimator: Any, edges: Any = "auto") -> Skeleton | None:
-    """Return the layout of a fitted model's points, where it is given or recognised."""
-    shape = estimator.mean_shape_ @ view_of(estimator).T
-    return choose_layout(edges, shape, names_of_points(estimator))
+def view_and_layout(
+    estimator: Any, edges: Any = "auto", origin: Origin = "auto"
+) -> tuple[NDArray, Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+    """Return the view of a fitted model, its layout, the lines to draw, the origin."""
+    view = view_of(estimator)
+    shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
+    layout = choose_layout(edges, shape, names)
+    skeleton = choose_skeleton(edges, shape, names)
+    return view, layout, skeleton, choose_origin(origin, shape, layout)
 
 
 def euclidean_axes(estimator: Any) -> NDArray:
-    """
-    Return the axes of the viewing frame of a model with calibrated cameras.
-
-    Parameters
-    ----------
-    estimator : AffineNRSfM
-        A fitted model with calibrated cameras that has kept its frames.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        A rotation T: ``shape @ T.T`` is seen from the front.
-    """
+    """Return the viewing axes (3, 3) of a model with calibrated cameras."""
     shape = estimator.mean_shape_
     axes = front_axes(
         unit_cameras(np.asarray(estimator.motion_)),
@@ -107,29 +81,12 @@ def euclidean_axes(estimator: Any) -> NDArray:
 
 
 def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
-    """
-    Find the transform of space into the frame in which shapes are looked at.
+    """Return the transform T (3, 3) of affine space into the viewing frame.
 
-    In that frame the cameras are as nearly as possible scaled rows of a rotation
-    (`metric_quadric`; where it finds nothing, the mean of ``M_i^T M_i`` over the unit
-    cameras is made isotropic instead). The x and y axes are those of the reference
-    camera's image (`front_axes`): x points right, and y down where the image's y does.
-    The third axis keeps the handedness of the given coordinates. A camera of median
-    size has rows of length one, so that shapes are in the units of the image.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        The affine cameras, in coordinates in which the mean shape is white.
-    reference_motion : ndarray of shape (2, 3)
-        The camera that sees the front view.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        The transform T with non-negative determinant: ``shape @ T.T`` is a shape in
-        the viewing frame. If the cameras are weak-perspective ones of some shape, that
-        is this shape up to scale, a rotation and its mirror image.
+    In that frame, ``shape @ T.T``, the cameras (n_frames, 2, 3) are as nearly as
+    possible scaled rows of a rotation, and the median camera has rows of length one. If
+    `metric_quadric` finds nothing, the mean of ``M_i^T M_i`` over the unit cameras is
+    made isotropic. The x and y axes are `front_axes`; T has a non-negative determinant.
     """
     G = metric_quadric(motion)
     if G is None:
