@@ -213,27 +213,3 @@ def test_normals_of_points_without_triangles_look_at_the_viewer():
 def test_edges_of_triangles_are_their_sides_once():
     edges = choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4).edges
     assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"edges": [[0, 68]]}, "must name points 0 to 67; got 0 to 68"),
-        ({"edges": [[0, 1, 70]]}, "must name points 0 to 67; got 0 to 70"),
-        ({"edges": [[0, 1, 2, 3]]}, r"\(n_edges, 2\).*or \(n_triangles, 3\)"),
-        ({"edges": [[0.5, 1, 2]]}, r"\(n_edges, 2\).*or \(n_triangles, 3\)"),
-        ({"names": ["one"]}, "names must hold 3 names, one a basis shape; got 1"),
-        ({"camera": "perspective"}, "camera must be"),
-    ],
-    ids=["edge", "triangle", "square", "fraction", "names", "camera"],
-)
-def test_bad_options_are_refused(tmp_path, options, message):
-    path = tmp_path / "model.glb"
-    with pytest.raises(ValueError, match=message):
-        write_glb(face_model(), path, **options)
-    assert not path.exists()
-
-
-def test_other_suffixes_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"path must end in \.glb; got .*model\.gltf"):
-        write_glb(face_model(), tmp_path / "model.gltf")

@@ -73,10 +73,6 @@ class TestFramePoses:
         )
         assert np.isnan(frame_poses(model).yaw_std).all()
 
-    def test_needs_cameras_that_tell_angles(self, fitted):
-        with pytest.raises(ValueError, match="angles need cameras"):
-            frame_poses(fitted[1], camera=None)
-
 
 class TestAngleDeviations:
     def test_of_random_small_turns(self):
@@ -113,19 +109,6 @@ class TestPointDistances:
         assert mouth.mean() == pytest.approx(50.0, rel=0.01)
         some = point_distances(model, [MOUTH], faces.data[:5])
         assert_allclose(some, eyes[:5], atol=2e-3)
-
-    @pytest.mark.parametrize(
-        ("pairs", "options", "message"),
-        [
-            ([(1, 99)], {}, "no point 99; the 68 points"),
-            ([(1, 1)], {}, "two different points"),
-            ([MOUTH], {"length": 0.0}, "length must be a positive number; got 0"),
-            ([MOUTH], {"camera": None}, "distances need cameras"),
-        ],
-    )
-    def test_refusals(self, fitted, pairs, options, message):
-        with pytest.raises(ValueError, match=message):
-            point_distances(fitted[1], pairs, **options)
 
 
 def test_uncertainty_needs_calibrated_cameras(fitted):

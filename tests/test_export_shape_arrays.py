@@ -73,8 +73,3 @@ def test_names_are_cell_arrays_in_matlab(tmp_path):
     names = loadmat(path)["component_names"]
     assert names.dtype == object
     assert names.shape == (N_COMPONENTS, 1)
-
-
-def test_other_suffixes_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"\.npz or \.mat; got .*shapes\.csv"):
-        write_shapes(face_model(), tmp_path / "shapes.csv")

@@ -2,8 +2,6 @@ import numpy as np
 import pytest
 from export_models import aligned, blob_model, calibrated_model, face_model, faces
 from numpy.testing import assert_allclose
-from sklearn.decomposition import PCA
-from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.projection import compose, project
@@ -148,19 +146,3 @@ def test_calibrated_cameras_that_see_one_side_only_are_no_error(recwarn):
     recwarn.clear()
     upright_basis(space_of(model), model)
     assert len(recwarn) == 0
-
-
-def test_what_is_refused():
-    model = blob_model()
-    with pytest.raises(ValueError, match="model should be an AffineNRSfM; got PCA"):
-        space_of(PCA())
-    with pytest.raises(NotFittedError):
-        space_of(AffineNRSfM())
-    with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
-        space_of(model, camera="orthographic")
-    with pytest.raises(ValueError, match="origin must be"):
-        space_of(model, origin="left")
-    table = faces().data[:40]
-    without = AffineNRSfM(1, random_state=0, keep_frames=False).fit(table)
-    with pytest.raises(ValueError, match="exporting shapes needs the cameras"):
-        space_of(without)

@@ -134,30 +134,6 @@ def test_affine_shapes_have_no_poses_and_say_so(written):
     assert data["about"].startswith("Affine shapes: angles and depth are not")
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"labels": ["a", "b"]}, "labels must hold 150 labels, one a row; got"),
-        ({"labels": range(N_FRAMES)}, "at most 30 different values; got 150"),
-        ({"n_frames": -1}, "n_frames must be a whole number, not negative; got -1"),
-        ({"n_frames": 2.5}, "n_frames must be a whole number, not negative; got 2.5"),
-        ({"names": ["jaw"]}, "names must hold 3 names"),
-        ({"edges": [[0, 99]]}, "edges must name points 0 to 67"),
-    ],
-    ids=["few", "many", "negative", "fraction", "names", "edges"],
-)
-def test_bad_options_are_refused(tmp_path, options, message):
-    path = tmp_path / "viewer.html"
-    with pytest.raises(ValueError, match=message):
-        write_viewer(face_model(), path, **options)
-    assert not path.exists()
-
-
-def test_other_suffixes_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"must end in \.html; got .*viewer\.txt"):
-        write_viewer(face_model(), tmp_path / "viewer.txt")
-
-
 def test_the_sides_of_a_known_layout_are_told(written):
     data = written(face_model())
     assert data["sides"] == get_skeleton("ibug-68").sides.tolist()

@@ -1,4 +1,4 @@
-"""What is drawn of a shape: triangles, edges or points alone."""
+"""The parts of a shape that are drawn: triangles, edges or only points."""
 
 from typing import Any, NamedTuple
 
@@ -15,16 +15,7 @@ Links = ArrayLike | Skeleton | str | None
 
 
 class Drawing(NamedTuple):
-    """
-    What is drawn of a shape, and on which side.
-
-    Attributes
-    ----------
-    links : ndarray of shape (n_edges, 2) or (n_triangles, 3)
-        Pairs of points, or triangles; none where points are drawn alone.
-    sides : ndarray of shape (n_points,)
-        The side of each point, 0 in the middle, 1 left, 2 right.
-    """
+    """Pairs of points or triangles to draw, and the side (n_points,) of each point."""
 
     links: NDArray[np.intp]
     sides: NDArray[np.intp]
@@ -46,19 +37,7 @@ class Drawing(NamedTuple):
 
 
 def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawing:
-    """
-    Return what to draw of a shape.
-
-    Parameters
-    ----------
-    edges : "auto", str, Skeleton, None or array-like
-        Pairs of points (n_edges, 2) or triangles (n_triangles, 3); None for points
-        alone; for everything else what the layout joins.
-    layout : Skeleton or None
-        The layout of the points, where it is known.
-    n_points : int
-        Number of points.
-    """
+    """Return the lines or triangles of `edges`, otherwise those of the layout."""
     links = np.empty((0, 2), dtype=np.intp)
     sides = np.zeros(n_points, dtype=np.intp)
     if edges is None:
@@ -71,30 +50,16 @@ def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawin
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
-    """
-    Return the Delaunay triangles of the front view of a shape.
+    """Return the Delaunay triangles (n, 3) of the front view of a shape (n_points, 3).
 
-    Parameters
-    ----------
-    shape : ndarray of shape (n_points, 3)
-        A shape whose x points right, y up and z to the viewer.
-
-    Returns
-    -------
-    ndarray of shape (n_triangles, 3)
-        Triangles, counter-clockwise for the viewer.
-
-    Raises
-    ------
-    ValueError
-        If the points are on one line in the front view.
+    They are counter-clockwise for the viewer: x points right, y up and z to the viewer.
     """
     try:
         corners = Delaunay(shape[:, :2]).simplices.astype(np.intp)
     except QhullError as error:
         raise ValueError(
             "the points are on one line in the front view and have no triangles there; "
-            "say by edges what to draw, or None for points alone"
+            "set edges, or edges=None to draw only points"
         ) from error
     a, b, c = shape[corners, :2].transpose(1, 0, 2)
     area = np.linalg.det(np.stack([b - a, c - a], axis=1))
@@ -103,21 +68,9 @@ def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
 
 
 def vertex_normals(shape: NDArray, triangles: NDArray[np.intp]) -> NDArray:
-    """
-    Return unit normals of the points of a mesh.
+    """Return unit normals (n_points, 3) of the points of a mesh, weighted with areas.
 
-    Parameters
-    ----------
-    shape : ndarray of shape (n_points, 3)
-        The points.
-    triangles : ndarray of shape (n_triangles, 3)
-        Triangles, counter-clockwise as seen from outside.
-
-    Returns
-    -------
-    ndarray of shape (n_points, 3)
-        Normals of the triangles round a point, weighted with their areas; towards the
-        viewer, (0, 0, 1), for points without any.
+    Points without triangles have normals towards the viewer, (0, 0, 1).
     """
     a, b, c = shape[triangles].transpose(1, 0, 2)
     faces = np.cross(b - a, c - a)

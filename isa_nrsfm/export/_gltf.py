@@ -4,7 +4,6 @@ import json
 import os
 import struct
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from isa_nrsfm.export._drawing import (
     frontal_triangles,
     vertex_normals,
 )
-from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._names import names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
     upright_basis,
@@ -33,11 +32,6 @@ from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
 VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
-# The largest index that shorts can hold; one more means something else.
-LARGEST_SHORT = 65534
-NO_EDGES = np.empty((0, 2), dtype=np.intp)
-# The animation: standard deviations, seconds for a basis shape, keys for one swing.
-AMPLITUDE, SECONDS, KEYS = 2.0, 2.0, 17
 # Matt materials, seen from both sides: those of points and edges in the middle, on the
 # left and on the right, and that of surfaces.
 PLAIN, LEFT, RIGHT, SURFACE = range(4)
@@ -131,8 +125,7 @@ def write_glb(
     of affine cameras are the least squares fit to the shapes of the frames; those of
     calibrated cameras are the model's.
     """
-    if Path(path).suffix.lower() != ".glb":
-        raise ValueError(f"path must end in .glb; got {os.fspath(path)}")
+    suffix_of(path, [".glb"])
     space = upright_space(model, camera, origin, mirrored, edges)
     n_components = len(model.basis_)
     targets = names_of_components(names, n_components)
@@ -143,7 +136,10 @@ def write_glb(
     drawing = choose_drawing(edges, space.layout, len(mean))
     surface = None
     if drawing.links.shape[1] == 3:
-        surface, drawing = drawing.links, drawing._replace(links=NO_EDGES)
+        surface, drawing = (
+            drawing.links,
+            drawing._replace(links=np.empty((0, 2), np.intp)),
+        )
     elif isinstance(edges, str) and edges == "auto":
         if space.layout is None or space.layout.kind == "face":
             surface = frontal_triangles(mean)
@@ -187,16 +183,7 @@ def write_glb(
 
 
 class Binary:
-    """
-    The arrays of a glTF file, one after the other.
-
-    Attributes
-    ----------
-    parts : list of bytes
-        The bytes of the arrays, whose numbers are multiples of four.
-    views, accessors : list of dict
-        Where each array is and what it holds, in the words of glTF.
-    """
+    """The arrays of a glTF file, one after the other, and their description."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -206,25 +193,17 @@ class Binary:
     def add(
         self, array: NDArray, use: int | None = None, *, bounds: bool = False
     ) -> int:
-        """
-        Add an array and return its number.
+        """Add numbers (n,) or vectors (n, 3), integers as indices; return their number.
 
-        Parameters
-        ----------
-        array : ndarray of shape (n,) or (n, 3)
-            Numbers or vectors; integers are indices.
-        use : int, default=None
-            What the bytes are for, VERTICES or INDICES.
-        bounds : bool, default=False
-            Whether to tell the smallest and the largest value.
+        The use of the bytes is VERTICES or INDICES; bounds add minimum and maximum.
         """
         if array.dtype.kind in "iu":
-            small = array.size == 0 or array.max() <= LARGEST_SHORT
-            kind, array = (
-                (SHORTS, array.astype("<u2"))
-                if small
-                else (INTEGERS, array.astype("<u4"))
-            )
+            # Shorts have no index 65535: it means something else.
+            kind, array = SHORTS, array.astype("<u4")
+            if array.size and array.max() > 65534:
+                kind = INTEGERS
+            else:
+                array = array.astype("<u2")
         else:
             kind, array = FLOATS, array.astype("<f4")
         accessor = {
@@ -325,10 +304,11 @@ def _surface(
 
 def _swings(n_components: int) -> tuple[NDArray, NDArray]:
     """Return times (n,) and weights (n, n_components) of swings one after the other."""
-    phase = np.linspace(0, 1, KEYS)[1:]
-    swing = AMPLITUDE * np.sin(2 * np.pi * phase)
+    phase = np.linspace(0, 1, 17)[1:]
+    swing = 2.0 * np.sin(2 * np.pi * phase)  # standard deviations
     # Exactly at rest where the next one begins.
     swing[-1] = 0.0
     weights = np.kron(np.eye(n_components), swing[:, None])
     times = (np.arange(n_components)[:, None] + phase).ravel()
-    return SECONDS * np.append(0.0, times), np.vstack([np.zeros(n_components), weights])
+    rest = np.zeros(n_components)
+    return 2.0 * np.append(0.0, times), np.vstack([rest, weights])  # two seconds each

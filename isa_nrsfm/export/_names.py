@@ -1,18 +1,39 @@
-"""Names of coefficients."""
+"""Names, suffixes and frames of what is exported."""
 
+import os
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+
+from numpy.typing import NDArray
 
 
 def names_of_components(names: Any, n_components: int) -> list[str]:
-    """Return the names of the coefficients, by default alpha_1, alpha_2, ...
-
-    Numbers count from 1: number 0 is the mean shape.
-    """
+    """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
     if names is None:
         return [f"alpha_{k + 1}" for k in range(n_components)]
     names = [str(name) for name in names]
     if len(names) != n_components:
         raise ValueError(
-            f"names must hold {n_components} names, one a basis shape; got {len(names)}"
+            f"names must hold {n_components} names, one for each basis shape; got "
+            f"{len(names)}"
         )
     return names
+
+
+def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
+    """Return the suffix of a path in lower case, which must be one of those given."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        raise ValueError(
+            f"path must end in {' or '.join(suffixes)}; got {os.fspath(path)}"
+        )
+    return suffix
+
+
+def frames_of_table(model: Any, X: Any) -> tuple[NDArray, NDArray]:
+    """Return cameras and coefficients of a table, None for the fitted one."""
+    if X is None:
+        return model.motion_, model.alpha_
+    motion, _, alpha, _ = model.decompose(X)
+    return motion, alpha

@@ -1,7 +1,7 @@
 """Point distribution models, and their files for OpenFace."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -15,21 +15,16 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm._compat.whole_files import whole_file, write_whole
 from isa_nrsfm._frames.projection import compose
+from isa_nrsfm.export._names import suffix_of
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
 from isa_nrsfm.plotting._edges import Origin
 
 SUFFIXES = (".txt", ".mat", ".npz")
-# The number by which OpenCV calls matrices of doubles.
-OPENCV_DOUBLES = 6
 COMMENTS = (
     "The mean values of the components: x, y and z of all points",
     "The principal components (eigenvectors), one a column",
     "The variances of the components (eigenvalues)",
 )
-# Principal axes with a smaller share of the largest variance are rounding errors.
-SMALLEST_VARIANCE = 1e-10
-# Rounds of aligning shapes to their mean, and its relative change that ends them.
-MAX_ROUNDS, SETTLED = 100, 1e-12
 
 
 class PointDistributionModel(NamedTuple):
@@ -197,7 +192,7 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     of comment that begin with ``#``, its numbers of rows and columns, the number 6 (for
     doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
-    suffix = _suffix(path)
+    suffix = suffix_of(path, SUFFIXES)
     mean, modes, eigenvalues = map(np.asarray, pdm)
     _check_shapes(PointDistributionModel(mean, modes, eigenvalues))
     n_modes = len(eigenvalues)
@@ -212,8 +207,9 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
             savemat(file, {"M": M, "V": V, "E": eigenvalues[:, None]})
         return
     lines = []
+    # OpenCV calls matrices of doubles 6.
     for comment, matrix in zip(COMMENTS, (M, V, eigenvalues[None]), strict=True):
-        lines += [f"# {comment}", *map(str, (*matrix.shape, OPENCV_DOUBLES))]
+        lines += [f"# {comment}", *map(str, (*matrix.shape, 6))]
         lines += [" ".join(format(x, ".17g") for x in row) for row in matrix]
     write_whole(path, ("\n".join(lines) + "\n").encode("ascii"))
 
@@ -249,11 +245,14 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     -----
     SciPy reads ``.mat`` files. Damaged ones can end Python: of strangers, take a text.
     """
-    suffix = _suffix(path)
+    suffix = suffix_of(path, SUFFIXES)
     with reading(path, "a point distribution model"):
         if suffix == ".npz":
             names = PointDistributionModel._fields
-            pdm = PointDistributionModel(*_numbers(_unzipped(path, names), names))
+            with ZipFile(path) as archive:
+                stored = {*names} & {name[:-4] for name in archive.namelist()}
+                found = {name: array_in(archive.read(f"{name}.npy")) for name in stored}
+            pdm = PointDistributionModel(*_numbers(found, names))
         elif suffix == ".mat":
             pdm = _from_matrices(*_numbers(loadmat(path), "MVE"))
         else:
@@ -262,17 +261,6 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
         if not all(np.isfinite(part).all() for part in pdm):
             raise ValueError("its numbers should be finite; got NaN or infinity")
         return pdm
-
-
-def _suffix(path: str | os.PathLike[str]) -> str:
-    """Return the suffix of the path of a point distribution model."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(
-            f"a point distribution model is a file {', '.join(SUFFIXES[:-1])} or "
-            f"{SUFFIXES[-1]}; got {os.fspath(path)}"
-        )
-    return suffix
 
 
 def _check_shapes(pdm: PointDistributionModel) -> None:
@@ -301,17 +289,6 @@ def _from_matrices(M: NDArray, V: NDArray, E: NDArray) -> PointDistributionModel
         )
     modes = V.reshape(3, n_points, n_modes).transpose(2, 1, 0)
     return PointDistributionModel(M.reshape(3, n_points).T, modes, E.ravel())
-
-
-def _unzipped(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str, NDArray]:
-    """Return those arrays of an .npz file that have one of the names."""
-    with ZipFile(path) as archive:
-        stored = set(archive.namelist())
-        return {
-            name: array_in(archive.read(f"{name}.npy"))
-            for name in names
-            if f"{name}.npy" in stored
-        }
 
 
 def _numbers(found: Mapping[str, NDArray], names: Sequence[str]) -> list[NDArray]:
@@ -348,12 +325,12 @@ def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
 
 
 def _check_n_modes(n_modes: Any) -> None:
-    """Raise if a number of modes or a share of the variance is neither."""
-    is_number = isinstance(n_modes, Integral) and not isinstance(n_modes, bool)
-    is_share = not isinstance(n_modes, Integral) and isinstance(n_modes, Real)
-    if n_modes is None or (is_number and n_modes >= 1):
+    """Raise unless this is None, a number of modes or a share of the variance."""
+    if n_modes is None:
         return
-    if not (is_share and 0 < n_modes < 1):
+    whole = isinstance(n_modes, Integral) and not isinstance(n_modes, bool)
+    share = isinstance(n_modes, Real) and not isinstance(n_modes, Integral)
+    if not (whole and n_modes >= 1) and not (share and 0 < n_modes < 1):
         raise ValueError(
             "n_modes must be None, a whole number of at least 1 or a share between 0 "
             f"and 1; got {n_modes!r}"
@@ -381,7 +358,7 @@ def _aligned(shapes: NDArray) -> NDArray:
     shapes = shapes - shapes.mean(axis=1, keepdims=True)
     mean = shapes.mean(axis=0)
     aligned = shapes
-    for _ in range(MAX_ROUNDS):
+    for _ in range(100):
         left, stretch, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ mean)
         turned = np.linalg.det(left @ right)
         left[:, :, 2] *= turned[:, None]
@@ -390,7 +367,7 @@ def _aligned(shapes: NDArray) -> NDArray:
         scales = np.sum(mean**2) / stretch.sum(axis=1)
         aligned = scales[:, None, None] * (shapes @ (left @ right))
         previous, mean = mean, aligned.mean(axis=0)
-        if np.linalg.norm(mean - previous) <= SETTLED * np.linalg.norm(mean):
+        if np.linalg.norm(mean - previous) <= 1e-12 * np.linalg.norm(mean):
             break
     return aligned
 
@@ -400,7 +377,8 @@ def _principal_axes(rows: NDArray) -> tuple[NDArray, NDArray]:
     wide = len(rows) < rows.shape[1]
     gram = rows @ rows.T if wide else rows.T @ rows
     energies, vectors = np.linalg.eigh(gram)
-    large = energies > SMALLEST_VARIANCE * max(energies[-1], 0.0)
+    # Axes with a smaller share of the largest variance are rounding errors.
+    large = energies > 1e-10 * max(energies[-1], 0.0)
     energies, vectors = energies[large][::-1], vectors[:, large][:, ::-1]
     if wide:
         # The products are orthogonal up to the rounding errors of the Gram matrix.

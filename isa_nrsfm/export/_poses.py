@@ -1,4 +1,4 @@
-"""Head pose and lengths of frames, as people tell them."""
+"""Head pose of frames, and distances between points."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,6 +10,7 @@ from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.calibration import angle_deviations, view_angles
+from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
     Camera,
     UprightSpace,
@@ -17,9 +18,6 @@ from isa_nrsfm.export._upright import (
     upright_space,
 )
 from isa_nrsfm.plotting._edges import Origin
-
-# The outer corners of the eyes in the order of iBUG.
-EYE_CORNERS = (36, 45)
 
 
 class FramePoses(NamedTuple):
@@ -114,41 +112,21 @@ def frame_poses(
     (100,)
     """
     if camera is None:
-        raise ValueError("angles need cameras that tell them; got camera=None")
+        raise ValueError("angles need calibrated cameras; got camera=None")
     space = upright_space(model, camera, origin, mirrored, edges)
-    if X is None:
-        motion, alpha = model.motion_, model.alpha_
-    else:
-        motion, _, alpha, _ = model.decompose(X)
-    return poses_in(space, model, motion, alpha, X)
+    return poses_in(space, model, *frames_of_table(model, X), X)
 
 
 def poses_in(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray, X: Any
 ) -> FramePoses:
-    """
-    Return the poses of frames in an upright space.
-
-    Parameters
-    ----------
-    space : UprightSpace
-        The space.
-    model : AffineNRSfM
-        The model.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    X : array-like of shape (n_frames, 2 * n_points) or None
-        The table that tells how certain rotations are; None if that is not asked for.
-
-    Returns
-    -------
-    FramePoses
-        The poses.
-    """
+    """Return the poses of frames in an upright space; deviations need their table X."""
     _, rotations, scales = upright_frames(space, model, motion, alpha)
-    if not _determined(space, model):
+    # The fitted table must determine the depth.
+    determined = frames_of(model).certainty.determined
+    if space.metric is not None:
+        determined = space.metric.condition_number <= LARGEST_CONDITION
+    if not determined:
         rotations = np.full_like(rotations, np.nan)
     angles = view_angles(rotations)
     deviations = np.full((3, len(scales)), np.nan)
@@ -157,13 +135,6 @@ def poses_in(
         turned = space.transform @ covariance @ space.transform.T
         deviations = np.array(angle_deviations(angles, turned))
     return FramePoses(*angles, np.asarray(scales), *deviations)
-
-
-def _determined(space: UprightSpace, model: Any) -> bool:
-    """Return whether the fitted table determines the depth, and so the angles."""
-    if space.metric is not None:
-        return space.metric.condition_number <= LARGEST_CONDITION
-    return bool(frames_of(model).certainty.determined)
 
 
 def point_distances(
@@ -217,7 +188,7 @@ def point_distances(
     (100, 2)
     """
     if camera is None:
-        raise ValueError("distances need cameras that tell them; got camera=None")
+        raise ValueError("distances need calibrated cameras; got camera=None")
     if not 0 < length < np.inf:
         raise ValueError(f"length must be a positive number; got {length}")
     space = upright_space(model, camera, "auto", False)
@@ -228,13 +199,9 @@ def point_distances(
             raise ValueError(
                 "unit must name two points, as these are not the 68 of a face"
             )
-        unit = EYE_CORNERS
+        unit = (36, 45)  # the outer corners of the eyes
     a, b = point_numbers(unit, names)
-    if X is None:
-        motion, alpha = model.motion_, model.alpha_
-    else:
-        motion, _, alpha, _ = model.decompose(X)
-    shapes = upright_frames(space, model, motion, alpha).shapes
+    shapes = upright_frames(space, model, *frames_of_table(model, X)).shapes
     mean = np.nanmean(shapes, axis=0)
     size = np.linalg.norm(mean[a] - mean[b])
     if not size > 0:

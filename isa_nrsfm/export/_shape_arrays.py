@@ -1,7 +1,6 @@
 """The arrays of a fitted model, for NumPy and for MATLAB."""
 
 import os
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.export._names import names_of_components
-
-SUFFIXES = (".npz", ".mat")
+from isa_nrsfm.export._names import names_of_components, suffix_of
 
 
 class ShapeArrays(NamedTuple):
@@ -130,12 +127,7 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
     coefficient k of frame i, mean_shape(j, :) point j, squeeze(basis(k, j, :)) its
     drift.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise ValueError(
-            f"shapes are written to files {' or '.join(SUFFIXES)}; got "
-            f"{os.fspath(path)}"
-        )
+    suffix = suffix_of(path, [".npz", ".mat"])
     arrays = shape_arrays(model)._asdict()
     if suffix == ".npz":
         with whole_file(path) as file:

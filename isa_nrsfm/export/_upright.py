@@ -43,24 +43,12 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 class UprightSpace(NamedTuple):
-    """
-    How the space of a model becomes upright.
+    """The transform from the space of a model to the upright space.
 
-    Attributes
-    ----------
-    camera : {"weak_perspective", "orthographic"} or None
-        The cameras that tell true proportions; None for affine shapes.
-    metric : DeformationMetric or None
-        The metric in which shapes are Euclidean; None for affine shapes, and for those
-        of calibrated cameras, which are Euclidean as they are.
-    transform : ndarray of shape (3, 3)
-        Takes Euclidean shapes, or affine ones, to the upright space:
-        ``shape @ transform.T``. Orthogonal for Euclidean shapes.
-    image_axes : ndarray of shape (3, 3)
-        Diagonal; takes the axes of an image and its depth to those of the upright
-        space.
-    layout : Skeleton or None
-        The layout of the points, where it is known.
+    ``shape @ transform.T`` is upright; the transform of Euclidean shapes is orthogonal.
+    `camera` is None for affine shapes. `metric` makes shapes of affine cameras
+    Euclidean, otherwise it is None. `image_axes` is diagonal and takes the axes of an
+    image and its depth to those of the upright space.
     """
 
     camera: str | None
@@ -77,37 +65,12 @@ def upright_space(
     mirrored: bool,
     edges: Any = "auto",
 ) -> UprightSpace:
-    """
-    Find the upright space of a fitted model.
+    """Find the upright space of a fitted model, or raise.
 
-    Parameters
-    ----------
-    model : AffineNRSfM
-        A fitted model that has kept its frames.
-    camera : {"weak_perspective", None}
-        What is known of the cameras of a model with affine ones. None takes the one
-        affinity of space under which they come nearest to weak-perspective ones, as
-        figures do. For a model with calibrated cameras None only keeps the warning of
-        uncertain depths.
-    origin : {"auto", "upper", "lower"}
-        Where y is zero in the table, as in `isa_nrsfm.plotting.BasisShapeDisplay`.
-    mirrored : bool
-        Whether to take the mirror image in depth.
-    edges : "auto", str, Skeleton, None or array-like, default="auto"
-        The layout of the points or its name; otherwise it is recognised.
-
-    Returns
-    -------
-    UprightSpace
-        Faces and bodies of known layouts stand upright, look at the viewer and have the
-        depth that puts noses and toes in front; hands stand upright. Other shapes are
-        turned to the view of the mean camera.
-
-    Raises
-    ------
-    ValueError
-        If the model is no AffineNRSfM or has kept no frames, if `camera` or `origin` is
-        something else, or if the cameras see less than three directions of space.
+    Faces and bodies of known layouts stand upright, look at the viewer and have noses
+    and toes in front; hands stand upright. Other shapes are turned to the view of the
+    mean camera. With affine cameras and `camera` None the space is that of the figures.
+    With calibrated cameras None only omits the warning of uncertain depths.
     """
     check_class(model, "model")
     check_is_fitted(model)
@@ -116,8 +79,9 @@ def upright_space(
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
     told: str | None = camera if fitted == "affine" else fitted
-    if camera is not None:
-        warn_of_depth(model)
+    certainty = frames_of(model).certainty
+    if camera is not None and not certainty.determined:
+        warn_caller(certainty.advice)
     if fitted != "affine":
         transform = euclidean_axes(model)
         shape = model.mean_shape_ @ transform.T
@@ -149,48 +113,12 @@ def upright_space(
     return UprightSpace(told, metric, transform, image_axes, layout)
 
 
-def warn_of_depth(model: Any) -> None:
-    """
-    Warn if calibrated cameras do not determine the depth.
-
-    Parameters
-    ----------
-    model : AffineNRSfM
-        A fitted model.
-
-    Warns
-    -----
-    UserWarning
-        If the scale of its depths is too uncertain for angles and proportions.
-    """
-    certainty = frames_of(model).certainty
-    if not certainty.determined:
-        warn_caller(certainty.advice)
-
-
 def upright_frames(
     space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
 ) -> EuclideanFrames:
-    """
-    Return Euclidean shapes and poses of frames in an upright space.
+    """Return upright Euclidean shapes, rotations and scales of frames.
 
-    Parameters
-    ----------
-    space : UprightSpace
-        Of the model, with cameras that tell true proportions.
-    model : AffineNRSfM
-        The fitted model.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras of the frames.
-    alpha : ndarray of shape (n_frames, n_components)
-        Their coefficients.
-
-    Returns
-    -------
-    EuclideanFrames
-        Shapes, rotations and scales as of `euclidean_frames`, or those of a model with
-        calibrated cameras; NaN where a frame has no camera. Rotations lead to the image
-        turned upright.
+    NaN for frames without a camera. Rotations lead to the image turned upright.
     """
     if space.metric is None:
         rotations, scales = full_rotations(np.asarray(motion, dtype=np.float64))
@@ -206,28 +134,10 @@ def upright_frames(
 def upright_basis(
     space: UprightSpace, model: Any, block_numbers: int = 2**23
 ) -> tuple[NDArray, NDArray]:
-    """
-    Return the mean shape and the basis shapes in the upright space.
+    """Return the mean shape and the basis shapes in the upright space.
 
-    Euclidean shapes of affine cameras are not exactly linear in the coefficients, since
-    the metric depends on them: the least squares fit to the frames of the table is
-    taken.
-
-    Parameters
-    ----------
-    space : UprightSpace
-        Of the model.
-    model : AffineNRSfM
-        The fitted model.
-    block_numbers : int
-        So many numbers of shapes are computed at a time.
-
-    Returns
-    -------
-    mean_shape : ndarray of shape (n_points, 3)
-        The mean shape, centred.
-    basis : ndarray of shape (n_components, n_points, 3)
-        The basis shapes, for one unit of their coefficients.
+    Euclidean shapes of affine cameras are not exactly linear in the coefficients: these
+    are the least squares fit to the frames of the table, computed in blocks.
     """
     if space.metric is None:
         return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T

@@ -7,7 +7,6 @@ import os
 from collections.abc import Sequence
 from importlib.resources import files
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,9 @@ from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.frame_columns import checked_times
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.export._drawing import Links, choose_drawing
-from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
-    UprightSpace,
     upright_basis,
     upright_frames,
     upright_space,
@@ -33,11 +31,11 @@ from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
 MOST_LABELS = 30
 UNLABELLED = "(no label)"
 ABOUT = {
-    "weak_perspective": "Proportions are those that weak-perspective cameras tell.",
-    "orthographic": "Proportions are those that orthographic cameras tell.",
+    "weak_perspective": "Proportions are estimated with weak-perspective cameras.",
+    "orthographic": "Proportions are estimated with orthographic cameras.",
     None: "Affine shapes: angles and depth are not those of the object.",
-    "unknown": "The depth is not known: angles and proportions are not those of the "
-    "object.",
+    "unknown": "The depth is not determined: angles and proportions are not those of "
+    "the object.",
 }
 
 
@@ -126,20 +124,21 @@ def write_viewer(
     the frames; those of calibrated cameras are the model's. Rows of which too little is
     seen are not shown; the page says how many are.
     """
-    if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"path must end in .html; got {os.fspath(path)}")
-    _check_n_frames(n_frames)
+    suffix_of(path, [".html", ".htm"])
+    if not isinstance(n_frames, Integral) or n_frames < 0:
+        raise ValueError(
+            f"n_frames must be a whole number of at least 0; got {n_frames!r}"
+        )
     space = upright_space(model, camera, origin, mirrored, edges)
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
-    rows = _evenly_spread(n_rows, n_frames)
-    if X is None:
+    # The first and the last row are among those shown.
+    rows = np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
+    if X is None or not len(rows):
         motion, alpha = model.motion_[rows], model.alpha_[rows]
-    elif len(rows):
-        motion, _, alpha, _ = model.decompose(taken_rows(X, rows))
     else:
-        motion, alpha = np.empty((0, 2, 3)), np.empty((0, len(components)))
+        motion, alpha = frames_of_table(model, taken_rows(X, rows))
     motion, alpha = np.asarray(motion), np.asarray(alpha)
     seen = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
@@ -150,14 +149,18 @@ def write_viewer(
     centre = mean.mean(axis=0)
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
-    rotations = _rotations(space, model, motion, alpha)
-    told = space.camera if frames_of(model).certainty.determined else "unknown"
+    rotations = np.empty((0, 3, 3))
+    if space.camera is not None and len(motion):
+        rotations = upright_frames(space, model, motion, alpha).rotations
+        rotations = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
+    labelled = hasattr(X, "iloc")  # pandas: rows have names
+    known = space.camera if frames_of(model).certainty.determined else "unknown"
     content = {
-        "about": ABOUT[told] + " The mirror image in depth fits the images as well.",
+        "about": ABOUT[known] + " The mirror image in depth fits the images as well.",
         "points": list(names_of_points(model)),
         "components": components,
         "categories": categories,
-        "rows": _row_names(X, rows),
+        "rows": [str(name) for name in (X.index[rows] if labelled else rows)],
         "labels": codes[rows].tolist() if categories else [],
         "count": _count(n_rows, len(seen), len(rows)),
         "shapes": _encoded(shapes, "<f4"),
@@ -195,35 +198,6 @@ def _page(content: dict[str, Any]) -> str:
 def _encoded(array: NDArray, dtype: str) -> str:
     """Return the numbers of an array as text."""
     return base64.b64encode(array.astype(dtype).tobytes()).decode()
-
-
-def _rotations(
-    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray
-) -> NDArray:
-    """Return what turns the shapes of frames to how their cameras see them."""
-    if space.camera is None or not len(motion):
-        return np.empty((0, 3, 3))
-    rotations = upright_frames(space, model, motion, alpha).rotations
-    return UPSIDE_DOWN @ rotations @ UPSIDE_DOWN
-
-
-def _evenly_spread(n_rows: int, n_frames: int) -> NDArray[np.intp]:
-    """Return at most n_frames of n_rows, the first and the last among them."""
-    return np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
-
-
-def _check_n_frames(n_frames: Any) -> None:
-    """Raise if a number of frames is none."""
-    if not isinstance(n_frames, Integral) or n_frames < 0:
-        raise ValueError(
-            f"n_frames must be a whole number, not negative; got {n_frames!r}"
-        )
-
-
-def _row_names(X: Any, rows: NDArray[np.intp]) -> list[str]:
-    """Return what rows of a table are called: the index of a DataFrame or numbers."""
-    names = X.index[rows] if hasattr(X, "iloc") else rows
-    return [str(name) for name in names]
 
 
 def _count(n_rows: int, n_chosen: int, n_shown: int) -> str:
