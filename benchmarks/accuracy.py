@@ -371,7 +371,7 @@ def prior(options):
 def noise(options):
     """Noise without floor and prior, to that of the spectrum; errors by the cut-off.
 
-    Models are right up to a ratio of `JudgementOptions.right`. The errors are those of
+    Models are right up to a ratio of `JointOptions.right`. The errors are those of
     `prior`.
     """
     for kind in ("weak_perspective", "affine"):
@@ -403,8 +403,7 @@ def noise(options):
     )
     print("cut-off" + headings_of(cases))
     for cut_off in CUT_OFFS:
-        judgement = JOINT_OPTIONS.judgement._replace(cut_off=cut_off)
-        joint = JOINT_OPTIONS._replace(judgement=judgement)
+        joint = JOINT_OPTIONS._replace(cut_off=cut_off)
         row = "".join(f"{chosen_error(*case, joint):10.4f}" for case in cases)
         print(f"{cut_off:7g}{row}", flush=True)
 
@@ -414,10 +413,9 @@ def noise_ratio(X, camera, n_components):
     ratios, original = [], joint_fit.judged
 
     def recorded(problem, result, start, cameras, spectrum):
-        n_seen, energy = problem.totals
         free = joint_fit.unregularised(problem, result.state, cameras)
-        known = max(spectrum.noise, problem.options.judgement.exact)
-        ratios.append(free.state.noise * n_seen / energy / known)
+        known = max(spectrum.noise, 1e-10)
+        ratios.append(free.state.noise / problem.mean_square / known)
         return original(problem, result, start, cameras, spectrum)
 
     with mock.patch.object(joint_fit, "judged", recorded):

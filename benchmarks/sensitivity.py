@@ -2,13 +2,13 @@
 Halve and double what steers the stages of a fit, one by one: errors and CPU seconds.
 
 Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are "fit", for the numbers
-of `Limits`, and the tuples in `Limits` and `JointOptions`. The first line of each is
-that of the values as they are; then a line a value follows. Errors in 3D are
-`affine_shape_error` in percent, "SNR" is inverse SNR in percent. Of missing points of
-real tables it is their error in percent of the size of frames, of the stage
-"joint.relevance" the mean number of basis shapes that "auto" finds, of the gauge the
-least similarity of a basis shape to the true one, in percent. Tables are small: every
-few frames of real ones, and artificial ones. "s" are the CPU seconds of all fits.
+of `Limits`, and the tuples in `Limits`. The first line of each is that of the values as
+they are; then a line a value follows. Errors in 3D are `affine_shape_error` in percent,
+"SNR" is inverse SNR in percent, "auto" the mean number of basis shapes that it finds.
+Of missing points of real tables it is their error in percent of the size of frames, of
+the gauge the least similarity of a basis shape to the true one, in percent. Tables are
+small: every few frames of real ones, and artificial ones. "s" are the CPU seconds of
+all fits.
 """
 
 import time
@@ -140,12 +140,6 @@ USUAL = {
     "noisy 3D": of_instances,
     "large 3D": partial(of_instances, n_frames=2600, n_points=30),
 }
-EXACT = {
-    "exact 3D": partial(of_instances, noise=0.0),
-    "affine": partial(of_instances, noise=0.0, camera="affine"),
-    "missing": partial(of_instances, noise=0.0, missing=0.2),
-    "shark 3D": partial(of_set, "shark", 1, 2, "affine"),
-}
 ROBUST = {
     "huber 3D": partial(of_instances, outliers=0.05, loss="huber"),
     "cauchy 3D": partial(of_instances, outliers=0.05, loss="cauchy"),
@@ -164,12 +158,6 @@ LARGE = {
     "faces 3D": partial(of_set, "ict_68", 1, 9, "affine"),
     "wild SNR": partial(of_set, "faces_wild", 1, 9, "affine"),
 }
-DENSE = {
-    "400 3D": partial(of_instances, n_points=400),
-    "noisy": partial(of_instances, n_points=400, noise=0.1),
-    "exact": partial(of_instances, n_points=400, noise=0.0),
-    "K=1": partial(of_instances, n_points=250, K=1),
-}
 MATRIX = {"2000 x 1600": partial(of_instances, n_frames=1000, n_points=1600, K=2)}
 GAUGE = {
     "shapes": similarity,
@@ -178,25 +166,19 @@ GAUGE = {
     "700 points": partial(similarity, n_points=700),
     "many": partial(similarity, n_points=3200, n_frames=60, K=2),
 }
-COUNTS = {
-    f"{100 * noise:g} %, K={K}": partial(counted, noise=noise, K=K)
-    for K in (2, 4)
-    for noise in (0.005, 0.02, 0.05)
+JOINT = {
+    **USUAL,
+    "exact 3D": partial(of_instances, noise=0.0),
+    "400 points": partial(of_instances, n_points=400),
+    "auto, K=2": partial(counted, K=2),
+    "auto, 5 %": partial(counted, noise=0.05, K=4),
 }
-# What shows the options of each stage. `Effort` is of small and of large tables.
+# The cases that show the options of each stage.
 STAGES = {
     "outliers": ROBUST,
     "completion": MISSING,
     "fit": {**LARGE, **MATRIX},
-    "joint": USUAL,
-    "joint.small": USUAL,
-    "joint.large": LARGE,
-    "joint.starts": USUAL,
-    "joint.judgement": {**USUAL, "exact 3D": partial(of_instances, noise=0.0)},
-    "joint.search": {**USUAL, "exact 3D": partial(of_instances, noise=0.0)},
-    "joint.many_points": DENSE,
-    "joint.reweighting": ROBUST,
-    "joint.relevance": COUNTS,
+    "joint": JOINT,
     "gauge": GAUGE,
 }
 
@@ -210,13 +192,11 @@ def changed(value, factor):
     return factor * value
 
 
-def replaced(limits, path, name, value):
-    """Return limits with the field `name` of the tuple at a path set to a value."""
-    if not path:
+def replaced(limits, stage, name, value):
+    """Return limits with a field of a stage set to a value."""
+    if stage == "fit":
         return limits._replace(**{name: value})
-    first, *others = path
-    inner = replaced(getattr(limits, first), others, name, value)
-    return limits._replace(**{first: inner})
+    return limits._replace(**{stage: getattr(limits, stage)._replace(**{name: value})})
 
 
 def measured(limits, cases):
@@ -242,10 +222,7 @@ def stage(name, cases, options):
         if getattr(case, "func", None) not in (of_set, of_missing)
         or is_present(case.args[0])
     }
-    path = [] if name == "fit" else name.split(".")
-    known = Limits()
-    for part in path:
-        known = getattr(known, part)
+    known = Limits() if name == "fit" else getattr(Limits(), name)
     print(" " * 34 + "".join(f"{title:>12}" for title in cases) + "       s")
     measured(Limits(), cases)  # not counted: tables are made
     row("as it is", *measured(Limits(), cases))
@@ -256,7 +233,7 @@ def stage(name, cases, options):
             other = changed(value, factor)
             if other == value:
                 continue
-            limits = replaced(Limits(), path, field, other)
+            limits = replaced(Limits(), name, field, other)
             shown = f"{other:g}" if np.isscalar(other) else "x".join(map(str, other))
             row(f"{field} {shown}", *measured(limits, cases))
 

@@ -26,7 +26,7 @@ from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
-from isa_nrsfm._fit_options import PAPER_TOL, FitOptions, Limits
+from isa_nrsfm._fit_options import PAPER_TOL, FitOptions
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
@@ -41,7 +41,8 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
-from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
+from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
+from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._joint.sample_posterior import (
     certainty_of,
     posterior_blocks,
@@ -53,12 +54,11 @@ from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
-from isa_nrsfm._paper.svd import Triplets, block_triplets
+from isa_nrsfm._paper.svd import block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import outliers_of_table
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import Table
 
 # Reported only with the joint refinement.
@@ -222,38 +222,18 @@ def fit_ready_table(
     """
     # 1. The rest of the table
     unit = 1.0 if options.scale_frames else float(table.sizes[0])
-    outliers, used = _completed(table, n_components, options)
-    progress("table")
     # 2. Factorisation
-    triplets, sample, factors = _factors(
-        table, used, n_components, options.joint, options.limits
-    )
-    progress("factorisation")
+    factorised = _factorised(table, n_components, options, progress)
+    triplets, factors = factorised.triplets, factorised.factors
     # 3. and 4. The paper's pipeline
     isa, paper = None, None
     if not starts:
         isa, paper = _paper_result(factors, n_components, options, progress)
     # 5. Joint refinement
     if paper is None or options.joint:
-        spectrum = Spectrum.from_singular_values(
-            triplets.values,
-            triplets.rest_share,
-            n_components,
-            table.n_points,
-            table.n_seen,
-        )
+        shapes = starts[0].shapes if paper is None else paper.shapes
         refined = _refined_jointly(
-            table,
-            used,
-            outliers,
-            sample,
-            factors,
-            starts[0].shapes if paper is None else paper.shapes,
-            starts,
-            spectrum,
-            options,
-            unit,
-            progress,
+            table, factorised, shapes, starts, options, unit, progress
         )
     else:
         refined = _refined_by_paper(table, factors, paper, options, unit)
@@ -298,23 +278,9 @@ def _count_components(source: Table, options: FitOptions) -> int:
         table = ready_table(source, 1, options)
     most = largest_n_components(table.n_points)
     most = min(options.limits.most_components, most, most_for_frames(len(table.sizes)))
-    outliers, used = _completed(table, most, options)
-    _, sample, factors = _factors(table, used, most, True, options.limits)
-    _, paper = _paper_result(factors, most, options, lambda stage: None)
-    found = count_components(
-        table.rows,
-        used,
-        table.n_seen,
-        sample,
-        factors,
-        paper.shapes,
-        camera=options.camera,
-        outliers=outliers,
-        loss=options.loss,
-        max_iter=options.max_iter,
-        tol=options.joint_tol,
-        options=options.limits.joint,
-    )
+    factorised = _factorised(table, most, options, NoProgress())
+    _, paper = _paper_result(factorised.factors, most, options, NoProgress())
+    found = count_components(factorised, paper.shapes, _joint_settings(options))
     # Outliers that count a little look like shapes: a fit with final weights decides.
     while found > 1 and options.loss != "linear":
         with warnings.catch_warnings():
@@ -360,44 +326,52 @@ def ready_table(source: Table, n_components: int, options: FitOptions) -> Scaled
     )
 
 
-def _completed(
-    table: ScaledTable, n_components: int, options: FitOptions
-) -> tuple[NDArray | None, FrameBlocks]:
-    """
-    Return gross outliers (n_frames, n_points) or None, and completed frames.
+def _factorised(
+    table: ScaledTable,
+    n_components: int,
+    options: FitOptions,
+    report: Callable[[str], None],
+) -> FactorisedTable:
+    """Return a table with outliers, completed frames, sample and factors.
 
     Outliers are looked for with a robust loss only. They count as missing points.
     """
     outliers, used, complete = None, table.rows, table.complete
-    limits = options.limits
+    limits, n_points = options.limits, table.n_points
     if options.loss != "linear":
-        outliers = outliers_of_table(table.rows, table.n_points, limits.outliers)
+        outliers = outliers_of_table(table.rows, n_points, limits.outliers)
         used = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
     if not complete:
-        used = complete_rows(used, table.n_points, n_components, limits.completion)
-    return outliers, used
-
-
-def _factors(
-    table: ScaledTable,
-    used: FrameBlocks,
-    n_components: int,
-    joint: bool,
-    limits: Limits,
-) -> tuple[Triplets, Sample, Factorisation]:
-    """Return the singular triplets of completed frames, a sample, and its factors."""
-    shape = 2 * len(table.sizes), table.n_points
+        used = complete_rows(used, n_points, n_components, limits.completion)
+    report("table")
+    shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(used, shape, 3 * n_components + 3, limits.dense)
-    if joint:
-        rigid_shape = triplets.vectors[:3]
+    if options.joint:
         sample = sample_frames(
-            used, table.n_points, rigid_shape, limits.sample, limits.small_table
+            used, n_points, triplets.vectors[:3], limits.sample, limits.small_table
         )
     else:
         sample = Sample(used.whole().reshape(shape), [])
     factors = factorise(sample.W, n_components, table.precision, triplets)
-    return triplets, sample, factors
+    report("factorisation")
+    return FactorisedTable(
+        table.rows, used, table.n_seen, outliers, triplets, sample, factors
+    )
+
+
+def _joint_settings(
+    options: FitOptions, on_step: Callable[[], None] | None = None
+) -> JointSettings:
+    """Return how the joint refinement fits a table."""
+    return JointSettings(
+        options.camera,
+        options.loss,
+        options.max_iter,
+        options.joint_tol,
+        on_step,
+        options.limits.joint,
+    )
 
 
 def _paper_result(
@@ -466,53 +440,36 @@ def _refined_by_paper(
 
 def _refined_jointly(
     table: ScaledTable,
-    completed: FrameBlocks,
-    outliers: NDArray | None,
-    sample: Sample,
-    factors: Factorisation,
+    factorised: FactorisedTable,
     paper_shapes: NDArray,
     starts: Sequence[Start],
-    spectrum: Spectrum,
     options: FitOptions,
     unit: float,
     progress: FitProgress | NoProgress,
 ) -> Refined:
     """Return the shapes of the joint refinement, and their fit of the frames."""
-    fitted = fit_jointly(
-        table.rows,
-        completed,
-        table.n_seen,
-        sample,
-        factors,
-        paper_shapes,
-        spectrum=spectrum,
-        camera=options.camera,
-        outliers=outliers,
-        loss=options.loss,
-        max_iter=options.max_iter,
-        tol=options.joint_tol,
-        on_step=progress.step,
-        starts=starts,
-        options=options.limits.joint,
+    fitted, fitted_frames, alpha = fit_jointly(
+        factorised, paper_shapes, _joint_settings(options, progress.step), starts
     )
+    shapes, _, noise_variance = fitted.state
     progress(JOINT_STAGE)
     # Posterior of every frame
     frames = PosteriorFrames(
-        fitted.shapes,
-        fitted.noise_variance,
-        spread_starts(fitted.alpha, options.limits.n_starts),
+        shapes,
+        noise_variance,
+        spread_starts(alpha, options.limits.n_starts),
         options.loss,
         FrameMap.identity(len(paper_shapes) - 1),
         options.camera,
     )
     if options.camera != "affine":
         frames = replace(frames, certainty=certainty_of(frames, table.rows))
-    posteriors = posterior_blocks(frames, fitted.frames, table.rows)
+    posteriors = posterior_blocks(frames, fitted_frames, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     _check_determined(motion, table.shown)
     # Gauge of shapes, cameras and coefficients
     gauge = independent_gauge(
-        fitted.shapes,
+        shapes,
         motion,
         alpha,
         options.independence,
@@ -542,7 +499,7 @@ def _refined_jointly(
         len(fitted.history) - 1,
         fitted.converged,
         JointNumbers(
-            unit**2 * fitted.noise_variance,
+            unit**2 * noise_variance,
             fitted.camera_noise_ratio,
             frames.certainty.total,
             reliabilities(alpha, covariance, *(sum(part) for part in chance)),

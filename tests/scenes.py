@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.point_sums import frame_tracks
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks
 
 
@@ -161,3 +164,11 @@ def spherical_sources(seed, n_samples, n_subspaces, size=3):
     radius = rng.exponential(size=(n_samples, n_subspaces, 1))
     sources = rng.normal(size=(n_samples, n_subspaces, size)) * radius
     return sources.reshape(n_samples, -1) / np.sqrt(2.0)
+
+
+def likelihood_of(tracks, weights, penalty, block_frames=2048):
+    """Return the objective of the joint fit for tracks (n_frames, n_points, 2)."""
+    pieces = frame_tracks(tracks, weights).pieces(block_frames)
+    blocks = [block for _, block in pieces]
+    lengths = [len(block.weight) for block in blocks]
+    return MarginalLikelihood(FrameBlocks.of_blocks(blocks, lengths), penalty)

@@ -27,7 +27,6 @@ from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._fit_options import Limits as FitLimits
-from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
@@ -258,19 +257,13 @@ def test_a_common_rotation_and_the_mirror_image_are_no_error(mirror):
 
 
 def test_all_limits_of_a_fit_can_be_varied():
-    known = {name.split(".")[0] for name in sensitivity.STAGES} - {"fit"}
+    known = set(sensitivity.STAGES) - {"fit"}
     stages = {
         name
         for name, value in FitLimits()._asdict().items()
         if hasattr(value, "_fields")
     }
     assert known == stages
-    joint = {
-        f"joint.{name}"
-        for name, value in JointOptions()._asdict().items()
-        if hasattr(value, "_fields")
-    }
-    assert joint <= set(sensitivity.STAGES)
 
 
 def test_limits_are_halved_and_doubled(capsys):

@@ -10,18 +10,19 @@ from scenes import permute_frames, rotate_frames
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likely_basis import likely_basis
-from isa_nrsfm._joint.options import JOINT_OPTIONS
-from isa_nrsfm._joint.problem import JointProblem, Steps
+from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.starts import (
+    HELD_STEPS,
     affine_start,
     best_starts,
     lifted_shapes,
+    likely_basis,
     mixed_cameras,
     rigid_start,
 )
 from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -245,10 +246,11 @@ class TestLiftedShapes:
         assert np.isfinite(lifted_shapes(scene.rows, scene.motion, 2)).all()
 
 
-def problem_of(scene, effort=JOINT_OPTIONS.small):
+def problem_of(scene, thorough=True):
     rows = FrameBlocks.of_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
-    return JointProblem(frames, Steps(1000, 0.01, effort=effort), 0.0)
+    settings = JointSettings("orthographic", "linear", 1000, 0.01)
+    return JointProblem(frames, settings, thorough)
 
 
 def paper_shapes(factors):
@@ -262,7 +264,8 @@ def started(scene, camera, problem=None):
     factors = scene.factors
     problem = problem or problem_of(scene)
     paper = paper_shapes(factors)
-    return best_starts(problem, scene.W, factors, paper, CAMERAS[camera])
+    table = FactorisedTable(*[None] * 5, Sample(scene.W, []), factors)
+    return best_starts(problem, table, paper, CAMERAS[camera])
 
 
 class TestBestStarts:
@@ -281,17 +284,13 @@ class TestBestStarts:
         candidates = [rigid]
         mixed = mixed_cameras(scene.rows, scales if scaled else None, np.arange(60))
         candidates += list(mixed)[:2]
-        n_seen, energy = problem.totals
-        least_noise = problem.options.least_noise
-        held_steps = problem.options.starts.held_steps
+        least_noise = problem.settings.options.least_noise
         for motion in candidates:
             shapes = lifted_shapes(scene.rows, motion, 2)
             noise_variance = 0.1 * np.mean((scene.rows - motion @ shapes[0]) ** 2)
-            noise_variance = max(noise_variance, least_noise * energy / n_seen)
+            noise_variance = max(noise_variance, least_noise * problem.mean_square)
             start = JointState(shapes, motion, noise_variance)
-            held = problem.refined(
-                start, AffineCameras(held=True), least_noise, max_iter=held_steps
-            )
+            held = problem.refined(start, AffineCameras(held=True), max_iter=HELD_STEPS)
             assert value < held.history[-1]
 
     @pytest.mark.parametrize("seed", range(2))
@@ -302,13 +301,13 @@ class TestBestStarts:
         motion = started(scene, "orthographic")[0].motion
         assert camera_error(motion, scene.motion) < 0.05
 
-    @pytest.mark.parametrize("effort", [JOINT_OPTIONS.large, JOINT_OPTIONS.small])
-    def test_of_many_frames_has_cameras_of_all(self, effort):
+    @pytest.mark.parametrize(("thorough", "n_starts"), [(False, 1), (True, 3)])
+    def test_of_many_frames_has_cameras_of_all(self, thorough, n_starts):
         # The comparison is of some of them.
         scene = random_scene(n_frames=450, noise=0.01)
-        problem = problem_of(scene, effort)
+        problem = problem_of(scene, thorough)
         states = started(scene, "orthographic", problem)
-        assert len(states) == effort.n_finalists
+        assert len(states) == n_starts
         for state in states:
             assert state.motion.shape == (450, 2, 3)
             assert_calibrated(state.motion, "orthographic")

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from scenes import random_rotation
+from scenes import likelihood_of, random_rotation
 
-from isa_nrsfm._joint.likelihood import likelihood_of
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 NOISE = 0.05
@@ -22,9 +21,11 @@ class Scene(NamedTuple):
     motion: NDArray  # (n_frames, 2, 3)
 
     def at(self, penalty=0.0, noise=NOISE, **options):
-        """Return the objective and its derivatives."""
+        """Return the objective and its derivatives, frames first by coefficients."""
         likelihood = likelihood_of(self.tracks, self.weights, penalty, **options)
-        return likelihood(self.shapes, self.motion, noise)
+        terms = likelihood(self.shapes, self.motion, noise)
+        gradient = frames_first(terms.motion_gradient)
+        return terms._replace(alpha=terms.alpha.T, motion_gradient=gradient)
 
 
 def random_scene(kind, seed=0, n_frames=11, n_points=9, n_components=3):

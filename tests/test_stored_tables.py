@@ -42,11 +42,6 @@ SAMPLED = Limits()._replace(
     sample=50,
     completion=Limits().completion._replace(model_frames=100, fewest_shown=20),
     outliers=Limits().outliers._replace(model_frames=100, fewest_shown=20),
-    joint=Limits().joint._replace(
-        reweighting=Limits().joint.reweighting._replace(
-            model_frames=100, fewest_shown=20
-        )
-    ),
 )
 KRYLOV = Limits(dense=300)
 
@@ -152,7 +147,7 @@ class TestFit:
     def test_of_many_points_of_which_some_are_missing(self, tmp_path, loss):
         # Completed frames along directions first: the end is that of the seen points.
         X, joint = table(0.1, n_points=210), Limits().joint
-        few = joint._replace(many_points=joint.many_points._replace(least_points=999))
+        few = joint._replace(many_points=999)
         at_once = estimator(Limits()._replace(joint=few), loss=loss, tol=1e-4).fit(X)
         model = estimator(loss=loss, tol=1e-4).fit(X)
         assert_allclose(model.basis_, at_once.basis_, rtol=0, atol=1e-4)

@@ -9,7 +9,8 @@ from benchmarks.asv_suite._measured import TABLES, Measured, Table, load
 from benchmarks.speed import measured as measurement_matrix, with_holes
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._gauge.independent import independent_gauge
-from isa_nrsfm._joint.fit import Spectrum, fit_jointly
+from isa_nrsfm._joint.fit import fit_jointly
+from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._paper.alternating import refine_alternating
 from isa_nrsfm._paper.block_structure import (
     lifted_moments,
@@ -20,6 +21,7 @@ from isa_nrsfm._paper.block_structure import (
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import sample_frames
+from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._prepare.completion import complete_tracks
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.layout import (
@@ -226,29 +228,22 @@ class JointRefinement(Stage):
         self.of_sample = factorise(self.sample.W, self.K)
 
     def run(self):
-        return fit_jointly(
+        table = FactorisedTable(
             self.rows,
             self.rows,
             self.n_seen,
+            None,
+            leading_triplets(self.W, 3 * self.K + 3),
             self.sample,
             self.of_sample,
-            self.paper.shapes,
-            spectrum=Spectrum.from_singular_values(
-                np.linalg.svd(self.W, compute_uv=False)[: 3 * self.K + 3],
-                self.model.rank_floor_,
-                self.K,
-                self.W.shape[1],
-                self.n_seen,
-            ),
-            camera="affine",
-            loss="linear",
-            max_iter=1000,
-            tol=0.05,
         )
+        settings = JointSettings("affine", "linear", max_iter=1000, tol=0.05)
+        return fit_jointly(table, self.paper.shapes, settings)
 
     def track_affine_shape_error(self, cache, table):
-        fit = self.run()
-        shapes = fit.shapes[0] + np.tensordot(fit.alpha, fit.shapes[1:], axes=1)
+        fit, _, alpha = self.run()
+        shapes = fit.state.shapes
+        shapes = shapes[0] + np.tensordot(alpha, shapes[1:], axes=1)
         return self.table.error_3d(shapes.transpose(0, 2, 1))
 
     def track_inverse_snr(self, cache, table):

@@ -12,35 +12,27 @@
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
 from isa_nrsfm._joint.frames import JointFrames, WeightedRows
-from isa_nrsfm._joint.many_points import (
-    has_many_points,
-    in_all_points,
-    leading_directions,
-)
-from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions
-from isa_nrsfm._joint.problem import JointProblem, Steps
-from isa_nrsfm._joint.quasi_newton import JointResult, JointState
+from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
+from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointFit, JointState
 from isa_nrsfm._joint.relevance import relevant_components
 from isa_nrsfm._joint.reweighting import reweighted
 from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-from isa_nrsfm._paper.factors import Factorisation
-from isa_nrsfm._paper.sample import Sample
-from isa_nrsfm._tables.blocks import FrameBlocks
 
 
 class Spectrum(NamedTuple):
     """
-    What the singular values of a table say of a model with K basis shapes.
+    Noise level and missing energy of a rank-(3K+3) model, from the singular values.
 
     Attributes
     ----------
@@ -59,43 +51,17 @@ class Spectrum(NamedTuple):
     missing: float
 
     @classmethod
-    def from_singular_values(
-        cls,
-        values: NDArray,
-        rest_share: float,
-        n_components: int,
-        n_points: int,
-        n_seen: NDArray,
-    ) -> "Spectrum":
-        """
-        Return the spectrum for the 3K + 3 largest singular values and the rest.
-
-        Parameters
-        ----------
-        values : ndarray
-            The largest singular values, 3K + 3 or as many as there are.
-        rest_share : float
-            Share of the energy beyond them.
-        n_components : int
-            K.
-        n_points : int
-            Number of points.
-        n_seen : ndarray of int, shape (n_frames,)
-            How many points each frame shows; the others were filled in.
-
-        Returns
-        -------
-        Spectrum
-            Of the table.
-        """
+    def of(cls, table: FactorisedTable, n_components: int) -> "Spectrum":
+        """Return the spectrum of a table for K basis shapes."""
+        rest_share = table.triplets.rest_share
         # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
-        seen = float(np.mean(n_seen))
+        seen = float(np.mean(table.n_seen))
         n_others = seen - 1 - (3 * n_components + 3)
         noise = rest_share * (seen - 1) / n_others if n_others > 0 else 0.0
         # Points that were filled in add to the energy of the table, but have no noise.
-        noise *= n_points / seen
-        energy = np.sum(values**2)
-        beyond = np.sum(values[n_components + 3 :] ** 2) / (energy or 1.0)
+        noise *= table.sample.W.shape[1] / seen
+        squares = table.triplets.values**2
+        beyond = np.sum(squares[n_components + 3 :]) / (np.sum(squares) or 1.0)
         return cls(noise, float(rest_share + (1 - rest_share) * beyond))
 
 
@@ -120,339 +86,205 @@ class Start(NamedTuple):
     calibrated_first: bool = False
 
 
-class JointFit(NamedTuple):
-    """
-    Result of the joint fit of a table.
-
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        B_0, ..., B_K, centred, scaled and mixed such that alpha ~ N(0, I).
-    alpha : ndarray of shape (n_chosen, n_components)
-        Posterior means of the coefficients of the frames of the sample.
-    noise_variance : float
-        Variance of the noise of a coordinate, corrected for the degrees of freedom that
-        cameras and shapes take.
-    camera_noise_ratio : float
-        Noise variance with calibrated cameras divided by that with affine ones, for the
-        frames of the sample.
-    history : ndarray of shape (n_iter + 1,)
-        The objective at the start and after each step of the last refinement.
-    gradient_norm : float
-        As in `JointResult`.
-    converged : bool
-        Whether the refinement has converged.
-    frames : JointFrames
-        The frames as they were fitted in the end.
-    """
-
-    shapes: NDArray
-    alpha: NDArray
-    noise_variance: float
-    camera_noise_ratio: float
-    history: NDArray
-    gradient_norm: float
-    converged: bool
-    frames: JointFrames
-
-
 def fit_jointly(
-    rows: FrameBlocks,
-    completed: FrameBlocks,
-    n_seen: NDArray,
-    sample: Sample,
-    factors: Factorisation,
+    table: FactorisedTable,
     paper_shapes: NDArray,
-    *,
-    spectrum: Spectrum,
-    camera: str,
-    outliers: NDArray | None = None,
-    loss: str,
-    max_iter: int,
-    tol: float,
-    on_step: Callable[[], None] | None = None,
+    settings: JointSettings,
     starts: Sequence[Start] = (),
-    options: JointOptions = JOINT_OPTIONS,
-) -> JointFit:
+) -> tuple[JointFit, JointFrames, NDArray]:
     """
     Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
     Parameters
     ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
-        NaN where a point is missing.
-    completed : FrameBlocks
-        The same frames with missing points, and outliers, filled in.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of points that each frame shows.
-    sample : Sample
-        The frames that the first steps are made on.
-    factors : Factorisation
-        Of their measurement matrix.
+    table : FactorisedTable
+        The table.
     paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes of the paper's pipeline.
-    spectrum : Spectrum
-        What the singular values of the table say of its noise.
-    camera : {"affine", "weak_perspective", "orthographic"}
-        What cameras may be.
-    outliers : ndarray of bool, shape (n_frames, n_points), optional
-        Points that a robust loss leaves out at first. Its weights decide later how much
-        they count. To be given with such a loss.
-    loss : {"linear", "huber", "cauchy"}
-        How points count that are far from the model.
-    max_iter : int
-        Largest number of steps.
-    tol, on_step
-        As in `refine_joint`.
+    settings : JointSettings
+        How the table is fitted.
     starts : sequence of Start, default=()
         Where the fit starts, instead of `paper_shapes` and the search for starts.
-    options : JointOptions
-        The limits of all stages.
 
     Returns
     -------
-    JointFit
-        The fit. With `starts` its `camera_noise_ratio` is NaN.
+    fit : JointFit
+        Its shapes are centred, scaled and mixed such that alpha ~ N(0, I). The noise
+        variance is corrected for the unknowns of cameras and shapes.
+    frames : JointFrames
+        The frames as they were fitted in the end.
+    alpha : ndarray of shape (n_chosen, n_components)
+        Posterior means of the coefficients of the frames of the sample.
     """
-    n_shapes, _, n_points = paper_shapes.shape
-    steps = Steps(max_iter, tol, on_step)
-    table = rows, completed, n_seen, sample, factors, paper_shapes
-    ready = _ready(*table, outliers, loss, steps, options)
-    first, problem, cameras = ready.problems[0], ready.problems[-1], CAMERAS[camera]
+    problems, seen = _problems(table, paper_shapes, settings)
+    first, sampled = problems[0], len(problems) > 1
+    camera, cameras = settings.camera, CAMERAS[settings.camera]
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if starts:
-        result, ratio, start = _continued_fit(first, starts, camera)
+        fit, start = _continued_fit(first, starts)
     else:
-        result, ratio, start = _first_fit(first, sample, factors, paper_shapes, camera)
-    result, least_noise, right = judged(first, result, start, cameras, spectrum)
+        fit, start = _first_fit(first, table, paper_shapes)
+    ratio = fit.camera_noise_ratio
+    spectrum = Spectrum.of(table, len(paper_shapes) - 1)
+    fit, least_noise, right = judged(first, fit, start, cameras, spectrum)
     refined = partial(_refined, cameras=cameras, least_noise=least_noise)
-    problems = ready.problems
     if right:
-        problems = [each.with_penalty(0.0) for each in problems]
-        problem = problems[-1]
-    # For a right model it is safe to go on to a smaller tolerance.
-    if right and not sample.parts:
-        tol = options.judgement.polish * problem.steps.tol
-        result = refined(problem, result.state, tol=tol)
+        problems = [replace(each, penalty=0.0) for each in problems]
+        if not sampled:  # for a right model a smaller tolerance is safe
+            fit = refined(problems[0], fit.state, tol=0.1**2 * settings.tol)
     # Fits of larger samples, and of all frames
-    for larger in problems[1:]:
-        result = refined(larger, larger.aligned(result.state, camera))
-    # Further directions, then the points that are seen, and robust weights
-    if ready.wide:
-        result, problem = in_all_points(result, problem, completed, refined)
-    if ready.seen is not None:
-        shapes = problem.frames.points(result.state.shapes)
-        problem = problem.with_frames(ready.seen)
-        result = refined(problem, result.state._replace(shapes=shapes))
-    noise, n_pose = result.state.noise, 2 + cameras.n_parameters
-    if ready.left_out is not None:
-        weighted = partial(reweighted, cameras=cameras, refined=refined)
+    for problem in problems[1:]:
+        fit = refined(problem, problem.aligned(fit.state, camera))
+    # After completed frames, the points that are seen, and robust weights
+    problem = problems[-1]
+    if seen is not None:
+        shapes = problem.frames.points(fit.state.shapes)
+        problem = replace(problem, frames=seen)
+        fit = refined(problem, fit.state._replace(shapes=shapes))
+    noise, n_pose = fit.state.noise, 2 + cameras.n_parameters
+    if table.outliers is not None:
         # This noise variance is corrected for the unknowns of the frames already.
-        result, noise = weighted(problem, rows, ready.left_out, result, loss)
+        fit, noise = reweighted(problem, table.rows, table.outliers, fit, refined)
         n_pose = 0
-    shapes = problem.frames.points(result.state.shapes)
+    shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
-    state = result.state._replace(shapes=first.frames.coordinates(shapes))
-    if sample.parts:
-        state = state._replace(motion=state.motion[sample.parts[0]])
-    noise *= _freedom_correction(n_seen, n_points, n_shapes, n_pose)
-    return JointFit(
-        shapes - shapes.mean(axis=2, keepdims=True),
-        first.coefficients(state),
-        max(noise, OF_DISTANCES**2),
-        ratio,
-        result.history,
-        result.gradient_norm,
-        result.converged,
-        problem.frames,
-    )
+    state = fit.state._replace(shapes=first.frames.coordinates(shapes))
+    if sampled:
+        state = state._replace(motion=state.motion[table.sample.parts[0]])
+    noise *= _freedom_correction(table.n_seen, shapes.shape, n_pose)
+    centred = shapes - shapes.mean(axis=2, keepdims=True)
+    end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
+    fit = fit._replace(state=end, camera_noise_ratio=ratio)
+    return fit, problem.frames, first.coefficients(state)
 
 
 def count_components(
-    rows: FrameBlocks,
-    completed: FrameBlocks,
-    n_seen: NDArray,
-    sample: Sample,
-    factors: Factorisation,
-    paper_shapes: NDArray,
-    *,
-    camera: str,
-    outliers: NDArray | None = None,
-    loss: str,
-    max_iter: int,
-    tol: float,
-    options: JointOptions = JOINT_OPTIONS,
+    table: FactorisedTable, paper_shapes: NDArray, settings: JointSettings
 ) -> int:
+    """Return the number of basis shapes that a table supports, at least one.
+
+    They are those of a fit of the sample that are relevant. The arguments are those of
+    `fit_jointly`, with more basis shapes than are expected.
     """
-    Return the number of basis shapes that a table supports.
+    problem = _problems(table, paper_shapes, settings)[0][0]
+    fit, _ = _first_fit(problem, table, paper_shapes)
+    return max(relevant_components(problem, fit.state, CAMERAS[settings.camera]), 1)
 
-    Parameters
-    ----------
-    rows, completed, n_seen, sample, factors, paper_shapes
-        As of `fit_jointly`, with more basis shapes than are expected.
-    camera, outliers, loss, max_iter, tol, options
-        As of `fit_jointly`.
 
-    Returns
-    -------
-    int
-        The number, at least one: the basis shapes of a fit of the sample that are
-        relevant.
+def _problems(
+    table: FactorisedTable, paper_shapes: NDArray, settings: JointSettings
+) -> tuple[list[JointProblem], JointFrames | None]:
+    """Return the problems of larger and larger samples, and of all frames.
+
+    Of many points frames are completed and given by few directions. Where points are
+    missing or left out, the second result has the frames by the points that are seen.
     """
-    steps = Steps(max_iter, tol)
-    table = rows, completed, n_seen, sample, factors, paper_shapes
-    ready = _ready(*table, outliers, loss, steps, options)
-    first = ready.problems[0]
-    result, *_ = _first_fit(first, sample, factors, paper_shapes, camera)
-    return max(relevant_components(first, result.state, CAMERAS[camera]), 1)
-
-
-class _Ready(NamedTuple):
-    """A table that is ready for the joint fit."""
-
-    problems: list[JointProblem]  # of larger and larger samples, and of all frames
-    wide: bool  # whether they are of completed frames, given by directions
-    seen: JointFrames | None  # if they do not tell all, frames by seen points
-    left_out: NDArray | None  # (n_frames, n_points), outliers; robust losses only
-
-
-def _ready(
-    rows: FrameBlocks,
-    completed: FrameBlocks,
-    n_seen: NDArray,
-    sample: Sample,
-    factors: Factorisation,
-    paper_shapes: NDArray,
-    outliers: NDArray | None,
-    loss: str,
-    steps: Steps,
-    options: JointOptions,
-) -> _Ready:
-    """Return a table ready for the joint fit."""
     n_shapes, _, n_points = paper_shapes.shape
-    n_frames = len(n_seen)
-    complete = bool((n_seen == n_points).all())
-    left_out = None
-    if loss != "linear":
-        none = np.zeros((n_frames, n_points), dtype=bool)
-        left_out = none if outliers is None else outliers
-    # Many points: completed frames, given by directions, before those that are seen
-    wide, seen = has_many_points(n_points, n_shapes, options.many_points), None
-    if wide:
-        frames = JointFrames.from_directions(completed, leading_directions(factors))
-        if not complete or left_out is not None:
-            seen = _seen_frames(rows, complete, left_out)
+    options, outliers = settings.options, table.outliers
+    complete = bool((table.n_seen == n_points).all())
+    if outliers is None or not outliers.any():
+        frames = JointFrames.from_points(table.rows, complete)
     else:
-        frames = _seen_frames(rows, complete, left_out)
-    small = n_frames <= options.few_frames
-    steps = steps._replace(effort=options.small if small else options.large)
-    problem = JointProblem(frames, steps, 0.0, options)
+        rows = table.rows.derive(WeightedRows.without, outliers)
+        frames = JointFrames.from_weighted(rows)
+    seen = None
+    if n_points > max(24 * n_shapes, options.many_points):
+        seen = frames if not complete or outliers is not None else None
+        directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
+        directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
+        frames = JointFrames.from_directions(table.completed, directions)
     # Penalty of sum_i ||M_i B_k||^2 for the prior of basis shapes in frames of mean
     # square energy / n_numbers. The prior counts once, not for each frame.
-    n_numbers, energy = problem.totals
-    variance = options.basis_std**2 * energy
-    problem = problem.with_penalty(n_numbers / (variance * n_frames))
-    by_chance = options.by_chance * frames.coordinates(paper_shapes).size
+    n_numbers, energy = frames.totals
+    penalty = n_numbers / (options.basis_std**2 * energy * frames.n_frames)
+    thorough = frames.n_frames <= options.few_frames
+    problem = JointProblem(frames, settings, thorough, penalty)
+    # Each number that is fitted lowers the objective by about one by chance. Steps on a
+    # sample end when they gain less than 3 % of that for all shapes together.
+    chance = 0.03 * frames.coordinates(paper_shapes).size
+    samples = replace(problem, thorough=False)
     problems = [
-        problem.part(
-            part, tol=max(steps.tol, by_chance / len(part)), effort=options.large
-        )
-        for part in sample.parts
+        samples.part(part, tol=max(settings.tol, chance / len(part)))
+        for part in table.sample.parts
     ]
-    return _Ready([*problems, problem], wide, seen, left_out)
-
-
-def _seen_frames(
-    rows: FrameBlocks, complete: bool, left_out: NDArray | None
-) -> JointFrames:
-    """Return frames given by the points that are seen and not left out."""
-    if left_out is None or not left_out.any():
-        return JointFrames.from_points(rows, complete)
-    return JointFrames.from_weighted(rows.derive(WeightedRows.without, left_out))
+    return [*problems, problem], seen
 
 
 def _first_fit(
-    problem: JointProblem,
-    sample: Sample,
-    factors: Factorisation,
-    paper_shapes: NDArray,
-    camera: str,
-) -> tuple[JointResult, float, JointState]:
-    """
-    Return the fit of the sample, its `camera_noise_ratio`, and one of its starts.
+    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
+) -> tuple[JointFit, JointState]:
+    """Return the fit of the sample, with its ratio of noises, and one of its starts.
 
     A calibrated and an affine fit are made in any case: the ratio needs both.
     """
     # Calibrated cameras, from the best starts
+    settings, affine = problem.settings, CAMERAS["affine"]
+    camera = settings.camera
     calibrated = CAMERAS["weak_perspective" if camera == "affine" else camera]
-    starts = best_starts(problem, sample.W, factors, paper_shapes, calibrated)
-    result = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
+    starts = best_starts(problem, table, paper_shapes, calibrated)
+    fit = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
     # Affine cameras, from the calibrated fit and from the paper's result
-    rigid = affine_start(problem, sample.W, paper_shapes)
+    rigid = affine_start(problem, table.sample.W, paper_shapes)
     states = [
-        problem.aligned(result.state, "affine"),
-        settled(problem, rigid, CAMERAS["affine"]),
+        problem.aligned(fit.state, "affine"),
+        settled(problem, rigid, affine),
     ]
-    refined = partial(_refined, problem, cameras=CAMERAS["affine"])
-    max_iter = problem.steps.max_iter
-    if camera != "affine":
-        max_iter = min(max_iter, problem.options.compared_steps)
-    race_steps = problem.steps.effort.race_steps
-    if race_steps is not None:  # only the better one goes on
-        first = _least(refined(s, max_iter=min(max_iter, race_steps)) for s in states)
-        states = [first.state]
-    affine = _least(refined(state, max_iter=max_iter) for state in states)
-    ratio = result.left / min(affine.left, result.left)
+    max_iter = settings.max_iter
+    if camera != "affine":  # only compared
+        max_iter = min(max_iter, 60)
+    if not problem.thorough:  # only the better one goes on
+        few = min(max_iter, 5)
+        raced = [_refined(problem, each, affine, max_iter=few) for each in states]
+        states = [_least(raced).state]
+    other = _least(_refined(problem, s, affine, max_iter=max_iter) for s in states)
+    ratio = fit.left / min(other.left, fit.left)
     if camera == "affine":
-        return affine, ratio, rigid
-    return result, ratio, starts[0]
+        return other._replace(camera_noise_ratio=ratio), rigid
+    return fit._replace(camera_noise_ratio=ratio), starts[0]
 
 
 def _continued_fit(
-    problem: JointProblem, starts: Sequence[Start], camera: str
-) -> tuple[JointResult, float, JointState]:
-    """
-    Return the fit from the best of given starts, NaN, and that start.
+    problem: JointProblem, starts: Sequence[Start]
+) -> tuple[JointFit, JointState]:
+    """Return the fit from the best of given starts, and that start.
 
     The first start is fitted. Each other one goes on only if it can catch up: it may
-    not lack more, after some steps, than the second half of them gained. The second
-    number would be the `camera_noise_ratio`, which needs both camera models.
+    not lack more, after some steps, than the second half of them gained.
     """
-    cameras = CAMERAS[camera]
-    n_steps = min(problem.options.starts.catching_up, problem.steps.max_iter)
+    settings = problem.settings
+    cameras = CAMERAS[settings.camera]
+    n_steps = min(settings.options.catching_up, settings.max_iter)
     fitted = _calibrated_fit if cameras.calibrated else _refined
-    fits: list[tuple[JointResult, float, JointState]] = []
+    fits: list[tuple[JointFit, JointState]] = []
     for start in starts:
-        state = given = _aligned_start(problem, start, camera)
+        state = given = _aligned_start(problem, start)
         if fits:
             tried = _refined(problem, state, cameras, max_iter=n_steps)
-            history = tried.history
-            gained = history[len(history) // 2] - history[-1]
-            least = min(result.history[-1] for result, *_ in fits)
-            if history[-1] - least > gained:
+            gained = tried.history[len(tried.history) // 2] - tried.value
+            if tried.value - min(fit.value for fit, _ in fits) > gained:
                 continue
             state = tried.state
-        fits.append((fitted(problem, state, cameras), np.nan, given))
-    return min(fits, key=lambda found: found[0].history[-1])
+        fits.append((fitted(problem, state, cameras), given))
+    return min(fits, key=lambda found: found[0].value)
 
 
-def _aligned_start(problem: JointProblem, start: Start, camera: str) -> JointState:
-    """Return a given start with cameras, preceded by calibrated ones if it says so."""
+def _aligned_start(problem: JointProblem, start: Start) -> JointState:
+    """Return a given start with cameras, after calibrated ones if it asks for them."""
+    camera = problem.settings.camera
     shapes = problem.frames.coordinates(start.shapes)
     state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
     if start.calibrated_first and not CAMERAS[camera].calibrated:
         # As many steps as starts of the search make
-        max_iter = min(problem.options.starts.freed_steps, problem.steps.max_iter)
+        max_iter = min(30, problem.settings.max_iter)
         calibrated = "weak_perspective"
         state = problem.aligned(state, calibrated)
         state = problem.refined(state, CAMERAS[calibrated], max_iter=max_iter).state
     return problem.aligned(state, camera)
 
 
-def _least(results: Iterable[JointResult]) -> JointResult:
-    """Return the refinement with the lowest objective at its end."""
-    return min(results, key=lambda result: result.history[-1])
+def _least(fits: Iterable[JointFit]) -> JointFit:
+    """Return the fit with the lowest objective at its end."""
+    return min(fits, key=lambda fit: fit.value)
 
 
 def _calibrated_fit(
@@ -460,15 +292,15 @@ def _calibrated_fit(
     state: JointState,
     cameras: CameraModel,
     least_noise: float | None = None,
-) -> JointResult:
+) -> JointFit:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
-    result = _refined(problem, state, cameras, least_noise)
-    for _ in range(problem.steps.effort.reversals):
-        state, n_reversed = problem.reversed_back(result.state, cameras)
+    fit = _refined(problem, state, cameras, least_noise)
+    for _ in range(5 if problem.thorough else 0):
+        state, n_reversed = problem.reversed_back(fit.state, cameras)
         if not n_reversed:
             break
-        result = _refined(problem, state, cameras, least_noise)
-    return result
+        fit = _refined(problem, state, cameras, least_noise)
+    return fit
 
 
 def _refined(
@@ -476,74 +308,79 @@ def _refined(
     state: JointState,
     cameras: CameraModel,
     least_noise: float | None = None,
-    **steps: Any,
-) -> JointResult:
+    max_iter: int | None = None,
+    tol: float | None = None,
+) -> JointFit:
     """Return the refinement of a state, with a smaller tolerance for small tables."""
-    steps = {"tol": problem.steps.tol * problem.steps.effort.polish, **steps}
-    return problem.refined(state, cameras, least_noise, **steps)
+    if tol is None:
+        tol = problem.settings.tol * (0.1 if problem.thorough else 1.0)
+    return problem.refined(
+        state, cameras, least_noise=least_noise, max_iter=max_iter, tol=tol
+    )
 
 
 def judged(
     problem: JointProblem,
-    result: JointResult,
+    fit: JointFit,
     start: JointState,
     cameras: CameraModel,
     spectrum: Spectrum,
-) -> tuple[JointResult, float, bool]:
+) -> tuple[JointFit, float, bool]:
     """
-    Return the fit for the judgement of its model, the least noise, and the judgement.
+    Decide whether K is sufficient and refit accordingly.
 
-    A model is right if its residual is no larger than the noise that the spectrum
-    tells. Then the maximum of the likelihood needs neither floor nor prior, and the fit
-    without them is returned (released). Deformation below the floor has vanished from
-    the result, so that the released fit is tried from the start of the fit as well.
+    Returns the fit, its noise floor and the decision. A model is right if its residual
+    is no larger than the noise of the spectrum. Then the maximum of the likelihood
+    needs neither floor nor prior, and the fit without them is returned (released).
+    Deformation below the floor has vanished from the result, so that the released fit
+    is tried from the start of the fit as well.
 
     A model that is not right has too few basis shapes, and cameras or depths explain
     the deformation that is missing. Calibrated cameras are fitted again, with a floor
     of the noise as high as that deformation. Orthographic ones, which have no scales
     that could explain any of it, only if their noise is at the lower floor.
     """
-    options, least_noise = problem.options.judgement, problem.options.least_noise
-    n_seen, energy = problem.totals
-    mean_square = energy / n_seen
-    right_noise = max(options.right * spectrum.noise, options.exact) * mean_square
-    at_floor = result.state.noise < (1 + options.slack) * least_noise * mean_square
+    options, mean_square = problem.settings.options, problem.mean_square
+    least_noise = options.least_noise
+    # A spectrum of only 3K + 3 singular values has no noise.
+    right_noise = max(options.right * spectrum.noise, 1e-10) * mean_square
+    at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
     # Right: without floor and prior
-    if at_floor or result.state.noise < right_noise:
-        for state in (result.state, start):
+    if at_floor or fit.state.noise < right_noise:
+        for state in (fit.state, start):
             released = unregularised(problem, state, cameras)
             if released.state.noise < right_noise:
-                return released, problem.options.search.noise_floor, True
+                return released, NOISE_FLOOR, True
     # Not right: with a floor as high as the missing deformation
     follows = cameras.scaled or at_floor
     if cameras.calibrated and follows and spectrum.noise > 0:
         missing = options.cut_off * spectrum.missing
         least_noise = np.clip(missing, least_noise, options.most_noise)
-        result = _calibrated_fit(problem, result.state, cameras, least_noise)
-    return result, least_noise, False
+        fit = _calibrated_fit(problem, fit.state, cameras, least_noise)
+    return fit, least_noise, False
 
 
 def unregularised(
     problem: JointProblem, state: JointState, cameras: CameraModel
-) -> JointResult:
+) -> JointFit:
     """Return the fit without prior and floor. It ends when the noise hardly falls."""
-    problem = problem.with_penalty(0.0)
+    problem = replace(problem, penalty=0.0)
     state = with_prior(problem, state)
-    options, floor = problem.options.judgement, problem.options.search.noise_floor
-    steps = min(options.released_steps, problem.steps.max_iter)
-    for _ in range(problem.steps.max_iter // steps):
+    max_iter = problem.settings.max_iter
+    steps = min(60, max_iter)
+    for _ in range(max_iter // steps):
         before = state.noise
-        result = _refined(problem, state, cameras, floor, max_iter=steps)
-        state = result.state
-        if state.noise > options.falling * before:
+        fit = _refined(problem, state, cameras, NOISE_FLOOR, max_iter=steps)
+        state = fit.state
+        if state.noise > 0.95 * before:
             break
         if cameras.calibrated:
             state, _ = problem.reversed_back(state, cameras)
-    return result
+    return fit
 
 
 def _freedom_correction(
-    n_seen: NDArray, n_points: int, n_shapes: int, n_pose: int
+    n_seen: NDArray, shape: tuple[int, int, int], n_pose: int
 ) -> float:
     """
     Return the number of seen coordinates N over the residual's degrees of freedom.
@@ -554,6 +391,7 @@ def _freedom_correction(
     the mean shape and nine of the affinity of space, which share one scale. At least
     ``N / 10`` degrees of freedom are assumed.
     """
+    n_shapes, _, n_points = shape
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()
     unknowns = n_pose * n_frames + 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     return float(n_numbers / max(n_numbers - unknowns, 0.1 * n_numbers))

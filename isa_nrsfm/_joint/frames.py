@@ -6,33 +6,25 @@ energy and its inner products with directions that span the shapes. With these a
 over the frames costs the same for any number of points.
 """
 
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
-from isa_nrsfm._joint.likelihood import BLOCK_FRAMES
+from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, totals
 from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
 
 
 class WeightedRows(NamedTuple):
-    """
-    Frames of a table with a weight for each point.
+    """Frames of a table with a weight for each point."""
 
-    Attributes
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_points)
-        Frames, NaN where a point is missing.
-    weights : ndarray of shape (n_frames, n_points)
-        Weights, zero where a point is missing.
-    """
-
-    rows: NDArray
-    weights: NDArray
+    rows: NDArray  # (n_frames, 2, n_points), NaN where a point is missing
+    weights: NDArray  # (n_frames, n_points), zero where a point is missing
 
     @classmethod
     def without(cls, rows: NDArray, left_out: NDArray) -> Self:
@@ -41,7 +33,8 @@ class WeightedRows(NamedTuple):
         return cls(rows, (seen & ~left_out) * 1.0)
 
 
-class JointFrames(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class JointFrames:
     """
     Frames of a table, ready for passes over them.
 
@@ -55,53 +48,33 @@ class JointFrames(NamedTuple):
     """
 
     blocks: FrameBlocks
-    directions: NDArray | None
+    directions: NDArray | None = None
 
     @property
     def n_frames(self) -> int:
         """Number of frames."""
         return self.blocks.n_frames
 
+    @cached_property
+    def totals(self) -> tuple[float, float]:
+        """Number of coordinates that the frames show, and their energy."""
+        return totals(self.blocks)
+
     @classmethod
     def from_points(cls, rows: FrameBlocks, complete: bool) -> Self:
-        """
-        Return frames given by their points.
-
-        Parameters
-        ----------
-        rows : FrameBlocks
-            Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
-        complete : bool
-            Whether no point is missing.
-
-        Returns
-        -------
-        JointFrames
-            The frames. All points that are seen have weight one.
-        """
-        return cls(rows.derive(partial(_plain_frames, complete=complete)), None)
+        """Return frames by points, from blocks of rows (n, 2, J); weights are one."""
+        return cls(rows.derive(partial(_plain_frames, complete=complete)))
 
     @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
-        """Return frames given by their points, from blocks of `WeightedRows`."""
-        return cls(weighted.derive(_weighted_frames), None)
+        """Return frames by points, from blocks of `WeightedRows`."""
+        return cls(weighted.derive(_weighted_frames))
 
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
-        """
-        Return complete frames given by their products with some directions.
+        """Return frames by their products with directions (n_directions, n_points).
 
-        Parameters
-        ----------
-        rows : FrameBlocks
-            Blocks of frames (n_frames, 2, n_points).
-        directions : ndarray of shape (n_directions, n_points)
-            Orthonormal rows, each with sum zero.
-
-        Returns
-        -------
-        JointFrames
-            The frames.
+        The rows (n_frames, 2, n_points) are complete. Each direction has the sum zero.
         """
         blocks = rows.derive(partial(_compressed_frames, directions=directions))
         return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
@@ -111,7 +84,7 @@ class JointFrames(NamedTuple):
         return shapes if self.directions is None else shapes @ self.directions.T
 
     def points(self, shapes: NDArray) -> NDArray:
-        """Return shapes (..., n_points) from what `coordinates` returns."""
+        """Return shapes (..., n_points) from the result of `coordinates`."""
         return shapes if self.directions is None else shapes @ self.directions
 
     def take(self, frames: NDArray) -> Self:
@@ -120,8 +93,9 @@ class JointFrames(NamedTuple):
         chosen[frames] = True
         taken = [part for part in self.blocks.map(_taken, chosen) if len(part.weight)]
         blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
-        blocks = blocks.regrouped(joined_frames, BLOCK_FRAMES)
-        return type(self)(blocks, self.directions)
+        return type(self)(
+            blocks.regrouped(joined_frames, BLOCK_FRAMES), self.directions
+        )
 
 
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
@@ -136,11 +110,10 @@ def _weighted_frames(block: WeightedRows) -> FrameTracks:
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
-    """
-    Return complete frames (n_frames, 2, n_points) by their products with directions.
+    """Return complete frames (n_frames, 2, n_points) by their products with directions.
 
-    The directions (n_directions, n_points) take the place of points, whose centroid is
-    zero. The number of points and the energy are those of the frames themselves.
+    The directions take the place of points, whose centroid is zero. The number of
+    points and the energy are those of the frames themselves.
     """
     n_frames, _, n_points = rows.shape
     products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)

@@ -25,7 +25,7 @@ but for rounding. The pass over a block works with the frame as the last index o
 arrays, with cameras M and the gradient G by them (2, 3, n_frames).
 """
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -34,22 +34,14 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
-from isa_nrsfm._frames.point_sums import (
-    FrameTracks,
-    ShapeProducts,
-    frame_sums,
-    frame_tracks,
-)
+from isa_nrsfm._frames.point_sums import FrameTracks, ShapeProducts, frame_sums
 from isa_nrsfm._joint.extents import extent_penalty
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.vectors import frames_last
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048
-# With a noise variance below this share of the mean square of the tracks, the normal
-# equations of the coefficients get one step of iterative refinement.
-TINY_NOISE = 1e-7
 
 
 class LikelihoodTerms(NamedTuple):
@@ -62,8 +54,6 @@ class LikelihoodTerms(NamedTuple):
         The objective.
     shape_gradient : ndarray of shape (n_shapes, 3, n_points)
         Its derivative by the shapes.
-    motion_gradient : ndarray of shape (n_frames, 2, 3)
-        Its derivative by the cameras.
     noise_gradient : float
         Its derivative by the logarithm of the noise variance.
     shape_curvature : ndarray of shape (n_points or 1, 3 * n_shapes, 3 * n_shapes)
@@ -71,51 +61,24 @@ class LikelihoodTerms(NamedTuple):
         (1, alpha). Times ``2 / s2`` it is the Hessian by point j of the shapes, with
         the posterior and the positions held fixed. One matrix stands for all points
         where all weights are one.
+    residual : float
+        Sum of squared residuals of the tracks at the posterior means.
+    motion_gradient : ndarray of shape (2, 3, n_frames)
+        Derivative by the cameras.
     motion_curvature : ndarray of shape (6, n_frames)
         ``sum_kl E_kl B_k B_l^T``, packed: the same for each row of the cameras.
-    alpha : ndarray of shape (n_frames, n_components)
+    alpha : ndarray of shape (n_components, n_frames)
         Posterior means of the coefficients.
-    residual : float
-        Sum of squared residuals of the tracks at these means.
     """
 
     value: float
     shape_gradient: NDArray
-    motion_gradient: NDArray
     noise_gradient: float
     shape_curvature: NDArray
+    residual: float
+    motion_gradient: NDArray
     motion_curvature: NDArray
     alpha: NDArray
-    residual: float
-
-
-def likelihood_of(
-    tracks: NDArray,
-    weights: NDArray | None,
-    penalty: NDArray | float,
-    block_frames: int = BLOCK_FRAMES,
-) -> "MarginalLikelihood":
-    """
-    Return the objective for tracks in memory.
-
-    Parameters
-    ----------
-    tracks, weights
-        As of `frame_tracks`.
-    penalty : float
-        As of `MarginalLikelihood`.
-    block_frames : int, default=2048
-        Frames of a block.
-
-    Returns
-    -------
-    MarginalLikelihood
-        The objective.
-    """
-    pieces = frame_tracks(tracks, weights).pieces(block_frames)
-    blocks = [block for _, block in pieces]
-    lengths = [len(block.weight) for block in blocks]
-    return MarginalLikelihood(FrameBlocks.of_blocks(blocks, lengths), penalty)
 
 
 class MarginalLikelihood:
@@ -130,7 +93,7 @@ class MarginalLikelihood:
         Regularisation weight: factor of ``sum_i tr H_i``, or one factor for the
         diagonal entry of each basis shape.
     known : tuple of float, optional
-        What `totals` returns for these blocks, if it has been computed already.
+        `totals` of these blocks, if they have been computed already.
     extent_weight : float, default=0.0
         Weight of the prior of the extents, for each coordinate.
 
@@ -151,116 +114,57 @@ class MarginalLikelihood:
         known: tuple[float, float] | None = None,
         extent_weight: float = 0.0,
     ):
-        self.frames, self.extent_weight = frames, extent_weight
+        self.frames, self.penalty, self.extent_weight = frames, penalty, extent_weight
         self.n_frames = frames.n_frames
-        self.penalty = penalty
         self.n_seen, self.square = totals(frames) if known is None else known
 
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
     ) -> LikelihoodTerms:
-        """
-        Return the objective, its gradient and an approximate curvature.
+        """Return the terms at shapes (n_shapes, 3, n_points), M (n_frames, 2, 3), s2.
 
-        Parameters
-        ----------
-        shapes : ndarray of shape (n_shapes, 3, n_points)
-            B_0, ..., B_K.
-        motion : ndarray of shape (n_frames, 2, 3)
-            M_i.
-        noise : float
-            s2.
-
-        Returns
-        -------
-        LikelihoodTerms
-            The sums over the frames.
+        Added to the sums over the frames is what is common to all of them: ``N log
+        s2`` and its derivative, ``2 / s2 curvature B``, and the prior of the extents.
         """
-        n_shapes = len(shapes)
-        over_block = self._over_block(shapes, noise)
-        alpha = np.empty((n_shapes - 1, self.n_frames)).T
-        motion_gradient = frames_first(np.empty((2, 3, self.n_frames)))
-        motion_curvature = np.empty((6, self.n_frames))
-        sums: Any = (0.0,) * 5
-        passes = self.frames.map(over_block, motion)
-        for frames, part in zip(self.frames.slices, passes, strict=True):
-            alpha[frames] = part.alpha
-            motion_gradient[frames] = part.motion_gradient
-            motion_curvature[:, frames] = part.motion_curvature
-            sums = [a + b for a, b in zip(sums, _sums(part), strict=True)]
-        value, shape_gradient, noise_gradient, packed, residual = sums
-        curvature = kronecker_matrices(packed, n_shapes)
-        # What is common to all frames: 2 / s2 curvature B, N log s2 and its derivative.
-        rows = shapes.reshape(3 * n_shapes, -1).T[:, :, None]
-        pulled = (curvature @ rows)[:, :, 0].T.reshape(shapes.shape)
-        shape_gradient = shape_gradient + (2 / noise) * pulled
-        value += self.n_seen * np.log(noise)
+        terms = self._sums(shapes, motion, noise)
+        curvature = _kronecker_matrices(terms.shape_curvature, len(shapes))
+        columns = shapes.reshape(3 * len(shapes), -1).T[:, :, None]
+        pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
+        value = terms.value + self.n_seen * np.log(noise)
+        shape_gradient = terms.shape_gradient + (2 / noise) * pulled
         if self.extent_weight:
             weight = self.extent_weight * self.n_seen
             # With one curvature for all points the shapes are centred already.
             penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
             value += weight * penalty
             shape_gradient = shape_gradient + weight * slope
-        return LikelihoodTerms(
-            float(value),
-            shape_gradient,
-            motion_gradient,
-            float(noise_gradient + self.n_seen),
-            curvature,
-            motion_curvature,
-            alpha,
-            float(residual),
+        return terms._replace(
+            value=float(value),
+            shape_gradient=shape_gradient,
+            noise_gradient=float(terms.noise_gradient + self.n_seen),
+            shape_curvature=curvature,
         )
 
     def coefficients(self, shapes: NDArray, motion: NDArray, noise: float) -> NDArray:
-        """
-        Return the posterior means of the coefficients.
+        """Return the posterior means of the coefficients (n_frames, n_components)."""
+        return np.ascontiguousarray(self._sums(shapes, motion, noise).alpha.T)
 
-        Parameters
-        ----------
-        shapes, motion, noise
-            As of a call.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_components)
-            The means.
-        """
-        alpha = np.empty((self.n_frames, len(shapes) - 1))
-        passes = self.frames.map(self._over_block(shapes, noise), motion)
-        for frames, part in zip(self.frames.slices, passes, strict=True):
-            alpha[frames] = part.alpha
-        return alpha
-
-    def _over_block(
-        self, shapes: NDArray, noise: float
-    ) -> Callable[..., LikelihoodTerms]:
-        """Return the function of a block and its cameras that computes the terms."""
-        return partial(
+    def _sums(self, shapes: NDArray, motion: NDArray, noise: float) -> LikelihoodTerms:
+        """Return the sums over all frames, the curvature by the shapes packed."""
+        # With tiny noise normal equations get a step of iterative refinement.
+        tiny_noise = noise * self.n_seen < 1e-7 * self.square
+        over_block = partial(
             _block_terms,
             shapes=ShapeProducts(shapes),
             noise=noise,
             penalty=self.penalty,
-            tiny_noise=noise * self.n_seen < TINY_NOISE * self.square,
+            tiny_noise=tiny_noise,
         )
+        return _joined(self.frames.map(over_block, motion))
 
 
 def totals(frames: FrameBlocks) -> tuple[float, float]:
-    """
-    Return the number of coordinates that frames show, and their energy.
-
-    Parameters
-    ----------
-    frames : FrameBlocks
-        Blocks of FrameTracks.
-
-    Returns
-    -------
-    n_seen : float
-        Number of coordinates with a positive weight.
-    square : float
-        Weighted energy of the centred tracks.
-    """
+    """Return the number of coordinates that blocks of frames show, and their energy."""
     n_seen, square = np.sum(list(frames.map(_totals)), axis=0)
     return float(n_seen), float(square)
 
@@ -273,61 +177,43 @@ def _totals(block: FrameTracks) -> tuple[float, float]:
     return 2.0 * points, block.energy.sum()
 
 
-def _sums(part: LikelihoodTerms) -> tuple[float, NDArray, float, NDArray, float]:
-    """Return those terms that are sums over the frames."""
-    return (
-        part.value,
-        part.shape_gradient,
-        part.noise_gradient,
-        part.shape_curvature,
-        part.residual,
-    )
+def _joined(parts: Iterable[LikelihoodTerms]) -> LikelihoodTerms:
+    """Add the sums of consecutive frames up, and join what each frame has."""
+    remaining, n_sums = iter(parts), 5
+    first = next(remaining)
+    sums: list[Any] = list(first[:n_sums])
+    by_frame = [first[n_sums:]]
+    for part in remaining:
+        sums = [a + b for a, b in zip(sums, part[:n_sums], strict=True)]
+        by_frame.append(part[n_sums:])
+    if len(by_frame) == 1:
+        return first
+    joined = (np.concatenate(each, axis=-1) for each in zip(*by_frame, strict=True))
+    return LikelihoodTerms(*sums, *joined)
 
 
 def _block_terms(
-    block: FrameTracks,
-    motion: NDArray,
-    shapes: ShapeProducts,
-    noise: float,
-    penalty: NDArray | float,
-    tiny_noise: bool,
+    block: FrameTracks, motion: NDArray, **constants: Any
 ) -> LikelihoodTerms:
     """Return the terms of a block, summed over pieces whose matrices fit the cache."""
     M = frames_last(motion)
-    parts = [
-        _frame_terms(piece, shapes, M[:, :, frames], noise, penalty, tiny_noise)
+    return _joined(
+        _frame_terms(piece, M[:, :, frames], **constants)
         for frames, piece in block.pieces(BLOCK_FRAMES)
-    ]
-    if len(parts) == 1:
-        return parts[0]
-    sums: Any = (sum(part) for part in zip(*map(_sums, parts), strict=True))
-    value, shape_gradient, noise_gradient, shape_curvature, residual = sums
-    return LikelihoodTerms(
-        value,
-        shape_gradient,
-        np.concatenate([part.motion_gradient for part in parts]),
-        noise_gradient,
-        shape_curvature,
-        np.concatenate([part.motion_curvature for part in parts], axis=-1),
-        np.concatenate([part.alpha for part in parts]),
-        residual,
     )
 
 
 def _frame_terms(
     block: FrameTracks,
-    shapes: ShapeProducts,
     M: NDArray,
+    shapes: ShapeProducts,
     noise: float,
     penalty: NDArray | float,
     tiny_noise: bool,
 ) -> LikelihoodTerms:
-    """
-    Return the terms of frames of one block, M (2, 3, n_frames).
+    """Return the sums over frames, M (2, 3, n_frames), as `MarginalLikelihood._sums`.
 
-    Left out is what the caller adds for all frames at once: ``N log s2``, and the term
-    ``2 / s2 curvature B`` of the gradient by the shapes. The curvature by the shapes is
-    packed: (n_pairs, 6, n_points or 1).
+    The curvature by the shapes is packed: (n_pairs, 6, n_points or 1).
     """
     n_shapes, _, n_points = shapes.shapes.shape
     products = frame_sums(block, shapes)
@@ -360,22 +246,18 @@ def _frame_terms(
         means = np.einsum("abi,kbi->kai", unpack3(cameras), mixed)
         shape_gradient += means.reshape(3 * n_shapes, -1) @ block.weights.T
     return LikelihoodTerms(
-        float(value),
-        (-2 / noise) * shape_gradient.reshape(shapes.shapes.shape),
-        frames_first((2 / noise) * G),
-        -(residual + spread) / noise,
-        shape_curvature,
-        motion_curvature,
-        alpha.T,
-        residual,
+        value=float(value),
+        shape_gradient=(-2 / noise) * shape_gradient.reshape(shapes.shapes.shape),
+        noise_gradient=-(residual + spread) / noise,
+        shape_curvature=shape_curvature,
+        residual=residual,
+        motion_gradient=(2 / noise) * G,
+        motion_curvature=motion_curvature,
+        alpha=alpha,
     )
 
 
-def kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
-    """
-    Return the matrices (n, 3 n_shapes, 3 n_shapes) of packed curvatures.
-
-    They come as (n_pairs, 6, n), packed over pairs of shapes and pairs of axes.
-    """
+def _kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
+    """Return matrices (n, 3 n_shapes, 3 n_shapes), packed by shapes and by axes."""
     size = 3 * n_shapes
     return unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)

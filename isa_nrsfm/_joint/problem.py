@@ -1,8 +1,9 @@
 """The joint fit as a problem: frames, penalty, and how long to iterate."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,136 +12,129 @@ from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import fit_frames, frame_search
+from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood, totals
-from isa_nrsfm._joint.options import JOINT_OPTIONS, Effort, JointOptions
-from isa_nrsfm._joint.quasi_newton import JointResult, JointState, refine_joint
+from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood
+from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions
+from isa_nrsfm._joint.quasi_newton import JointFit, JointState, refine_joint
+from isa_nrsfm._paper.factors import Factorisation
+from isa_nrsfm._paper.sample import Sample
+from isa_nrsfm._paper.svd import Triplets
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 
-class Steps(NamedTuple):
+class FactorisedTable(NamedTuple):
     """
-    When the iteration of a fit ends.
+    A table that is ready for a fit.
 
     Attributes
     ----------
-    max_iter : int
-        Largest number of steps.
-    tol : float
-        Convergence tolerance, as of `refine_joint`.
-    on_step : callable or None
-        As of `refine_joint`.
-    effort : Effort
-        How much the fit compares.
+    rows : FrameBlocks
+        Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
+        NaN where a point is missing.
+    completed : FrameBlocks
+        The same frames with missing points, and outliers, filled in.
+    n_seen : ndarray of int, shape (n_frames,)
+        Number of points that each frame shows.
+    outliers : ndarray of bool, shape (n_frames, n_points), or None
+        Points that a robust loss leaves out at first; None for other losses.
+    triplets : Triplets
+        The 3K + 3 largest singular values of the completed table, and the rest.
+    sample : Sample
+        The frames that the first steps are made on.
+    factors : Factorisation
+        Of their measurement matrix.
     """
 
+    rows: FrameBlocks
+    completed: FrameBlocks
+    n_seen: NDArray
+    outliers: NDArray | None
+    triplets: Triplets
+    sample: Sample
+    factors: Factorisation
+
+
+class JointSettings(NamedTuple):
+    """How a table is fitted, as in `AffineNRSfM` and `refine_joint`."""
+
+    camera: str
+    loss: str
     max_iter: int
     tol: float
     on_step: Callable[[], None] | None = None
-    effort: Effort = JOINT_OPTIONS.large
+    options: JointOptions = JOINT_OPTIONS
 
 
+@dataclass(frozen=True, eq=False)
 class JointProblem:
     """
     The objective of the joint fit of some frames, and the steps that minimise it.
 
-    Parameters
+    Attributes
     ----------
     frames : JointFrames
         The frames.
-    steps : Steps
-        When its iteration ends.
+    settings : JointSettings
+        How they are fitted.
+    thorough : bool
+        Whether many starts are compared, as those of small tables are.
     penalty : float or ndarray of shape (n_components,)
         As of `MarginalLikelihood`.
-    options : JointOptions
-        The limits of all stages.
     """
 
-    def __init__(
-        self,
-        frames: JointFrames,
-        steps: Steps,
-        penalty: NDArray | float,
-        options: JointOptions = JOINT_OPTIONS,
-    ):
-        self.frames, self.steps, self.penalty = frames, steps, penalty
-        self.options = options
+    frames: JointFrames
+    settings: JointSettings
+    thorough: bool = False
+    penalty: NDArray | float = 0.0
 
-    def part(self, chosen: NDArray, **changed: Any) -> Self:
-        """Return the problem of some of the frames, with some fields of `Steps` set."""
-        steps = self.steps._replace(**changed)
-        return type(self)(self.frames.take(chosen), steps, self.penalty, self.options)
-
-    def with_frames(self, frames: JointFrames) -> Self:
-        """Return the problem of the same frames in other coordinates or weights."""
-        return type(self)(frames, self.steps, self.penalty, self.options)
-
-    def with_penalty(self, penalty: NDArray | float) -> Self:
-        """Return the problem with another penalty, or one for each basis shape."""
-        problem = type(self)(self.frames, self.steps, penalty, self.options)
-        problem.totals = self.totals  # saves a pass over all frames
-        return problem
+    def part(self, chosen: NDArray, tol: float) -> "JointProblem":
+        """Return the problem of some of the frames, with another tolerance."""
+        settings = self.settings._replace(tol=tol)
+        return replace(self, frames=self.frames.take(chosen), settings=settings)
 
     @property
-    def n_frames(self) -> int:
-        """Number of frames."""
-        return self.frames.n_frames
-
-    @cached_property
-    def totals(self) -> tuple[float, float]:
-        """Number of coordinates that the frames show, and their energy."""
-        return totals(self.frames.blocks)
+    def mean_square(self) -> float:
+        """Mean square of the coordinates that the frames show."""
+        n_seen, energy = self.frames.totals
+        return energy / n_seen
 
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
         """The objective."""
-        return MarginalLikelihood(self.frames.blocks, self.penalty, self.totals)
+        frames = self.frames
+        return MarginalLikelihood(frames.blocks, self.penalty, frames.totals)
 
     def coefficients(self, state: JointState) -> NDArray:
         """Return the posterior means of the coefficients (n_frames, n_components)."""
         return self.likelihood.coefficients(*state)
 
     def aligned(self, state: JointState, camera: str) -> JointState:
-        """
-        Return a state with approximately optimal cameras for its shapes and noise.
+        """Return a state with nearly optimal cameras for its centred shapes.
 
-        The shapes are centred. The cameras come from a few steps of the search for each
-        frame, not from the state.
+        They come from a few steps of the search for each frame, not from the state.
         """
         shapes = state.shapes
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
         aligned = partial(
-            _aligned_cameras, shapes=shapes, noise=state.noise, camera=camera
+            _aligned_cameras, search=frame_search(camera, shapes), noise=state.noise
         )
         return JointState(shapes, self.frames.blocks.joined(aligned), state.noise)
 
     def reversed_back(
         self, state: JointState, cameras: CameraModel
     ) -> tuple[JointState, int]:
-        """
-        Return a state without frames that are reversed in depth, and how many were.
+        """Return a state without frames that are reversed in depth, and their number.
 
-        Parameters
-        ----------
-        state : JointState
-            Shapes and calibrated cameras.
-        cameras : CameraModel
-            Their model.
-
-        Returns
-        -------
-        state : JointState
-            The search for each frame is repeated from its camera reversed in depth. The
-            camera that it finds is taken where the objective is lower.
-        n_reversed : int
-            The number of these frames.
+        The search for each frame is repeated from its camera reversed in depth. The
+        camera that it finds is taken where the objective is lower.
         """
         function = partial(
             _reversed_back,
-            shapes=state.shapes,
+            search=CalibratedSearch(state.shapes, cameras.scaled),
             noise=state.noise,
-            scaled=cameras.scaled,
         )
         found = self.frames.blocks.map(function, state.motion)
         motion, better = map(np.concatenate, zip(*found, strict=True))
@@ -150,58 +144,37 @@ class JointProblem:
         self,
         state: JointState,
         cameras: CameraModel,
+        *,
         least_noise: float | None = None,
-        **changed: Any,
-    ) -> JointResult:
-        """
-        Return the joint refinement of a state.
+        max_iter: int | None = None,
+        tol: float | None = None,
+    ) -> JointFit:
+        """Return the joint refinement of a state, by default with the settings.
 
-        Parameters
-        ----------
-        state : JointState
-            The first iterate.
-        cameras : CameraModel
-            The cameras that are allowed.
-        least_noise : float, optional
-            Lower bound of the noise variance, as a share of the mean square. By default
-            that of a model that may be wrong.
-        **changed : object
-            Settings of `Steps` that are different.
-
-        Returns
-        -------
-        JointResult
-            The refinement.
+        The default of `least_noise` is that of a model that may be wrong.
         """
-        steps = self.steps._replace(**changed)
-        likelihood = self.likelihood
+        settings, likelihood = self.settings, self.likelihood
         if cameras.name != "affine":
             likelihood = MarginalLikelihood(
-                self.frames.blocks, self.penalty, self.totals, EXTENT_WEIGHT
+                likelihood.frames, self.penalty, self.frames.totals, EXTENT_WEIGHT
             )
+        if least_noise is None:
+            least_noise = settings.options.least_noise
         return refine_joint(
             likelihood,
             state,
             cameras,
-            least_noise=(
-                self.options.least_noise if least_noise is None else least_noise
-            ),
-            max_iter=steps.max_iter,
-            tol=steps.tol,
-            on_step=steps.on_step,
-            options=self.options,
+            least_noise=least_noise,
+            max_iter=settings.max_iter if max_iter is None else max_iter,
+            tol=settings.tol if tol is None else tol,
+            on_step=settings.on_step,
         )
 
 
 def _reversed_back(
-    block: FrameTracks,
-    motion: NDArray,
-    shapes: NDArray,
-    noise: float,
-    scaled: bool,
+    block: FrameTracks, motion: NDArray, search: CalibratedSearch, noise: float
 ) -> tuple[NDArray, NDArray]:
     """Return the better cameras (n_frames, 2, 3), and which ones were reversed."""
-    search = CalibratedSearch(shapes, scaled)
     found = [
         search.reversed_cameras(frame_sums(piece, search.shared), noise, motion[frames])
         for frames, piece in block.pieces(BLOCK_FRAMES)
@@ -210,9 +183,6 @@ def _reversed_back(
     return cameras, better
 
 
-def _aligned_cameras(
-    block: FrameTracks, shapes: NDArray, noise: float, camera: str
-) -> NDArray:
-    """Return nearly optimal cameras (n_frames, 2, 3) for shapes (n_shapes, 3, n)."""
-    search = frame_search(camera, shapes)
+def _aligned_cameras(block: FrameTracks, search: FrameSearch, noise: float) -> NDArray:
+    """Return nearly optimal cameras (n_frames, 2, 3) for the shapes of a search."""
     return fit_frames(block, search, noise, covariances=False, rough=True).motion

@@ -17,9 +17,15 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions, SearchOptions
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
+
+# Lower bound of the noise variance, as a share of the mean square of the tracks. It
+# keeps the objective finite for tables without noise.
+NOISE_FLOOR = 1e-11
+
+# Pairs of a step, and of the change of the gradient, with their product.
+Memory = deque[tuple[NDArray, NDArray, float]]
 
 
 class JointState(NamedTuple):
@@ -41,7 +47,7 @@ class JointState(NamedTuple):
     noise: float
 
 
-class JointResult(NamedTuple):
+class JointFit(NamedTuple):
     """
     Result of the joint refinement.
 
@@ -58,18 +64,25 @@ class JointResult(NamedTuple):
         still possible.
     converged : bool
         Whether it stopped by the convergence tolerance, not by the number of steps.
-    residual : float
-        Mean square residual of the shapes with the posterior means of the coefficients.
     left : float
-        The larger one of noise variance and residual.
+        The noise variance, or the mean square residual of the shapes with the posterior
+        means of the coefficients where that is larger.
+    camera_noise_ratio : float
+        Of `fit_jointly`: noise variance with calibrated cameras divided by that with
+        affine ones, for the frames of the sample. NaN with given starts.
     """
 
     state: JointState
     history: NDArray
     gradient_norm: float
     converged: bool
-    residual: float
     left: float
+    camera_noise_ratio: float = np.nan
+
+    @property
+    def value(self) -> float:
+        """The objective at the end."""
+        return float(self.history[-1])
 
 
 def refine_joint(
@@ -77,12 +90,11 @@ def refine_joint(
     start: JointState,
     cameras: CameraModel,
     *,
-    least_noise: float | None = None,
+    least_noise: float = NOISE_FLOOR,
     max_iter: int,
     tol: float,
     on_step: Callable[[], None] | None = None,
-    options: JointOptions = JOINT_OPTIONS,
-) -> JointResult:
+) -> JointFit:
     """
     Minimise the objective of `MarginalLikelihood`.
 
@@ -94,9 +106,8 @@ def refine_joint(
         The first iterate.
     cameras : CameraModel
         The cameras that are allowed, and how a step changes them.
-    least_noise : float, optional
+    least_noise : float
         Lower bound of the noise variance, as a share of the mean square of the tracks.
-        By default the `noise_floor` of the options.
     max_iter : int
         Largest number of steps.
     tol : float
@@ -104,25 +115,19 @@ def refine_joint(
         the objective by less than tol times the number of frames.
     on_step : callable, optional
         Called before each step.
-    options : JointOptions
-        How steps are made; only `search` is looked at.
 
     Returns
     -------
-    JointResult
+    JointFit
         The result.
     """
-    search = options.search
-    floor = search.noise_floor if least_noise is None else least_noise
-    floor = floor * likelihood.square / likelihood.n_seen
+    floor = least_noise * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
     iterate = _Iterate(likelihood, cameras, start, floor)
-    most = search.memory_numbers // (2 * iterate.gradient.size)
-    memory: deque[tuple[NDArray, NDArray, float]] = deque(
-        maxlen=max(min(most, search.memory), search.least_memory)
-    )
-    history = [iterate.value]
-    small_steps = 0
+    # At most 20 pairs, fewer if they would exceed 2^25 numbers, but never less than 3
+    most = 2**25 // (2 * iterate.gradient.size)
+    memory: Memory = deque(maxlen=max(min(most, 20), 3))
+    history, small_steps = [iterate.value], 0
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
             on_step()
@@ -131,16 +136,17 @@ def refine_joint(
         if not iterate.gradient @ direction < 0:
             memory.clear()
             direction = -iterate.precondition(iterate.gradient)
-        # Armijo line search
-        reached, step = _line_search(likelihood, iterate, direction, floor, search)
+        reached, step = _line_search(likelihood, iterate, direction, floor)
         if reached is None:
             if not memory:  # the gradient itself fails: rounding errors are left
                 small_steps = 2
             memory.clear()
             continue
-        # Update of the memory
+        # Update of the memory, if the curvature along the step is positive
         change = reached.gradient - iterate.gradient
-        _remember(memory, step, change, search.least_curvature)
+        curvature = float(step @ change)
+        if curvature > 1e-10 * np.linalg.norm(step) * np.linalg.norm(change):
+            memory.append((step, change, curvature))
         # Convergence test
         gain = iterate.value - reached.value
         rounding = OF_SUMS * likelihood.square / reached.state.noise
@@ -150,32 +156,13 @@ def refine_joint(
         history.append(iterate.value)
     memory.clear()
     slope = iterate.gradient @ iterate.precondition(iterate.gradient)
-    return JointResult(
+    return JointFit(
         iterate.state,
         np.array(history),
         float(np.sqrt(max(slope, 0.0) / likelihood.n_seen)),
         small_steps >= 2 and bool(np.isfinite(iterate.value)),
-        iterate.residual,
         iterate.left,
     )
-
-
-def _remember(
-    memory: deque[tuple[NDArray, NDArray, float]],
-    step: NDArray,
-    change: NDArray,
-    least_curvature: float,
-) -> None:
-    """
-    Add a pair to the L-BFGS memory, if the curvature along the step is positive.
-
-    Both are vectors of all unknowns: the step ``s`` and the change ``y`` of the
-    gradient. The curvature is ``s^T y``; its least value is relative to ``|s| |y|``.
-    """
-    curvature = float(step @ change)
-    size = least_curvature * np.linalg.norm(step) * np.linalg.norm(change)
-    if curvature > size:
-        memory.append((step, change, curvature))
 
 
 class _Iterate:
@@ -198,13 +185,11 @@ class _Iterate:
         self.M = frames_last(state.motion)
         self.n_seen = likelihood.n_seen
         self.value = passed.value
-        self.residual = passed.residual / likelihood.n_seen
-        # The noise variance, or the mean square residual where that is larger.
-        self.left = max(state.noise, self.residual)
+        self.left = max(state.noise, passed.residual / likelihood.n_seen)
         at_floor = state.noise <= floor * (1 + 1e-6)
         self.gradient = _stacked(
             passed.shape_gradient,
-            cameras.gradient(self.M, frames_last(passed.motion_gradient)),
+            cameras.gradient(self.M, passed.motion_gradient),
             # At its lower bound the noise variance may only rise.
             min(passed.noise_gradient, 0.0 if at_floor else np.inf),
         )
@@ -255,11 +240,7 @@ class _Iterate:
 
 
 def regular(curvature: NDArray) -> NDArray:
-    """
-    Return curvatures (n, m, m) by the shapes with a small ridge added.
-
-    They are singular where the table does not determine the shapes.
-    """
+    """Return curvatures (n, m, m) with a small ridge, as they can be singular."""
     size = curvature.shape[-1]
     # Points that no frame shows have no curvature, and no gradient either.
     ridge = OF_DIFFERENCES * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
@@ -271,16 +252,13 @@ def _stacked(shapes: NDArray, steps: NDArray, noise: float) -> NDArray:
     return np.concatenate([shapes.ravel(), steps.ravel(), [noise]])
 
 
-def _inverse_hessian_product(
-    iterate: _Iterate, memory: deque[tuple[NDArray, NDArray, float]]
-) -> NDArray:
+def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
     """Return the L-BFGS inverse Hessian times the gradient (two-loop recursion)."""
     vector = iterate.gradient.copy()
     weights = []
     for step, change, curvature in reversed(memory):
-        weight = step @ vector / curvature
-        vector -= weight * change
-        weights.append(weight)
+        weights.append(step @ vector / curvature)
+        vector -= weights[-1] * change
     vector = iterate.precondition(vector)
     for (step, change, curvature), weight in zip(
         memory, reversed(weights), strict=True
@@ -294,31 +272,27 @@ def _line_search(
     iterate: _Iterate,
     direction: NDArray,
     floor: float,
-    options: SearchOptions,
 ) -> tuple[_Iterate | None, NDArray]:
-    """
-    Return the first iterate along a direction that meets the Armijo condition.
+    """Return the first iterate that meets the Armijo condition, and the step to it.
 
-    The step that leads there is returned, too. The iterate is None if none is found.
+    The iterate is None if no step length above 1e-8 does.
     """
     slope = iterate.gradient @ direction
     # Largest step length that the parametrisation of noise and cameras allows
     length = min(
         1.0,
-        options.largest_noise_step / max(abs(direction[-1]), 1e-300),
+        1.5 / max(abs(direction[-1]), 1e-300),
         iterate.cameras.largest_length(iterate.split(direction)[1]),
     )
-    while length > options.shortest_step:
+    while length > 1e-8:
         step = length * direction
         state = iterate.moved(step, floor)
         reached = _Iterate(likelihood, iterate.cameras, state, floor)
-        enough = options.sufficient_decrease * length * slope
-        if reached.value <= iterate.value + enough:
+        if reached.value <= iterate.value + 1e-4 * length * slope:
             # The lower bound may have shortened the change of the noise.
             step[-1] = np.log(reached.state.noise / iterate.state.noise)
             return reached, step
         # Backtracking by quadratic interpolation of both values and the slope
         excess = reached.value - iterate.value - length * slope
-        best = -length * slope / (2 * excess)
-        length *= min(max(best, options.strongest_cut), options.weakest_cut)
+        length *= min(max(-length * slope / (2 * excess), 0.1), 0.5)
     return None, direction

@@ -12,6 +12,8 @@ g_k is the share of the 3J numbers of B_k that the table determines rather than 
 prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,73 +26,40 @@ from isa_nrsfm._linalg.vectors import frames_last
 def relevant_components(
     problem: JointProblem, state: JointState, cameras: CameraModel
 ) -> int:
-    """
-    Return the number of relevant basis shapes.
-
-    Parameters
-    ----------
-    problem : JointProblem
-        The frames.
-    state : JointState
-        A fit with more basis shapes than are expected to be relevant.
-    cameras : CameraModel
-        How its cameras may move.
-
-    Returns
-    -------
-    int
-        The number.
-    """
+    """Return the number of relevant basis shapes of a fit with more of them."""
     n_points = problem.frames.points(state.shapes).shape[2]
-    n_numbers = 3 * n_points
+    n_numbers, n_frames = 3 * n_points, problem.frames.n_frames
     penalty = np.full(len(state.shapes) - 1, problem.penalty)
     determined = np.ones(len(penalty))
-    options = problem.options.relevance
-    for _ in range(options.rounds):
-        part = problem.with_penalty(penalty)
-        start = _orthogonal(state)
-        state = part.refined(start, cameras, max_iter=options.steps).state
-        # g_k and v_k, with penalty = 1 / (v_k n_frames)
-        energy, uncertain = _image_energies(part, state, n_points)
+    for _ in range(3):
+        part = replace(problem, penalty=penalty)
+        # Basis shapes whose images are orthogonal on average
+        axes = np.linalg.eigh(_image_moments(state)[1])[1][:, ::-1]
+        basis = np.tensordot(axes.T, state.shapes[1:], 1)
+        shapes = np.concatenate([state.shapes[:1], basis])
+        start = state._replace(shapes=shapes)
+        state = part.refined(start, cameras, max_iter=30).state
+        C, images = _image_moments(state)
+        energy = np.diagonal(images)
         if not energy.any():
             return 0  # nothing deforms
-        determined = 1.0 - uncertain * penalty * problem.n_frames / n_numbers
-        determined = np.clip(determined, options.smallest, 1.0)
-        variance = np.maximum(
-            energy / (n_numbers * determined), options.smallest * energy.max()
-        )
-        penalty = 1.0 / (variance * problem.n_frames)
-    return int(np.sum(determined > options.determined))
+        # Posterior covariance of each point: half the Hessian is curvature / s2.
+        curvature = part.likelihood(*state).shape_curvature
+        covariance = state.noise * np.linalg.inv(regular(curvature))
+        # One matrix stands for all points where all weights are one.
+        total = covariance.sum(axis=0) * (n_points / len(covariance))
+        total = total.reshape(len(shapes), 3, len(shapes), 3)
+        uncertain = np.einsum("ab,kakb->k", C, total)[1:]
+        # g_k and v_k, with penalty = 1 / (v_k n_frames)
+        determined = 1.0 - uncertain * penalty * n_frames / n_numbers
+        determined = np.clip(determined, 1e-9, 1.0)
+        variance = np.maximum(energy / (n_numbers * determined), 1e-9 * energy.max())
+        penalty = 1.0 / (variance * n_frames)
+    return int(np.sum(determined > problem.settings.options.determined))
 
 
-def _camera_moments(state: JointState) -> NDArray:
-    """Return ``C = mean_i M_i^T M_i`` (3, 3)."""
-    M = frames_last(state.motion)
-    return np.einsum("rai,rbi->ab", M, M) / M.shape[2]
-
-
-def _orthogonal(state: JointState) -> JointState:
-    """Return the same fit with basis shapes whose images are orthogonal on average."""
-    basis = state.shapes[1:]
-    images = np.einsum(
-        "ab,kaj,lbj->kl", _camera_moments(state), basis, basis, optimize=True
-    )
-    axes = np.linalg.eigh(images)[1][:, ::-1]
-    basis = np.tensordot(axes.T, basis, 1)
-    return state._replace(shapes=np.concatenate([state.shapes[:1], basis]))
-
-
-def _image_energies(
-    problem: JointProblem, state: JointState, n_points: int
-) -> tuple[NDArray, NDArray]:
-    """Return ``mean_i ||M_i B_k||^2`` and ``tr(C cov B_k)`` of each basis shape."""
-    C, basis = _camera_moments(state), state.shapes[1:]
-    energy = np.einsum("ab,kaj,kbj->k", C, basis, basis, optimize=True)
-    curvature = problem.likelihood(*state).shape_curvature
-    # Posterior covariance of each point: half the Hessian is curvature / s2.
-    covariance = state.noise * np.linalg.inv(regular(curvature))
-    # One matrix stands for all points where all weights are one.
-    total = covariance.sum(axis=0) * (n_points / len(covariance))
-    n = len(basis) + 1
-    blocks = total.reshape(n, 3, n, 3)[np.arange(1, n), :, np.arange(1, n)]
-    return energy, np.einsum("ab,kab->k", C, blocks)
+def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
+    """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
+    M, basis = frames_last(state.motion), state.shapes[1:]
+    C = np.einsum("rai,rbi->ab", M, M) / M.shape[2]
+    return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import distances, stacked_motion
@@ -16,8 +17,6 @@ from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._tables.blocks import FrameBlocks
 
-# Unknowns of camera and position of a frame.
-N_POSE = 8
 # Residuals that are longer, in standard deviations of a coordinate, are left out of the
 # uncertainty of fits with a robust loss: one of 3,000 points without outliers.
 OUTLYING = 4.0
@@ -26,22 +25,11 @@ OUTLYING = 4.0
 def posterior_blocks(
     model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
 ) -> FrameBlocks:
-    """
-    Return the fits of all frames of a table, before the gauge.
+    """Return the fits of all frames of a table, before the gauge.
 
-    Parameters
-    ----------
-    model : PosteriorFrames
-        The model of a frame.
-    frames : JointFrames
-        The frames in the form that the joint refinement used.
-    rows : FrameBlocks
-        The frames themselves (n_frames, 2, n_points), NaN where a point is missing.
-
-    Returns
-    -------
-    FrameBlocks
-        Blocks of FramePosterior.
+    The model is in points. The frames are those of the joint refinement, in points or
+    directions, and rows the same (n_frames, 2, n_points). The blocks are of
+    FramePosterior.
     """
     if model.loss != "linear":
         return rows.derive(partial(_row_posterior, model=model))
@@ -55,23 +43,7 @@ def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
 
 
 def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return cameras, coefficients and mean covariance of the fits of frames.
-
-    Parameters
-    ----------
-    posteriors : FrameBlocks
-        Blocks of FramePosterior.
-
-    Returns
-    -------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    covariance : ndarray of shape (n_components, n_components)
-        Posterior covariance of the coefficients, mean over the frames.
-    """
+    """Return cameras, coefficients, and their mean covariance (n_components, ...)."""
     motion, alpha, covariance = zip(*posteriors.map(_moments), strict=True)
     total = np.sum(covariance, axis=0) / posteriors.n_frames
     return np.concatenate(motion), np.concatenate(alpha), total
@@ -87,20 +59,9 @@ def shape_uncertainty(
     """
     Return the covariance of a point of the shapes for noise of variance one.
 
-    Parameters
-    ----------
-    motion, alpha, covariance
-        As `posterior_moments` returns.
-    share : ndarray of shape (n_frames,)
-        Share of the points that each frame shows.
-    slices : sequence of slice
-        Frames that are worked on at a time.
-
-    Returns
-    -------
-    ndarray of shape (3 * n_components + 3, 3 * n_components + 3)
-        Inverse of ``N = sum_i share_i E_i (x) M_i^T M_i`` with the second moments E_i
-        of (1, alpha).
+    It is the inverse of ``sum_i share_i E_i (x) M_i^T M_i`` with the second moments
+    E_i of (1, alpha), where frame i shows a share of the points. The slices are frames
+    that are worked on at a time.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
@@ -124,19 +85,6 @@ def shown_frames(
     M_i``. From there it moves the coefficients of the frame by ``n_i s2_i Sigma_i / s2
     tr(M_i (N^-1 X_i^T)_k)`` on average.
 
-    Parameters
-    ----------
-    posterior : FramePosterior
-        Fits of a block of frames.
-    sizes : ndarray of shape (n_frames,)
-        Their sizes.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of points that each frame shows.
-    frames : PosteriorFrames
-        The model of a frame.
-    uncertainty : ndarray
-        As of `shape_uncertainty`.
-
     Returns
     -------
     shown : Decomposition
@@ -151,7 +99,8 @@ def shown_frames(
     Z = X @ uncertainty
     # Degrees of freedom of the residual, without those that the shapes take
     leverage = np.einsum("irp,irp->i", X, Z)
-    noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - N_POSE, 1.0)
+    n_pose = 2 + CAMERAS[frames.camera].n_parameters
+    noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - n_pose, 1.0)
     own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
     shift = np.einsum("i,ikl,il->ik", n_seen * noise, posterior.covariance, own)
     return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
@@ -163,21 +112,7 @@ def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """
-    Estimate the uncertainty of a fit with calibrated cameras from some of its frames.
-
-    Parameters
-    ----------
-    frames : PosteriorFrames
-        The model of a frame.
-    rows : FrameBlocks
-        The frames (n_frames, 2, n_points), NaN where a point is missing.
-
-    Returns
-    -------
-    DepthCertainty
-        The uncertainty.
-    """
+    """Estimate the uncertainty of a fit with calibrated cameras, from its rows."""
     n_frames = rows.n_frames
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)

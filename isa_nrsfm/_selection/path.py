@@ -232,6 +232,7 @@ def extended(frames: PosteriorFrames, table: ScaledTable, n_components: int) -> 
     rows = table.rows.take(few)
     fit = frames.posterior(rows.transpose(0, 2, 1))
     n_more = n_components + 1 - len(frames.shapes)
+    rows = rows - fit.translation[:, :, None]
     shapes = extended_shapes(rows, frames.shapes, fit.motion, fit.alpha, n_more)
     return Start(shapes, frames.noise_variance)
 
