@@ -33,7 +33,7 @@ from benchmarks._sets import SETS, is_present, load, shapes_in_camera
 from benchmarks.recovery import instance
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit_options import Limits
+from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint import fit as joint_fit
 from isa_nrsfm._joint.options import JOINT_OPTIONS

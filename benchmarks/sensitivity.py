@@ -5,10 +5,9 @@ Run ``python -m benchmarks.sensitivity [stage ...]``. Stages are "fit", for the 
 of `Limits`, and the tuples in `Limits`. The first line of each is that of the values as
 they are; then a line a value follows. Errors in 3D are `affine_shape_error` in percent,
 "SNR" is inverse SNR in percent, "auto" the mean number of basis shapes that it finds.
-Of missing points of real tables it is their error in percent of the size of frames, of
-the gauge the least similarity of a basis shape to the true one, in percent. Tables are
-small: every few frames of real ones, and artificial ones. "s" are the CPU seconds of
-all fits.
+Of missing points of real tables it is their error in percent of the size of frames.
+Tables are small: every few frames of real ones, and artificial ones. "s" are the CPU
+seconds of all fits.
 """
 
 import time
@@ -20,9 +19,9 @@ import numpy as np
 from benchmarks._command import run
 from benchmarks._sets import is_present, load
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit_options import Limits
+from isa_nrsfm._fit import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.metrics import affine_shape_error, basis_similarity
+from isa_nrsfm.metrics import affine_shape_error
 
 SEEDS = range(2)
 
@@ -99,24 +98,6 @@ def of_missing(name, step, n_components, estimator):
     return 100 * np.sqrt(np.mean((filled - X)[hidden] ** 2)) / size
 
 
-def similarity(
-    estimator,
-    n_frames=150,
-    n_points=40,
-    camera="weak_perspective",
-    K=4,
-    **parameters,
-):
-    """Return the least similarity of basis shapes to the true ones, in percent."""
-    found = []
-    for seed in SEEDS:
-        tracks = artificial(seed, n_frames, n_points, K, 0.02, camera)
-        settings = {"camera": camera, "random_state": 0, **parameters}
-        model = estimator(K, **settings).fit(tracks.data)
-        found.append(basis_similarity(tracks.basis, model.basis_).min())
-    return 100 * np.mean(found)
-
-
 def counted(estimator, noise=0.02, K=3):
     """Return the mean number of basis shapes that "auto" finds."""
     found = [
@@ -159,13 +140,6 @@ LARGE = {
     "wild SNR": partial(of_set, "faces_wild", 1, 9, "affine"),
 }
 MATRIX = {"2000 x 1600": partial(of_instances, n_frames=1000, n_points=1600, K=2)}
-GAUGE = {
-    "shapes": similarity,
-    "coeff.": partial(similarity, independence="coefficients"),
-    "affine": partial(similarity, camera="affine"),
-    "700 points": partial(similarity, n_points=700),
-    "many": partial(similarity, n_points=3200, n_frames=60, K=2),
-}
 JOINT = {
     **USUAL,
     "exact 3D": partial(of_instances, noise=0.0),
@@ -179,7 +153,6 @@ STAGES = {
     "completion": MISSING,
     "fit": {**LARGE, **MATRIX},
     "joint": JOINT,
-    "gauge": GAUGE,
 }
 
 

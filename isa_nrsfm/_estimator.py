@@ -1,26 +1,20 @@
 """AffineNRSfM: the scikit-learn transformer on top of the stages."""
 
 import copy
+import os
 from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import (
-    clone,
-)
+from sklearn.base import clone
 from sklearn.utils import check_random_state
 
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import JOINT_STAGE, STAGES, Fit, fit_table
-from isa_nrsfm._fit_options import FitOptions, Limits
-from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import (
-    full_rotations,
-)
-from isa_nrsfm._frames.models import Decomposition
+from isa_nrsfm._fit import JOINT_STAGE, STAGES, Limits, fit_table
+from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CAMERA_NAMES,
@@ -29,18 +23,11 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_names
-from isa_nrsfm._tables.kept_arrays import Keep, kept_arrays
+from isa_nrsfm._tables.kept_arrays import kept_arrays
 from isa_nrsfm._tables.layout import LAYOUTS, Layout
-from isa_nrsfm._tables.sources import (
-    StoredTable,
-    Table,
-    is_on_dask,
-)
+from isa_nrsfm._tables.sources import StoredTable, Table, is_on_dask
 from isa_nrsfm._transformer import TableTransformer
 from isa_nrsfm.isa import PooledFastICA
-
-# Runs of FastICA where the result of the paper's pipeline is only a start.
-START_RUNS = 2
 
 
 class AffineNRSfM(CallbackSupportMixin, TableTransformer):
@@ -48,9 +35,10 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     Affine non-rigid structure from motion by independent subspace analysis.
 
     Factorises a table of 2D landmarks, one frame a row, into a mean 3D shape, basis
-    shapes, and for each frame a camera and coefficients, which are free of the
-    viewpoint where points are fixed on the surface. No calibration, training data or
-    order of the frames is needed. Row i, reshaped to (n_points, 2), is modelled as::
+    shapes, and for each frame a camera and coefficients. The coefficients do not depend
+    on the viewpoint if the points are fixed on the surface. No calibration, training
+    data or order of the frames is needed. Row i, reshaped to (n_points, 2), is modelled
+    as::
 
         (mean_shape_ + tensordot(alpha_[i], basis_, 1)) @ motion_[i].T + translation_[i]
 
@@ -58,48 +46,48 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     ----------
     n_components : int or "auto", default=3
         K, the number of basis shapes. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames. "auto" takes those of twelve, or of as many as
-        the table allows, that are relevant (joint refinement only); ``len(basis_)`` is
-        what was found.
+        ``ceil(8 (K + 2) / 5)`` frames. "auto" takes the relevant ones of twelve, or of
+        as many as the table allows (joint refinement only); ``len(basis_)`` is the
+        number found.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or
-        `PooledFastICA`, with subspaces of size three; None is ``PooledFastICA()``, with
-        two runs where the joint refinement only starts from it. A clone is fitted;
-        where its `random_state`, `n_jobs` or `verbose` is None or 0 it gets that of
-        this estimator (a seed drawn from it).
+        `PooledFastICA`, with subspaces of size three. None is ``PooledFastICA()``, with
+        two runs if the joint refinement only starts from it. A clone is fitted. Its
+        `random_state`, `n_jobs` and `verbose` are inherited from this estimator unless
+        set.
     block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\
 "generalized_eigen"
-        How the 3x3 matrix of each subspace is found that brings its motion to the
-        rigid motion: "eigen" is the exact minimiser under a norm constraint, "irls"
-        the published iteration for the same cost, "generalized_eigen" maximises the
-        share of the motion that is explained. The first two can collapse onto a
-        direction in which the subspace hardly moves, and "irls" depends on which
-        frame comes first; the default does neither. With `refinement` all three
-        lead to nearly the same result, because it starts from more places.
+        Method for the 3x3 matrix of each subspace that brings its motion to the rigid
+        motion. "eigen" is the exact minimiser under a norm constraint, "irls" the
+        published iteration for the same cost, "generalized_eigen" maximises the
+        explained share of the motion. The first two can collapse onto a direction in
+        which the subspace hardly moves, and "irls" depends on the first frame; the
+        default does neither. With a refinement all three lead to nearly the same
+        result, because it starts from more places.
     refinement : {"joint", "alternating", None}, default="joint"
         "joint" finds the cameras, shapes and noise variance of greatest marginal
-        likelihood, the coefficients being drawn from a normal distribution; it starts
-        from the paper's result and recovers the true shapes as far as the images
-        determine them. "alternating" is the paper's alternating least squares for
-        basis shapes and coefficients, with the rigid cameras held.
+        likelihood, with normally distributed coefficients. It starts from the paper's
+        result and recovers the true shapes as far as the images determine them.
+        "alternating" is the paper's alternating least squares for basis shapes and
+        coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        What is known of the cameras. "affine" assumes nothing: shapes are known up to
-        an affinity of space, and where an object moves much, as bodies do, cameras
-        absorb part of the deformation. "weak_perspective" are rotations with a scale
-        for each frame, a good model of most photos of objects that are far away for
-        their size; "orthographic" ones have the same scale in all frames. With these
-        shapes, lengths and angles are true, up to one mirror image (`mirror`).
+        Camera model. "affine" assumes nothing: shapes are known up to an affinity of
+        space, and cameras absorb part of large deformations, such as those of bodies.
+        "weak_perspective" cameras are rotations with a scale for each frame, a good
+        model of photos of objects that are far away for their size. "orthographic" ones
+        have the same scale in all frames. With these two, shapes, lengths and angles
+        are true, up to one mirror image (`mirrored`).
     independence : {"shapes", "coefficients", None}, default="shapes"
-        What fixes the basis of the joint refinement, which any mixing of its basis
-        shapes leaves as likely: "shapes" makes these independent of each other over the
-        points, as the paper assumes, "coefficients" makes their coefficients
-        independent over the frames, and None takes the principal axes of the
-        deformation. Shapes of frames, reprojection and score do not depend on it. Only
-        for the joint refinement, without which "coefficients" is refused.
+        Criterion for the basis of the joint refinement: any mixing of the basis shapes
+        is as likely. "shapes" makes them independent of each other over the points, as
+        the paper assumes. "coefficients" makes their coefficients independent over the
+        frames. None takes the principal axes of the deformation. Shapes of frames,
+        reprojection and score do not depend on it. Without the joint refinement
+        "coefficients" is refused.
     loss : {"linear", "huber", "cauchy"}, default="linear"
-        How points count that are far from the model: less than by their square with
-        "huber" from 1.5, with "cauchy" from 2.5 standard deviations of the noise; not
-        at all beyond six sizes of their frame. Only for the joint refinement.
+        Loss of points far from the model. They count less than by their square from 1.5
+        ("huber") or 2.5 ("cauchy") standard deviations of the noise, and not at all
+        beyond six sizes of their frame. Only for the joint refinement.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
@@ -108,33 +96,35 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         the scale is given back to `motion_`. With False frames count by their size.
         With orthographic cameras, which have one scale, frames are not scaled.
     max_iter : int, default=1000
-        The most steps of the refinement.
+        Largest number of steps of the refinement.
     tol : float or None, default=None
-        The joint refinement has converged when two successive steps each lower minus
-        twice the log likelihood by less than tol for each frame (0.025 by default; its
-        first steps, on a sample of a large table, end before that), and
-        the alternating one when a step would gain less than this share of the energy
-        it explains (1e-10 by default).
+        Convergence tolerance. The joint refinement has converged when two successive
+        steps each lower minus twice the log likelihood by less than tol for each frame
+        (default 0.025; its first steps, on a sample of a large table, end earlier). The
+        alternating refinement has converged when a step gains less than this share of
+        the energy it explains (default 1e-10).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
-    keep_frames : bool, str or path-like, default=True
-        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept. With the
-        path of a folder they are memory maps of files of these names, ``alpha.npy`` and
-        so on, in a new folder within that one, which each fit makes for itself;
-        ``alpha_.filename`` says where. A fit that fails leaves none. Fits never remove
-        the files of earlier ones, which other models may use.
+    keep_frames : bool, default=True
+        Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
+    frames_folder : str, path-like or None, default=None
+        Folder for the kept arrays. Each fit makes a new folder within it, with files
+        ``alpha.npy`` and so on, and the attributes are memory maps of them;
+        ``alpha_.filename`` is the path. A fit that fails leaves no files. Fits never
+        remove the files of earlier ones, which other models may use. None keeps the
+        arrays in memory.
     working_memory : float or None, default=None
-        Megabytes that a block of a table takes that is not in memory (a memory map or a
-        table of `isa_nrsfm.io.open_table`); None is scikit-learn's setting
-        `working_memory`. The result does not depend on it. A few numbers for each frame
-        are in memory besides, about 1 kB.
+        Megabytes for a block of a table that is not in memory (a memory map or a table
+        of `isa_nrsfm.io.open_table`); None is scikit-learn's setting `working_memory`.
+        The result does not depend on it. About 1 kB for each frame is in memory in any
+        case.
     n_jobs : int or None, default=None
         Number of threads that work on the frames, in `fit` and in the methods for
         tables, and of joblib workers for strategies that use them. The result does not
         depend on it.
     verbose : int, default=0
         Above zero, print a line for each stage, above one also the current step. With
-        scikit-learn 1.9 and later the fit tells its callbacks of stages and steps, too:
+        scikit-learn 1.9 and later the stages and steps are reported to the callbacks of
         ``set_callbacks(ProgressBar())``.
 
     Attributes
@@ -143,17 +133,17 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is
         the identity (of rank two for flat objects). With weak-perspective cameras only
         the mean square of its coordinates is one, with orthographic ones it is in the
-        units of the table. x and y are the axes of the mean
-        camera (so y points down for image coordinates), z is depth; its mirror image
-        fits as well.
+        units of the table. x and y are the axes of the mean camera (so y points down
+        for image coordinates), z is depth. Its mirror image fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
-        Basis shapes B_k, centred, by decreasing energy in the images; one standard
-        deviation of `alpha_` each. Those the table has no motion for are zero.
+        Basis shapes B_k, centred, by decreasing energy in the images, each for one
+        standard deviation of `alpha_`. Basis shapes without motion in the table are
+        zero.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the frames, with unit variance over the frames and a third
-        moment that is not negative; after the joint refinement with mean zero.
+        Coefficients of the frames, scaled to unit variance; signs chosen so that the
+        skewness is non-negative. Their mean is zero after the joint refinement.
     alpha_std_ : ndarray of shape (n_frames, n_components)
-        Their posterior standard deviations, shapes and noise being known (joint
+        Posterior standard deviations of `alpha_` for known shapes and noise (joint
         refinement only).
     motion_ : ndarray of shape (n_frames, 2, 3)
         Affine cameras, in the units of the table.
@@ -161,29 +151,26 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Images of the origin of the shapes, in the units of the table: the centroids of
         complete frames.
     depth_uncertainty_ : float
-        Root mean square error of the depths of the frames that is to be expected,
-        relative to their root mean square. Set with calibrated cameras and the joint
-        refinement.
+        Expected root mean square error of the depths of the frames, relative to their
+        root mean square (calibrated cameras with the joint refinement only).
     rotations_ : ndarray of shape (n_frames, 3, 3)
         Rotations of calibrated cameras, of determinant one: the rows are the axes of
         the image, x, y and z (only with such cameras, as `scales_`).
     scales_ : ndarray of shape (n_frames,)
-        Their scales, in units of the table per unit of the shapes; one where they are
-        orthographic. The image of frame i is ``scales_[i] * S_i @ rotations_[i, :2].T +
-        translation_[i]`` with ``S_i = reconstruct(X)[i]``.
+        Scales of calibrated cameras, in units of the table per unit of the shapes; one
+        for orthographic cameras. The image of frame i is ``scales_[i] * S_i @
+        rotations_[i, :2].T + translation_[i]`` with ``S_i = reconstruct(X)[i]``.
     inverse_snr_ : float
-        ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled
-        as in the fit; of the points that are seen.
+        ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
+        visible points, scaled as in the fit.
     rank_floor_ : float
-        The least inverse SNR that any model of rank 3K + 3 reaches, missing points
-        being filled in.
+        Lowest inverse SNR of any model of rank 3K + 3, with missing points filled in.
     noise_variance_ : float
         Variance of the noise of a coordinate; of frames of size one where frames are
         scaled (joint refinement only, as are the next four).
     camera_noise_ratio_ : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
-        with affine ones, from the frames that the first steps are made on; see
-        `diagnostics`.
+        with affine ones, from the frames of the first steps; see `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are not uncertainty, of their
         own or of the shapes, along uncorrelated directions, decreasing; zero for noise.
@@ -203,8 +190,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     singular_values_ : ndarray of shape (3 * n_components + 3,)
         Largest singular values of W, decreasing.
     reference_motion_ : ndarray of shape (2, 3)
-        The camera that `inverse_transform` takes by default: the mean view of the
-        table.
+        Default camera of `inverse_transform`: the mean view of the table.
     reference_translation_ : ndarray of shape (2,)
         Its translation, the mean centroid.
     isa_ : object
@@ -229,18 +215,18 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     Notes
     -----
     Affine cameras determine the shapes up to one affinity of space and one scale a
-    frame. The affinity is fixed as said above; angles and proportions in depth are
-    not those of the object.
+    frame. The affinity is fixed as described for `mean_shape_`; angles and proportions
+    in depth are not those of the object.
 
-    `fit` and the methods for new tables take tables that are not in memory, too. Of a
-    dask array `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays, and
-    so is what `transform`, `decompose`, `reconstruct` and `reproject` return.
+    `fit` and the methods for new tables accept tables that are not in memory. Of a dask
+    array `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays, and so
+    are the results of `transform`, `decompose`, `reconstruct` and `reproject`.
 
-    Points that are missing are NaN, in `fit` and everywhere else. A point of which only
-    one coordinate is missing counts as missing, with a warning. Rows that show no point
-    at all are left out of the fit, with a warning, and have NaN in `alpha_` and the
-    other attributes of frames. Rows of which something is seen, but too little to
-    determine a camera, are refused by `fit` and have NaN elsewhere.
+    Missing points are NaN, in `fit` and everywhere else. A point with one missing
+    coordinate counts as missing, with a warning. Rows without any point are left out of
+    the fit, with a warning, and have NaN in `alpha_` and the other attributes of
+    frames. Rows with too few points to determine a camera are refused by `fit` and have
+    NaN elsewhere.
 
     References
     ----------
@@ -262,35 +248,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     (5, 4)
     """
 
-    mean_shape_: NDArray
-    basis_: NDArray
-    alpha_: NDArray
-    alpha_std_: NDArray
-    motion_: NDArray
-    translation_: NDArray
-    inverse_snr_: float
-    rank_floor_: float
-    noise_variance_: float
-    camera_noise_ratio_: float
-    depth_uncertainty_: float
-    rotations_: NDArray
-    scales_: NDArray
-    reliability_: NDArray
-    objective_history_: NDArray
-    gradient_norm_: float
-    energy_share_: NDArray
-    mode_covariance_: NDArray
-    singular_values_: NDArray
-    reference_motion_: NDArray
-    reference_translation_: NDArray
-    isa_: Any
-    n_iter_: int
-    camera_: str
-    frames_scaled_: bool
-    _model: TableModel
-    n_features_in_: int
-    feature_names_in_: NDArray
-
     _limits: ClassVar[Limits] = Limits()  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
@@ -308,7 +265,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
-        "keep_frames": ["boolean", str, HasMethods("__fspath__")],
+        "keep_frames": ["boolean"],
+        "frames_folder": [None, str, HasMethods("__fspath__")],
         "working_memory": [None, Interval(Real, 0, None, closed="neither")],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
@@ -329,7 +287,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         max_iter: int = 1000,
         tol: float | None = None,
         random_state: Any = None,
-        keep_frames: Any = True,
+        keep_frames: bool = True,
+        frames_folder: str | os.PathLike[str] | None = None,
         working_memory: float | None = None,
         n_jobs: int | None = None,
         verbose: int = 0,
@@ -347,6 +306,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         self.tol = tol
         self.random_state = random_state
         self.keep_frames = keep_frames
+        self.frames_folder = frames_folder
         self.working_memory = working_memory
         self.n_jobs = n_jobs
         self.verbose = verbose
@@ -373,31 +333,38 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Raises
         ------
         ValueError
-            If X has an odd number of columns, infinite values, too few points or
-            frames for `n_components`, a frame whose points are all equal, that shows
-            one to three points or some on one line only, a point that is seen in too
-            few frames, or column names that contradict `layout`; if `loss` is not
-            linear, or X a `StoredTable` or a dask array, without the joint refinement;
-            or if `keep_frames` is an empty text.
+            If X has an odd number of columns, infinite values, too few points or frames
+            for `n_components`, or column names that contradict `layout`; if a frame
+            shows one to three points, or points on one line only; if a point is visible
+            in too few frames; if parameters or tables need the joint refinement; or if
+            `frames_folder` is an empty text.
         OSError
-            If the folder of `keep_frames` cannot be made or written to, before the fit;
-            if the disk is full, after it.
+            If `frames_folder` cannot be made or written to, before the fit; if the disk
+            is full, after it.
 
         Warns
         -----
         UserWarning
-            If calibrated cameras do not determine the depth, if rows show no point and
-            are left out, if points lack one coordinate, if
-            the other layout explains the table much better, or if a refinement has not
-            converged.
+            If calibrated cameras do not determine the depth, if rows without points are
+            left out, if points lack one coordinate, if the other layout explains the
+            table much better, or if a refinement has not converged.
         """
-        try:
-            self._forget()
-            with kept_arrays(self.keep_frames) as keep:
-                self._fit(X, y, keep)
-        except BaseException:
-            self._forget()
-            raise
+        self._forget()
+        joint = self.refinement == "joint"
+        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
+        with kept_arrays(self.frames_folder) as keep:
+            progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+            fitted = copy.copy(self)
+            source = fitted._checked(X)
+            frames = fit_table(fitted, source, progress)
+            if self.keep_frames:
+                kept = keep(frames._asdict())
+                fitted._set_frames(*map(source.blocks.as_collected, kept.values()))
+            certainty = fitted._model.frames.certainty
+            if not certainty.determined:
+                warn_caller(certainty.advice)
+        self.__dict__.update(vars(fitted))  # all at once
+        progress.end()
         return self
 
     def fit_transform(self, X: Any, y: Any = None) -> NDArray:
@@ -419,74 +386,34 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         self.fit(X)
         return self.alpha_.copy() if self.keep_frames else self.transform(X)
 
-    def _fit(self, X: Any, y: Any, keep: Keep) -> None:
-        """Check a table and its options, fit it, and set what was found."""
-        joint = self.refinement == "joint"
-        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
-        progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
-        fitted = copy.copy(self)
-        source, options = fitted._checked(X)
-        fit = fit_table(source, self.n_components, options, progress)
-        fitted._set(fit, source, keep)
-        certainty = fit.model.frames.certainty
-        if not certainty.determined:
-            warn_caller(certainty.advice)
-        self.__dict__.update(vars(fitted))  # all at once
-        progress.end()
-
-    def _checked(self, X: Any) -> tuple[Table, FitOptions]:
-        """Check a table and the options of its fit, and return both."""
-        self._check_options(X)
-        if isinstance(X, np.memmap) and self.refinement != "joint":
-            X = np.asarray(X)
-        source = self._opened(X, reset=True)
-        names = getattr(self, "feature_names_in_", None)
-        check_names(names, self.layout)
-        options = FitOptions(
-            self._strategy(),
-            self.isa is None,
-            self.block_recovery,
-            self.refinement,
-            self.camera,
-            self.independence,
-            self.loss,
-            self.layout,
-            self.scale_frames and self.camera != "orthographic",
-            self.max_iter,
-            self.tol,
-            names,
-            self._limits,
-        )
-        return source, options
-
-    def _check_options(self, X: Any) -> None:
-        """Refuse options that do not go together, or not with a table."""
+    def _checked(self, X: Any) -> Table:
+        """Check parameters and a table, and set the attributes that a fit needs."""
         only_joint = {
             "n_components": self.n_components == "auto",
             "loss": self.loss != "linear",
             "independence": self.independence == "coefficients",
         }
-        for name, asked_for in only_joint.items():
-            if asked_for and self.refinement != "joint":
-                raise ValueError(
-                    f"{name}={getattr(self, name)!r} needs refinement='joint'; "
-                    f"got refinement={self.refinement!r}"
-                )
-        stored = is_on_dask(X) or isinstance(X, StoredTable)
-        if stored and self.refinement != "joint":
-            raise ValueError(
-                "tables that are not in memory need refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
+        if self.refinement != "joint":
+            got = f"needs refinement='joint'; got refinement={self.refinement!r}"
+            for name, asked_for in only_joint.items():
+                if asked_for:
+                    raise ValueError(f"{name}={getattr(self, name)!r} {got}")
+            if is_on_dask(X) or isinstance(X, StoredTable):
+                raise ValueError(f"a table that is not in memory {got}")
+            if isinstance(X, np.memmap):
+                X = np.asarray(X)
+        source = self._opened(X, reset=True)
+        check_names(getattr(self, "feature_names_in_", None), self.layout)
+        self.isa_ = self._strategy()
+        self.frames_scaled_ = self.scale_frames and self.camera != "orthographic"
+        return source
 
     def _strategy(self) -> Any:
-        """Return the unfitted strategy, with what it leaves open filled in."""
+        """Return the unfitted strategy, with parameters inherited where not set."""
         if self.isa is not None:
             isa = clone(self.isa)
-        elif self.refinement == "joint":
-            isa = PooledFastICA(n_init=START_RUNS)
         else:
-            isa = PooledFastICA()
+            isa = PooledFastICA(n_init=2 if self.refinement == "joint" else 16)
         params = isa.get_params(deep=False)
         if params.get("subspace_size", 3) != 3:
             raise ValueError(
@@ -503,8 +430,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         return isa
 
     def _forget(self) -> None:
-        """Remove what an earlier fit has found, all of it at once."""
-        found = ("_model", "_unit", "_frame_sizes", "_n_features_out")
+        """Remove all results of an earlier fit at once."""
+        found = ("_model", "_frame_sizes", "_n_features_out")
         left = [name for name in vars(self) if not name.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
 
@@ -512,58 +439,17 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         """Return whether a fit has ended."""
         return hasattr(self, "_model")
 
-    def _set(self, fit: Fit, source: Table, keep: Keep) -> None:
-        """Set all that a fit has found."""
-        found: dict[str, Any] = {
-            "mean_shape": fit.model.mean_shape,
-            "basis": fit.model.basis,
-            "isa": fit.isa,
-            "inverse_snr": fit.inverse_snr,
-            "rank_floor": fit.rank_floor,
-            "singular_values": fit.singular_values,
-            "mode_covariance": fit.mode_covariance,
-            "energy_share": fit.energy_share,
-            "n_iter": fit.n_iter,
-            "camera": fit.model.frames.camera,
-            "frames_scaled": fit.model.unit is None,
-            "reference_motion": fit.reference_motion,
-            "reference_translation": fit.reference_translation,
-        }
-        if fit.numbers is not None:
-            found |= fit.numbers._asdict()
-            if self.camera == "affine":
-                del found["depth_uncertainty"]
-        if self.keep_frames:
-            kept = Decomposition(**keep(fit.frames._asdict()))
-            kept = Decomposition(*map(source.blocks.as_collected, kept))
-            found |= kept._asdict()
-            if fit.numbers is None:
-                del found["alpha_std"]
-            if self.camera != "affine":
-                found["rotations"], found["scales"] = full_rotations(kept.motion)
-            self._frame_sizes = fit.frame_sizes
-        for name, value in found.items():
-            setattr(self, f"{name}_", value)
-        self._unit, self._n_features_out = fit.unit, len(fit.model.basis)
-        self._model = fit.model
+    def _set_frames(self, *frames: NDArray) -> None:
+        """Set the attributes of the frames of the table, in the order of `Decomposition`."""
+        self.motion_, self.translation_, self.alpha_, alpha_std = frames
+        if self.refinement == "joint":
+            self.alpha_std_ = alpha_std
+        if self.camera != "affine":
+            self.rotations_, self.scales_ = full_rotations(self.motion_)
 
 
 def limited(limits: Limits) -> type[AffineNRSfM]:
-    """
-    Return the estimator with other limits.
-
-    Tests and benchmarks show with it what the limits do.
-
-    Parameters
-    ----------
-    limits : Limits
-        What steers the stages of its fits.
-
-    Returns
-    -------
-    type
-        A subclass of `AffineNRSfM`.
-    """
+    """Return a subclass of `AffineNRSfM` with other limits, for tests."""
     return type("LimitedNRSfM", (AffineNRSfM,), {"_limits": limits})
 
 
@@ -573,37 +459,3 @@ def check_class(estimator: object, where: str) -> None:
         raise ValueError(
             f"{where} should be an AffineNRSfM; got {type(estimator).__name__}"
         )
-
-
-class CheckedTable(NamedTuple):
-    """
-    A table that was checked for the fits of an estimator.
-
-    Attributes
-    ----------
-    source : Table
-        The table.
-    options : FitOptions
-        How it is fitted.
-    estimator : AffineNRSfM
-        The estimator, unfitted, that knows the columns of the table.
-    """
-
-    source: Table
-    options: FitOptions
-    estimator: AffineNRSfM
-
-    @classmethod
-    def of(cls, estimator: AffineNRSfM, X: Any) -> Self:
-        """Return a table X that was checked for a clone of an estimator."""
-        estimator = clone(estimator)
-        source, options = estimator._checked(X)
-        return cls(source, options, estimator)
-
-    def fitted(self, fit: Fit, source: Table) -> AffineNRSfM:
-        """Return the estimator with a fit of a part of the table, given as source."""
-        model = copy.copy(self.estimator)
-        model.set_params(n_components=len(fit.model.basis))
-        with kept_arrays(model.keep_frames) as keep:
-            model._set(fit, source, keep)
-        return model

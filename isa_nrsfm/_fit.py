@@ -1,21 +1,21 @@
-"""The stages of a fit, in order: from a table to a fitted model.
+"""The stages of a fit, in order: from a table to the attributes of an estimator.
 
 1. The table is checked, scaled and, where points are missing, completed.
 2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
 3. and 4. The paper's pipeline: independent subspaces, then block structure and
    refinement. With the joint refinement its result is only a start.
-5. The joint refinement, with `refinement="joint"`.
-6. Gauge, and camera and coefficients of every frame.
+5. The joint refinement, with `refinement="joint"`, or the frames of the paper.
+6. Measures of the fit.
 
-The first and the last stage use all frames. So do the last steps of the joint
-refinement. All others use the frames of the sample.
+The first and the last two stages use all frames, the others those of the sample.
 """
 
+import copy
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
-from isa_nrsfm._fit_options import PAPER_TOL, FitOptions
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import reference_camera
@@ -42,7 +41,10 @@ from isa_nrsfm._gauge.canonical import (
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._gauge.rigid import rigid_gauge
 from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
+from isa_nrsfm._joint.quasi_newton import JointFit
 from isa_nrsfm._joint.sample_posterior import (
     certainty_of,
     posterior_blocks,
@@ -57,9 +59,11 @@ from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
+from isa_nrsfm._prepare.options import CompletionOptions, OutlierOptions
 from isa_nrsfm._prepare.robust import outliers_of_table
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.sources import Table
+from isa_nrsfm._transformer import TableTransformer
 
 # Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
@@ -71,411 +75,351 @@ STAGES = (
     JOINT_STAGE,
     "gauge and coefficients",
 )
+# Convergence tolerances by default. JOINT_TOL: decrease of the objective of the joint
+# refinement for each frame. PAPER_TOL: gain of the paper's refinement, as a share of
+# the energy that it explains.
+JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 
 
-class JointNumbers(NamedTuple):
+class Limits(NamedTuple):
     """
-    Results of the joint refinement alone.
-
-    They become public attributes of the same names with an underscore.
-    """
-
-    noise_variance: float
-    camera_noise_ratio: float
-    depth_uncertainty: float
-    reliability: NDArray
-    objective_history: NDArray
-    gradient_norm: float
-
-
-class Refined(NamedTuple):
-    """
-    The fitted model and the fit of the frames, without error and energies.
+    Numbers that tests and benchmarks vary.
 
     Attributes
     ----------
-    model : TableModel
-        The fitted model, in the gauge.
-    frames : Decomposition
-        The fit of the frames of the table.
-    mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
-        As of `AffineNRSfM`.
-    n_iter : int
-        Number of steps of the last refinement.
-    converged : bool
-        Whether the refinement has converged.
-    numbers : JointNumbers or None
-        None for the paper's refinement.
+    dense : int
+        A table with more points and more rows of images than this is not factorised as
+        a whole.
+    sample : int
+        Number of frames of the first sample of a large table.
+    small_table : int
+        Tables with fewer coordinates than this are fitted without a sample.
+    outliers, completion, joint
+        Of the search for gross outliers, of missing points, of the joint refinement.
     """
 
-    model: TableModel
-    frames: Decomposition
-    mode_covariance: NDArray
-    n_iter: int
-    converged: bool
-    numbers: JointNumbers | None
-
-
-class Fit(NamedTuple):
-    """
-    Result of a fit.
-
-    Attributes
-    ----------
-    model : TableModel
-        The fitted model.
-    unit : float
-        The one size of all frames, 1 where each has its own.
-    frames : Decomposition
-        The fit of all rows of the table; NaN for rows that show nothing.
-    frame_sizes : ndarray of shape (n_rows,)
-        What the frames were divided by.
-    isa : object
-        The fitted strategy.
-    numbers : JointNumbers or None
-        What only the joint refinement tells.
-    inverse_snr, rank_floor, singular_values, mode_covariance, energy_share, n_iter
-        As of `AffineNRSfM`.
-    reference_motion, reference_translation : ndarray of shape (2, 3) and (2,)
-        As of `AffineNRSfM`.
-    """
-
-    model: TableModel
-    unit: float
-    frames: Decomposition
-    frame_sizes: NDArray
-    isa: Any
-    numbers: JointNumbers | None
-    inverse_snr: float
-    rank_floor: float
-    singular_values: NDArray
-    mode_covariance: NDArray
-    energy_share: NDArray
-    n_iter: int
-    reference_motion: NDArray
-    reference_translation: NDArray
-
-    @property
-    def n_supported(self) -> int:
-        """Number of reliable directions of the coefficients, after the joint fit."""
-        found = () if self.numbers is None else self.numbers.reliability
-        return int(np.sum(np.asarray(found) >= LEAST_RELIABILITY))
+    dense: int = 1500
+    sample: int = 600
+    small_table: int = 150_000
+    outliers: OutlierOptions = OutlierOptions()
+    completion: CompletionOptions = CompletionOptions()
+    joint: JointOptions = JointOptions()
 
 
 def fit_table(
-    source: Table, n_components: Any, options: FitOptions, progress: FitProgress
-) -> Fit:
+    estimator: TableTransformer, source: Table, progress: FitProgress
+) -> Decomposition:
     """
-    Fit a table.
+    Fit a table, and set the attributes of an estimator.
 
     Parameters
     ----------
+    estimator : TableTransformer
+        The estimator; its parameters are checked, and `isa_` is the unfitted strategy.
     source : Table
         The table.
-    n_components : int or "auto"
-        K.
-    options : FitOptions
-        How the table is fitted.
     progress : FitProgress
         Called after each stage, and before each step of the joint refinement.
 
     Returns
     -------
-    Fit
-        The fitted model, the fit of the frames, and measures of the fit.
+    Decomposition
+        The fit of the rows of the table; NaN for rows that show nothing.
     """
+    n_components = estimator.n_components
     if n_components == "auto":
-        n_components = _count_components(source, options)
-    table = ready_table(source, n_components, options)
-    return fit_ready_table(table, n_components, options, progress)
+        n_components = _count_components(estimator, source)
+    table = ready_table(estimator, source, n_components)
+    return fit_ready_table(estimator, table, n_components, progress)
 
 
 @one_blas_thread
 def fit_ready_table(
+    estimator: TableTransformer,
     table: ScaledTable,
     n_components: int,
-    options: FitOptions,
     progress: FitProgress | NoProgress,
     starts: Sequence[Start] = (),
-) -> Fit:
+) -> Decomposition:
     """
-    Fit a table that is ready.
+    Fit a table that is checked, centred and scaled: stages 1 to 6.
 
     Parameters
     ----------
+    estimator, progress
+        As in `fit_table`.
     table : ScaledTable
-        The table, checked and scaled.
+        The table.
     n_components : int
         K.
-    options : FitOptions
-        How the table is fitted.
-    progress : FitProgress or NoProgress
-        As of `fit_table`.
     starts : sequence of Start, default=()
-        Where the fit starts, with the joint refinement. Otherwise it searches for
-        starts, and the result of the paper's pipeline is one of them.
+        Starts of the joint refinement. By default it searches for them, from the result
+        of the paper's pipeline among others.
 
     Returns
     -------
-    Fit
-        The fit; with `starts` its strategy `isa` is None.
+    Decomposition
+        As in `fit_table`.
     """
-    # 1. The rest of the table
-    unit = 1.0 if options.scale_frames else float(table.sizes[0])
-    # 2. Factorisation
-    factorised = _factorised(table, n_components, options, progress)
-    triplets, factors = factorised.triplets, factorised.factors
+    # 1. and 2. The rest of the table, and its factorisation
+    factorised = _factorised(estimator, table, n_components, progress)
+    factors = factorised.factors
     # 3. and 4. The paper's pipeline
-    isa, paper = None, None
-    if not starts:
-        isa, paper = _paper_result(factors, n_components, options, progress)
-    # 5. Joint refinement
-    if paper is None or options.joint:
-        shapes = starts[0].shapes if paper is None else paper.shapes
-        refined = _refined_jointly(
-            table, factorised, shapes, starts, options, unit, progress
-        )
+    if starts:
+        estimator.isa_, paper = None, None
     else:
-        refined = _refined_by_paper(table, factors, paper, options, unit)
-    if not refined.converged:
+        paper = _paper_result(estimator, factors, n_components, progress)
+    # 5. Refinement, gauge and frames
+    if estimator.refinement == "joint":
+        shapes = starts[0].shapes if paper is None else paper.shapes
+        settings = _joint_settings(estimator, progress.step)
+        fitted, tracks, alpha = fit_jointly(factorised, shapes, settings, starts)
+        progress(JOINT_STAGE)
+        frames = _joint_frames(estimator, table, fitted, tracks, alpha)
+        converged = fitted.converged
+    else:
+        assert paper is not None
+        frames, converged = (
+            _paper_frames(estimator, table, factors, paper),
+            paper.converged,
+        )
+    if not converged:
         warn_caller(
-            f"the refinement did not converge in max_iter={options.max_iter} steps; "
+            f"the refinement did not converge in max_iter={estimator.max_iter} steps; "
             "increase max_iter or tol",
             ConvergenceWarning,
         )
-    # 6. Measures of the fit; the gauge is taken at the end of the refinement
-    cameras = refined.frames.motion / table.sizes[:, None, None]
-    energy = image_energies(cameras, refined.model.basis, refined.frames.alpha)
-    fit = Fit(
-        model=refined.model,
-        unit=unit,
-        frames=Decomposition(
-            *(table.of_all_rows(each.astype(table.dtype)) for each in refined.frames)
-        ),
-        frame_sizes=table.of_all_rows(table.sizes),
-        isa=isa,
-        numbers=refined.numbers,
-        inverse_snr=_inverse_snr(table, refined, cameras),
-        rank_floor=triplets.rest_share,
-        singular_values=unit * triplets.values,
-        mode_covariance=unit**2 * refined.mode_covariance,
-        energy_share=energy / (energy.sum() or 1.0),
-        n_iter=refined.n_iter,
-        reference_motion=_reference(cameras, table, options.camera),
-        reference_translation=refined.frames.translation.mean(axis=0).astype(
-            table.dtype
-        ),
+    # 6. Measures of the fit
+    unit, fit = estimator._model.unit or 1.0, estimator._model
+    estimator.mean_shape_, estimator.basis_ = fit.mean_shape, fit.basis
+    estimator.camera_, estimator._n_features_out = estimator.camera, n_components
+    estimator.rank_floor_ = factorised.triplets.rest_share
+    estimator.singular_values_ = unit * factorised.triplets.values
+    estimator.mode_covariance_ *= unit**2
+    cameras = frames.motion / table.sizes[:, None, None]
+    energy = image_energies(cameras, fit.basis, frames.alpha)
+    estimator.energy_share_ = energy / (energy.sum() or 1.0)
+    estimator.inverse_snr_ = reprojection_error(
+        table.rows,
+        np.concatenate([fit.mean_shape[None], fit.basis]).transpose(0, 2, 1),
+        cameras,
+        (frames.translation - table.translation) / table.sizes[:, None],
+        frames.alpha,
     )
+    reference = reference_camera(cameras, table.sizes)
+    if estimator.camera != "affine":
+        (row,), (scale,) = nearest_calibrated(reference[None])
+        reference = scale * row
+    estimator.reference_motion_ = reference.astype(table.dtype)
+    estimator.reference_translation_ = frames.translation.mean(axis=0).astype(
+        table.dtype
+    )
+    if estimator.keep_frames:
+        estimator._frame_sizes = table.of_all_rows(table.sizes)
     progress("gauge and coefficients")
-    return fit
+    return Decomposition(
+        *(table.of_all_rows(each.astype(table.dtype)) for each in frames)
+    )
 
 
 @one_blas_thread
-def _count_components(source: Table, options: FitOptions) -> int:
-    """Return the number of basis shapes that a table supports."""
+def _count_components(estimator: TableTransformer, source: Table) -> int:
+    """Return the number of basis shapes that a table supports, of at most twelve."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
-        table = ready_table(source, 1, options)
-    most = largest_n_components(table.n_points)
-    most = min(options.limits.most_components, most, most_for_frames(len(table.sizes)))
-    factorised = _factorised(table, most, options, NoProgress())
-    _, paper = _paper_result(factorised.factors, most, options, NoProgress())
-    found = count_components(factorised, paper.shapes, _joint_settings(options))
+        table = ready_table(estimator, source, 1)
+    largest = largest_n_components(table.n_points), most_for_frames(len(table.sizes))
+    most = min(12, *largest)
+    trial = copy.copy(estimator)
+    factorised = _factorised(trial, table, most, NoProgress())
+    paper = _paper_result(trial, factorised.factors, most, NoProgress())
+    found = count_components(factorised, paper.shapes, _joint_settings(estimator))
     # Outliers that count a little look like shapes: a fit with final weights decides.
-    while found > 1 and options.loss != "linear":
+    while found > 1 and estimator.loss != "linear":
+        trial = copy.copy(estimator)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            fit = fit_ready_table(table, found, options, NoProgress())
-        if fit.n_supported == found:
+            fit_ready_table(trial, table, found, NoProgress())
+        n_supported = int(np.sum(trial.reliability_ >= LEAST_RELIABILITY))
+        if n_supported == found:
             break
-        found = max(fit.n_supported, 1)
+        found = max(n_supported, 1)
     if found == most:
         warn_caller(
-            f"all {most} basis shapes that were tried are relevant: the table may "
-            f"ask for more than n_components={most}"
+            f"all {most} basis shapes that were tried are relevant: more than "
+            f"n_components={most} may be needed for this table"
         )
     return found
 
 
 @one_blas_thread
-def ready_table(source: Table, n_components: int, options: FitOptions) -> ScaledTable:
-    """
-    Return a table checked, centred and scaled.
-
-    Parameters
-    ----------
-    source : Table
-        The table.
-    n_components : int
-        The largest K that it has to be large enough for.
-    options : FitOptions
-        How the table is fitted.
-
-    Returns
-    -------
-    ScaledTable
-        The table, ready for `fit_ready_table`.
-    """
+def ready_table(
+    estimator: TableTransformer, source: Table, n_components: int
+) -> ScaledTable:
+    """Return a table centred, scaled and checked for fits of at most K basis shapes."""
     return scaled_table(
         source,
         n_components,
-        layout=options.layout,
-        names=options.names,
-        scale_frames=options.scale_frames,
-        robust=options.loss != "linear",
+        layout=estimator.layout,
+        names=getattr(estimator, "feature_names_in_", None),
+        scale_frames=estimator.frames_scaled_,
+        robust=estimator.loss != "linear",
+    )
+
+
+def joint_tol(estimator: TableTransformer) -> float:
+    """Return the tolerance of the joint refinement."""
+    return JOINT_TOL if estimator.tol is None else estimator.tol
+
+
+def _joint_settings(
+    estimator: TableTransformer, on_step: Callable[[], None] | None = None
+) -> JointSettings:
+    """Return how the joint refinement fits a table."""
+    return JointSettings(
+        estimator.camera,
+        estimator.loss,
+        estimator.max_iter,
+        joint_tol(estimator),
+        on_step,
+        estimator._limits.joint,
     )
 
 
 def _factorised(
+    estimator: TableTransformer,
     table: ScaledTable,
     n_components: int,
-    options: FitOptions,
     report: Callable[[str], None],
 ) -> FactorisedTable:
     """Return a table with outliers, completed frames, sample and factors.
 
     Outliers are looked for with a robust loss only. They count as missing points.
     """
-    outliers, used, complete = None, table.rows, table.complete
-    limits, n_points = options.limits, table.n_points
-    if options.loss != "linear":
+    limits, n_points = estimator._limits, table.n_points
+    outliers, completed, complete = None, table.rows, table.complete
+    if estimator.loss != "linear":
         outliers = outliers_of_table(table.rows, n_points, limits.outliers)
-        used = table.rows.derive(rows_without, outliers)
+        completed = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
     if not complete:
-        used = complete_rows(used, n_points, n_components, limits.completion)
+        completed = complete_rows(completed, n_points, n_components, limits.completion)
     report("table")
     shape = 2 * len(table.sizes), n_points
-    triplets = block_triplets(used, shape, 3 * n_components + 3, limits.dense)
-    if options.joint:
-        sample = sample_frames(
-            used, n_points, triplets.vectors[:3], limits.sample, limits.small_table
-        )
+    triplets = block_triplets(completed, shape, 3 * n_components + 3, limits.dense)
+    if estimator.refinement == "joint":
+        rigid, first = triplets.vectors[:3], limits.sample
+        sample = sample_frames(completed, n_points, rigid, first, limits.small_table)
     else:
-        sample = Sample(used.whole().reshape(shape), [])
+        sample = Sample(completed.whole().reshape(shape), [])
     factors = factorise(sample.W, n_components, table.precision, triplets)
     report("factorisation")
     return FactorisedTable(
-        table.rows, used, table.n_seen, outliers, triplets, sample, factors
-    )
-
-
-def _joint_settings(
-    options: FitOptions, on_step: Callable[[], None] | None = None
-) -> JointSettings:
-    """Return how the joint refinement fits a table."""
-    return JointSettings(
-        options.camera,
-        options.loss,
-        options.max_iter,
-        options.joint_tol,
-        on_step,
-        options.limits.joint,
+        table.rows, completed, table.n_seen, outliers, triplets, sample, factors
     )
 
 
 def _paper_result(
+    estimator: TableTransformer,
     factors: Factorisation,
     n_components: int,
-    options: FitOptions,
     report: Callable[[str], None],
-) -> tuple[Any, PaperResult]:
-    """Return the fitted strategy and what the paper's pipeline finds with it."""
-    # A clone: the options stay as they are, also where K is looked for first.
-    isa, joint, limits = clone(options.isa), options.joint, options.limits
-    tol = PAPER_TOL if options.tol is None else options.tol
+) -> PaperResult:
+    """Return the result of the paper's pipeline, and set the fitted strategy."""
+    estimator.isa_ = clone(estimator.isa_)
+    refinement, max_iter = estimator.refinement, estimator.max_iter
+    tol = PAPER_TOL if estimator.tol is None else estimator.tol
     with warnings.catch_warnings():
-        if joint and options.default_isa:
-            # The joint refinement only starts from this result.
-            warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
-        result = run_paper_pipeline(
+        if refinement == "joint":
+            # It only starts from this result.
+            refinement, max_iter, tol = "alternating", 200, 1e-5
+            if estimator.isa is None:
+                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
+        return run_paper_pipeline(
             factors,
             n_components,
-            isa,
-            block_recovery=options.block_recovery,
-            refinement="alternating" if joint else options.refinement,
-            max_iter=limits.start_steps if joint else options.max_iter,
-            tol=limits.start_tol if joint else tol,
+            estimator.isa_,
+            block_recovery=estimator.block_recovery,
+            refinement=refinement,
+            max_iter=max_iter,
+            tol=tol,
             report=report,
         )
-    return isa, result
 
 
-def _refined_by_paper(
+def _paper_frames(
+    estimator: TableTransformer,
     table: ScaledTable,
     factors: Factorisation,
     paper: PaperResult,
-    options: FitOptions,
-    unit: float,
-) -> Refined:
-    """Return the model and the frames of the paper's pipeline."""
+) -> Decomposition:
+    """Return the frames of the paper's pipeline in its gauge, and set the model."""
     shapes = paper.shapes
-    if options.camera != "affine":
-        scaled = options.camera == "weak_perspective"
+    if estimator.camera != "affine":
+        scaled = estimator.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
     source = table.source._replace(dtype=np.float64)
 
-    def model(mean_shape: NDArray, basis: NDArray) -> TableModel:
-        frames = RigidFrames(mean_shape, basis, options.camera)
-        return _model(frames, mean_shape, basis, options, unit)
+    def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
+        frames = RigidFrames(mean_shape, basis, estimator.camera)
+        return _table_model(estimator, table, frames, mean_shape, basis)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     gauge = rigid_gauge(
         shapes[0].T,
         shapes[1:].transpose(0, 2, 1),
         table.sizes,
-        lambda mean_shape, basis: model(mean_shape, basis).decompose(source),
-        camera=options.camera,
+        lambda mean_shape, basis: fitted(mean_shape, basis).decompose(source),
+        camera=estimator.camera,
         dtype=table.dtype,
     )
-    return Refined(
-        model(gauge.mean_shape, gauge.basis),
-        gauge.frames,
-        reorder_blocks(paper.mode_covariance, gauge.order),
-        paper.n_iter,
-        paper.converged,
-        None,
-    )
+    estimator._model = fitted(gauge.mean_shape, gauge.basis)
+    estimator.mode_covariance_ = reorder_blocks(paper.mode_covariance, gauge.order)
+    estimator.n_iter_ = paper.n_iter
+    return gauge.frames
 
 
-def _refined_jointly(
+def _joint_frames(
+    estimator: TableTransformer,
     table: ScaledTable,
-    factorised: FactorisedTable,
-    paper_shapes: NDArray,
-    starts: Sequence[Start],
-    options: FitOptions,
-    unit: float,
-    progress: FitProgress | NoProgress,
-) -> Refined:
-    """Return the shapes of the joint refinement, and their fit of the frames."""
-    fitted, fitted_frames, alpha = fit_jointly(
-        factorised, paper_shapes, _joint_settings(options, progress.step), starts
-    )
+    fitted: JointFit,
+    tracks: JointFrames,
+    alpha: NDArray,
+) -> Decomposition:
+    """
+    Return the frames of a joint fit in the independent gauge, and set the model.
+
+    `tracks` are the frames as they were fitted, `alpha` coefficients of some frames.
+    """
     shapes, _, noise_variance = fitted.state
-    progress(JOINT_STAGE)
-    # Posterior of every frame
     frames = PosteriorFrames(
         shapes,
         noise_variance,
-        spread_starts(alpha, options.limits.n_starts),
-        options.loss,
-        FrameMap.identity(len(paper_shapes) - 1),
-        options.camera,
+        spread_starts(alpha, 8),
+        estimator.loss,
+        FrameMap.identity(len(shapes) - 1),
+        estimator.camera,
     )
-    if options.camera != "affine":
+    if estimator.camera != "affine":
         frames = replace(frames, certainty=certainty_of(frames, table.rows))
-    posteriors = posterior_blocks(frames, fitted_frames, table.rows)
+        estimator.depth_uncertainty_ = frames.certainty.total
+    posteriors = posterior_blocks(frames, tracks, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
-    _check_determined(motion, table.shown)
+    unknown = np.isnan(motion).any(axis=(1, 2))
+    if unknown.any():
+        row = np.flatnonzero(table.shown)[unknown.argmax()]
+        raise ValueError(
+            f"{unknown.sum()} of {len(unknown)} frame(s) (first: row {row}) do not "
+            "determine a camera: their visible points are coplanar. Remove these rows."
+        )
     # Gauge of shapes, cameras and coefficients
     gauge = independent_gauge(
         shapes,
         motion,
         alpha,
-        options.independence,
-        options.camera,
-        float(table.sizes[0]) if options.camera == "orthographic" else None,
-        options.limits.gauge,
+        estimator.independence,
+        estimator.camera,
+        float(table.sizes[0]) if estimator.camera == "orthographic" else None,
     )
     frames = replace(frames, gauge=gauge.frames)
     share = table.n_seen / table.n_points
@@ -485,69 +429,32 @@ def _refined_jointly(
         *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
     )
     shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
-    cameras = shown.motion / table.sizes[:, None, None]
-    return Refined(
-        _model(
-            frames,
-            gauge.mean_shape.astype(table.dtype),
-            gauge.basis.astype(table.dtype),
-            options,
-            unit,
-        ),
-        shown._replace(translation=shown.translation + table.translation),
-        mode_covariance(cameras, shown.alpha),
-        len(fitted.history) - 1,
-        fitted.converged,
-        JointNumbers(
-            unit**2 * noise_variance,
-            fitted.camera_noise_ratio,
-            frames.certainty.total,
-            reliabilities(alpha, covariance, *(sum(part) for part in chance)),
-            fitted.history,
-            fitted.gradient_norm,
-        ),
+    estimator._model = _table_model(
+        estimator,
+        table,
+        frames,
+        gauge.mean_shape.astype(table.dtype),
+        gauge.basis.astype(table.dtype),
     )
+    cameras = shown.motion / table.sizes[:, None, None]
+    estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
+    estimator.noise_variance_ = (estimator._model.unit or 1.0) ** 2 * noise_variance
+    estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
+    estimator.reliability_ = reliabilities(alpha, covariance, *map(sum, chance))
+    estimator.objective_history_ = fitted.history
+    estimator.gradient_norm_ = fitted.gradient_norm
+    estimator.n_iter_ = len(fitted.history) - 1
+    return shown._replace(translation=shown.translation + table.translation)
 
 
-def _check_determined(motion: NDArray, shown: NDArray) -> None:
-    """Refuse frames without a camera: motion (n_frames, 2, 3), shown (n_rows,)."""
-    unknown = np.isnan(motion).any(axis=(1, 2))
-    if unknown.any():
-        row = np.flatnonzero(shown)[unknown.argmax()]
-        raise ValueError(
-            f"the points that {unknown.sum()} of {len(unknown)} frame(s) show, the "
-            f"first is row {row}, do not determine a camera: they lie in a plane of "
-            "the mean shape; leave such rows out"
-        )
-
-
-def _model(
+def _table_model(
+    estimator: TableTransformer,
+    table: ScaledTable,
     frames: RigidFrames | PosteriorFrames,
     mean_shape: NDArray,
     basis: NDArray,
-    options: FitOptions,
-    unit: float,
 ) -> TableModel:
     """Return the fitted model as a function of tables."""
-    # With scale_frames each frame has a size of its own.
-    one_unit = None if options.scale_frames else unit
-    return TableModel(
-        frames, mean_shape, basis, options.layout, options.names, one_unit
-    )
-
-
-def _inverse_snr(table: ScaledTable, refined: Refined, cameras: NDArray) -> float:
-    """Return the inverse SNR of all frames, for cameras (n, 2, 3) in scaled units."""
-    model, frames = refined.model, refined.frames
-    position = (frames.translation - table.translation) / table.sizes[:, None]
-    shapes = np.concatenate([model.mean_shape[None], model.basis]).transpose(0, 2, 1)
-    return reprojection_error(table.rows, shapes, cameras, position, frames.alpha)
-
-
-def _reference(cameras: NDArray, table: ScaledTable, camera: str) -> NDArray:
-    """Return the mean view (2, 3) of cameras (n, 2, 3), of the same camera model."""
-    reference = reference_camera(cameras, table.sizes)
-    if camera != "affine":
-        row, scale = nearest_calibrated(reference[None])
-        reference = (scale[:, None, None] * row)[0]
-    return reference.astype(table.dtype)
+    unit = None if estimator.frames_scaled_ else float(table.sizes[0])
+    names = getattr(estimator, "feature_names_in_", None)
+    return TableModel(frames, mean_shape, basis, estimator.layout, names, unit)

@@ -1,21 +1,17 @@
-"""What a notebook shows of a fitted model, below scikit-learn's own picture of it."""
+"""Summary of a fitted model in notebooks, below scikit-learn's diagram."""
 
 import html
 import math
-import warnings
 from typing import Any
 
 import numpy as np
 
 from isa_nrsfm._diagnostics import camera_meaning
 
-# Basis shapes whose energy is listed, at most.
-MOST_LISTED = 12
-
 
 def summary_html(model: Any) -> str:
     """
-    Return what is to be said first of a fitted model.
+    Return the key figures of a fitted model as an HTML table.
 
     Parameters
     ----------
@@ -57,14 +53,11 @@ def _lines(model: Any) -> dict[str, str]:
             else f"{noise:.3g} in the units of the table"
         )
     shares = [_percent(share) for share in model.energy_share_]
-    more = ["..."] * (len(shares) > MOST_LISTED)
-    lines["Energy of each"] = ", ".join(shares[:MOST_LISTED] + more)
+    more = ["..."] * (len(shares) > 12)
+    lines["Energy of each"] = ", ".join(shares[:12] + more)
     if "Noise" in lines and "Frames" in lines:
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            model.diagnostics()
-        said = [str(warning.message) for warning in found]
-        lines["Diagnostics"] = "; ".join(said) or "no warning"
+        messages = model.diagnostics().messages
+        lines["Diagnostics"] = "; ".join(messages) or "no warning"
     return lines
 
 

@@ -1,5 +1,6 @@
 """A fitted model as a transformer of tables: all methods but `fit`."""
 
+import copy
 from numbers import Integral, Real
 from typing import Any, NamedTuple, Self
 
@@ -13,13 +14,7 @@ from sklearn.base import (
 from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._diagnostics import (
-    Diagnostics,
-    diagnose,
-    outlier_advice,
-    warn_of_coefficients,
-)
+from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._dynamics import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
@@ -29,8 +24,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._tables.layout import tracks_to_table
+from isa_nrsfm._tables.layout import Layout, tracks_to_table
 from isa_nrsfm._tables.sources import (
     CHECKS,
     Table,
@@ -40,7 +34,6 @@ from isa_nrsfm._tables.sources import (
     is_stored,
     unmasked,
 )
-from isa_nrsfm.skeletons import find_skeleton
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -66,7 +59,7 @@ class SmoothedCoefficients(NamedTuple):
 
 
 class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
-    """Names what `transform` returns."""
+    """Names of the columns of the results of `transform`."""
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray:
         """
@@ -94,24 +87,51 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
     They use attributes that `fit` sets. The fitted model itself is `_model`.
     """
 
+    n_components: int | str
+    isa: Any
+    block_recovery: str
+    refinement: str | None
+    camera: str
+    independence: str | None
+    loss: str
+    layout: Layout
+    scale_frames: bool
+    max_iter: int
+    tol: float | None
+    keep_frames: bool
+    working_memory: float | None
+    n_jobs: int | None
+
     mean_shape_: NDArray
     basis_: NDArray
     alpha_: NDArray
+    alpha_std_: NDArray
     motion_: NDArray
+    translation_: NDArray
     rotations_: NDArray
-    mode_covariance_: NDArray
-    reference_motion_: NDArray
-    reference_translation_: NDArray
+    scales_: NDArray
+    inverse_snr_: float
+    rank_floor_: float
     noise_variance_: float
     camera_noise_ratio_: float
+    depth_uncertainty_: float
     reliability_: NDArray
-    refinement: str | None
-    keep_frames: Any
-    working_memory: float | None
-    n_jobs: int | None
+    objective_history_: NDArray
+    gradient_norm_: float
+    energy_share_: NDArray
+    mode_covariance_: NDArray
+    singular_values_: NDArray
+    reference_motion_: NDArray
+    reference_translation_: NDArray
+    isa_: Any
+    n_iter_: int
     camera_: str
+    frames_scaled_: bool
+    n_features_in_: int
+    feature_names_in_: NDArray
+
+    _limits: Any
     _model: TableModel
-    _unit: float
     _frame_sizes: NDArray
 
     def __sklearn_tags__(self) -> Any:
@@ -122,7 +142,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         return tags
 
     def _html_repr(self) -> str:
-        """Return what a notebook shows: scikit-learn's picture, and a summary."""
+        """Return scikit-learn's diagram for notebooks, and a summary."""
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
@@ -178,9 +198,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Return coefficients of the frames of a video, smoothed in time.
 
         The coefficients follow a first-order autoregression that is estimated from the
-        table. Each frame counts by the posterior covariance of its coefficients: one in
-        which few points are seen counts little. The fit of the shapes does not depend
-        on the order of the frames: this is a step after it.
+        table. Each frame is weighted by the posterior covariance of its coefficients:
+        frames with few visible points have little weight. The fit of the shapes does
+        not depend on the order of the frames: smoothing is a step after it.
 
         Parameters
         ----------
@@ -194,7 +214,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         groups : array-like of shape (n_frames,), default=None
             People, videos or scenes, between which nothing is carried on. Each has an
             intercept of its own: differences between people are no dynamics. None for
-            one.
+            one group.
         max_gap : int, default=30
             After a gap of more steps nothing is carried on.
         max_iter : int, default=100
@@ -226,12 +246,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
         check_scalar(tol, "tol", Real, min_val=0.0)
         table = self._opened(X)
-        frames = self._model.frames
-        if not isinstance(frames, PosteriorFrames):
-            raise ValueError(
-                "smooth needs a model with refinement='joint', which knows how certain "
-                f"coefficients are; got refinement={self.refinement!r}"
-            )
+        frames = self._jointly_fitted("smooth")
         alone = self._model.posterior(table)
         mean, covariance, time_scales = smoothed_posterior(
             alone.alpha,
@@ -245,14 +260,12 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         alpha, deviation, _ = frames.gauge.coefficients(mean, covariance)
         dtype = table.dtype
         return SmoothedCoefficients(
-            alpha.astype(dtype, copy=False),
-            deviation.astype(dtype, copy=False),
-            time_scales,
+            alpha.astype(dtype), deviation.astype(dtype), time_scales
         )
 
     def rotation_covariance(self, X: Any) -> NDArray:
         """
-        Return how certain the rotations of calibrated cameras are.
+        Return the posterior covariances of the rotations of calibrated cameras.
 
         Parameters
         ----------
@@ -264,9 +277,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ndarray of shape (n_frames, 3, 3)
             Posterior covariances, in radians squared, of the rotation vectors w by
             which rotations R may be off: ``R exp(hat(w))``, w in the axes of the
-            shapes. They contain the uncertainty of coefficients and shapes, and count
-            the misfit as common to many points. NaN for rows of which too little is
-            seen.
+            shapes. They contain the uncertainty of coefficients and shapes, and treat
+            the misfit as common to many points. NaN for rows with too few visible
+            points.
 
         Raises
         ------
@@ -274,7 +287,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             If the model has affine cameras, or was not refined jointly.
         """
         table = self._opened(X)
-        frames = self._calibrated_frames("rotation_covariance")
+        frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.space, frames.certainty
         found = self._model.posterior(table)
         covariance = found.turn_covariance
@@ -355,7 +368,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             )
         table = self._opened(X)
         if return_std:
-            self._calibrated_frames("return_std")
+            self._jointly_fitted("return_std", calibrated=True)
         fitted, metric = self.camera_, None
         if fitted != "affine" and camera not in (None, fitted):
             raise ValueError(
@@ -372,21 +385,20 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         _, scales = full_rotations(np.asarray(self._model.decompose(table).motion))
         return shapes, self._model.depth_deviations(table) / scales[:, None]
 
-    def mirror(self) -> Self:
+    def mirrored(self) -> Self:
         """
-        Turn the model into its mirror image in depth, which fits as well.
+        Return the mirror image of the model in depth, which fits equally well.
 
-        Neither affine nor calibrated cameras tell an object from its mirror image. The
-        fit chooses the one whose mean shape has a positive third moment of its depths.
-        If that is the wrong one, such as a face whose nose points away, this method
-        takes the other. Coefficients, reprojection and score stay as they are.
+        Neither affine nor calibrated cameras distinguish an object from its mirror
+        image. The fit chooses the one with a positive skewness of the depths of the
+        mean shape. If that is the wrong one, such as a face whose nose points away, use
+        this method. Coefficients, reprojection and score stay the same.
 
         Returns
         -------
         AffineNRSfM
-            The same estimator: the signs of z of its shapes and of the third column of
-            its cameras are changed, and rotations are ``D R D`` with ``D = diag(1, 1,
-            -1)``.
+            A copy with changed signs of z of the shapes and of the third column of the
+            cameras. Its rotations are ``D R D`` with ``D = diag(1, 1, -1)``.
 
         Examples
         --------
@@ -394,26 +406,25 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         >>> from isa_nrsfm.datasets import make_face_tracks
         >>> faces = make_face_tracks(n_frames=100, random_state=0)
         >>> model = AffineNRSfM(2, camera="weak_perspective").fit(faces.data)
-        >>> depth = model.mean_shape_[:, 2].copy()
-        >>> bool((model.mirror().mean_shape_[:, 2] == -depth).all())
+        >>> bool((model.mirrored().mean_shape_[:, 2] == -model.mean_shape_[:, 2]).all())
         True
         """
         check_is_fitted(self)
-        dtype = self.mean_shape_.dtype
+        found, dtype = copy.copy(self), self.mean_shape_.dtype
         for name in ("mean_shape_", "basis_", "reference_motion_", "motion_"):
             if hasattr(self, name):
-                setattr(self, name, getattr(self, name) * MIRROR.astype(dtype))
+                setattr(found, name, getattr(self, name) * MIRROR.astype(dtype))
         if hasattr(self, "rotations_"):
             turned = MIRROR[:, None] * self.rotations_ * MIRROR
-            self.rotations_ = turned.astype(dtype, copy=False)
+            found.rotations_ = turned.astype(dtype, copy=False)
         signs = np.tile(MIRROR, len(self.basis_))
-        self.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
-        self._model = self._model._replace(
+        found.mode_covariance_ = signs[:, None] * self.mode_covariance_ * signs
+        found._model = self._model._replace(
             frames=self._model.frames.mirrored(),
-            mean_shape=self.mean_shape_,
-            basis=self.basis_,
+            mean_shape=found.mean_shape_,
+            basis=found.basis_,
         )
-        return self
+        return found
 
     def reproject(self, X: Any) -> NDArray:
         """
@@ -427,8 +438,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         ndarray of shape (n_frames, 2 * n_points)
-            Points of the fitted shapes in the fitted cameras. NaN for rows of which too
-            little is seen.
+            Points of the fitted shapes in the fitted cameras. NaN for rows with too
+            few visible points.
         """
         table = self._opened(X)
         return self._model.reproject(table)
@@ -513,69 +524,35 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         -------
         Diagnostics
             Named tuple of camera_singular_values, deformation_amplitude, reliability,
-            effective_frames, weak_deviations, camera_noise_ratio, camera_meaning,
-            pose_share, outlier_share and outliers.
+            effective_frames, weak_deviations, depth_uncertainty, camera_noise_ratio,
+            camera_meaning, pose_share, outlier_share, outliers and messages. The
+            messages are sentences, for example if the table supports fewer basis
+            shapes, or if it has outliers.
 
         Raises
         ------
         ValueError
             If the model was not refined jointly: the paper's pipeline has no noise
             variance.
-
-        Warns
-        -----
-        UserWarning
-            If the table does not support so many basis shapes, or hardly determines
-            the part of them that cameras absorb. If a handful of frames decide a
-            coefficient. If the pose predicts a coefficient and the points are those of
-            a layout with a contour. If X has outliers and the loss is linear; these
-            may be the reason for all others, which are not given then.
         """
         check_is_fitted(self)
-        if not hasattr(self, "noise_variance_"):
-            raise ValueError(
-                "diagnostics needs a model with refinement='joint'; "
-                f"got refinement={self.refinement!r}"
-            )
+        self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        fitted = np.isfinite(self._frame_sizes)
-        motion = np.asarray(self.motion_)[fitted]
-        alpha = np.asarray(self.alpha_, dtype=np.float64)
-        names, loss = names_of_points(self), frames_of(self).loss
-        found = diagnose(
-            self.mean_shape_.astype(np.float64),
-            self.basis_.astype(np.float64),
-            motion / self._frame_sizes[fitted, None, None],
-            alpha[fitted],
-            self.noise_variance_ / self._unit**2,
-            self.reliability_,
-            getattr(self, "camera_noise_ratio_", np.nan),
-            getattr(self, "depth_uncertainty_", np.nan),
-            None if X is None else self._model.distances(self._opened(X)),
-            loss,
-        )
-        if not frames_of(self).certainty.determined:  # neither are the poses
-            found = found._replace(pose_share=np.full(len(found.pose_share), np.nan))
-        rows = X.index if hasattr(X, "iloc") else range(len(fitted))
-        if loss == "linear" and (advice := outlier_advice(found, rows, names)):
-            warn_caller(
-                f'{advice}: they bend the shapes; take loss="cauchy" (--loss cauchy), '
-                "or correct them"
-            )
-            return found
-        image = self.mean_shape_ @ self.reference_motion_.T
-        layout = find_skeleton(len(names), names, shape=image)
-        warn_of_coefficients(found, alpha, rows, layout)
-        return found
+        distance = None if X is None else self._model.distances(self._opened(X))
+        rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
+        return diagnose(self, distance, rows)
 
-    def _calibrated_frames(self, name: str) -> PosteriorFrames:
-        """Return the model of a frame, with calibrated cameras and noise, or raise."""
+    def _jointly_fitted(self, name: str, calibrated: bool = False) -> PosteriorFrames:
+        """Return the model of a frame with noise, and calibrated cameras, or raise."""
         frames = self._model.frames
-        if self.camera_ == "affine" or not isinstance(frames, PosteriorFrames):
+        if not isinstance(frames, PosteriorFrames):
             raise ValueError(
-                f"{name} needs a model with calibrated cameras and "
-                f"refinement='joint'; got camera={self.camera_!r} and "
-                f"refinement={self.refinement!r}"
+                f"{name} needs a model with refinement='joint', which has a noise "
+                f"variance; got refinement={self.refinement!r}"
+            )
+        if calibrated and self.camera_ == "affine":
+            raise ValueError(
+                f"{name} needs a model with calibrated cameras; got camera='affine'"
             )
         return frames
 
@@ -622,6 +599,6 @@ def check_frames_kept(estimator: Any, what: str) -> None:
     """Refuse what depends on the frames of the fit where they were not kept."""
     if not hasattr(estimator, "motion_"):
         raise ValueError(
-            f"{what} needs the cameras and coefficients of the fitted table; fit with "
-            f"keep_frames=True, got keep_frames={estimator.keep_frames!r}"
+            f"{what} needs the cameras and coefficients of the fitted table: fit with "
+            f"keep_frames=True; got keep_frames={estimator.keep_frames!r}"
         )

@@ -26,7 +26,7 @@ from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._fit_options import Limits as FitLimits
+from isa_nrsfm._fit import Limits as FitLimits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 

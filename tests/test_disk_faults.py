@@ -186,7 +186,7 @@ class TestKeepFrames:
     @staticmethod
     def estimator(folder, **params):
         quick = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
-        return AffineNRSfM(1, keep_frames=folder, **quick, **params)
+        return AffineNRSfM(1, frames_folder=folder, **quick, **params)
 
     @pytest.mark.parametrize("strike", slow_after(1, STRIKES))
     def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
@@ -230,8 +230,8 @@ class TestKeepFrames:
         def never(*_args):
             raise AssertionError("the fit has begun")
 
-        monkeypatch.setattr(AffineNRSfM, "_fit", never)
-        with pytest.raises(ValueError, match=r"keep_frames should be .* got ''"):
+        monkeypatch.setattr(AffineNRSfM, "_checked", never)
+        with pytest.raises(ValueError, match=r"frames_folder should be .* got ''"):
             self.estimator("").fit(table)
         (tmp_path / "file").write_bytes(OLD)
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):

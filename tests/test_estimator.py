@@ -1259,7 +1259,7 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
     model, truth = calibrated(camera)
     S = model.reconstruct(truth.data)
     errors = []
-    for fitted in (model, clone(model).fit(truth.data).mirror()):
+    for fitted in (model, clone(model).fit(truth.data).mirrored()):
         convention = "sequence" if camera == "orthographic" else "frame"
         errors.append(
             mean_shape_error_3d(
@@ -1281,7 +1281,7 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
 @pytest.mark.parametrize("refinement", ["joint", "alternating"])
 def test_mirror_images_fit_as_well(camera, refinement):
     model, truth = calibrated(camera, refinement)
-    mirrored = copy.deepcopy(model).mirror()
+    mirrored = model.mirrored()
     depth = np.array([1.0, 1.0, -1.0])
     assert_array_equal(mirrored.mean_shape_, model.mean_shape_ * depth)
     assert_array_equal(mirrored.motion_, model.motion_ * depth)
@@ -1293,7 +1293,7 @@ def test_mirror_images_fit_as_well(camera, refinement):
     if camera != "affine":
         assert_allclose(np.linalg.det(mirrored.rotations_), 1)
         assert_allclose(mirrored.rotations_, depth[:, None] * model.rotations_ * depth)
-    again = mirrored.mirror()
+    again = mirrored.mirrored()
     assert_array_equal(again.basis_, model.basis_)
     assert_array_equal(again.mode_covariance_, model.mode_covariance_)
 

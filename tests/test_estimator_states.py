@@ -170,7 +170,7 @@ def assert_not_fitted(model, X, folder):
         lambda: model.score(X),
         lambda: model.inverse_transform(alpha),
         lambda: model.diagnostics(),
-        lambda: model.mirror(),
+        lambda: model.mirrored(),
         lambda: model.get_feature_names_out(),
         lambda: save_model(model, folder / "none.npz"),
     ):
@@ -368,7 +368,7 @@ def test_frames_whose_points_lie_in_a_plane_of_the_object_are_refused():
     X = np.vstack([np.full((1, 24), np.nan), pairs.reshape(60, -1)])
     with (
         pytest.warns(UserWarning, match="show no point"),
-        pytest.raises(ValueError, match=r"row 4, do not determine a camera"),
+        pytest.raises(ValueError, match=r"\(first: row 4\) do not determine a camera"),
     ):
         AffineNRSfM(1, random_state=0).fit(X)
 

@@ -73,8 +73,8 @@ CASES = {
         TABLE.astype(np.float32),
     ),
     "missing points": ({}, HOLED),
-    "folder": ({"keep_frames": "folder"}, TABLE),
-    "path of a folder": ({"keep_frames": Path("folder")}, TABLE),
+    "folder": ({"frames_folder": "folder"}, TABLE),
+    "path of a folder": ({"frames_folder": Path("folder")}, TABLE),
     "mirrored": ({"camera": "weak_perspective", "mirror": True}, TABLE),
     "numbers of numpy": (
         {
@@ -100,15 +100,15 @@ def fitted(tmp_path_factory):
         parameters, table = CASES[case]
         parameters = {"n_components": 2, "random_state": 0, "max_iter": 3} | parameters
         mirror = parameters.pop("mirror", False)
-        if str(parameters.get("keep_frames")) == "folder":
-            kind = type(parameters["keep_frames"])
+        if str(parameters.get("frames_folder")) == "folder":
+            kind = type(parameters["frames_folder"])
             folder = tmp_path_factory.mktemp("frames")
-            parameters["keep_frames"] = folder if kind is not str else str(folder)
+            parameters["frames_folder"] = folder if kind is not str else str(folder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
             warnings.filterwarnings("ignore", "1 of 20 row.* show no point")
             model = AffineNRSfM(**parameters).fit(table)
-        return (model.mirror() if mirror else model), table
+        return (model.mirrored() if mirror else model), table
 
     return fit
 

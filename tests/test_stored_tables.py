@@ -9,7 +9,7 @@ from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._estimator import limited
-from isa_nrsfm._fit_options import Limits
+from isa_nrsfm._fit import Limits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -87,11 +87,13 @@ class TestFit:
         empty = np.arange(len(X)) % 7 == 3
         empty[40:100] = True
         expected = estimator(
-            SAMPLED, working_memory=0.02, keep_frames=tmp_path / "expected"
+            SAMPLED, working_memory=0.02, frames_folder=tmp_path / "expected"
         )
         expected.fit(memmap(X[~empty], tmp_path))
         X[empty] = np.nan
-        model = estimator(SAMPLED, working_memory=0.02, keep_frames=tmp_path / "found")
+        model = estimator(
+            SAMPLED, working_memory=0.02, frames_folder=tmp_path / "found"
+        )
         with pytest.warns(UserWarning, match=rf"{empty.sum()} of 150 row\(s\)"):
             model.fit(memmap(X, tmp_path))
         for name in OF_SHAPES:
@@ -234,7 +236,7 @@ class TestKeepFrames:
         X = table()
         plain = estimator().fit(X)
         found = tmp_path / "found"
-        model = estimator(keep_frames=found).fit(X)
+        model = estimator(frames_folder=found).fit(X)
         for name in ATTRIBUTES_OF_FRAMES:
             array = getattr(model, name)
             assert isinstance(array, np.memmap)

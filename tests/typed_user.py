@@ -43,7 +43,7 @@ def of_attributes(model: AffineNRSfM) -> Floats:
 
 
 def of_calibrated_cameras(table: Floats) -> tuple[Floats, str]:
-    model = AffineNRSfM("auto", camera="weak_perspective").fit(table).mirror()
+    model = AffineNRSfM("auto", camera="weak_perspective").fit(table).mirrored()
     poses: Floats = model.rotations_ * model.scales_[:, None, None]
     ratio: float = model.camera_noise_ratio_
     return poses * ratio, model.diagnostics().camera_meaning

@@ -11,8 +11,7 @@ from sklearn.exceptions import ConvergenceWarning
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._selection.path import Row
 
-BEST, ONE_STANDARD_ERROR = "best", "one_standard_error"
-SELECTIONS = (BEST, ONE_STANDARD_ERROR)
+SELECTIONS = ("best", "one_standard_error")
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
     "no number of basis shapes predicts held-out points better than the centroid of "
@@ -22,19 +21,7 @@ NO_SHAPE = (
 
 
 def results_of(rows: Sequence[Row]) -> dict[str, Any]:
-    """
-    Return the rows of a path as the dictionary that `GridSearchCV` has.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        The rows.
-
-    Returns
-    -------
-    dict
-        `cv_results_` of `AffineNRSfMCV`.
-    """
+    """Return `cv_results_` of `AffineNRSfMCV`, as in `GridSearchCV`."""
     scores = np.array([row.scores for row in rows])
     mean = scores.mean(axis=1)
     results: dict[str, Any] = {
@@ -58,26 +45,12 @@ def results_of(rows: Sequence[Row]) -> dict[str, Any]:
 
 def selected(scores: NDArray, select: str) -> int:
     """
-    Return which number of basis shapes is chosen.
+    Return the index of the chosen number of basis shapes.
 
-    Parameters
-    ----------
-    scores : ndarray of shape (n_candidates, n_splits)
-        Scores, by ascending number of basis shapes.
-    select : {"best", "one_standard_error"}
-        The best mean, or the fewest basis shapes whose mean is at most one standard
-        error of the best mean below it (Hastie, Tibshirani, Friedman, "The elements of
-        statistical learning", 2009, section 7.10).
-
-    Returns
-    -------
-    int
-        The index of the candidate.
-
-    Raises
-    ------
-    ValueError
-        If no mean is a number, or there is no standard error: there is only one split.
+    Scores are (n_candidates, n_splits), by ascending number of basis shapes. `select`
+    is "best", the best mean, or "one_standard_error", the fewest basis shapes whose
+    mean is at most one standard error of the best mean below it (Hastie, Tibshirani,
+    Friedman, "The elements of statistical learning", 2009, section 7.10).
     """
     mean = scores.mean(axis=1)
     if np.isnan(mean).all():
@@ -86,7 +59,7 @@ def selected(scores: NDArray, select: str) -> int:
             "points that are held out"
         )
     best = int(np.nanargmax(mean))
-    if select == BEST:
+    if select == "best":
         return best
     n_splits = scores.shape[1]
     if n_splits < 2:
@@ -99,19 +72,7 @@ def selected(scores: NDArray, select: str) -> int:
 
 
 def standard_errors(scores: NDArray) -> NDArray:
-    """
-    Return the standard errors of mean scores over splits.
-
-    Parameters
-    ----------
-    scores : ndarray of shape (..., n_splits)
-        Scores.
-
-    Returns
-    -------
-    ndarray of shape (...)
-        Standard errors; NaN with one split.
-    """
+    """Return the standard errors of mean scores (..., n_splits); NaN with one split."""
     n_splits = scores.shape[-1]
     if n_splits < 2:
         return np.full(scores.shape[:-1], np.nan)
@@ -119,22 +80,7 @@ def standard_errors(scores: NDArray) -> NDArray:
 
 
 def line(row: Row, held_out: bool) -> str:
-    """
-    Return a row of a path as text.
-
-    Parameters
-    ----------
-    row : Row
-        The row.
-    held_out : bool
-        Whether the score is that of points that are held out, minus their error.
-
-    Returns
-    -------
-    str
-        The number of basis shapes, mean and standard error of the score, and the
-        seconds.
-    """
+    """Return a row of a path as text; a held-out error is minus the score."""
     mean, error = row.scores.mean(), standard_errors(row.scores)
     score = f"score {mean:.4g}, standard error {error:.2g}"
     if held_out:

@@ -43,13 +43,9 @@ from isa_nrsfm._selection.choice import (
     warn_of_no_shape,
     warn_of_unconverged,
 )
-from isa_nrsfm._selection.path import Split, ready_part, walk
+from isa_nrsfm._selection.path import ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 from isa_nrsfm._transformer import CoefficientNamesMixin
-
-# Blocks of rows that are held out in turn by default. More cost more, and hardly change
-# the choice: neighbours are alike, and large blocks keep them together.
-N_BLOCKS = 3
 
 
 class AffineNRSfMCV(
@@ -75,19 +71,19 @@ class AffineNRSfMCV(
         All other parameters, such as the camera; its `n_components` is not used. None
         is ``AffineNRSfM()``. A clone is fitted.
     cv : int, cross-validation generator or iterable, default=None
-        How frames are held out: None for three blocks of rows, an int for as many, or a
-        splitter such as ``GroupKFold()``, with which all frames of a person are held
-        out together, or an iterable of pairs (train, test) of row numbers. Blocks are
-        not shuffled, for neighbours in a video are alike.
+        Frames that are held out: None for three blocks of rows, an int for as many
+        blocks, a splitter such as ``GroupKFold()``, which holds out all frames of a
+        person together, or an iterable of pairs (train, test) of row numbers. Blocks
+        are not shuffled, because neighbours in a video are alike.
     scoring : str or callable, default=None
-        A scorer as of scikit-learn, ``scorer(estimator, X, y)``, of which larger is
-        better. None is `AffineNRSfM.score`: points of the frames held out that are
-        predicted from the others of their frame.
+        A scorer of scikit-learn, ``scorer(estimator, X, y)``; larger is better. None is
+        `AffineNRSfM.score`: points of the held-out frames that are predicted from the
+        others of their frame.
     select : {"best", "one_standard_error"}, default="best"
-        Whether the best mean score decides, or the fewest basis shapes are taken whose
+        Whether the best mean score decides, or the fewest basis shapes are chosen whose
         mean score is at most one standard error below the best one.
     n_jobs : int or None, default=None
-        How many parts of the table are fitted at the same time, as of joblib.
+        Number of parts of the table that are fitted at the same time, as in joblib.
     verbose : int, default=0
         Above zero, print a line for each number of basis shapes when it is known.
 
@@ -103,7 +99,7 @@ class AffineNRSfMCV(
         ``split0_test_score`` and so on, `mean_test_score`, `std_test_score`,
         `rank_test_score`; the seconds `mean_fit_time`, `std_fit_time`,
         `mean_score_time`, `std_score_time` for each part, and `path_fit_time` of the
-        fit of all frames that others start from; and `params`, a list.
+        fit of all frames from which others start; and `params`, a list.
     best_index_ : int
         The index of `n_components_` in the arrays of `cv_results_`.
     best_score_ : float
@@ -127,7 +123,7 @@ class AffineNRSfMCV(
     Notes
     -----
     The table is checked, centred and scaled once. A fit of all frames starts from the
-    one before, from its shapes and the leading directions of what they leave. The fit
+    one before, from its shapes and the leading directions of the residuals. The fit
     of a part of the frames starts from that of all frames, and from the one before of
     the same part. The lower objective decides, on that part alone, and the steps go on
     until it has converged; a start that falls behind is dropped before. Frames that are
@@ -228,7 +224,7 @@ class AffineNRSfMCV(
         Warns
         -----
         UserWarning
-            As of `AffineNRSfM.fit`, and if fits of the path have not converged or all
+            As in `AffineNRSfM.fit`, and if fits of the path have not converged or all
             held-out errors are above 100 %.
         """
         estimator = self._estimator()
@@ -239,8 +235,8 @@ class AffineNRSfMCV(
         scorer = self._scorer()
         table = ready_part(estimator, X, candidates[-1])
         splits = [
-            Split(np.asarray(train), np.asarray(test))
-            for train, test in self._splitter().split(X, y, **routed["splitter"])
+            (np.asarray(train), np.asarray(held_out))
+            for train, held_out in self._splitter().split(X, y, **routed["splitter"])
         ]
         rows = []
         for row in walk(
@@ -284,9 +280,9 @@ class AffineNRSfMCV(
         X : array-like of shape (n_frames, 2 * n_points)
             The table.
         y : array-like of shape (n_frames,), default=None
-            As of `fit`.
+            As in `fit`.
         **params : dict
-            As of `fit`.
+            As in `fit`.
 
         Returns
         -------
@@ -308,7 +304,7 @@ class AffineNRSfMCV(
         Returns
         -------
         ndarray of shape (n_frames, `n_components_`)
-            As of `AffineNRSfM.transform`.
+            As in `AffineNRSfM.transform`.
         """
         check_is_fitted(self)
         return self.best_estimator_.transform(X)
@@ -324,9 +320,9 @@ class AffineNRSfMCV(
         alpha : array-like of shape (n_frames, `n_components_`)
             Coefficients.
         motion : array-like of shape (n_frames, 2, 3) or (2, 3), default=None
-            Cameras, as of `AffineNRSfM.inverse_transform`.
+            Cameras, as in `AffineNRSfM.inverse_transform`.
         translation : array-like of shape (n_frames, 2) or (2,), default=None
-            Positions, as of `AffineNRSfM.inverse_transform`.
+            Positions, as in `AffineNRSfM.inverse_transform`.
 
         Returns
         -------
@@ -348,7 +344,7 @@ class AffineNRSfMCV(
         Returns
         -------
         Decomposition
-            As of `AffineNRSfM.decompose`.
+            As in `AffineNRSfM.decompose`.
         """
         check_is_fitted(self)
         return self.best_estimator_.decompose(X)
@@ -362,12 +358,12 @@ class AffineNRSfMCV(
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
         camera : {"orthographic", "weak_perspective"} or None, default=None
-            As of `AffineNRSfM.reconstruct`.
+            As in `AffineNRSfM.reconstruct`.
 
         Returns
         -------
         ndarray of shape (n_frames, n_points, 3)
-            As of `AffineNRSfM.reconstruct`.
+            As in `AffineNRSfM.reconstruct`.
         """
         check_is_fitted(self)
         return self.best_estimator_.reconstruct(X, camera)
@@ -384,7 +380,7 @@ class AffineNRSfMCV(
         Returns
         -------
         ndarray of shape (n_frames, 2 * n_points)
-            As of `AffineNRSfM.reproject`.
+            As in `AffineNRSfM.reproject`.
         """
         check_is_fitted(self)
         return self.best_estimator_.reproject(X)
@@ -476,7 +472,9 @@ class AffineNRSfMCV(
 
     def _splitter(self) -> Any:
         """Return the splitter of the rows of a table."""
-        return check_cv(N_BLOCKS if self.cv is None else self.cv)
+        # More blocks cost more, and hardly change the choice. Neighbours are alike, and
+        # large blocks keep them together.
+        return check_cv(3 if self.cv is None else self.cv)
 
     def _routed(self, method: str, params: dict[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the metadata for the splitter and the scorer."""
@@ -494,24 +492,7 @@ class AffineNRSfMCV(
 
 
 def checked_candidates(n_components: Any) -> list[int]:
-    """
-    Return numbers of basis shapes in ascending order.
-
-    Parameters
-    ----------
-    n_components : array-like of int, or int
-        The numbers, or the only one.
-
-    Returns
-    -------
-    list of int
-        The numbers.
-
-    Raises
-    ------
-    ValueError
-        If they are not different whole numbers above zero.
-    """
+    """Return different numbers of basis shapes above zero in ascending order."""
     given = np.atleast_1d(np.asarray(n_components))
     if given.ndim != 1 or not len(given) or given.dtype.kind not in "iu":
         raise ValueError(
@@ -537,36 +518,20 @@ def refuse_blocks(X: Any) -> None:
 
 
 def held_out_score(
-    model: AffineNRSfM, split: Split, scorer: Any, X: Any, y: Any, params: Any
+    model: AffineNRSfM, held_out: NDArray, scorer: Any, X: Any, y: Any, params: Any
 ) -> float:
     """
     Return the score of a fitted estimator on rows that are held out.
 
-    Parameters
-    ----------
-    model : AffineNRSfM
-        The fit of the other rows.
-    split : Split
-        The split.
-    scorer : callable
-        The scorer.
-    X, y : array-like
-        The whole table, and what goes with its rows or None.
-    params : dict
-        Metadata, of which those with an entry for each row are split, too.
-
-    Returns
-    -------
-    float
-        The score.
+    X and y are those of the whole table. Metadata `params` with an entry for each row
+    are split as well.
     """
     n_rows = number_of_rows(X)
     own = {
-        name: taken_rows(value, split.test)
+        name: taken_rows(value, held_out)
         if hasattr(value, "__len__") and len(value) == n_rows
         else value
         for name, value in params.items()
     }
-    part = taken_rows(X, split.test)
-    wanted = None if y is None else taken_rows(y, split.test)
-    return float(scorer(model, part, wanted, **own))
+    y = None if y is None else taken_rows(y, held_out)
+    return float(scorer(model, taken_rows(X, held_out), y, **own))

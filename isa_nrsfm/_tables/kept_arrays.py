@@ -7,7 +7,6 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 
 
 @contextlib.contextmanager
-def kept_arrays(keep_frames: Any) -> Iterator[Keep]:
+def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
     """
     Make ready to keep arrays in files, and remove the files if the block fails.
 
@@ -27,9 +26,9 @@ def kept_arrays(keep_frames: Any) -> Iterator[Keep]:
 
     Parameters
     ----------
-    keep_frames : bool, str or path-like
-        The path of the folder. It is made if it does not exist. A bool keeps arrays
-        where they are.
+    path : str, path-like or None
+        The path of the folder. It is made if it does not exist. None keeps arrays where
+        they are.
 
     Yields
     ------
@@ -44,14 +43,12 @@ def kept_arrays(keep_frames: Any) -> Iterator[Keep]:
     OSError
         If the folder cannot be made or written to, or a file cannot be written.
     """
-    if not isinstance(keep_frames, str | os.PathLike):
+    if path is None:
         yield dict
         return
-    if not os.fspath(keep_frames):
-        raise ValueError(
-            "keep_frames should be True, False or the path of a folder; got ''"
-        )
-    folder = Path(keep_frames)
+    if not os.fspath(path):
+        raise ValueError("frames_folder should be None or the path of a folder; got ''")
+    folder = Path(path)
     name = f"fit-{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{uuid.uuid4().hex[:12]}"
 
     def keep(arrays: Mapping[str, NDArray]) -> dict[str, NDArray]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, Decomposition, __version__
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._diagnostics import (
     Diagnostics,
     camera_advice,
@@ -76,6 +77,8 @@ def model_report(
     certainty = frames_of(estimator).certainty
     _, layout, _, _ = view_and_layout(estimator, edges)
     found = estimator.diagnostics(X) if estimator.refinement == "joint" else None
+    for message in () if found is None else found.messages:
+        warn_caller(message)
     report = {
         "n_components": len(names),
         **quality_report(estimator, X, fitted_frames(estimator)),

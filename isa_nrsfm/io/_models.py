@@ -60,7 +60,7 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     estimator : AffineNRSfM
-        A fitted estimator. Memory maps (a path as `keep_frames`) are copied into the
+        A fitted estimator. Memory maps (with `frames_folder`) are copied into the
         file. Callbacks are left out. Of strategies that are not part of
         `isa_nrsfm.isa` the file holds the name and the fitted arrays.
     path : str or path-like
@@ -213,7 +213,7 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         getattr(estimator, "feature_names_in_", None),
         None if each_scaled else entries["unit"],
     )
-    estimator._unit, estimator._n_features_out = entries["unit"], len(estimator.basis_)
+    estimator._n_features_out = len(estimator.basis_)
     estimator.camera_, estimator.frames_scaled_ = entries["camera"], each_scaled
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
@@ -277,7 +277,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "camera": frames.camera,
         "layout": model.layout,
         "each_scaled": model.unit is None,
-        "unit": estimator._unit,
+        "unit": model.unit or 1.0,
         "sizes": vars(estimator).get("_frame_sizes"),
     }
     if isinstance(frames, RigidFrames):

@@ -123,7 +123,9 @@ def with_parts(kind: type, parts: Any, arrays: Arrays) -> Any:
     parameters = {
         name: unpacked(value, arrays) for name, value in parts["parameters"].items()
     }
-    check_names(parameters, kind().get_params(deep=False), "parameters")
+    # Parameters that are newer than the file have their defaults.
+    defaults = kind().get_params(deep=False)
+    check_names({**defaults, **parameters}, defaults, "parameters")
     created = kind(**parameters)
     for name, value in parts["attributes"].items():
         if name.startswith("_") or not name.endswith("_"):
