@@ -440,7 +440,9 @@ def _joint_frames(
     estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
     estimator.noise_variance_ = (estimator._model.unit or 1.0) ** 2 * noise_variance
     estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
-    estimator.reliability_ = reliabilities(alpha, covariance, *map(sum, chance))
+    estimator.reliability_ = reliabilities(
+        alpha, covariance, *(sum(part) for part in chance)
+    )
     estimator.objective_history_ = fitted.history
     estimator.gradient_norm_ = fitted.gradient_norm
     estimator.n_iter_ = len(fitted.history) - 1

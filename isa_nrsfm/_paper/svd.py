@@ -91,7 +91,7 @@ def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDAr
     for part in blocks.map(partial(_block_triangle, V=V)):
         pending.append(part)
         if sum(map(len, pending)) > 6 * width:
-            pending = [np.linalg.qr(np.concatenate(pending), mode="r")]
+            pending = [np.asarray(np.linalg.qr(np.concatenate(pending), mode="r"))]
     return np.asarray(np.linalg.qr(np.concatenate(pending), mode="r"))
 
 

@@ -242,7 +242,7 @@ def _objective(
     n_samples) are (n_signals, n_signals).
     """
     if covariance is None:
-        density, size = SqrtDensity(), np.count_nonzero(in_order == 0)
+        density, size = SqrtDensity(), int(np.count_nonzero(in_order == 0))
         return (
             likelihood_gains(W @ Z, density),
             lambda rows: float(log_likelihood(W[rows], Z, size, density)),
