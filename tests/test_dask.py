@@ -111,7 +111,7 @@ class TestThreads:
     def test_errors(self):
         with pytest.raises(ValueError, match="got n_features=39"):
             AffineNRSfM(K).fit(chunked(table())[:, :39])
-        with pytest.raises(ValueError, match=r"not in memory need refinement='joint'"):
+        with pytest.raises(ValueError, match=r"not in memory needs refinement='joint'"):
             AffineNRSfM(K, refinement="alternating").fit(chunked(table()))
         X = table()
         X[200, 3] = np.inf

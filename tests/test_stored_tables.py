@@ -308,7 +308,7 @@ class TestErrors:
 
     def test_what_needs_memory(self, tmp_path):
         stored = folder(table(), tmp_path, "npy")
-        with pytest.raises(ValueError, match=r"not in memory need refinement='joint'"):
+        with pytest.raises(ValueError, match=r"not in memory needs refinement='joint'"):
             estimator(refinement="alternating").fit(stored)
 
     def test_memory_maps_are_taken_as_arrays_where_that_is_needed(self, tmp_path):
