@@ -440,7 +440,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         return hasattr(self, "_model")
 
     def _set_frames(self, *frames: NDArray) -> None:
-        """Set the attributes of the frames of the table, in the order of `Decomposition`."""
+        """Set the attributes of the frames, in the order of `Decomposition`."""
         self.motion_, self.translation_, self.alpha_, alpha_std = frames
         if self.refinement == "joint":
             self.alpha_std_ = alpha_std
