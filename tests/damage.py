@@ -155,49 +155,33 @@ def as_json(tree):
 def damaged_array(array, rng):
     """Return an array of another type, shape or content."""
     array = np.asarray(array)
-    match int(rng.integers(12)):
-        case 0:
-            return array[..., None] if rng.integers(2) else array[None]
-        case 1:
-            return array.T.copy()
-        case 2:
-            return array[: len(array) // 2] if array.ndim else array[None]
-        case 3:
-            return array.ravel()[:0] if rng.integers(2) else array.ravel()
-        case 4 if array.dtype.kind in "fiub":
-            kinds = (
-                "?",
-                "i1",
-                "u8",
-                "f2",
-                "f4",
-                ">f8",
-                "g",
-                "c16",
-                "U3",
-                "S2",
-                "M8[s]",
-            )
-            with np.errstate(all="ignore"):
-                return array.astype(pick(rng, kinds))
-        case 5:
-            return np.array([None, "x", 1.0], dtype=object)
-        case 6:
-            return np.zeros(2, dtype=[("a", "f8"), ("b", "U2")])
-        case 7:
-            return np.zeros(pick(rng, ((), (0,), (1,), (0, 3), (3, 0), (2, 2, 2))))
-        case _ if array.dtype.kind == "f" and array.size:
-            array = array.copy()
-            value = pick(
-                rng, (np.nan, np.inf, -np.inf, 1e308, 1e160, 0.0, -1.0, 5e-324)
-            )
-            if rng.integers(4) == 0:
-                array[...] = value
-            else:
-                array.flat[int(rng.integers(array.size))] = value
-            return array
-        case _:
-            return np.full(array.shape, pick(rng, (2**62, -(2**63), -1, 0)))
+    kinds = "? i1 u8 f2 f4 >f8 g c16 U3 S2 M8[s]".split()
+    shapes = ((), (0,), (1,), (0, 3), (3, 0), (2, 2, 2))
+    changes = [
+        lambda: array[..., None],
+        lambda: array[None],
+        lambda: array.T.copy(),
+        lambda: array[: len(array) // 2] if array.ndim else array[None],
+        lambda: array.ravel()[: int(rng.integers(2)) * array.size],
+        lambda: np.array([None, "x", 1.0], dtype=object),
+        lambda: np.zeros(2, dtype=[("a", "f8"), ("b", "U2")]),
+        lambda: np.zeros(pick(rng, shapes)),
+        lambda: np.full(array.shape, pick(rng, (2**62, -(2**63), -1, 0))),
+    ]
+    if array.dtype.kind in "fiub":
+        changes += 2 * [lambda: array.astype(pick(rng, kinds))]
+    if array.dtype.kind == "f" and array.size:
+        changes += 4 * [lambda: _with_value(array.copy(), rng)]
+    with np.errstate(all="ignore"):
+        return pick(rng, changes)()
+
+
+def _with_value(array, rng):
+    """Set one number of an array, or all, to an unusual one."""
+    where = ... if rng.integers(4) == 0 else int(rng.integers(array.size))
+    array.flat[where] = pick(
+        rng, (np.nan, np.inf, -np.inf, 1e308, 1e160, 0.0, -1.0, 5e-324)
+    )
     return array
 
 
@@ -218,35 +202,26 @@ def damaged_npy(content, rng):
 
 
 def damaged_archive(content, rng):
-    """Return a zip archive of which one file is damaged, lost or another.
-
-    Its files are arrays in numpy's format, and json.
-    """
+    """Return a zip archive of arrays of which one is damaged, lost or another."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     name, other = pick(rng, [*files]), pick(rng, [*files])
-    # A model has many arrays, but one tree.
-    trees = [file for file in files if file.endswith(".json")]
-    if trees and rng.integers(2):
-        name = pick(rng, trees)
     compression = zipfile.ZIP_STORED
-    match int(rng.integers(10)):
+    match int(rng.integers(9)):
         case 0:
             del files[name]
         case 1:
             files[name] = files[other]
         case 2:
             files[name] = damaged_bytes(files[name], rng)
-        case 3 if name.endswith(".npy"):  # a small file that unpacks to much
+        case 3:  # a small file that unpacks to much
             compression = zipfile.ZIP_DEFLATED
             files[name] = as_npy(np.zeros(2**21))
-        case 4 if name.endswith(".npy"):  # an array that claims to be very large
+        case 4:  # an array that claims to be very large
             whole = as_npy(np.zeros(0))
             files[name] = whole.replace(b"(0,), }" + b" " * 10, b"(10000000000,), }")
         case 5:
             files[pick(rng, ("x", "../x", "/x", "x/"))] = b"text"
-        case _ if name.endswith(".json"):
-            files[name] = as_json(damaged_tree(json.loads(files[name]), rng))
         case _:
             files[name] = damaged_npy(files[name], rng)
     buffer = io.BytesIO()
@@ -260,153 +235,84 @@ def damage_hdf5(path, rng):
     """Change an HDF5 file: a dataset, a group or an attribute is lost or another."""
     import h5py
 
+    empty = h5py.Empty("f8")
+    plain = [v for v in VALUES if isinstance(v, int | float | str | bool)]
+    plain = [v for v in plain if v not in (10**400, "é\x00\n")]
     with h5py.File(path, "r+") as file:
         names = []
         file.visit(names.append)
         names = [name for name in names if "/_i_" not in name]  # indices of PyTables
-        holders = [file, *(file[name] for name in names)]
+        holder = pick(rng, [file, *(file[name] for name in names)])
         # Names in capitals are those of PyTables, of which there are many.
-        attributes = [
-            (holder, name)
-            for holder in holders
-            for name in holder.attrs
-            if not name.isupper()
-        ]
-        if attributes and rng.integers(2):
-            holder, name = pick(rng, attributes)
-            _damage_attribute(holder, name, rng)
-        else:
-            _damage_object(file, pick(rng, names), names, rng)
-
-
-def _damage_attribute(holder, name, rng):
-    """Remove an attribute of an HDF5 file, or give it another value."""
-    import h5py
-
-    value = holder.attrs[name]
-    match int(rng.integers(6)):
-        case 0:
-            del holder.attrs[name]
-        case 1 if isinstance(value, str | bytes):
-            value = value.encode() if isinstance(value, str) else bytes(value)
-            holder.attrs[name] = np.bytes_(damaged_bytes(value, rng))
-        case 2:
-            holder.attrs[name] = h5py.Empty("f8")
-        case 3:
-            holder.attrs[name] = np.full(pick(rng, ((0,), (3,), (2, 2))), -1.0)
-        case _:
-            plain = [v for v in VALUES if isinstance(v, int | float | str | bool)]
-            plain = [v for v in plain if v not in (10**400, "é\x00\n")]
-            holder.attrs[name] = pick(rng, plain)
-
-
-def _damage_object(file, name, names, rng):
-    """Remove a dataset or group of an HDF5 file, or put something else there."""
-    import h5py
-
-    old = file[name][()] if isinstance(file[name], h5py.Dataset) else None
-    attributes = dict(file[name].attrs)
-    match int(rng.integers(9)):
-        case 0:
-            del file[name]
+        known = [name for name in holder.attrs if not name.isupper()]
+        if known and rng.integers(2):
+            name = pick(rng, known)
+            if rng.integers(5) == 0:
+                del holder.attrs[name]
+            else:
+                others = [empty, np.full((2, 2), -1.0), np.bytes_(b"x"), *plain]
+                holder.attrs[name] = pick(rng, others)
             return
-        case 1:
-            del file[name]
-            file.create_group(name)
-        case 2:
-            del file[name]
-            file[name] = h5py.SoftLink(pick(rng, ("/nowhere", f"/{name}", "/")))
-            return
-        case 3:
-            other = pick(rng, names)
-            del file[name]
-            if other in file:
+        name, other = pick(rng, names), pick(rng, names)
+        old = file[name][()] if isinstance(file[name], h5py.Dataset) else None
+        attributes = dict(file[name].attrs)
+        del file[name]
+        match int(rng.integers(8)):
+            case 0:
+                return
+            case 1:
+                file.create_group(name)
+            case 2:
+                file[name] = h5py.SoftLink(pick(rng, ("/nowhere", f"/{name}", "/")))
+                return
+            case 3 if other in file:
                 file[name] = file[other]
-            return
-        case 4:  # a dataset that claims to be very large, and has no data
-            del file[name]
-            shape = (2**40,) if old is None else (2**20, *np.shape(old)[1:], 2**12)
-            file.create_dataset(name, shape=shape, dtype="f8", chunks=True)
-        case 5:
-            del file[name]
-            file[name] = pick(rng, (1.0, 3, "text", b"bytes", [], ["a", "b"], [[1, 2]]))
-        case _ if isinstance(old, np.ndarray) and old.dtype.names is None:
-            new = damaged_array(old, rng)
-            if new.dtype.kind not in "fiucb":
-                new = np.array([b"text"] * 3)
-            del file[name]
-            file[name] = new
-        case _ if isinstance(old, np.ndarray) and old.ndim:
-            del file[name]
-            file[name] = old[: int(rng.integers(len(old)))] if len(old) else old
-        case _:
-            del file[name]
-            file[name] = h5py.Empty("f8")
-    for key, value in attributes.items():
-        file[name].attrs[key] = value
+            case 4:  # a dataset that claims to be very large, and has no data
+                file.create_dataset(name, shape=(2**40,), dtype="f8", chunks=True)
+            case 5 | 6 if isinstance(old, np.ndarray) and old.dtype.names is None:
+                new = damaged_array(old, rng)
+                file[name] = new if new.dtype.kind in "fiucb" else [b"text"] * 3
+            case 5 | 6 if isinstance(old, np.ndarray) and old.size:
+                file[name] = old[: int(rng.integers(len(old)))]
+            case _:
+                others = (empty, 1.0, 3, "text", b"bytes", [], ["a", "b"], [[1, 2]])
+                file[name] = pick(rng, others)
+        for key, value in attributes.items():
+            file[name].attrs[key] = value
 
 
 def damaged_parquet(content, rng):
-    """Return a parquet file of which a column, or what is said of it, is another."""
+    """Return a parquet file of which a column, or its metadata, is another."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     table = pq.read_table(io.BytesIO(content))
-    place = int(rng.integers(table.num_columns))
-    name, values = table.column_names[place], table.column(place).to_numpy()
-    n = len(values)
-    options = {}
-    match int(rng.integers(9)):
+    place, n = int(rng.integers(table.num_columns)), table.num_rows
+    columns = (
+        *([None] * n, ["1.5"] * n, [True] * n, [b"x"] * n, [[1.0]] * n),
+        *([{"a": 1}] * n, [2**62] * n, [np.inf] * n, [1e308] * n, [np.nan] * n),
+        *([Decimal("1.5")] * n, np.full(n, 1.5, np.float16)),
+        np.arange(n).astype("M8[s]"),
+    )
+    said = dict(table.schema.metadata or {b"pandas": b"{}"})
+    match int(rng.integers(8)):
         case 0:
             table = table.remove_column(place)
         case 1:
-            table = table.append_column(name, table.column(place))
+            table = table.append_column(table.column_names[place], table.column(place))
         case 2:
             table = table.slice(0, int(rng.integers(n)))
         case 3:
             table = table.select([])
         case 4:
-            said = dict(table.schema.metadata or {b"pandas": b"{}"})
             key = pick(rng, [*said])
-            try:
-                changed = as_json(damaged_tree(json.loads(said[key]), rng))
-            except ValueError:
-                changed = damaged_bytes(said[key], rng)
-            table = table.replace_schema_metadata({**said, key: changed})
-        case 5:
-            options = pick(
-                rng,
-                (
-                    {"row_group_size": 1},
-                    {"compression": "gzip"},
-                    {"use_dictionary": False, "data_page_version": "2.0"},
-                    {"store_schema": False},
-                ),
+            table = table.replace_schema_metadata(
+                {**said, key: damaged_bytes(said[key], rng)}
             )
         case _:
-            changed = pick(
-                rng,
-                (
-                    pa.array([None] * n),
-                    pa.array(["1.5"] * n),
-                    pa.array(["a"] * n).dictionary_encode(),
-                    pa.array([True] * n),
-                    pa.array([b"x"] * n),
-                    pa.array([[1.0]] * n),
-                    pa.array([{"a": 1}] * n),
-                    pa.array([2**62] * n),
-                    pa.array([1.5, None] * n)[:n],
-                    pa.array(np.full(n, 1.5, np.float16)),
-                    pa.array(np.arange(n).astype("M8[s]")),
-                    pa.array([Decimal("1.5")] * n),
-                    pa.array([np.inf] + [1.0] * (n - 1)),
-                    pa.array([1e308] * n),
-                    pa.array([np.nan] * n),
-                ),
-            )
-            said = table.schema.metadata
-            table = table.set_column(place, name, changed)
+            changed = pa.array(pick(rng, columns))
+            table = table.set_column(place, table.column_names[place], changed)
             table = table.replace_schema_metadata(said)
     buffer = io.BytesIO()
-    pq.write_table(table, buffer, **options)
+    pq.write_table(table, buffer, row_group_size=pick(rng, (1, 1000)))
     return buffer.getvalue()

@@ -247,3 +247,40 @@ def write_json(path, content):
     """Write json."""
     path.write_text(json.dumps(content))
     return path
+
+
+TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
+FRAME = deeplabcut_frame(TRACKS)
+RESULTS = [
+    {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
+    for i, row in enumerate(np.dstack([TRACKS, np.full((12, 8), 0.7)]))
+]
+# Of each format, files of one individual: what writes them into a folder and returns
+# their path. A further word tells variants of a format apart.
+WRITERS = {
+    "openface": lambda d: write_openface(d / "a.csv", TRACKS),
+    "openface-1": lambda d: write_openface(d / "a.csv", TRACKS, separator=", "),
+    "openface-image": lambda d: write_openface(d / "a.csv", TRACKS, video=False),
+    "pyfeat": lambda d: write_pyfeat(d / "a.csv", TRACKS),
+    "pyfeat-v2": lambda d: write_pyfeat(d / "a.csv", TRACKS, detector="Detectorv2"),
+    "pyfeat-mp": lambda d: write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
+    "mediapipe-pixels": lambda d: write_mesh(d / "a.csv", MESH, shares=False),
+    "mediapipe-sizes": lambda d: write_mesh(d / "a.csv", MESH, sizes=True),
+    "pts": lambda d: write_pts(d / "a", TRACKS),
+    "pts-file": lambda d: write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
+    "wflw": lambda d: write_wflw(d / "a.txt", WFLW),
+    "wflw-test": lambda d: write_wflw(d / "a.txt", WFLW, rest=False),
+    "deeplabcut": lambda d: write_deeplabcut(d / "a.csv", FRAME),
+    "deeplabcut-table": lambda d: write_deeplabcut(d / "a.h5", FRAME),
+    "deeplabcut-fixed": lambda d: write_deeplabcut(d / "a.h5", FRAME, how="fixed"),
+    "sleap": lambda d: write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
+    "sleap-csv": lambda d: write_sleap_csv(
+        d / "a.csv", TRACKS[:, None], np.ones((12, 1, 8)), names=["a"]
+    ),
+    "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
+    "coco-results": lambda d: write_json(d / "a.json", RESULTS),
+    "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
+}
+# The points that are not `TRACKS`.
+EXPECTED = dict.fromkeys(["pyfeat-mp", "mediapipe-pixels", "mediapipe-sizes"], MESH)
+EXPECTED |= {"pts-file": TRACKS[:1], "wflw": WFLW, "wflw-test": WFLW}

@@ -13,9 +13,7 @@ import os
 import signal
 import warnings
 import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import damage
 import landmark_files as files
@@ -35,6 +33,7 @@ from isa_nrsfm.io import (
     read_landmarks,
     read_table,
     save_model,
+    write_table,
 )
 
 resource = pytest.importorskip("resource", reason="limits the memory of a process")
@@ -44,57 +43,46 @@ for library in ("h5py", "tables", "pyarrow"):
 REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
 # What the reading of a small file may take: seconds, and bytes besides what is used.
 SECONDS, MEMORY = 60, 2**31
-QUICK, ALL = 8, 500
+QUICK, ALL = 8, 250
 
-TRACKS = files.scene(n_frames=4)
 FACES = make_face_tracks(20, n_components=1, random_state=0).data[:, :28]
 PDM = PointDistributionModel(
     files.scene(7, 3)[..., 0][:, :3].copy(), np.ones((2, 7, 3)), np.array([2.0, 1.0])
 )
 
 
-class Format(NamedTuple):
-    """
-    Files of a format.
-
-    `write` writes a valid file or folder and returns its path, `damage` takes the path
-    of a file and a generator, and `read` takes the path and asserts what is promised
-    of the result.
-    """
-
-    write: Callable
-    damage: Callable
-    read: Callable
-
-
 # --- damages ------------------------------------------------------------------------
 
 
-def rewritten(damaged, *, also=damage.damaged_bytes, of_bytes=1):
-    """Return what damages a file: its bytes, or of each four `of_bytes` by `also`."""
-
-    def change(path, rng):
-        how = also if rng.integers(4) < of_bytes else damaged
-        path.write_bytes(how(path.read_bytes(), rng))
-
-    return change
-
-
-def of_text(separator=","):
-    return rewritten(
-        lambda content, rng: damage.damaged_text(content.decode(), rng, separator)
-    )
-
-
-def of_json(content, rng):
+def of_tree(content, rng):
     return damage.as_json(damage.damaged_tree(json.loads(content), rng))
 
 
-def of_hdf5(path, rng):
-    if rng.integers(3) == 0:
+def text(separator):
+    return lambda content, rng: damage.damaged_text(content.decode(), rng, separator)
+
+
+# By suffix. Of each four damages one is of bytes.
+DAMAGES = {
+    ".csv": text(","),
+    ".tsv": text("\t"),
+    ".txt": text(" "),
+    ".pts": text(" "),
+    ".json": of_tree,
+    ".npy": damage.damaged_npy,
+    ".npz": damage.damaged_archive,
+    ".parquet": damage.damaged_parquet,
+}
+
+
+def change(path, rng):
+    """Damage a file."""
+    if rng.integers(4) == 0:
         path.write_bytes(damage.damaged_bytes(path.read_bytes(), rng))
-    else:
+    elif path.suffix == ".h5":
         damage.damage_hdf5(path, rng)
+    else:
+        path.write_bytes(DAMAGES[path.suffix](path.read_bytes(), rng))
 
 
 # --- promises -----------------------------------------------------------------------
@@ -138,13 +126,15 @@ def check_cells(points, failed, path, separator=","):
             assert np.isnan(value) if missing else float(cell) == value
 
 
-def read_format(format, *, cells=False, **options):
+def read_format(name):
+    format = name.partition("-")[0]
+
     def read(path):
         with contextlib.suppress(ValueError):
             find_format(path)
-        found = read_landmarks(path, format, **options)
+        found = read_landmarks(path, format)
         check_landmarks(found)
-        if cells:
+        if format in ("openface", "pyfeat"):
             check_cells(found.points, found.failed, path)
 
     return read
@@ -211,16 +201,13 @@ def export_edges(path):
 # --- formats ------------------------------------------------------------------------
 
 
-def write_points(path, separator=","):
+def write_points(path):
     frame = pd.DataFrame(
-        TRACKS.reshape(len(TRACKS), -1),
+        files.TRACKS.reshape(len(files.TRACKS), -1),
         columns=[f"{name}_{axis}" for name in files.BODYPARTS for axis in "xy"],
     )
     frame.insert(0, "id", [f"00{i}" for i in range(len(frame))])
-    if path.suffix == ".parquet":
-        frame.to_parquet(path)
-    else:
-        frame.to_csv(path, sep=separator, index=False)
+    write_table(frame, path)
     return path
 
 
@@ -257,99 +244,18 @@ def write_shape_model(path):
     return path
 
 
-npz = rewritten(damage.damaged_archive)
+# Writes a valid file or folder and returns its path; reads it and asserts the promises.
 FORMATS = {
-    "csv": Format(lambda d: write_points(d / "a.csv"), of_text(), read_text_table),
-    "tsv": Format(
-        lambda d: write_points(d / "a.tsv", "\t"), of_text("\t"), read_text_table
-    ),
-    "parquet": Format(
-        lambda d: write_points(d / "a.parquet"),
-        rewritten(damage.damaged_parquet, of_bytes=2),
-        read_parquet,
-    ),
-    "openface": Format(
-        lambda d: files.write_openface(d / "a.csv", TRACKS),
-        of_text(),
-        read_format("openface", cells=True),
-    ),
-    "pyfeat": Format(
-        lambda d: files.write_pyfeat(d / "a.csv", TRACKS),
-        of_text(),
-        read_format("pyfeat", cells=True),
-    ),
-    "mediapipe": Format(
-        lambda d: files.write_mesh(d / "a.csv", TRACKS, sizes=True),
-        of_text(),
-        read_format("mediapipe"),
-    ),
-    "pts": Format(
-        lambda d: files.write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
-        of_text(" "),
-        read_format("pts"),
-    ),
-    "pts folder": Format(
-        lambda d: files.write_pts(d / "a", TRACKS[:2]),
-        of_text(" "),
-        read_format("pts"),
-    ),
-    "wflw": Format(
-        lambda d: files.write_wflw(d / "a.txt", files.scene(3, 98)),
-        of_text(" "),
-        read_format("wflw"),
-    ),
-    "deeplabcut csv": Format(
-        lambda d: files.write_deeplabcut(d / "a.csv", files.deeplabcut_frame(TRACKS)),
-        of_text(),
-        read_format("deeplabcut"),
-    ),
-    "deeplabcut h5": Format(
-        lambda d: files.write_deeplabcut(
-            d / "a.h5", files.deeplabcut_frame(TRACKS), how="table"
-        ),
-        of_hdf5,
-        read_format("deeplabcut"),
-    ),
-    "deeplabcut fixed h5": Format(
-        lambda d: files.write_deeplabcut(
-            d / "a.h5", files.deeplabcut_frame(TRACKS), how="fixed"
-        ),
-        of_hdf5,
-        read_format("deeplabcut"),
-    ),
-    "sleap h5": Format(
-        lambda d: files.write_sleap(d / "a.h5", TRACKS.reshape(2, 2, 8, 2)),
-        of_hdf5,
-        read_format("sleap"),
-    ),
-    "sleap csv": Format(
-        lambda d: files.write_sleap_csv(
-            d / "a.csv", TRACKS.reshape(2, 2, 8, 2), np.ones((2, 2, 8))
-        ),
-        of_text(),
-        read_format("sleap"),
-    ),
-    "coco": Format(
-        lambda d: files.write_json(d / "a.json", files.coco_annotations(TRACKS)),
-        rewritten(of_json),
-        read_format("coco"),
-    ),
-    "model": Format(lambda d: write_model(d / "a.npz"), npz, read_model),
-    "pdm npz": Format(lambda d: write_shape_model(d / "a.npz"), npz, read_shape_model),
-    "pdm txt": Format(
-        lambda d: write_shape_model(d / "a.txt"), of_text(" "), read_shape_model
-    ),
-    "edges": Format(lambda d: write_edges(d / "a.csv"), of_text(), export_edges),
-    "npy folder": Format(
-        lambda d: write_parts(d / "a", ".npy"),
-        rewritten(damage.damaged_npy),
-        read_stored,
-    ),
-    "parquet folder": Format(
-        lambda d: write_parts(d / "a", ".parquet"),
-        rewritten(damage.damaged_parquet, of_bytes=2),
-        read_stored,
-    ),
+    "csv": (lambda d: write_points(d / "a.csv"), read_text_table),
+    "tsv": (lambda d: write_points(d / "a.tsv"), read_text_table),
+    "parquet": (lambda d: write_points(d / "a.parquet"), read_parquet),
+    "model": (lambda d: write_model(d / "a.npz"), read_model),
+    "pdm npz": (lambda d: write_shape_model(d / "a.npz"), read_shape_model),
+    "pdm txt": (lambda d: write_shape_model(d / "a.txt"), read_shape_model),
+    "edges": (lambda d: write_edges(d / "a.csv"), export_edges),
+    "npy folder": (lambda d: write_parts(d / "a", ".npy"), read_stored),
+    "parquet folder": (lambda d: write_parts(d / "a", ".parquet"), read_stored),
+    **{name: (write, read_format(name)) for name, write in files.WRITERS.items()},
 }
 
 
@@ -405,7 +311,7 @@ def outcome(read, path, damaged):
 
 def tried(format, numbers, folder):
     """Return outcomes of damages by their numbers, and what is wrong with some."""
-    write, change, read = FORMATS[format]
+    write, read = FORMATS[format]
     path = write(folder)
     read(path)
     targets = sorted(path.iterdir()) if path.is_dir() else [path]

@@ -6,6 +6,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
+from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS
 
 from isa_nrsfm.io import (
     FORMATS,
@@ -16,48 +17,6 @@ from isa_nrsfm.io import (
     read_landmarks,
 )
 from isa_nrsfm.skeletons import get_skeleton
-
-TRACKS = files.scene()
-MESH = files.scene(n_frames=4, n_points=478)
-WFLW = files.scene(n_frames=4, n_points=98)
-FRAME = files.deeplabcut_frame(TRACKS)
-
-# Each writes a file that a single individual fills, and returns its path.
-WRITERS = {
-    "openface": lambda d: files.write_openface(d / "a.csv", TRACKS),
-    "openface-1": lambda d: files.write_openface(d / "a.csv", TRACKS, separator=", "),
-    "openface-image": lambda d: files.write_openface(d / "a.csv", TRACKS, video=False),
-    "pyfeat": lambda d: files.write_pyfeat(d / "a.csv", TRACKS),
-    "pyfeat-v2": lambda d: files.write_pyfeat(
-        d / "a.csv", TRACKS, detector="Detectorv2"
-    ),
-    "pyfeat-mp": lambda d: files.write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
-    "mediapipe-pixels": lambda d: files.write_mesh(d / "a.csv", MESH, shares=False),
-    "mediapipe-sizes": lambda d: files.write_mesh(d / "a.csv", MESH, sizes=True),
-    "pts": lambda d: files.write_pts(d / "a", TRACKS),
-    "pts-file": lambda d: files.write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
-    "wflw": lambda d: files.write_wflw(d / "a.txt", WFLW),
-    "wflw-test": lambda d: files.write_wflw(d / "a.txt", WFLW, rest=False),
-    "deeplabcut": lambda d: files.write_deeplabcut(d / "a.csv", FRAME),
-    "deeplabcut-table": lambda d: files.write_deeplabcut(d / "a.h5", FRAME),
-    "deeplabcut-fixed": lambda d: files.write_deeplabcut(
-        d / "a.h5", FRAME, how="fixed"
-    ),
-    "sleap": lambda d: files.write_sleap(d / "a.h5", TRACKS[:, None], names=["a"]),
-    "coco": lambda d: files.write_json(d / "a.json", files.coco_annotations(TRACKS)),
-    "coco-results": lambda d: files.write_json(
-        d / "a.json",
-        [
-            {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
-            for i, row in enumerate(np.dstack([TRACKS, np.full((12, 8), 0.7)]))
-        ],
-    ),
-    "table": lambda d: files.write_mesh(d / "a.csv", TRACKS, shares=False),
-}
-EXPECTED = {"pyfeat-mp": MESH, "pts-file": TRACKS[:1]} | dict.fromkeys(
-    ["mediapipe-pixels", "mediapipe-sizes"], MESH
-)
-EXPECTED |= dict.fromkeys(["wflw", "wflw-test"], WFLW)
 
 
 def tracks_of(landmarks):
@@ -102,6 +61,24 @@ def test_files_read_back_as_they_were_written(name, tmp_path):
     assert not landmarks.failed.any()
     again = FORMATS[format].read(path)
     pd.testing.assert_frame_equal(again.points, landmarks.points)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
+def test_truncated_files_and_those_of_other_formats_are_refused(name, tmp_path):
+    path, format = WRITERS[name](tmp_path), name.partition("-")[0]
+    if path.is_dir():
+        path /= "image_000.pts"
+    content = path.read_bytes()
+    for wrong in {*FORMATS} - {format}:
+        if not {format, wrong} & {"mediapipe", "table"}:
+            with pytest.raises(ValueError, match=str(path)):
+                read_landmarks(path, wrong)
+    for length in np.linspace(0, len(content) // 3, 6).astype(int):
+        path.write_bytes(content[:length])
+        if length < len(content) // 4:
+            with pytest.raises(ValueError, match=str(path)):
+                read_landmarks(path, format)
 
 
 def test_every_format_is_written_here():
