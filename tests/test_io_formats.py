@@ -1,5 +1,7 @@
 """Files of other programs, read back as these have written them."""
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import landmark_files as files
@@ -81,8 +83,10 @@ def test_truncated_files_and_those_of_other_formats_are_refused(name, tmp_path):
                 read_landmarks(path, format)
 
 
-def test_every_format_is_written_here():
+def test_every_format_is_written_here_and_described():
     assert {name.partition("-")[0] for name in WRITERS} == set(FORMATS)
+    page = Path(__file__).parents[1] / "docs" / "formats.md"
+    assert set(re.findall(r"^\| `(\w+)` \|", page.read_text(), re.M)) == set(FORMATS)
     assert all(name == found.name for name, found in FORMATS.items())
     with pytest.raises(TypeError):
         FORMATS["new"] = FORMATS["table"]
