@@ -86,18 +86,6 @@ def of_instances(
     return 100 * np.mean(errors)
 
 
-def of_missing(name, step, n_components, estimator):
-    """Return the error of points of a set that are hidden, in percent of the size."""
-    X, _ = real(name, step)
-    hidden = np.random.default_rng(0).random((len(X), X.shape[1] // 2)) < 0.3
-    hidden = np.repeat(hidden, 2, axis=1)
-    holed = np.where(hidden, np.nan, X)
-    model = estimator(n_components, random_state=0).fit(holed)
-    filled = model.reproject(holed)
-    size = np.sqrt(np.mean((X - X.mean(axis=0)) ** 2))
-    return 100 * np.sqrt(np.mean((filled - X)[hidden] ** 2)) / size
-
-
 def counted(estimator, noise=0.02, K=3):
     """Return the mean number of basis shapes that "auto" finds."""
     found = [
@@ -126,13 +114,6 @@ ROBUST = {
     "cauchy 3D": partial(of_instances, outliers=0.05, loss="cauchy"),
     "missing": partial(of_instances, outliers=0.05, missing=0.1, loss="cauchy"),
 }
-MISSING = {
-    "yoga": partial(of_missing, "yoga", 3, 4),
-    "drink": partial(of_missing, "drink", 8, 3),
-    "faces": partial(of_missing, "ict_68", 8, 9),
-    "noisy 3D": partial(of_instances, missing=0.2),
-    "exact 3D": partial(of_instances, noise=0.0, missing=0.2),
-}
 LARGE = {
     "large 3D": partial(of_instances, n_frames=6000, n_points=30),
     "noisy": partial(of_instances, n_frames=6000, n_points=30, noise=0.1),
@@ -149,8 +130,6 @@ JOINT = {
 }
 # The cases that show the options of each stage.
 STAGES = {
-    "outliers": ROBUST,
-    "completion": MISSING,
     "fit": {**LARGE, **MATRIX},
     "joint": JOINT,
 }
@@ -192,8 +171,7 @@ def stage(name, cases, options):
     cases = {
         title: case
         for title, case in cases.items()
-        if getattr(case, "func", None) not in (of_set, of_missing)
-        or is_present(case.args[0])
+        if getattr(case, "func", None) is not of_set or is_present(case.args[0])
     }
     known = Limits() if name == "fit" else getattr(Limits(), name)
     print(" " * 34 + "".join(f"{title:>12}" for title in cases) + "       s")

@@ -59,8 +59,7 @@ from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
-from isa_nrsfm._prepare.options import CompletionOptions, OutlierOptions
-from isa_nrsfm._prepare.robust import outliers_of_table
+from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.sources import Table
 from isa_nrsfm._transformer import TableTransformer
@@ -94,15 +93,16 @@ class Limits(NamedTuple):
         Number of frames of the first sample of a large table.
     small_table : int
         Tables with fewer coordinates than this are fitted without a sample.
-    outliers, completion, joint
-        Of the search for gross outliers, of missing points, of the joint refinement.
+    model_frames : int
+        Largest number of frames from which outliers and missing points are modelled.
+    joint : JointOptions
+        Of the joint refinement.
     """
 
     dense: int = 1500
     sample: int = 600
     small_table: int = 150_000
-    outliers: OutlierOptions = OutlierOptions()
-    completion: CompletionOptions = CompletionOptions()
+    model_frames: int = 5_000
     joint: JointOptions = JointOptions()
 
 
@@ -299,11 +299,12 @@ def _factorised(
     limits, n_points = estimator._limits, table.n_points
     outliers, completed, complete = None, table.rows, table.complete
     if estimator.loss != "linear":
-        outliers = outliers_of_table(table.rows, n_points, limits.outliers)
+        outliers = gross_outliers(table.rows, limits.model_frames)
         completed = table.rows.derive(rows_without, outliers)
         complete = complete and not outliers.any()
     if not complete:
-        completed = complete_rows(completed, n_points, n_components, limits.completion)
+        most = limits.model_frames
+        completed = complete_rows(completed, n_points, n_components, most)
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(completed, shape, 3 * n_components + 3, limits.dense)

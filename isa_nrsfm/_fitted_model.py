@@ -19,7 +19,7 @@ from isa_nrsfm._tables.layout import (
     tracks_to_table,
 )
 from isa_nrsfm._tables.sources import Table
-from isa_nrsfm._tables.visibility import CentredFrames, seen_points, usable_frames
+from isa_nrsfm._tables.visibility import centred_frames, seen_points
 
 # Number of parts of the points that are held out in turn, and the fixed random seed of
 # the partition.
@@ -165,17 +165,16 @@ class TableModel(NamedTuple):
 
     def ready(self, tracks: NDArray) -> ReadyFrames:
         """Return the usable ones of tracks (n, n_points, 2), ready for the fit."""
-        frames = CentredFrames.of_tracks(tracks)
-        usable = frames.usable()
-        frames = frames.take(usable)
-        if self.robust:
+        centred, report = centred_frames(tracks)
+        usable = report.usable
+        if not usable.all():
+            centred, report = centred[usable], report.of_frames(usable)
+        translation, sizes = report.translation, report.size
+        if self.robust and len(centred):
             centred, translation = robustly_centred(tracks[usable])
-        else:
-            centred, translation = frames.marked(), frames.translation
-        if self.unit is not None or not len(centred):
+            sizes = robust_sizes(centred)
+        if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
-        else:
-            sizes = robust_sizes(centred) if self.robust else frames.sizes()
         return ReadyFrames(usable, centred, translation, sizes)
 
     @property
@@ -315,7 +314,8 @@ def held_out_energies(
         held = folds == fold
         # Fit without the held-out points
         visible = np.where(held[:, None], np.nan, tracks)
-        usable = np.flatnonzero(usable_frames(visible) & seen[:, held].any(axis=1))
+        enough = centred_frames(visible)[1].usable
+        usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
         if not len(usable):
             continue
         origin = np.zeros(3), np.zeros((len(basis), 3))  # of mean and basis shapes

@@ -20,7 +20,7 @@ from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import Triplets, leading_triplets
-from isa_nrsfm._prepare.completion import complete_tracks
+from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
@@ -98,7 +98,11 @@ def fitted(
     if outliers is not None:
         used = np.where(outliers[..., None], np.nan, tracks)
         used = used - np.nanmean(used, axis=1, keepdims=True)
-    completed = complete_tracks(used, np.ones(len(tracks)), n_components).centred
+    completed = used.transpose(0, 2, 1)
+    if np.isnan(used).any():
+        model = completion_model(completed, 3 * n_components + 3)
+        completed = filled_in(completed, model)
+    completed = completed.transpose(0, 2, 1)
     W = measurements(completed, scale_frames=False)
     triplets = leading_triplets(W, 3 * n_components + 3)
     sample = Sample(W, [])

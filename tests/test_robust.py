@@ -7,20 +7,21 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm._prepare.options import OUTLIER_OPTIONS
+from isa_nrsfm._prepare import robust
 from isa_nrsfm._prepare.robust import (
+    DISTANT,
     TUNING,
+    WEIGHTS,
     distant_points,
     frame_weights,
-    gross_outliers,
     median_noise,
     robust_sizes,
-    robust_weights,
     robustly_centred,
     spatial_median,
 )
+from isa_nrsfm._tables.blocks import FrameBlocks
 
-ROBUST = ["huber", "cauchy"]
+ROBUST = LOSSES[1:]
 
 
 def normal_mean(function):
@@ -45,7 +46,7 @@ def turned(tracks, angle):
 class TestWeights:
     @pytest.mark.parametrize("loss", LOSSES)
     def test_fall_from_one(self, loss):
-        weights = robust_weights(loss, np.linspace(0, 30, 400))
+        weights = WEIGHTS[loss](np.linspace(0, 30, 400))
         assert weights[0] == 1.0
         assert (np.diff(weights) <= 0).all()
         assert (weights > 0).all()
@@ -55,17 +56,17 @@ class TestWeights:
         # rho'(r) / r for rho = r^2 / 2, then c r - c^2 / 2; and c^2/2 log(1 + (r/c)^2).
         c = TUNING["huber"]
         r = np.array([0.1, 0.999 * c, 1.001 * c, 5.0, 1e3])
-        assert_allclose(robust_weights("huber", r), [1, 1, c / r[2], c / 5, c / 1e3])
+        assert_allclose(WEIGHTS["huber"](r), [1, 1, c / r[2], c / 5, c / 1e3])
         c, step = TUNING["cauchy"], 1e-5
         above, below = (c**2 / 2 * np.log1p(((r + d) / c) ** 2) for d in (step, -step))
         slope = (above - below) / (2 * step)
-        assert_allclose(robust_weights("cauchy", r), slope / r, rtol=1e-6)
+        assert_allclose(WEIGHTS["cauchy"](r), slope / r, rtol=1e-6)
 
     @pytest.mark.parametrize("loss", ROBUST)
     def test_have_95_percent_of_the_efficiency_of_least_squares(self, loss):
         # Location in the plane: (E trace of d psi / 2)^2 / (E |psi|^2 / 2), psi = w r.
         def weight(r):
-            return float(robust_weights(loss, np.array(r)))
+            return float(WEIGHTS[loss](np.array(r)))
 
         def psi_slope(r):
             step = 1e-6
@@ -80,18 +81,23 @@ class TestWeights:
     @pytest.mark.parametrize("loss", LOSSES)
     def test_have_any_shape(self, loss):
         distance = np.random.default_rng(0).exponential(size=(3, 4))
-        weights = robust_weights(loss, distance)
-        assert_array_equal(weights.ravel(), robust_weights(loss, distance.ravel()))
+        weights = WEIGHTS[loss](distance)
+        assert_array_equal(weights.ravel(), WEIGHTS[loss](distance.ravel()))
 
 
 class TestFrameWeights:
+    def test_each_loss_has_weights(self):
+        assert tuple(WEIGHTS) == LOSSES
+        with pytest.raises(KeyError, match="welsch"):
+            frame_weights("welsch", np.ones((1, 5)), 1.0, np.ones(1))
+
     @pytest.mark.parametrize("loss", ROBUST)
     def test_points_that_do_not_belong_to_their_frame_have_none(self, loss):
         distance = np.array(
             [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e140]]
         )
-        weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]), 6.0)
-        expected = robust_weights(loss, distance[:, :3] / 0.5)
+        weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]))
+        expected = WEIGHTS[loss](distance[:, :3] / 0.5)
         assert_array_equal(weights, np.pad(expected, ((0, 0), (0, 2))))
 
     @pytest.mark.parametrize("loss", ROBUST)
@@ -223,8 +229,8 @@ class TestDistantPoints:
         rng = np.random.default_rng(0)
         tracks = rng.normal(size=(10, 15, 2))
         tracks[3, :4] = np.nan
-        tracks[5, 2] += 8 * OUTLIER_OPTIONS.distant
-        tracks[6, 3, 1] -= 8 * OUTLIER_OPTIONS.distant
+        tracks[5, 2] += 8 * DISTANT
+        tracks[6, 3, 1] -= 8 * DISTANT
         expected = np.zeros(tracks.shape[:2], dtype=bool)
         expected[5, 2] = expected[6, 3] = True
         assert_array_equal(distant_points(tracks), expected)
@@ -236,8 +242,17 @@ class TestDistantPoints:
             points[100] = [0.6 * distance, 0.8 * distance]
             size = robust_sizes(points[None])[0]
             from_median = np.linalg.norm(points[100] - spatial_median(points[None])[0])
-            expected = from_median > OUTLIER_OPTIONS.distant * size
+            expected = from_median > DISTANT * size
             assert distant_points(points[None])[0, 100] == expected
+
+
+LARGEST_SHARE = 0.4  # of the points of a frame that may be outliers
+
+
+def gross_outliers(tracks, model_frames=1000):
+    """Return the outliers of tracks, in blocks of seven frames."""
+    rows = FrameBlocks.of_array(tracks.transpose(0, 2, 1), 7)
+    return robust.gross_outliers(rows, model_frames)
 
 
 def rigid_tracks(noise=0.02, n_frames=40, n_points=30):
@@ -290,7 +305,7 @@ class TestGrossOutliers:
 
     def test_a_point_that_is_off_in_some_frames_does_not(self):
         tracks = rigid_tracks()
-        some = int(OUTLIER_OPTIONS.largest_share * len(tracks) / 2)
+        some = int(LARGEST_SHARE * len(tracks) / 2)
         tracks[:some, 7] += np.random.default_rng(1).choice([-1, 1], size=(some, 2))
         found = gross_outliers(tracks)
         assert found[:some, 7].mean() > 0.8
@@ -314,11 +329,17 @@ class TestGrossOutliers:
 
     def test_frames_with_not_so_many_do_not(self):
         tracks = rigid_tracks()
-        some = int(OUTLIER_OPTIONS.largest_share * tracks.shape[1] / 2)
+        some = int(LARGEST_SHARE * tracks.shape[1] / 2)
         tracks[9, :some] += np.random.default_rng(1).normal(size=(some, 2))
         found = gross_outliers(tracks)[9]
         assert found[:some].mean() > 0.8
         assert found[some:].mean() < 0.1
+
+    def test_are_found_with_the_object_of_some_frames(self):
+        tracks, where = spoilt(rigid_tracks(n_frames=200), 2.0)
+        found = gross_outliers(tracks, model_frames=60)
+        assert found[where].mean() > 0.8
+        assert found[~where].mean() < 0.02
 
     def test_place_unit_and_order(self):
         tracks, _ = spoilt(rigid_tracks(), 2.0)

@@ -40,8 +40,7 @@ def table(missing=0.0, n_points=20, n_frames=150):
 SAMPLED = Limits()._replace(
     small_table=1000,
     sample=50,
-    completion=Limits().completion._replace(model_frames=100, fewest_shown=20),
-    outliers=Limits().outliers._replace(model_frames=100, fewest_shown=20),
+    model_frames=100,
 )
 KRYLOV = Limits(dense=300)
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
+from isa_nrsfm._prepare import layout_check
 from isa_nrsfm._prepare.checks import (
-    PointReport,
     check_names,
     check_points,
     check_size,
     clean_tracks,
     largest_n_components,
     smallest_n_frames,
+    visible_points,
 )
-from isa_nrsfm._prepare.layout_check import warn_if_other_layout
-from isa_nrsfm._prepare.options import LAYOUT_OPTIONS
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.layout import LAYOUTS, tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
@@ -72,12 +72,8 @@ class TestHalfPoints:
 
 
 def checked(tracks, *options):
-    """Check the points of tracks, in one block and in many."""
-    seen = ~np.isnan(tracks).any(axis=2)
-    for length in (len(seen), 7):
-        blocks = [seen[start : start + length] for start in range(0, len(seen), length)]
-        report = PointReport.merged([PointReport.from_seen(block) for block in blocks])
-        check_points(report, seen.sum(axis=1), *options)
+    """Check the points of tracks."""
+    check_points(visible_points(tracks), tracks.shape[1], *options)
 
 
 class TestPoints:
@@ -238,6 +234,11 @@ def faces():
     return tracks.data.reshape(40, 30, 2)
 
 
+def warn_if_other_layout(X, layout, scale_frames):
+    blocks = FrameBlocks.of_array(X, 17)
+    layout_check.warn_if_other_layout(blocks, X.shape[1], layout, scale_frames)
+
+
 class TestOtherLayout:
     @pytest.mark.parametrize("scale_frames", [True, False])
     @pytest.mark.parametrize(
@@ -267,7 +268,7 @@ class TestOtherLayout:
             warn_if_other_layout(X, "planar", True)
 
     def test_long_tables_are_sampled_evenly(self, faces):
-        X = tracks_to_table(np.tile(faces, (LAYOUT_OPTIONS.frames // 10, 1, 1)))
+        X = tracks_to_table(np.tile(faces, (100, 1, 1)))
         warn_if_other_layout(X, "interleaved", True)
         with pytest.warns(UserWarning, match="layout='interleaved' explains"):
             warn_if_other_layout(X, "planar", True)

@@ -22,7 +22,7 @@ from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import sample_frames
 from isa_nrsfm._paper.svd import leading_triplets
-from isa_nrsfm._prepare.completion import complete_tracks
+from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.layout import (
     centred_tracks,
@@ -143,14 +143,15 @@ class ChecksMissing(Checks):
 class Completion(Stage):
     def prepare(self):
         tracks = table_to_tracks(with_holes(self.X, MISSING))
-        self.centred, _ = centred_tracks(tracks)
-        self.sizes = weighting_sizes(self.centred, True)
+        centred, _ = centred_tracks(tracks)
+        self.sizes = weighting_sizes(centred, True)[:, None, None]
+        self.rows = (centred / self.sizes).transpose(0, 2, 1)
 
     def run(self):
-        return complete_tracks(self.centred, self.sizes, self.K)
+        return filled_in(self.rows, completion_model(self.rows, 3 * self.K + 3))
 
     def track_inverse_snr(self, cache, table):
-        completed = tracks_to_table(self.run().centred)
+        completed = tracks_to_table(self.sizes * self.run().transpose(0, 2, 1))
         return 100 * inverse_snr(self.X, completed, scale_frames=True)
 
     track_inverse_snr.unit = "%"

@@ -58,7 +58,7 @@ def reweighted(
     sizes = rows.joined(_sizes)
     weighted = rows.derive(WeightedRows.without, left_out)
     # The noise is that of the residuals of at most about 2,000 frames.
-    few = representative_frames(rows, left_out.shape[1], 2000, 200)
+    few = representative_frames(rows, 2000)
     few_rows = rows.take(few)
     weights = WeightedRows.without(few_rows, left_out[few]).weights
     for _ in range(20):

@@ -1,111 +1,15 @@
-"""What a table has to be before it is factorised, and what is said if it is not."""
-
-from collections.abc import Sequence
-from typing import NamedTuple, Self
+"""Checks of a table before it is factorised, and their messages."""
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bmat, csr_array
-from scipy.sparse.csgraph import connected_components
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
-from isa_nrsfm._tables.layout import (
-    Layout,
-    table_to_tracks,
-)
+from isa_nrsfm._tables.layout import Layout, table_to_tracks
+from isa_nrsfm._tables.visibility import seen_points
 
 
-class HalfPoints(NamedTuple):
-    """
-    Points of which only one of the two coordinates is there.
-
-    Attributes
-    ----------
-    n_points : int
-        How many there are.
-    n_rows : int
-        In how many rows.
-    first : tuple of int, or None
-        Row and point of the first one.
-    """
-
-    n_points: int
-    n_rows: int
-    first: tuple[int, int] | None
-
-    @classmethod
-    def merged(cls, parts: "Sequence[HalfPoints]", lengths: list[int]) -> Self:
-        """Return the half points of a table from those of its consecutive blocks."""
-        start, first = 0, None
-        for part, length in zip(parts, lengths, strict=True):
-            if first is None and part.first is not None:
-                first = (start + part.first[0], part.first[1])
-            start += length
-        n_points = sum(part.n_points for part in parts)
-        return cls(n_points, sum(part.n_rows for part in parts), first)
-
-    def warn(self, layout: Layout, names: NDArray | None) -> None:
-        """Warn if there are such points."""
-        if self.first is None:
-            return
-        row, point = self.first
-        warn_caller(
-            f"{self.n_points} point(s) in {self.n_rows} row(s) have only one of "
-            "their two coordinates and count as missing; the first is "
-            f"{_describe_point(point, layout, names)} in row {row}",
-        )
-
-
-class PointReport(NamedTuple):
-    """
-    In which frames points are seen.
-
-    Attributes
-    ----------
-    n_frames : ndarray of int, shape (n_points,)
-        Number of frames that show each point.
-    group : ndarray of int, shape (n_points,)
-        Connected component of each point. Two points are linked if a frame shows both.
-    """
-
-    n_frames: NDArray
-    group: NDArray
-
-    @classmethod
-    def from_seen(cls, seen: NDArray) -> Self:
-        """Return the report from the mask of seen points (n_frames, n_points)."""
-        n_frames = seen.sum(axis=0)
-        # Nearly always all points are in frames that share one with the fullest frame.
-        fullest = seen[np.argsort(seen.sum(axis=1))[-1:]]
-        if seen[(seen & fullest).any(axis=1)].any(axis=0).all():
-            return cls(n_frames, np.zeros(len(n_frames), dtype=np.intp))
-        shown = csr_array(seen)
-        # Nodes are the points, then the frames. A frame is linked to what it shows.
-        graph = bmat([[None, shown.T], [shown, None]])
-        return cls(
-            n_frames, connected_components(graph, directed=False)[1][: len(n_frames)]
-        )
-
-    @classmethod
-    def merged(cls, reports: "Sequence[PointReport]") -> Self:
-        """Return the report of a table from those of its blocks."""
-        n_points = len(reports[0].group)
-        points = np.arange(n_points)
-        firsts = []
-        for report in reports:
-            # Each point is tied to the first one of its group.
-            _, first, number = np.unique(
-                report.group, return_index=True, return_inverse=True
-            )
-            firsts.append(first[number])
-        rows, columns = np.tile(points, len(reports)), np.concatenate(firsts)
-        ties = csr_array((np.ones(len(rows)), (rows, columns)), (n_points, n_points))
-        _, group = connected_components(ties, directed=False)
-        return cls(np.sum([report.n_frames for report in reports], axis=0), group)
-
-
-def without_half_points(tracks: NDArray) -> tuple[NDArray, HalfPoints]:
+def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return tracks in which the two coordinates of a point are missing together.
 
@@ -117,52 +21,43 @@ def without_half_points(tracks: NDArray) -> tuple[NDArray, HalfPoints]:
     Returns
     -------
     tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks themselves, or a copy where points of which one coordinate is
-        missing have lost the other, too.
-    half : HalfPoints
-        How many such points there are, and where the first one is.
+        The tracks themselves, or a copy without points that have one coordinate.
+    n_half : ndarray of int, shape (n_frames,)
+        Number of such points in each frame.
+    first : ndarray of int, shape (n_frames,)
+        The first of them.
     """
+    none = np.zeros(len(tracks), dtype=int)
     if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
-        return tracks, HalfPoints(0, 0, None)
+        return tracks, none, none
     missing = np.isnan(tracks)
     half = missing[..., 0] != missing[..., 1]
     if not half.any():
-        return tracks, HalfPoints(0, 0, None)
-    row, point = np.argwhere(half)[0]
-    found = HalfPoints(
-        int(half.sum()), int(half.any(axis=1).sum()), (int(row), int(point))
+        return tracks, none, none
+    tracks = np.where(half[..., None], tracks.dtype.type(np.nan), tracks)
+    return tracks, half.sum(axis=1), half.argmax(axis=1)
+
+
+def warn_of_half_points(
+    n_half: NDArray, first: NDArray, layout: Layout, names: NDArray | None
+) -> None:
+    """Warn of points with one coordinate, as found by `without_half_points`."""
+    if not n_half.any():
+        return
+    row = int((n_half > 0).argmax())
+    warn_caller(
+        f"{n_half.sum()} point(s) in {np.count_nonzero(n_half)} row(s) have only one "
+        "of their two coordinates and count as missing; the first is "
+        f"{_describe_point(int(first[row]), layout, names)} in row {row}",
     )
-    return np.where(half[..., None], tracks.dtype.type(np.nan), tracks), found
 
 
 def clean_tracks(
     tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
 ) -> NDArray:
-    """
-    Return tracks in which the two coordinates of a point are missing together.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a coordinate is missing.
-    layout : {"interleaved", "planar"}
-        Order of the columns of the table.
-    names : ndarray of shape (2 * n_points,), optional
-        Names of the columns.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 2)
-        The tracks themselves, or a copy where points of which one coordinate is
-        missing have lost the other, too.
-
-    Warns
-    -----
-    UserWarning
-        If there are such points.
-    """
-    tracks, half = without_half_points(tracks)
-    half.warn(layout, names)
+    """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
+    tracks, n_half, first = without_half_points(tracks)
+    warn_of_half_points(n_half, first, layout, names)
     return tracks
 
 
@@ -241,9 +136,14 @@ def check_size(n_frames: int, n_points: int, n_components: int) -> None:
         )
 
 
+def visible_points(tracks: NDArray) -> NDArray:
+    """Return which points of tracks (I, J, 2) are seen, eight points in a byte."""
+    return np.packbits(seen_points(tracks), axis=1)
+
+
 def check_points(
-    report: PointReport,
-    n_seen: NDArray,
+    visible: NDArray,
+    n_points: int,
     n_components: int,
     layout: Layout = "interleaved",
     names: NDArray | None = None,
@@ -258,10 +158,10 @@ def check_points(
 
     Parameters
     ----------
-    report : PointReport
-        In which frames points are seen.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of points that each frame shows.
+    visible : ndarray of uint8, shape (n_frames, n_bytes)
+        The seen points of each frame, packed by `visible_points`.
+    n_points : int
+        Number of points.
     n_components : int
         K, the number of basis shapes.
     layout : {"interleaved", "planar"}
@@ -275,21 +175,22 @@ def check_points(
         If a point is seen in too few frames, if too few points are seen in all, or if
         the points fall into groups that no frame shows together.
     """
-    n_frames, group = report
-    if (n_frames == len(n_seen)).all():
+    patterns, counts = np.unique(visible, axis=0, return_counts=True)
+    seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
+    if seen.all():
         return
-    n_shapes = n_components + 1
+    n_frames, n_shapes = counts @ seen, n_components + 1
     least = -(-3 * n_shapes // 2)
     few = n_frames < least
     if few.any():
         point = int(few.argmax())
         raise ValueError(
             f"n_components={n_components} needs every point in at least {least} "
-            f"frames; {few.sum()} of {len(few)} point(s) are seen in fewer, the first "
+            f"frames; {few.sum()} of {n_points} point(s) are seen in fewer, the first "
             f"is {_describe_point(point, layout, names)}, seen in {n_frames[point]}"
         )
-    equations = np.maximum(2 * n_seen - 8 - n_components, 0).sum()
-    unknowns = 3 * n_shapes * (len(few) - 1) - n_shapes**2 - 8
+    equations = counts @ np.maximum(2 * seen.sum(axis=1) - 8 - n_components, 0)
+    unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     if equations < unknowns:
         raise ValueError(
             f"too few points are seen for n_components={n_components}: beyond cameras "
@@ -297,14 +198,28 @@ def check_points(
             f"{unknowns} unknowns; take fewer basis shapes or leave out points that "
             "are rarely seen"
         )
-    if (group != group[0]).any():
-        apart = int((group != group[0]).argmax())
+    group = _groups(seen)
+    if group.any():
         raise ValueError(
-            f"the points fall into {len(np.unique(group))} groups, and no frame shows "
-            f"points of two of them; {_describe_point(apart, layout, names)} is the "
-            f"first that is never seen with {_describe_point(0, layout, names)} or "
-            "others of its group"
+            f"the points fall into {group.max() + 1} groups, and no frame shows points "
+            f"of two of them; {_describe_point(int(group.argmax()), layout, names)} is "
+            "the first that is never seen with "
+            f"{_describe_point(0, layout, names)} or others of its group"
         )
+
+
+def _groups(seen: NDArray) -> NDArray:
+    """Return numbers of groups of points (J,) that frames (I, J) show together."""
+    group = np.full(seen.shape[1], -1)
+    for number in range(len(group)):
+        if (group >= 0).all():
+            break
+        reached, before = np.arange(len(group)) == group.argmin(), 0
+        while reached.sum() > before:
+            before = reached.sum()
+            reached = reached | seen[(seen & reached).any(axis=1)].any(axis=0)
+        group[reached] = number
+    return group
 
 
 def _describe_point(point: int, layout: Layout, names: NDArray | None) -> str:

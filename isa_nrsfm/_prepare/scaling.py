@@ -8,33 +8,18 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
-    HalfPoints,
-    PointReport,
     check_points,
     check_size,
+    visible_points,
+    warn_of_half_points,
     without_half_points,
 )
-from isa_nrsfm._prepare.layout_check import layout_sample, warn_if_other_layout
-from isa_nrsfm._prepare.options import OUTLIER_OPTIONS
-from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
+from isa_nrsfm._prepare.layout_check import warn_if_other_layout
+from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import (
-    Layout,
-    refuse_odd,
-    relative_precision,
-    table_to_tracks,
-)
+from isa_nrsfm._tables.layout import Layout, refuse_odd, table_to_tracks
 from isa_nrsfm._tables.sources import Table
-from isa_nrsfm._tables.visibility import (
-    FrameReport,
-    check_frames,
-    check_places,
-    report_frames,
-    seen_points,
-)
-
-# With fewer points matrix products are so small that single precision saves nothing.
-MANY_POINTS = 200
+from isa_nrsfm._tables.visibility import FrameReport, centred_frames, check_frames
 
 
 class ScaledTable(NamedTuple):
@@ -61,7 +46,7 @@ class ScaledTable(NamedTuple):
     n_points : int
         Number of points.
     precision : float
-        As of `relative_precision`.
+        Rounding error of the coordinates of the table, relative to its frames.
     dtype : dtype
         Type of the numbers of the given table.
     """
@@ -91,18 +76,9 @@ class ScaledTable(NamedTuple):
 
     def part(self, rows: NDArray) -> "ScaledTable":
         """
-        Return a part of the table.
+        Return the table of some rows, by a mask (n_rows,), scaled as they are.
 
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (n_rows,)
-            Which rows of the table.
-
-        Returns
-        -------
-        ScaledTable
-            The table of these rows, their frames scaled as they are. Whether they are
-            enough for a fit is not checked.
+        Whether they are enough for a fit is not checked.
         """
         kept = rows[self.shown]
         return self._replace(
@@ -163,48 +139,44 @@ def scaled_table(
     n_points = n_columns // 2
     refuse_odd(n_columns)
     check_size(blocks.n_frames, n_points, n_components)
-    found = list(blocks.map(partial(_examine, layout=layout)))
-    frames, points, half = zip(*found, strict=True)
-    HalfPoints.merged(half, blocks.lengths).warn(layout, names)
-    report = FrameReport(*map(np.concatenate, zip(*frames, strict=True)))
+    examined = blocks.map(partial(_examine, layout=layout, robust=robust))
+    parts = map(np.concatenate, zip(*examined, strict=True))
+    n_half, first, visible, largest, *rest = parts
+    report = FrameReport(*rest)
+    warn_of_half_points(n_half, first, layout, names)
     check_frames(report, n_points)
     shown = report.n_seen > 0
     if not shown.all():
         _warn_of_empty(shown)
         check_size(int(shown.sum()), n_points, n_components)
         blocks, report = blocks.subset(shown), report.of_frames(shown)
-    check_points(PointReport.merged(points), report.n_seen, n_components, layout, names)
-    check_places(report, n_points)
-    n_frames = blocks.n_frames
-    sampled = np.arange(n_frames)[layout_sample(n_frames, n_columns)]
-    warn_if_other_layout(blocks.take(sampled), layout, scale_frames)
-    size = np.sqrt(report.square / (2 * report.n_seen))
-    translation, largest = report.translation, report.largest
+        visible, largest = visible[shown], largest[shown]
+    check_points(visible, n_points, n_components, layout, names)
+    warn_if_other_layout(blocks, n_columns, layout, scale_frames)
+    translation, size, n_seen = report[:3]
     if robust:
-        # A point far off must neither move the others nor cost their digits.
-        robust_places = list(blocks.map(partial(_robust_places, layout=layout)))
-        translation, size = map(np.concatenate, zip(*robust_places, strict=True))
-        reach = OUTLIER_OPTIONS.distant * size
-        largest = np.minimum(largest, np.abs(translation).max(axis=1) + reach)
+        # A point far off must not cost the digits of the others.
+        reach = np.abs(translation).max(axis=1) + DISTANT * size
+        largest = np.minimum(largest, reach)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
     # Single precision for large complete tables: it saves memory, and time in the SVD.
-    single = dtype == np.float32 and n_points >= MANY_POINTS and not robust
-    single = single and bool((report.n_seen == n_points).all())
+    # With fewer points matrix products are so small that it saves nothing.
+    complete = bool((n_seen == n_points).all())
+    single = dtype == np.float32 and n_points >= 200 and complete and not robust
     unit_rows = partial(
         _unit_rows, layout=layout, dtype=np.float32 if single else np.float64
     )
-    rows = blocks.derive(unit_rows, translation, size)
-    precision = relative_precision(largest, dtype, size)
+    spacing = np.finfo(dtype).eps * largest.astype(np.float64)
     return ScaledTable(
         shown,
         table._replace(blocks=blocks),
-        rows,
+        blocks.derive(unit_rows, translation, size),
         size,
         translation,
-        report.n_seen,
+        n_seen,
         n_points,
-        precision,
+        float(np.sqrt(np.mean((spacing / size) ** 2))),
         dtype,
     )
 
@@ -220,29 +192,29 @@ def _warn_of_empty(shown: NDArray) -> None:
     )
 
 
-def _examine(
-    rows: NDArray, layout: Layout
-) -> tuple[FrameReport, PointReport, HalfPoints]:
-    """Return what the checks need of some rows (n_rows, 2 * n_points) of a table."""
-    tracks, half = without_half_points(table_to_tracks(rows, layout))
-    return report_frames(tracks), PointReport.from_seen(seen_points(tracks)), half
+def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]:
+    """
+    Return arrays for all checks of some rows (n_rows, 2 * n_points) of a table.
 
-
-def _robust_places(rows: NDArray, layout: Layout) -> tuple[NDArray, NDArray]:
-    """Return medians (n, 2) and robust sizes (n,) of some rows (n, 2 * n_points)."""
-    tracks, _ = without_half_points(table_to_tracks(rows, layout))
-    centred, middle = robustly_centred(tracks)
-    return middle, robust_sizes(centred)
+    They are numbers and first ones of half points, the points seen, the largest
+    magnitudes of coordinates, and the fields of a `FrameReport`.
+    """
+    tracks, n_half, first = without_half_points(table_to_tracks(rows, layout))
+    _, report = centred_frames(tracks)
+    shown = report.n_seen > 0
+    if robust and shown.any():
+        # A point far off must not move the others.
+        centred, report.translation[shown] = robustly_centred(tracks[shown])
+        report.size[shown] = robust_sizes(centred)
+    largest = np.fmax.reduce(np.abs(tracks), axis=(1, 2), initial=0.0)
+    return n_half, first, visible_points(tracks), largest, *report
 
 
 def _unit_rows(
     rows: NDArray, translation: NDArray, sizes: NDArray, layout: Layout, dtype: Any
 ) -> NDArray:
-    """Return rows of a table as frames (n_frames, 2, n_points) of size one, centred.
-
-    Rows are (n_frames, 2 * n_points), translation (n_frames, 2), sizes (n_frames,).
-    """
-    tracks, _ = without_half_points(table_to_tracks(rows, layout))
+    """Return rows (n, 2 * n_points) of a table as centred frames of size one."""
+    tracks, *_ = without_half_points(table_to_tracks(rows, layout))
     centred = np.array(tracks.transpose(0, 2, 1), dtype=np.float64, order="C")
     centred -= translation[:, :, None]
     centred /= sizes[:, None, None]
@@ -250,20 +222,6 @@ def _unit_rows(
 
 
 def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
-    """
-    Return frames without some of their points.
-
-    Parameters
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_points)
-        Frames.
-    left_out : ndarray of bool, shape (n_frames, n_points)
-        The points.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2, n_points)
-        Frames centred over the other points that are seen, NaN elsewhere.
-    """
+    """Return frames (n, 2, J) without points (n, J), centred over the others."""
     kept = np.where(left_out[:, None], np.nan, rows)
     return kept - np.nanmean(kept, axis=2, keepdims=True)

@@ -28,10 +28,9 @@ from isa_nrsfm._fit import fit_ready_table, joint_tol, ready_table
 from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.fit import Start
 from isa_nrsfm._joint.starts import extended_shapes
-from isa_nrsfm._prepare.checks import PointReport, check_points, check_size
+from isa_nrsfm._prepare.checks import check_points, check_size, visible_points
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables.ordering import spread
-from isa_nrsfm._tables.visibility import seen_points
 
 # Rows that are fitted, and rows that are held out.
 Split = tuple[NDArray, NDArray]
@@ -197,12 +196,12 @@ def _check_part(
 ) -> None:
     """Refuse a part of a table that is not enough for so many basis shapes."""
     n_frames, names = len(part.sizes), getattr(estimator, "feature_names_in_", None)
-    report = PointReport.merged(list(part.rows.map(_point_report)))
+    visible = part.rows.joined(_visible)
 
     def refused(k: int) -> ValueError | None:
         try:
             check_size(n_frames, part.n_points, k)
-            check_points(report, part.n_seen, k, estimator.layout, names)
+            check_points(visible, part.n_points, k, estimator.layout, names)
         except ValueError as error:
             return error
         return None
@@ -215,9 +214,9 @@ def _check_part(
         ) from error
 
 
-def _point_report(rows: NDArray) -> PointReport:
-    """Return in which frames of some rows (n_frames, 2, n_points) points are seen."""
-    return PointReport.from_seen(seen_points(rows.transpose(0, 2, 1)))
+def _visible(rows: NDArray) -> NDArray:
+    """Return the packed `visible_points` of some rows (n_frames, 2, n_points)."""
+    return visible_points(rows.transpose(0, 2, 1))
 
 
 def _fitted(

@@ -10,33 +10,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._tables.visibility import (
-    CentredFrames,
-    refuse_one_place,
-    seen_points,
-    zero_where_unseen,
-)
+from isa_nrsfm._tables.visibility import centred_frames, refuse_one_place
 
+# Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
 Layout = Literal["interleaved", "planar"]
 LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
 
 
 def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
-    """
-    Return the points of a table, one (x, y) pair a point.
-
-    Parameters
-    ----------
-    X : ndarray of shape (n_frames, 2 * n_points)
-        The table.
-    layout : {"interleaved", "planar"}
-        Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 2)
-        The tracks.
-    """
+    """Return the tracks (n_frames, n_points, 2) of a table."""
     n_frames, n_columns = X.shape
     refuse_odd(n_columns)
     if layout == "planar":
@@ -54,21 +36,7 @@ def refuse_odd(n_columns: int) -> None:
 
 
 def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
-    """
-    Return tracks as a table, the inverse of `table_to_tracks`.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks.
-    layout : {"interleaved", "planar"}
-        Order of the columns.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2 * n_points)
-        The table.
-    """
+    """Return tracks as a table, the inverse of `table_to_tracks`."""
     if layout == "planar":
         tracks = tracks.transpose(0, 2, 1)
     return tracks.reshape(len(tracks), -1)
@@ -76,28 +44,13 @@ def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
 
 def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return tracks centred over the seen points of each frame, in double precision.
+    Return tracks (I, J, 2) centred over the points that they show, and centroids.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a point is not seen.
-
-    Returns
-    -------
-    centred : ndarray of shape (n_frames, n_points, 2)
-        Tracks minus centroids, NaN where a point is not seen.
-    translation : ndarray of shape (n_frames, 2)
-        The centroids of the seen points, NaN for frames without any.
-
-    Raises
-    ------
-    ValueError
-        If all seen points of a frame are equal, up to rounding.
+    Frames whose seen points are all equal are refused.
     """
-    frames = CentredFrames.of_tracks(tracks)
-    refuse_one_place(frames.in_one_place(), frames.n_seen < tracks.shape[1])
-    return frames.marked(), frames.translation
+    centred, report = centred_frames(tracks)
+    refuse_one_place(report, tracks.shape[1])
+    return centred, report.translation
 
 
 def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
@@ -117,33 +70,10 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
         The root mean square of the seen coordinates of each frame. With one size for
         all it is the root of the mean of these mean squares.
     """
-    seen = seen_points(centred)
-    centred = zero_where_unseen(centred, seen)
-    square = np.einsum("ijc,ijc->i", centred, centred) / (2 * seen.sum(axis=1))
+    known = ~np.isnan(centred)
+    seen = np.where(known, centred, 0.0)
+    square = np.einsum("ijc,ijc->i", seen, seen) / known.sum(axis=(1, 2))
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
-
-
-def relative_precision(largest: NDArray, dtype: np.dtype, sizes: NDArray) -> float:
-    """
-    Return the rounding error of the coordinates of a table, relative to its frames.
-
-    Parameters
-    ----------
-    largest : ndarray of shape (n_frames,)
-        Largest magnitude of a coordinate that counts.
-    dtype : dtype
-        Type of the numbers of the table.
-    sizes : ndarray of shape (n_frames,)
-        Sizes of the frames.
-
-    Returns
-    -------
-    float
-        Spacing of floating-point numbers at the largest coordinate of a frame, divided
-        by the size of the frame: the root mean square over the frames.
-    """
-    spacing = np.finfo(dtype).eps * largest.astype(np.float64)
-    return float(np.sqrt(np.mean((spacing / sizes) ** 2)))
 
 
 def measurement_matrix(centred: NDArray) -> NDArray:

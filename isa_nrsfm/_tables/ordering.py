@@ -11,27 +11,17 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 def order_by_halves(rows: FrameBlocks) -> NDArray:
     """
-    Return an order of frames that stays the same when the frames are permuted.
+    Return an order of frames (n_frames,) that stays the same when they are permuted.
 
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, ...), NaN where a point is missing.
-
-    Returns
-    -------
-    ndarray of int, shape (n_frames,)
-        Frames sorted by the share of their energy that is in the first half of their
-        entries. For rows (2, n_points) of a scaled table that is the share of x.
+    Blocks of frames (n_frames, ...) are sorted by the share of their energy that is in
+    the first half of their entries. For rows (2, n_points) that is the share of x. NaN
+    counts as zero.
     """
     return np.argsort(rows.joined(_first_half), kind="stable")
 
 
 def _first_half(rows: NDArray) -> NDArray:
-    """Return the share of the energy that the first half of each row has: (n_frames,).
-
-    Rows are (n_frames, ...). NaN counts as zero.
-    """
+    """Return the share (n_frames,) of the energy in the first half of each row."""
     flat = rows.reshape(len(rows), -1)
     if np.isnan(flat.sum()):
         flat = np.where(np.isnan(flat), 0.0, flat)
@@ -45,27 +35,21 @@ def spread(order: NDArray, n: int) -> NDArray:
     return order[np.linspace(0, len(order) - 1, n).round().astype(int)]
 
 
-def representative_frames(
-    rows: FrameBlocks, n_points: int, most: int, fewest_shown: int
-) -> NDArray:
+def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     """
     Return frames from which the model of a large table is found.
 
     They are spread evenly over the order of `order_by_halves`, so that they do not
-    depend on the order of the table. For each point that too few of them show, frames
-    that show it are added, spread in the same way.
+    depend on the order of the table. For each point that few of them show, frames that
+    show it are added, spread in the same way.
 
     Parameters
     ----------
     rows : FrameBlocks
         Blocks of frames (n_frames, 2, n_points), NaN where a point is not seen.
-    n_points : int
-        Number of points.
     most : int
         Number of frames, before those that are added. A table with no more frames is
         taken whole.
-    fewest_shown : int
-        Frames are added for each point that fewer show.
 
     Returns
     -------
@@ -77,21 +61,20 @@ def representative_frames(
     order = order_by_halves(rows)
     chosen = np.zeros(len(order), dtype=bool)
     chosen[spread(order, most)] = True
-    shown = np.zeros(n_points)
-    for block in rows.map(_seen_rows, chosen):
-        shown += block.sum(axis=0)
-    for point in map(int, np.flatnonzero(shown < fewest_shown)):
-        seen = rows.joined(partial(_sees, point=point))
+    fewest = min(200, most // 5)
+    shown = sum(rows.map(_numbers_shown, chosen))
+    for point in np.flatnonzero(shown < fewest):
+        seen = rows.joined(partial(_shows, point=point))
         showing = order[seen[order]]
-        chosen[spread(showing, min(fewest_shown, len(showing)))] = True
+        chosen[spread(showing, min(fewest, len(showing)))] = True
     return np.flatnonzero(chosen)
 
 
-def _seen_rows(rows: NDArray, chosen: NDArray) -> NDArray:
-    """Return which points (n_chosen, n_points) the chosen frames of a block show."""
-    return ~np.isnan(rows[chosen, 0])
+def _numbers_shown(rows: NDArray, chosen: NDArray) -> NDArray:
+    """Return in how many of the chosen frames points (n_points,) are seen."""
+    return np.sum(~np.isnan(rows[chosen, 0]), axis=0)
 
 
-def _sees(rows: NDArray, point: int) -> NDArray:
+def _shows(rows: NDArray, point: int) -> NDArray:
     """Return which frames (n_frames,) of a block show a point."""
     return ~np.isnan(rows[:, 0, point])

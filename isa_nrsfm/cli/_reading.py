@@ -14,9 +14,9 @@ from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm._tables.visibility import (
     FEWEST_POINTS,
-    report_frames,
+    FrameReport,
+    centred_frames,
     seen_points,
-    usable_frames,
 )
 from isa_nrsfm.cli._drawing import is_configuration
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
@@ -127,8 +127,9 @@ def take_frames(
     stripped = [name.strip() for name in names]
     tracks = _tracks(args, table, columns, kept)
     tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
-    usable = usable_frames(tracks)
-    reasons = _reasons(tracks, usable, None if failed is None else failed[rows])
+    _, report = centred_frames(tracks)
+    usable = report.usable
+    reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons]
     at_origin = (tracks[usable] == 0).all(axis=2)
     if at_origin.any():
@@ -231,12 +232,9 @@ def _tracks(
 
 
 def _reasons(
-    tracks: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-    failed: NDArray[np.bool_] | None,
+    report: FrameReport, failed: NDArray[np.bool_] | None
 ) -> list[tuple[str, NDArray[np.bool_]]]:
     """Return reasons why frames cannot be fitted, and the frames of each."""
-    report = report_frames(tracks)
     n_seen = report.n_seen
     few = n_seen < FEWEST_POINTS
     in_one_place = report.in_one_place & ~few
@@ -250,7 +248,7 @@ def _reasons(
         *none,
         (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
         ("all points in one place", in_one_place),
-        ("points on one line, others missing", ~usable & ~few & ~in_one_place),
+        ("points on one line, others missing", ~report.usable & ~few & ~in_one_place),
     ]
 
 
