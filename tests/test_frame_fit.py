@@ -12,7 +12,7 @@ from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
-from isa_nrsfm._prepare.robust import distant_points, robust_weights
+from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
 
 
@@ -372,7 +372,7 @@ class TestPosteriorFrames:
         tracks[:, 7] += 2.0
         fitted = frames.posterior(tracks)
         apart = distances(tracks, frames.shapes, *fitted[:3])
-        weights = np.nan_to_num(robust_weights(loss, apart / NOISE))
+        weights = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
         again = fit_posterior(
             tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
         )
