@@ -6,18 +6,6 @@ from isa_nrsfm._compat.lazy import lazy_names
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "AffineNRSfM",
-    "AffineNRSfMCV",
-    "Decomposition",
-    "FastISA",
-    "PooledFastICA",
-    "SmoothedCoefficients",
-    "WithinGroups",
-    "__version__",
-    "association",
-]
-
 if TYPE_CHECKING:
     from isa_nrsfm import (
         analysis as analysis,
@@ -32,14 +20,17 @@ if TYPE_CHECKING:
         plotting as plotting,
         skeletons as skeletons,
     )
-    from isa_nrsfm._estimator import AffineNRSfM
-    from isa_nrsfm._frames.models import Decomposition
-    from isa_nrsfm._selection.estimator import AffineNRSfMCV
-    from isa_nrsfm._transformer import SmoothedCoefficients
-    from isa_nrsfm.analysis import WithinGroups, association
-    from isa_nrsfm.isa import FastISA, PooledFastICA
+    from isa_nrsfm._estimator import AffineNRSfM as AffineNRSfM
+    from isa_nrsfm._frames.models import Decomposition as Decomposition
+    from isa_nrsfm._selection.estimator import AffineNRSfMCV as AffineNRSfMCV
+    from isa_nrsfm._transformer import SmoothedCoefficients as SmoothedCoefficients
+    from isa_nrsfm.analysis import (
+        WithinGroups as WithinGroups,
+        association as association,
+    )
+    from isa_nrsfm.isa import FastISA as FastISA, PooledFastICA as PooledFastICA
 else:
-    __getattr__, __dir__ = lazy_names(
+    __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
             "isa_nrsfm._estimator": ["AffineNRSfM"],

@@ -100,7 +100,7 @@ def test_a_name_is_asked_for_once(monkeypatch):
 
 def test_the_error_of_an_import_comes_through(monkeypatch):
     monkeypatch.delenv("EAGER_IMPORT", raising=False)
-    find, _ = lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
+    find, _, _ = lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
     with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
         find("Absent")
     monkeypatch.setenv("EAGER_IMPORT", "1")

@@ -1,8 +1,7 @@
 """Public names that are imported when they are first used (SPEC 1).
 
-The packages of a folder's public names list them three times: under `TYPE_CHECKING`,
-for type checkers and editors; in ``__all__``; and for `lazy_names`, with the modules
-that define them. `tests/test_conventions.py` holds the three against each other.
+An ``__init__.py`` lists its public names twice: under `TYPE_CHECKING`, for type
+checkers and editors, and for `lazy_names`. `tests/test_conventions.py` compares them.
 
 See https://scientific-python.org/specs/spec-0001/.
 """
@@ -21,28 +20,13 @@ def lazy_names(
     package: str,
     names: Mapping[str, Sequence[str]],
     subpackages: Sequence[str] = (),
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """
-    Return ``__getattr__`` and ``__dir__`` of a package with lazy names.
+    Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
-    Where the environment has a non-empty `EAGER_IMPORT`, all names are imported at
-    once, so that no import error stays hidden.
-
-    Parameters
-    ----------
-    package : str
-        Name of the package, its ``__name__``.
-    names : dict of str to sequence of str
-        For each module that defines public names of the package, these names.
-    subpackages : sequence of str, optional
-        Folders of the package that are imported when they are first used, too.
-
-    Returns
-    -------
-    tuple of callable
-        ``__getattr__`` imports a name and keeps it, so that it is asked for each name
-        once. It raises AttributeError for all others, and lets the error of an import
-        through. ``__dir__`` lists the names whether they are imported or not.
+    `names` maps modules to the public names that they define; `subpackages` are folders
+    that are imported when they are first used. A name is imported once. Errors of
+    imports are raised unchanged, and at once if `EAGER_IMPORT` is set.
     """
     namespace = vars(sys.modules[package])
     modules = {name: module for module in names for name in names[module]}
@@ -65,4 +49,4 @@ def lazy_names(
     if os.environ.get(EAGER):
         for name in (*modules, *subpackages):
             imported(name)
-    return imported, listed
+    return imported, listed, list(modules)

@@ -4,30 +4,20 @@ from typing import TYPE_CHECKING
 
 from isa_nrsfm._compat.lazy import lazy_names
 
-__all__ = [
-    "AlignedFrames",
-    "Association",
-    "BetweenShare",
-    "WithinGroups",
-    "association",
-    "between_share",
-    "predictability",
-]
-
 if TYPE_CHECKING:
-    from isa_nrsfm.analysis._aligned_frames import AlignedFrames
+    from isa_nrsfm.analysis._aligned_frames import AlignedFrames as AlignedFrames
     from isa_nrsfm.analysis._association import (
-        Association,
-        association,
-        predictability,
+        Association as Association,
+        association as association,
+        predictability as predictability,
     )
     from isa_nrsfm.analysis._within_groups import (
-        BetweenShare,
-        WithinGroups,
-        between_share,
+        BetweenShare as BetweenShare,
+        WithinGroups as WithinGroups,
+        between_share as between_share,
     )
 else:
-    __getattr__, __dir__ = lazy_names(
+    __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
             "isa_nrsfm.analysis._aligned_frames": ["AlignedFrames"],

@@ -223,10 +223,12 @@ def block_ksvd(
     residual, settled = np.inf, False
     for n_iter in range(1, max_iter + 1):
         last = settled or n_iter == max_iter
-        code = code_frames(frames, atoms, sparsity, ridge)
-        atoms, *code, residuals = update_atoms(frames, atoms, *code, replace=not last)
+        blocks, active = code_frames(frames, atoms, sparsity, ridge)
+        atoms, blocks, active, residuals = update_atoms(
+            frames, atoms, blocks, active, replace=not last
+        )
         before, residual = residual, float(np.sum(residuals**2)) / energy
         if last:
             break
         settled = abs(before - residual) <= tol * residual
-    return atoms, *code, residual, n_iter
+    return atoms, blocks, active, residual, n_iter

@@ -229,15 +229,17 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         shapes = least_norm_shapes(W, cameras)
         # Accelerated steps are some hundred times as long as the published ones.
         default = 1e-4 if self.accelerated else 1e-6
-        options = {
-            "accelerated": self.accelerated,
-            "max_iter": self.max_iter,
-            "tol": default if self.tol is None else self.tol,
-        }
+        tol = default if self.tol is None else self.tol
         self.n_iter_, converged = 0, True
         for k in range(18):
             shapes, n_iter, settled = nuclear_norm_shapes(
-                W, cameras, 4.0**-k, shapes, **options
+                W,
+                cameras,
+                4.0**-k,
+                shapes,
+                accelerated=self.accelerated,
+                max_iter=self.max_iter,
+                tol=tol,
             )
             self.n_iter_ += n_iter
             converged &= settled

@@ -10,34 +10,27 @@ from typing import TYPE_CHECKING
 
 from isa_nrsfm._compat.lazy import lazy_names
 
-__all__ = [
-    "FramePoses",
-    "PointDistributionModel",
-    "ShapeArrays",
-    "frame_poses",
-    "point_distances",
-    "point_distribution_model",
-    "read_pdm",
-    "shape_arrays",
-    "write_glb",
-    "write_pdm",
-    "write_shapes",
-    "write_viewer",
-]
-
 if TYPE_CHECKING:
-    from isa_nrsfm.export._gltf import write_glb
+    from isa_nrsfm.export._gltf import write_glb as write_glb
     from isa_nrsfm.export._point_distribution import (
-        PointDistributionModel,
-        point_distribution_model,
-        read_pdm,
-        write_pdm,
+        PointDistributionModel as PointDistributionModel,
+        point_distribution_model as point_distribution_model,
+        read_pdm as read_pdm,
+        write_pdm as write_pdm,
     )
-    from isa_nrsfm.export._poses import FramePoses, frame_poses, point_distances
-    from isa_nrsfm.export._shape_arrays import ShapeArrays, shape_arrays, write_shapes
-    from isa_nrsfm.export._viewer import write_viewer
+    from isa_nrsfm.export._poses import (
+        FramePoses as FramePoses,
+        frame_poses as frame_poses,
+        point_distances as point_distances,
+    )
+    from isa_nrsfm.export._shape_arrays import (
+        ShapeArrays as ShapeArrays,
+        shape_arrays as shape_arrays,
+        write_shapes as write_shapes,
+    )
+    from isa_nrsfm.export._viewer import write_viewer as write_viewer
 else:
-    __getattr__, __dir__ = lazy_names(
+    __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
             "isa_nrsfm.export._gltf": ["write_glb"],

@@ -4,42 +4,28 @@ from typing import TYPE_CHECKING
 
 from isa_nrsfm._compat.lazy import lazy_names
 
-__all__ = [
-    "FORMATS",
-    "LandmarkFormat",
-    "LandmarkTable",
-    "Landmarks",
-    "find_format",
-    "from_mediapipe",
-    "from_movement",
-    "landmark_table",
-    "load_model",
-    "open_table",
-    "read_landmarks",
-    "read_table",
-    "save_model",
-    "write_table",
-]
-
 if TYPE_CHECKING:
     from isa_nrsfm.io._formats import (
-        FORMATS,
-        LandmarkFormat,
-        find_format,
-        read_landmarks,
+        FORMATS as FORMATS,
+        LandmarkFormat as LandmarkFormat,
+        find_format as find_format,
+        read_landmarks as read_landmarks,
     )
-    from isa_nrsfm.io._landmarks import Landmarks
-    from isa_nrsfm.io._models import load_model, save_model
-    from isa_nrsfm.io._results import from_mediapipe, from_movement
-    from isa_nrsfm.io._stored_tables import open_table
+    from isa_nrsfm.io._landmarks import Landmarks as Landmarks
+    from isa_nrsfm.io._models import load_model as load_model, save_model as save_model
+    from isa_nrsfm.io._results import (
+        from_mediapipe as from_mediapipe,
+        from_movement as from_movement,
+    )
+    from isa_nrsfm.io._stored_tables import open_table as open_table
     from isa_nrsfm.io._tables import (
-        LandmarkTable,
-        landmark_table,
-        read_table,
-        write_table,
+        LandmarkTable as LandmarkTable,
+        landmark_table as landmark_table,
+        read_table as read_table,
+        write_table as write_table,
     )
 else:
-    __getattr__, __dir__ = lazy_names(
+    __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
             "isa_nrsfm.io._formats": [

@@ -45,7 +45,7 @@ class NamedStrategy(BaseEstimator):
 # Strategies and densities of which parameters and fitted attributes are stored.
 STORED: dict[str, Any] = {
     "NamedStrategy": NamedStrategy,
-    **{name: getattr(isa, name) for name in isa.__all__},
+    **{name: getattr(isa, name) for name in vars(isa)["__all__"]},
 }
 
 
