@@ -8,9 +8,8 @@ from frame_parts import fit_posterior
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation
 
-from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import nearest_calibrated
-from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix

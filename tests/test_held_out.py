@@ -13,8 +13,7 @@ from isa_nrsfm._fitted_model import (
     N_FOLDS,
     held_out_energies,
 )
-from isa_nrsfm._frames.basis_change import FrameMap
-from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm.datasets import make_nonrigid_tracks
 

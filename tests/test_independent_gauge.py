@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import random_rotation
 
-from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._parameters.choices import INDEPENDENCE
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity

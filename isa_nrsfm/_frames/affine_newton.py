@@ -27,13 +27,12 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.point_sums import (
     TWICE,
-    FrameSums,
     affine_cameras,
     seen_changes,
     whitened,
     with_one,
 )
-from isa_nrsfm._frames.search import FramePosterior, FrameProblem, FrameSearch, State
+from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
 from isa_nrsfm._linalg.packed_symmetric import (
     diagonal_of,
     packed_products,
@@ -59,31 +58,10 @@ class AffineSearch(FrameSearch):
     def __init__(self, shapes: NDArray):
         super().__init__(*whitened(np.ascontiguousarray(shapes)))
 
-    def fit(
-        self,
-        products: FrameSums,
-        variance: NDArray,
-        initial: NDArray,
-        max_steps: int,
-        covariances: bool = True,
-        rough: bool = False,
-    ) -> FramePosterior:
-        """Return the minima that frames reach from given coefficients."""
-        problem = self.problem(products, variance)
-        T, _, M, _ = affine_cameras(products, with_one(initial.T))
-        step, _ = solve_positive(*_held(problem, initial.T, T, M))
-        alpha = initial.T + step
-        start = self.evaluate(problem, alpha)
-        alpha, converged = self.descend(problem, start, max_steps - 1)
-        _, _, M, explained = affine_cameras(products, with_one(alpha))
-        rest = products.energy - explained
-        rest += problem.noise * np.einsum("ki,ki->i", alpha, alpha)
-        covariance = None
-        if covariances:
-            covariance = problem.noise * self.evaluate(problem, alpha).inverse()
-        return self.posterior(
-            products, M, alpha, covariance, None, np.maximum(rest, 0.0), converged
-        )
+    def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
+        """Return coefficients (K, n) after a step with the cameras held."""
+        T, _, M, _ = affine_cameras(problem.products, with_one(alpha))
+        return alpha + solve_positive(*_held(problem, alpha, T, M))[0]
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``f(a) - ||W||^2`` and its derivatives at alpha (K, n)."""
@@ -96,6 +74,22 @@ class AffineSearch(FrameSearch):
         shape = len(F), 6, len(noise)
         schur = held - packed_products(FA.reshape(shape), F.reshape(shape))
         return State(position, value, slope, held, schur)
+
+    def solution(
+        self, problem: FrameProblem, position: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
+        products, noise = problem
+        _, _, M, explained = affine_cameras(products, with_one(position))
+        square = noise * np.einsum("ki,ki->i", position, position)
+        return M, position, products.energy - explained + square
+
+    def covariances(
+        self, problem: FrameProblem, position: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Return the covariances of coefficients (K, K, n), and NaN for rotations."""
+        inverse = self.evaluate(problem, position).inverse()
+        return problem.noise * inverse, np.full((3, 3, len(problem.noise)), np.nan)
 
 
 def _held(

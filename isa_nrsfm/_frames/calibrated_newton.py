@@ -31,7 +31,7 @@ from isa_nrsfm._frames.point_sums import (
     seen_changes,
     with_one,
 )
-from isa_nrsfm._frames.search import FramePosterior, FrameProblem, FrameSearch, State
+from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
 from isa_nrsfm._linalg.packed_symmetric import pair_indices, unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
@@ -66,34 +66,6 @@ class CalibratedSearch(FrameSearch):
         turned[0, size <= FLAT * size[0]] = 0.0
         super().__init__(turned, axes.T)
 
-    def fit(
-        self,
-        products: FrameSums,
-        variance: NDArray,
-        initial: NDArray,
-        max_steps: int,
-        covariances: bool = True,
-        rough: bool = False,
-    ) -> FramePosterior:
-        """
-        Return the minima that frames reach from given coefficients.
-
-        The first cameras are near the affine ones of least squares for the shapes with
-        these coefficients. Unless it is rough, the search is repeated from the cameras
-        reversed in depth.
-        """
-        problem = self.problem(products, variance)
-        M = self._first_cameras(problem, np.ascontiguousarray(initial.T))
-        M, converged = self.descend(problem, self.evaluate(problem, M), max_steps)
-        if not rough:
-            M, better, reached = self._better_reversed(problem, M, max_steps)
-            converged[better] = reached[better]
-        found = _posterior(problem, M)
-        spreads = self._covariances(problem, M) if covariances else (None, None)
-        return self.posterior(
-            products, M, found.alpha, *spreads, found.objective, converged
-        )
-
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
     ) -> tuple[NDArray, NDArray]:
@@ -127,6 +99,21 @@ class CalibratedSearch(FrameSearch):
         motion[better] = frames_first(M[:, :, better]) @ self.space
         return motion, better
 
+    def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
+        """
+        Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
+
+        Of two candidates, the nearest camera and that of `_completed`, the one with the
+        lower objective is taken.
+        """
+        M = affine_cameras(problem.products, with_one(alpha))[2]
+        starts = []
+        for rows, scales in nearest_calibrated(frames_first(M)), _completed(M):
+            scales = scales if self.model.scaled else np.ones_like(scales)
+            starts.append(frames_last(scales[:, None, None] * rows))
+        values = [_value(problem, _posterior(problem, each)) for each in starts]
+        return np.where(values[1] < values[0], *starts[::-1])
+
     def moved(self, position: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (p, n)."""
         return self.model.moved(position, step)
@@ -158,18 +145,15 @@ class CalibratedSearch(FrameSearch):
         value = _value(problem, posterior)
         return State(M, value, -gradient, definite, hessian)
 
-    def _coupling(
-        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-    ) -> tuple[NDArray, NDArray]:
-        """Return ``C = <D_c, F_k>`` (K, p, n), and ``Q C``."""
-        T = problem.products.gram.products(posterior.c)
-        F = seen_changes(problem.products.cross, T, M)
-        C = np.einsum("crai,krai->kci", self.model.tangents(M), F)
-        Q = -unpacked(posterior.inverse)[1:, 1:]
-        return C, np.einsum("kli,lci->kci", Q, C)
+    def solution(
+        self, problem: FrameProblem, position: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
+        found = _posterior(problem, position)
+        return position, found.alpha, found.objective
 
-    def _covariances(
-        self, problem: FrameProblem, M: NDArray
+    def covariances(
+        self, problem: FrameProblem, position: NDArray
     ) -> tuple[NDArray, NDArray]:
         """
         Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
@@ -178,7 +162,7 @@ class CalibratedSearch(FrameSearch):
         (Q + Q C^T Y^-1 C Q)``. C is the coupling, and Y the Hessian by the camera with
         the coefficients eliminated.
         """
-        noise = self.misfit * problem.noise
+        M, noise = position, self.misfit * problem.noise
         problem = problem._replace(noise=noise)
         posterior = _posterior(problem, M)
         _, through = self._coupling(problem, M, posterior)
@@ -188,20 +172,23 @@ class CalibratedSearch(FrameSearch):
         covariance = 0.5 * (covariance + covariance.swapaxes(0, 1))
         return noise * covariance, noise * inverse[:3, :3]
 
-    def _first_cameras(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
-        """
-        Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
+    def improved(
+        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
+    ) -> NDArray:
+        """Return the better ones of cameras and minima from reversed ones."""
+        M, better, reached = self._better_reversed(problem, position, n_steps)
+        converged[better] = reached[better]
+        return M
 
-        Of two candidates for each frame, the nearest camera and that of `_completed`,
-        the one with the lower objective is taken.
-        """
-        M = affine_cameras(problem.products, with_one(alpha))[2]
-        starts = []
-        for rows, scales in nearest_calibrated(frames_first(M)), _completed(M):
-            scales = scales if self.model.scaled else np.ones_like(scales)
-            starts.append(frames_last(scales[:, None, None] * rows))
-        values = [_value(problem, _posterior(problem, each)) for each in starts]
-        return np.where(values[1] < values[0], *starts[::-1])
+    def _coupling(
+        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
+    ) -> tuple[NDArray, NDArray]:
+        """Return ``C = <D_c, F_k>`` (K, p, n), and ``Q C``."""
+        T = problem.products.gram.products(posterior.c)
+        F = seen_changes(problem.products.cross, T, M)
+        C = np.einsum("crai,krai->kci", self.model.tangents(M), F)
+        Q = -unpacked(posterior.inverse)[1:, 1:]
+        return C, np.einsum("kli,lci->kci", Q, C)
 
     def _better_reversed(
         self, problem: FrameProblem, M: NDArray, max_steps: int

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import NOT_MEASURED, DepthCertainty, depth_deviations
@@ -54,6 +53,86 @@ class Decomposition(NamedTuple):
     translation: NDArray
     alpha: NDArray
     alpha_std: NDArray
+
+
+class FrameMap(NamedTuple):
+    """
+    Takes cameras and coefficients of frames to other shapes that fit equally well.
+
+    Attributes
+    ----------
+    mixing : ndarray of shape (n_components + 1, n_components + 1)
+        Takes ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale, different for
+        each frame, goes to its camera.
+    space : ndarray of shape (3, 3)
+        Affinity of space, ``new shape = shape @ space.T``.
+    """
+
+    mixing: NDArray
+    space: NDArray
+
+    @classmethod
+    def identity(cls, n_components: int) -> "FrameMap":
+        """Return the map that leaves everything as it is."""
+        return cls(np.eye(n_components + 1), np.eye(3))
+
+    def apply(
+        self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """
+        Return cameras, coefficients and their standard deviations for the new shapes.
+
+        Parameters
+        ----------
+        motion : ndarray of shape (n_frames, 2, 3)
+            Cameras.
+        alpha : ndarray of shape (n_frames, n_components)
+            Coefficients.
+        covariance : ndarray of shape (n_frames, n_components, n_components) or None
+            Their covariances; None where they are not known.
+
+        Returns
+        -------
+        motion : ndarray of shape (n_frames, 2, 3)
+            New cameras.
+        alpha : ndarray of shape (n_frames, n_components)
+            New coefficients.
+        deviation : ndarray of shape (n_frames, n_components)
+            Their standard deviations, to first order. NaN without covariances.
+        """
+        new, deviation, scale = self.coefficients(alpha, covariance)
+        cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
+        return cameras, new, deviation
+
+    def coefficients(
+        self, alpha: NDArray, covariance: NDArray | None
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """
+        Return coefficients, their standard deviations and the scales of the cameras.
+
+        Parameters
+        ----------
+        alpha, covariance
+            As of `apply`.
+
+        Returns
+        -------
+        alpha : ndarray of shape (n_frames, n_components)
+            New coefficients.
+        deviation : ndarray of shape (n_frames, n_components)
+            Their standard deviations, to first order. NaN without covariances.
+        scale : ndarray of shape (n_frames,)
+            Factors of the cameras.
+        """
+        mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
+        scale = mixed[:, 0]
+        new = mixed[:, 1:] / scale[:, None]
+        if covariance is None:
+            return new, np.full_like(new, np.nan), scale
+        # d new / d alpha, times scale
+        slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
+        variance = np.vecdot(slope @ covariance, slope)
+        return new, np.sqrt(variance) / np.abs(scale)[:, None], scale
 
 
 class RigidFrames(NamedTuple):
@@ -110,17 +189,20 @@ class RigidFrames(NamedTuple):
             zero where camera i does not see basis shape k at all; the least squares
             solution of least norm otherwise.
         """
-        n_frames, shape = len(tracks), (len(tracks), len(self.basis))
-        fit = np.empty((n_frames, 2, 3)), np.empty((n_frames, 2)), np.empty(shape)
+        n_frames, n_components = len(tracks), len(self.basis)
+        fit = Decomposition(
+            np.empty((n_frames, 2, 3)),
+            np.empty((n_frames, 2)),
+            np.empty((n_frames, n_components)),
+            np.full((n_frames, n_components), np.nan),
+        )
         seen = seen_points(tracks)
         complete = np.asarray(seen.all(axis=1))
-        parts: list[tuple[Any, Any]] = [(complete, self._separately(tracks[complete]))]
-        for i in np.flatnonzero(~complete):
-            parts.append((i, self._together(tracks[i, seen[i]], seen[i])))
-        for frames, part in parts:
-            for whole, values in zip(fit, part, strict=True):
-                whole[frames] = values
-        return Decomposition(*fit, np.full(shape, np.nan))
+        parts = [(np.array([i]), self._together) for i in np.flatnonzero(~complete)]
+        for frames, fitted in [(complete, self._separately), *parts]:
+            part = fitted(tracks[frames])
+            fit.motion[frames], fit.translation[frames], fit.alpha[frames] = part
+        return fit
 
     def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """
@@ -130,26 +212,6 @@ class RigidFrames(NamedTuple):
         """
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
-        motion, alpha = self.fit_rows(W)
-        return motion, translation, alpha
-
-    def fit_rows(self, W: NDArray) -> tuple[NDArray, NDArray]:
-        """
-        Return cameras and coefficients of complete frames.
-
-        Parameters
-        ----------
-        W : ndarray of shape (2 * n_frames, n_points)
-            Measurement matrix, rows centred. It may also be given by its products with
-            orthonormal directions that span the shapes, if those are given so, too.
-
-        Returns
-        -------
-        motion : ndarray of shape (n_frames, 2, 3)
-            Cameras.
-        alpha : ndarray of shape (n_frames, n_components)
-            Coefficients.
-        """
         motion = self._cameras(W, self.mean_shape)
         n_components, n_points, _ = self.basis.shape
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
@@ -162,32 +224,29 @@ class RigidFrames(NamedTuple):
         energy = np.einsum("ikrd,ikrd->ik", images, images)
         largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
         visible = energy > UNSEEN * largest
-        return motion, np.divide(along, energy, where=visible, out=np.zeros_like(along))
+        alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
+        return motion, translation, alpha
 
     def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
         """Return cameras (n_frames, 2, 3) for W (2 n_frames, J) and a shape (J, 3)."""
         motion = rigid_cameras(W, mean_shape)
         return CAMERAS[self.camera].nearest(motion)
 
-    def _together(
-        self, points: NDArray, seen: NDArray
-    ) -> tuple[NDArray, NDArray, NDArray]:
-        """
-        Return the fit of one frame from its seen points, all coefficients at once.
-
-        The points are (n_seen, 2), and seen (n_points,) says which ones they are.
-        """
-        centre, centroid = points.mean(axis=0), self.mean_shape[seen].mean(axis=0)
+    def _together(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Return the fit of one frame (1, n_points, 2), all coefficients at once."""
+        seen = seen_points(tracks[0])
+        points, mean_shape = tracks[0, seen], self.mean_shape[seen]
+        centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
         W = (points - centre).T
-        motion = self._cameras(W, self.mean_shape[seen] - centroid)
+        motion = self._cameras(W, mean_shape - centroid)
         # Least squares for what the mean shape leaves of the frame
         basis = self.basis[:, seen]
         middles = basis.mean(axis=1)
         images = (basis - middles[:, None]) @ motion[0].T
-        rest = W.T - (self.mean_shape[seen] - centroid) @ motion[0].T
+        rest = W.T - (mean_shape - centroid) @ motion[0].T
         alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
         translation = centre - motion[0] @ (centroid + alpha @ middles)
-        return motion[0], translation, alpha
+        return motion, translation, alpha
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,11 +197,57 @@ class FrameSearch:
         FramePosterior
             The minima, for the original shapes.
         """
+        problem = self.problem(products, variance)
+        start = self.evaluate(problem, self.start(problem, initial.T))
+        position, converged = self.descend(problem, start, max_steps)
+        if not rough:
+            position = self.improved(problem, position, converged, max_steps)
+        M, alpha, objective = self.solution(problem, position)
+        motion, n = frames_first(M), len(objective)
+        spreads = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
+        if covariances:
+            covariance, turns = self.covariances(problem, position)
+            turns = self.space.T @ frames_first(turns) @ self.space
+            spreads = frames_first(covariance), turns
+        return FramePosterior(
+            motion @ self.space,
+            products.positions(motion, alpha.T),
+            alpha.T,
+            *spreads,
+            np.maximum(objective, 0.0),  # less is rounding errors
+            converged,
+        )
+
+    def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
+        """Return frames with noise variances (n,) that are not zero."""
+        noise = np.maximum(variance, LEAST_NOISE * products.energy)
+        return FrameProblem(products, np.where(noise > 0, noise, 1.0))
+
+    def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
+        """Return where the search starts from coefficients (K, n)."""
         raise NotImplementedError
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return the objectives and their derivatives."""
         raise NotImplementedError
+
+    def solution(
+        self, problem: FrameProblem, position: NDArray
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
+        raise NotImplementedError
+
+    def covariances(
+        self, problem: FrameProblem, position: NDArray
+    ) -> tuple[NDArray, NDArray]:
+        """Return covariances of coefficients (K, K, n) and rotations (3, 3, n)."""
+        raise NotImplementedError
+
+    def improved(
+        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
+    ) -> NDArray:
+        """Return positions of lower minima, and set whether they have converged."""
+        return position
 
     def moved(self, position: NDArray, step: NDArray) -> NDArray:
         """Return the positions after steps (n_parameters, n)."""
@@ -210,34 +256,6 @@ class FrameSearch:
     def limited(self, step: NDArray) -> NDArray:
         """Return steps (n_parameters, n), each shortened to the largest allowed one."""
         return step
-
-    def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
-        """Return frames with noise variances (n,) that are not zero."""
-        noise = np.maximum(variance, LEAST_NOISE * products.energy)
-        return FrameProblem(products, np.where(noise > 0, noise, 1.0))
-
-    def posterior(
-        self,
-        products: FrameSums,
-        M: NDArray,
-        alpha: NDArray,
-        covariance: NDArray | None,
-        turns: NDArray | None,
-        objective: NDArray,
-        converged: NDArray,
-    ) -> FramePosterior:
-        """Return fits from cameras (2, 3, n), alpha (K, n), covariances (k, k, n)."""
-        motion, n = frames_first(M), M.shape[-1]
-        position = products.positions(motion, alpha.T)
-        spread, turn = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
-        if covariance is not None:
-            spread = frames_first(covariance)
-        if turns is not None:
-            turn = self.space.T @ frames_first(turns) @ self.space
-        motion = motion @ self.space
-        return FramePosterior(
-            motion, position, alpha.T, spread, turn, objective, converged
-        )
 
     def descend(
         self,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.basis_change import FrameMap
+from isa_nrsfm._frames.models import FrameMap
 from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing

@@ -3,7 +3,7 @@
 With the index last each operation is one pass over long rows of numbers. For matrices
 of one to fifteen rows that is faster than a call of LAPACK for each.
 
-k x k matrices are packed by rows, each row from the diagonal on: xx, xy, xz, yy, yz, zz
+The k (k + 1) / 2 entries of a matrix are packed by rows, each row from the diagonal on: xx, xy, xz, yy, yz, zz
 for the 3x3 matrices of space.
 
 No function divides by zero. A pivot that is not positive is left out: its row and its
@@ -45,7 +45,7 @@ def pair_indices(k: int) -> tuple[NDArray, NDArray]:
 def packed_rows(packed: NDArray) -> list[NDArray]:
     """Return views of the rows of packed matrices, each from the diagonal on."""
     rows, start = [], 0
-    for length in range(_size(packed), 0, -1):
+    for length in range(math.isqrt(2 * len(packed)), 0, -1):
         rows.append(packed[start : start + length])
         start += length
     return rows
@@ -53,7 +53,7 @@ def packed_rows(packed: NDArray) -> list[NDArray]:
 
 def unpacked(packed: NDArray) -> NDArray:
     """Return packed symmetric matrices (n_pairs, ...) as (k, k, ...)."""
-    k = _size(packed)
+    k = math.isqrt(2 * len(packed))
     first, second = pair_indices(k)
     full = np.empty((k, k, *packed.shape[1:]), packed.dtype)
     full[first, second] = full[second, first] = packed
@@ -62,7 +62,7 @@ def unpacked(packed: NDArray) -> NDArray:
 
 def diagonal_of(packed: NDArray) -> NDArray:
     """Return the indices (k,) of the diagonal in packed matrices (n_pairs, ...)."""
-    k = _size(packed)
+    k = math.isqrt(2 * len(packed))
     rows = np.arange(k)
     return rows * (2 * k + 1 - rows) // 2
 
@@ -74,11 +74,6 @@ def packed_products(A: NDArray, B: NDArray) -> NDArray:
     for i, row in enumerate(packed_rows(packed)):
         np.einsum("lmn,mn->ln", A[i:], B[i], out=row)
     return packed
-
-
-def _size(packed: NDArray) -> int:
-    """Return the number of rows of packed matrices."""
-    return (math.isqrt(8 * len(packed) + 1) - 1) // 2
 
 
 def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:

@@ -21,10 +21,9 @@ from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.basis_change import FrameMap
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import DepthCertainty
-from isa_nrsfm._frames.models import PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._tables.layout import LAYOUTS
 from isa_nrsfm.io._packed_values import (
