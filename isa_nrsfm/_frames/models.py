@@ -445,14 +445,13 @@ class PosteriorFrames:
         if len(lost):
             weights[lost] = 1.0
             fit.put(lost, fitted(tracks[lost], starts=self.starts))
-        seen, sizes = seen_points(tracks), robust_sizes(tracks)
+        sizes = robust_sizes(tracks)
         deviation = np.sqrt(self.noise_variance)
         changing = in_lanes(np.flatnonzero(np.isfinite(fit.objective)))
         # Then iteratively reweighted, for the frames whose weights still change
         for _ in range(50):
             part = tracks[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
-            distance = np.where(seen[changing], distance, np.inf)
             new = frame_weights(self.loss, distance, deviation, sizes[changing])
             change = np.abs(new - weights[changing]).max(axis=1)
             unsettled = change > 1e-4

@@ -3,8 +3,8 @@
 With the index last each operation is one pass over long rows of numbers. For matrices
 of one to fifteen rows that is faster than a call of LAPACK for each.
 
-The k (k + 1) / 2 entries of a matrix are packed by rows, each row from the diagonal on: xx, xy, xz, yy, yz, zz
-for the 3x3 matrices of space.
+The k (k + 1) / 2 entries of a matrix are packed by rows, each row from the diagonal on.
+Those of 3x3 matrices of space are xx, xy, xz, yy, yz, zz.
 
 No function divides by zero. A pivot that is not positive is left out: its row and its
 column count as zero, so that results are finite for any matrix.
