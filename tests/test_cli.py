@@ -435,7 +435,7 @@ def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
     assert code == 0
     zeros, few = report_of(tmp_path)["warnings"]
     assert "".join(f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)) == err
-    assert zeros.startswith("2 points in 2 rows are at exactly (0, 0).")
+    assert zeros.startswith("2 point(s) in 2 row(s) are at exactly (0, 0).")
     assert "--zeros-missing" in zeros
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 

@@ -133,10 +133,10 @@ def take_frames(
     left_out += [(reason, rows[which], False) for reason, which in reasons]
     at_origin = (tracks[usable] == 0).all(axis=2)
     if at_origin.any():
+        n_points, n_rows = at_origin.sum(), at_origin.any(axis=1).sum()
         warn_caller(
-            f"{np.count_nonzero(at_origin)} points in "
-            f"{np.count_nonzero(at_origin.any(axis=1))} rows are at exactly (0, 0). If "
-            "these points are missing, use --zeros-missing"
+            f"{n_points} point(s) in {n_rows} row(s) are at exactly (0, 0). If these "
+            "points are missing, use --zeros-missing"
         )
     # A format knows which of its columns are landmarks.
     not_used = {} if failed is not None else _sets_not_used(table, columns)

@@ -34,10 +34,11 @@ _CAMERAS = {
 
 
 class Cells(NamedTuple):
-    """A table: titles of the columns, if they have any, and rows."""
+    """A table: titles of the columns if they have any, rows, and a title."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
+    title: str = ""
 
     def aligned(self) -> list[list[tuple[str, bool]]]:
         """Return the rows, head first, and whether cells are aligned to the right."""
@@ -137,7 +138,8 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
     return [
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}",
         f"held-out error {_percent(quality['held_out_error'])}: the same for points "
-        "predicted from the other points of their frame",
+        "predicted from the other points of their frame. If it is much larger, there "
+        "are too many basis shapes.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in the units of the table)",
     ]
@@ -174,21 +176,26 @@ def write_page(folder: Path, report: dict[str, Any]) -> None:
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{escape(about)}</p>']
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
+    figures = []
     for name, content in report["files"].items():
         if name.endswith(".png"):
             image = base64.b64encode((folder / name).read_bytes()).decode()
             caption = escape(content)
-            parts.append(
+            figures.append(
                 f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
     sections = fit_sections(report)
+    for name in ("Fit", "Cameras"):
+        parts += _section(name, sections.pop(name))
+    parts += figures
+    sections["Table"] = sections.pop("Table")
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
     sections["Files"] = [Cells([], [[*each] for each in report["files"].items()])]
     for name, section in sections.items():
-        parts += [f"<h2>{name}</h2>", *map(_markup, section)]
+        parts += _section(name, section)
     template = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
     page = template.replace("{{title}}", title)
     page = page.replace("{{content}}", "\n".join(parts))
@@ -200,16 +207,22 @@ def _lines(part: str | Cells) -> list[str]:
     if isinstance(part, str):
         return textwrap.wrap(part, 90) if part.endswith(".") else [part]
     rows = part.aligned()
+    title = [part.title] if part.title else []
     widths = [
         max(len(cell) for cell, _ in column) for column in zip(*rows, strict=True)
     ]
-    return [
+    return title + [
         "  ".join(
             cell.rjust(width) if right else cell.ljust(width)
             for (cell, right), width in zip(row, widths, strict=True)
         ).rstrip()
         for row in rows
     ]
+
+
+def _section(name: str, parts: Sequence[str | Cells]) -> list[str]:
+    """Return the HTML of a section."""
+    return [f"<h2>{name}</h2>", *map(_markup, parts)]
 
 
 def _markup(part: str | Cells) -> str:
@@ -224,7 +237,8 @@ def _markup(part: str | Cells) -> str:
             for cell, right in row
         )
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+    title = f"<h3>{escape(part.title)}</h3>" if part.title else ""
+    return f'{title}<div class="wide"><table>{"".join(rows)}</table></div>'
 
 
 def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
@@ -308,7 +322,7 @@ def _label(label: dict[str, Any]) -> list[str | Cells]:
     if "classes" in label:
         title += f" of {len(label['classes'])} classes"
     if label["n_without_label"]:
-        title += f"; without a label and left out: {label['n_without_label']}"
+        title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
     statistic = "eta squared" if label["statistic"] == "eta_squared" else "Spearman"
     rows = [
@@ -317,7 +331,7 @@ def _label(label: dict[str, Any]) -> list[str | Cells]:
             names, label["values"], label["p_values"], strict=True
         )
     ]
-    parts: list[str | Cells] = [title, Cells(["", statistic, "p"], rows)]
+    parts: list[str | Cells] = [Cells(["", statistic, "p"], rows, title)]
     parts.append(f"p-values: permutations of {label['permuted']}")
     means = _class_lines(label, names)
     if means:
@@ -358,10 +372,10 @@ def _groups(groups: dict[str, Any]) -> list[str | Cells]:
             names_of_components(None, len(shares)), shares, strict=True
         )
     ]
-    return [
-        f"{groups['column']}: variance between and within {groups['n_groups']} groups",
-        Cells(["", "between", "within"], rows),
-    ]
+    title = (
+        f"{groups['column']}: variance between and within {groups['n_groups']} groups"
+    )
+    return [Cells(["", "between", "within"], rows, title)]
 
 
 def _time(time: dict[str, Any]) -> list[str | Cells]:
