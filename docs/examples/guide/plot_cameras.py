@@ -73,9 +73,9 @@ for camera, K in [("weak_perspective", 2), ("affine", 2), ("weak_perspective", 1
 # How many basis shapes
 # ---------------------
 #
-# Too few basis shapes are worse for calibrated cameras than for affine ones, which hide
-# what is missing. With enough of them it is the other way round. ``"auto"`` takes as
-# many as the table determines.
+# Too few basis shapes are worse for calibrated cameras than for affine cameras, which
+# absorb the missing ones. With enough basis shapes the opposite holds. ``"auto"`` uses
+# as many as the table determines.
 
 X = tables["weak_perspective"]
 numbers, errors = [1, 2, 3, 4], {"affine": [], "weak_perspective": []}
@@ -109,5 +109,5 @@ off = np.std(image - X[0].reshape(-1, 2)) / auto.scales_[0]
 print(f"image of frame 0: off by {off:.3f} of the size of the object")
 
 # %%
-# No camera tells an object from its mirror image in depth: `AffineNRSfM.mirror` takes
-# the other one. Units and conventions are in :doc:`/conventions`.
+# An object and its mirror image in depth have the same images: `AffineNRSfM.mirror`
+# selects the other one. Units and conventions are in :doc:`/conventions`.

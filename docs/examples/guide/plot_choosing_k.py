@@ -2,12 +2,11 @@
 Choosing the number of basis shapes
 ===================================
 
-More basis shapes always reproject the points better that they were fitted to. They do
-not predict better what they have not seen. `AffineNRSfM.score` measures that: the
-points are divided into five parts, each is predicted from the others, frame by frame,
-and the score is minus the error relative to the energy of the points. `AffineNRSfMCV`
-holds frames out besides, so that shapes are judged on frames that they were not fitted
-to.
+More basis shapes always reduce the reprojection error of the fitted points, but not the
+error of held-out points. `AffineNRSfM.score` measures the latter: the points are divided
+into five parts, and each is predicted from the others, frame by frame. The score is
+minus the error relative to the energy of the points. `AffineNRSfMCV` also holds out
+frames, so shapes are evaluated on frames that they were not fitted to.
 """
 
 import warnings
@@ -55,21 +54,20 @@ by_person = AffineNRSfMCV(range(2, 5), cv=GroupKFold(5))
 print(by_person.fit(tracks.data, groups=person).n_components_)
 
 # %%
-# The search walks a path. Each fit starts from others that are known: from the one with
-# fewer basis shapes and the leading direction of what it leaves, and that of a part of
-# the frames from that of all frames, too. All fits go on until they have converged, and
-# of the starts the one counts that explains best the frames that are fitted. Held-out
-# frames may so offer a start, and no more. On tables whose fits have one minimum the
-# errors are those of `GridSearchCV` within half a percent. Where there are several, as
-# in motion capture that affine cameras do not describe, both searches find this or that
-# one, and errors differ by several percent either way. ``python -m benchmarks.choice``
-# prints costs, choices and differences.
+# The search follows a path. Each fit starts from earlier fits: from the fit with fewer
+# basis shapes and the leading direction of its residual, and for a part of the frames
+# also from the fit of all frames. All fits run to convergence, and the start with the
+# best fit to the training frames is used. Held-out frames can only provide a start. If
+# fits have one minimum, the errors agree with `GridSearchCV` within half a percent. If
+# there are several, as for motion capture with affine cameras, both searches may find
+# different ones, and errors differ by several percent in either direction.
+# ``python -m benchmarks.choice`` prints costs, choices and differences.
 #
 # On the command line
 # -------------------
 #
 # ``isa-nrsfm fit faces.csv -k 1-8 --output out`` does the same, and fits the table with
-# the best. Where that is the largest number tried, it says what the next ones cost.
+# the best. If this is the largest number tried, it prints the cost of the next ones.
 #
 # Without a search
 # ----------------
@@ -85,7 +83,7 @@ print('"auto" finds', len(auto.basis_))
 # Diagnostics
 # -----------
 #
-# `AffineNRSfM.diagnostics` tells how far the table determines a fit, and warns where it
+# `AffineNRSfM.diagnostics` measures how well the table determines a fit, and warns if it
 # does not. With five basis shapes, two directions of the coefficients may well be
 # noise: their reliability, the share of their variance that is neither uncertainty nor
 # noise that the shapes have followed, is zero.
@@ -121,11 +119,11 @@ for name, figures in models[3].diagnostics()._asdict().items():
 # Real faces
 # ----------
 #
-# Faces of many people have more small deformations than a table tells apart. The
+# Faces of many people have more small deformations than a table determines. The
 # held-out error then falls slowly up to a large K (:doc:`/benchmarks/held_out` has the
 # curve of a table of 2500 rendered faces, where it still falls at 13), and there is no
-# true number. Take the K that the purpose wants: few basis shapes that can be named, or
-# as many as a classifier gains from, with the classifier in the loop as in
+# true number. Choose K for the purpose: few basis shapes that can be interpreted, or as
+# many as improve a classifier, cross-validated with the classifier as in
 # :ref:`sphx_glr_gallery_problems_plot_expressions.py`.
 #
 # K needs ``3 K + 4`` points and ``ceil(8 (K + 2) / 5)`` frames at least: a hand of 21

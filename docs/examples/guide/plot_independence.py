@@ -2,14 +2,14 @@
 Which basis shapes: independence
 ================================
 
-The joint fit finds what the basis shapes span. Any mixing of them fits as well: the
-images do not tell a smile and an open mouth from their sum and their difference.
-Something has to choose, the parameter `independence` of `AffineNRSfM`:
+The joint fit finds the span of the basis shapes. Any mixing of them fits equally well:
+images do not distinguish a smile and an open mouth from their sum and difference. The
+parameter `independence` of `AffineNRSfM` selects a mixing:
 
 - ``"shapes"``, the default: the basis shapes are independent over the points. That is
   the assumption of the paper.
-- ``"coefficients"``: the coefficients are independent over the frames. Take it where
-  what the frames show comes and goes by itself.
+- ``"coefficients"``: the coefficients are independent over the frames. Use it if the
+  deformations occur independently of each other.
 - ``None``: the principal axes of the deformation.
 
 The faces are artificial, and their expressions are drawn independently of each other.
@@ -51,5 +51,5 @@ for k, axis in enumerate(axes.flat):
     axis.set(xlabel=f"true {faces.component_names[k]}", ylabel=f"alpha_[:, {found}]")
 
 # %%
-# Of real faces nothing is quite independent. Which choice gives coefficients
-# that say something is told by labels and people: :doc:`/questions`.
+# In real faces nothing is fully independent. Labels and people show which choice gives
+# meaningful coefficients: :doc:`/questions`.

@@ -85,15 +85,14 @@ print(f"{display.off_block_share:.1%} of the squares outside the blocks")
 # Refinement
 # ----------
 #
-# In a subspace, a camera and a coefficient have to be told apart: the motion of
-# subspace k is that of the rigid part times a coefficient, after the right 3x3
+# In a subspace, camera and coefficient have to be separated: the motion of subspace k is that of the rigid part times a coefficient, after the right 3x3
 # transformation. The paper finds it, and refines the basis shapes with the rigid
-# cameras held. But faces that deform do so along their rigid shape, too, so the rigid
-# cameras are not the true ones: the basis shapes are off.
+# cameras held. But faces also deform along their rigid shape, so the rigid cameras are
+# not the true cameras, and the basis shapes are biased.
 #
-# The *joint refinement*, the default, moves cameras, shapes and noise together, with
-# the coefficients integrated out. Its objective never rises. Free cameras can hide part
-# of a deformation; those that are known to be weak-perspective ones cannot.
+# The *joint refinement*, the default, optimises cameras, shapes and noise together, with
+# the coefficients integrated out. Its objective never increases. Affine cameras can
+# absorb part of a deformation; weak-perspective cameras cannot.
 
 cases = {
     "none": {"refinement": None},
@@ -108,5 +107,5 @@ for name, options in cases.items():
     print(f"{name:27} {model.inverse_snr_:10.4%} {error:9.2%}")
 
 # %%
-# The joint fit finds what the basis shapes span. Any mixing of them fits as well, and
-# something has to choose: :doc:`plot_independence`.
+# The joint fit finds the span of the basis shapes. Any mixing of them fits equally well;
+# :doc:`plot_independence` shows how it is selected.

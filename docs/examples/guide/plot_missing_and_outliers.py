@@ -2,8 +2,8 @@
 Missing points and outliers
 ===========================
 
-A point that was not seen is NaN in both columns. No row has to be dropped for it, and
-nothing is filled in before the fit: what is missing has weight zero in it.
+A missing point is NaN in both columns. Rows with missing points are kept, and nothing
+is filled in before the fit: missing points have weight zero.
 """
 
 import matplotlib.pyplot as plt
@@ -34,8 +34,8 @@ for share in shares:
 print(f"noise: {np.sqrt(faces.noise_variance):.2f} pixels in x and in y")
 
 # %%
-# The errors grow because a frame with fewer points says less of its coefficients, and
-# ``alpha_std_`` says how much less. Here are the rows with most and with fewest points:
+# The errors grow because fewer points determine the coefficients less well;
+# ``alpha_std_`` has their uncertainty. These are the rows with most and fewest points:
 
 order = np.argsort(faces.visible.sum(axis=1))
 for i in (order[-1], order[0]):

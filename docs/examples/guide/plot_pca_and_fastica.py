@@ -42,13 +42,13 @@ features = {
 # -------------------------------------------------
 #
 # The share of the variance (R squared, cross-validated) that a linear regression
-# predicts from the coefficients: of yaw and pitch, of which nothing should be there,
-# and of the expressions, of which everything should. Where the first is near zero or
-# below, the coefficients do not tell the pose.
+# predicts from the coefficients: for yaw and pitch it should be zero, for the
+# expressions one. If the first is near zero or below, the coefficients do not predict
+# the pose.
 #
-# A regression may gather what is spread. Of a basis with a meaning, each expression is
-# a coefficient of its own: that is the third number, the largest correlation of an
-# expression with a single coefficient, mean of the expressions.
+# A regression can combine coefficients. In an interpretable basis, each expression is a
+# single coefficient. The third number measures this: the largest correlation of an
+# expression with a single coefficient, averaged over the expressions.
 
 truth = {"yaw and pitch": faces.angles[:, :2], "expressions": faces.strength}
 _, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")

@@ -3,9 +3,9 @@ Units, true proportions and head pose
 =====================================
 
 What are the units of the shapes? Where is the metric size? How is the head turned?
-Images alone do not say how large a thing is, nor, in affine cameras, what its angles
-and proportions in depth are: see :doc:`/conventions`. This page shows what can be had,
-and what for; :doc:`plot_cameras` says which camera to choose.
+Images do not determine the size of an object. With affine cameras, they do not
+determine its angles and proportions in depth either: see :doc:`/conventions`. This page
+shows how to obtain them; :doc:`plot_cameras` compares the cameras.
 
 In short:
 
@@ -53,9 +53,8 @@ for name, each in (("weak perspective", model), ("affine", affine)):
 # Upright and frontal
 # -------------------
 #
-# `canonical_pose` turns a shape by what is known of its points. For
-# :doc:`layouts that are known </skeletons>` the scheme says it; else give pairs of
-# points, such as ``left_right=[(right_eye, left_eye)], up=[(chin, nose)],
+# `canonical_pose` turns a shape upright. For :doc:`known layouts </skeletons>` set the
+# scheme; for others give pairs of points, such as ``left_right=[(right_eye, left_eye)], up=[(chin, nose)],
 # front=[(ears, nose)]``. The mean shape of affine cameras is white; the Euclidean one
 # is a face.
 
@@ -78,9 +77,9 @@ for k, (shape, what) in enumerate(
 # looks up, roll where it is turned clockwise in the image (:doc:`/conventions`). The
 # true angles are those of the true face, upright by the same definition.
 #
-# Bars, which one hardly sees, are two standard deviations. They come from the posterior
+# Bars, which are hardly visible, are two standard deviations. They come from the posterior
 # of the rotation of a frame, for the given shapes; only calibrated cameras have them.
-# :doc:`/questions` says how good all of it is on other faces.
+# :doc:`/questions` has their accuracy on other faces.
 
 poses = frame_poses(model, faces.data)
 turn = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
@@ -111,4 +110,4 @@ print("in truth:         ", true[:5].round(1))
 
 # %%
 # How large each frame is in the image, ``poses.scale``, over the unit in millimetres is
-# pixels a millimetre. It says how far the camera was, if its focal length is known.
+# pixels a millimetre. If the focal length is known, it gives the distance of the camera.

@@ -31,9 +31,9 @@ for axis, i in zip(display.axes_, shown, strict=True):
 
 # %%
 # The order of the joints is that of Human3.6M, a layout of `isa_nrsfm.skeletons`. It
-# tells what joins them, which side is left, and which of two mirror images is the right
-# one: noses are in front. `canonical_pose` turns the mean body upright. Which rotation
-# goes with a deformation no image tells, so each frame is turned onto the truth.
+# defines the edges, left and right, and the correct mirror image: noses are in front.
+# `canonical_pose` turns the mean body upright. Images do not determine the rotation
+# that accompanies a deformation, so each frame is rotated onto the truth.
 
 pose = canonical_pose(model.mean_shape_, scheme="h36m-17")
 found = model.reconstruct(bodies.data) @ pose.rotation.T
@@ -52,8 +52,8 @@ for axis, i in zip(display.axes_, shown, strict=True):
     axis.set_title(f"{bodies.labels[i]}, from the side", fontsize="small")
 
 # %%
-# Rings are the truth, lines are what was found. The error of all frames, after the best
-# rotation and scale of each, beside that of a body that stands still:
+# Rings are the truth, lines the estimate. The error of all frames, after the best
+# rotation and scale of each, compared with the error of a rigid body:
 
 still = np.broadcast_to(model.mean_shape_, found.shape)
 for name, shapes in (("found", found), ("standing still", still)):
@@ -61,8 +61,8 @@ for name, shapes in (("found", found), ("standing still", still)):
     print(f"{name:15} {error:.1%} of the size of the body")
 
 # %%
-# What the bodies do, in coefficients that do not depend on the camera: each person
-# takes 200 frames, and the colours are what they do.
+# The actions of the bodies, in coefficients that do not depend on the camera. Each
+# person has 200 frames; colours are actions.
 
 _, axis = plt.subplots(figsize=(8, 2.8), layout="constrained")
 for name in np.unique(bodies.labels):

@@ -37,7 +37,7 @@ for axis, i in zip(display.axes_, shown, strict=True):
     axis.set_title(labels[i])
 
 # %%
-# The whole pipeline is searched: the shapes are fitted inside of each fold, so that the
+# The whole pipeline is cross-validated: the shapes are fitted within each fold, so the
 # accuracy is that for new rows.
 
 pipeline = make_pipeline(
@@ -71,8 +71,7 @@ display = ConfusionMatrixDisplay.from_predictions(
 display.figure_.set_layout_engine("constrained")
 
 # %%
-# What tells the expressions apart are coefficients, and each is a basis shape that can
-# be looked at. Eta squared is the share of the variance of a coefficient that lies
+# Each coefficient belongs to a basis shape that can be inspected. Eta squared is the share of the variance of a coefficient that lies
 # between the expressions. These are the two with the largest, and their basis shapes.
 
 model = search.best_estimator_[0]

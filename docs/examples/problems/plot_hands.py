@@ -31,7 +31,7 @@ for axis, i in zip(display.axes_, shown, strict=True):
     axis.set_title(f"{hands.labels[i]}, person {hands.groups[i]}", fontsize="small")
 
 # %%
-# That these are hands is told by the number and the order of the points
+# The number and the order of the points identify hands
 # (`isa_nrsfm.skeletons.find_skeleton`). The basis shapes, turned upright:
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)

@@ -1,11 +1,11 @@
 """
-What a coefficient says: gestures and people
-============================================
+Relate coefficients to gestures and people
+==========================================
 
 Several people open a hand, close it and point. The coefficients of a fit change from
 gesture to gesture, and from person to person: hands have fingers of different lengths.
-Which coefficient says what? `isa_nrsfm.analysis` tells it in numbers.
-:doc:`/questions` says what they mean.
+Which coefficient describes what? `isa_nrsfm.analysis` measures it, and
+:doc:`/questions` explains the measures.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -38,8 +38,8 @@ for label, y, column in (("gesture", hands.labels, 0), ("person", people, 1)):
 #
 # Eta squared is the share of the variance of a coefficient that lies between the
 # gestures. For the p-values labels are permuted among people, and in blocks of frames
-# within them: the frames of a video are alike. `between_share` says the same of people:
-# about zero where they do not differ.
+# within them, because the frames of a video are similar. `between_share` is the share of
+# the variance between people: about zero if they do not differ.
 
 found = association(model.alpha_, hands.labels, people, random_state=0)
 share = between_share(model.alpha_, people)
@@ -49,9 +49,9 @@ for k in range(5):
     print(f"{k + 1:5}   {gesture:16} {share.between[k]:.2f}")
 
 # %%
-# Small p-values alone say little: with many frames, small effects are certain, too. The
-# sizes tell that the first two are gestures, and the others mostly people. So they
-# look:
+# Small p-values alone are not informative: with many frames, small effects are
+# significant. The effect sizes show that the first two coefficients describe gestures,
+# and the others mostly people. Their basis shapes:
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)
 
@@ -59,11 +59,11 @@ BasisShapeDisplay.from_estimator(model, n_columns=3)
 # All coefficients together
 # -------------------------
 #
-# How well do they tell the gestures of people who were not trained on? As many
-# components of PCA of the aligned frames see the same table. Relative to the mean of
-# their person, coefficients have lost what the person looks like. Three gestures are
-# easily told, by all of them; of seven expressions of faces the first two tell more
-# than PCA does (:doc:`/questions`).
+# How well do they predict the gestures of new people? The baseline are as many
+# components of PCA of the aligned frames. Coefficients relative to the mean of their
+# person do not contain the appearance of the person. Three gestures are easy to
+# predict for all of them. For seven expressions of faces, both kinds of coefficients
+# are better than PCA (:doc:`/questions`).
 
 features = {
     "alpha": model.alpha_,

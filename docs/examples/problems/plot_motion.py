@@ -1,10 +1,10 @@
 """
-A motion in time: smooth what was seen badly
-============================================
+Smooth a motion over time
+=========================
 
-In a video neighbouring frames are alike. The fit does not use it: it takes frames in
-any order. `AffineNRSfM.smooth` is a step after it, for coefficients of frames in order.
-A frame in which few points were seen then takes from its neighbours what it lacks.
+Neighbouring frames of a video are similar. The fit does not use this: frames may be in
+any order. `AffineNRSfM.smooth` uses it after the fit, for frames in a known order. A
+frame with few visible points then profits from its neighbours.
 
 A person walks, reaches and squats. The tracker is noisy, misses four points in ten, and
 sees nothing for more than a second.
@@ -40,15 +40,15 @@ for left, right in axes:
     right.set_ylim(left.get_ylim())
 
 # %%
-# Bands are one standard deviation. Where nothing was seen they open: nobody knows what
-# happened there. How long a motion is remembered is estimated from the table.
+# Bands are one standard deviation. They widen where nothing was seen. The memory of the
+# motion is estimated from the table.
 
 print("seconds until a motion is forgotten:", smooth.time_scales.round(1))
 
 # %%
-# Is it nearer to the truth? Errors of the 3D shapes of the frames that were seen, after
-# the best rotation and scale of each. What coefficients of frames without noise and
-# holes reach with the same basis shapes is the most that any smoothing can give.
+# Does smoothing reduce the error? These are the errors of the 3D shapes of the visible
+# frames, after the best rotation and scale of each. Coefficients of complete frames
+# without noise, with the same basis shapes, give the lower bound for any smoothing.
 
 clean = model.transform(body.clean.reshape(len(X), -1))
 for name, alpha in {
@@ -61,7 +61,7 @@ for name, alpha in {
     print(f"{name:24} {error:.1%} of the size of the body")
 
 # %%
-# Photos in no order have no dynamics. That is found, too, and nothing changes.
+# Photos in random order have no dynamics. The method detects this, and nothing changes.
 
 order = np.random.RandomState(0).permutation(np.flatnonzero(seen))
 shuffled = model.smooth(X[order])

@@ -34,8 +34,8 @@ model = AffineNRSfM(4, random_state=0).fit(X)
 completed = np.where(np.isnan(X), model.reproject(X), X)
 
 # %%
-# Against it another filling: the mean shape of the model in the affine camera that fits
-# the points of the frame best.
+# The baseline for the completion: the mean shape of the model in the affine camera that
+# fits the points of the frame best.
 
 mean_shape = np.c_[model.mean_shape_, np.ones(68)]
 rigid = np.empty_like(faces.tracks)
@@ -54,10 +54,9 @@ for name, found in {"AffineNRSfM": completed, "mean shape": rigid}.items():
 # How sure is it?
 # ---------------
 #
-# With only the mouth hidden the chin still tells how far it is open. With the jaw
-# hidden as well little does: the coefficient goes towards its mean, zero, and its
-# standard deviation towards that over all frames, one. So `alpha_std_` is the thing to
-# look at before a filled point is believed.
+# If only the mouth is hidden, the chin still shows how far it is open. If the jaw is
+# hidden as well, the coefficient tends to its mean, zero, and its standard deviation to
+# one, that over all frames. Check `alpha_std_` before you rely on a completed point.
 
 mouth = np.abs(np.corrcoef(faces.alpha[:, 0], model.alpha_.T)[0, 1:]).argmax()
 print(f"deviation of the coefficient of {faces.component_names[0]!r}")

@@ -39,8 +39,8 @@ print("mean", pdm.mean.shape, "modes", pdm.modes.shape)
 print("standard deviations", np.sqrt(pdm.eigenvalues).round(3))
 
 # %%
-# Images do not tell the unit of length. One known distance does: the outer corners of
-# the eyes, in millimetres.
+# Images do not determine the unit of length. One known distance does: that of the outer
+# corners of the eyes, in millimetres.
 
 known = np.linalg.norm(faces.neutral_shape[36] - faces.neutral_shape[45])
 pdm = pdm.scaled(known / np.linalg.norm(pdm.mean[36] - pdm.mean[45]))

@@ -27,16 +27,16 @@ tracks = np.concatenate([first.tracks, again])
 X = tracks.reshape(len(tracks), -1)
 
 # %%
-# Coefficients of unit variance count alike in the distance, but one that the points of
-# a frame hardly determine should count less: `alpha_std_` tells, and dividing by the
-# mean deviation makes distances that count what is known.
+# Coefficients of unit variance have equal weight in the distance, but a coefficient that
+# the points of a frame hardly determine should have less weight. Division by the mean of
+# `alpha_std_` achieves this.
 
 model = AffineNRSfM(K, random_state=0).fit(X)
 alpha = model.alpha_ / np.sqrt(np.mean(model.alpha_std_**2, axis=0))
 
 # %%
-# Against it the distance of the landmarks themselves, frames aligned by the best
-# similarity transform of the image (complex numbers make that one product).
+# The baseline is the distance of the landmarks, with frames aligned by the best
+# similarity transform of the image (a single product of complex numbers).
 
 z = tracks @ [1, 1j]
 z = z - z.mean(axis=1, keepdims=True)
@@ -52,8 +52,8 @@ for name, values in likeness.items():
     print(f"    and among the nearest five in {five:.0%}")
 
 # %%
-# Faces near rest are all alike, more alike than the noise tells apart. So the nearest
-# face need not be the same one; it should look the same from the front.
+# Faces near rest are similar; their differences are below the noise. The nearest face
+# need not be the same one, but it should look the same from the front.
 
 strong = np.argsort(first.strength[:, :3].max(axis=1))[-4:]
 nearest = {name: n_faces + values.argmax(axis=1) for name, values in likeness.items()}
