@@ -84,31 +84,13 @@ def smoothed_posterior(
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return the posterior of the coefficients, given all frames of their sequences.
+    Return posterior means and covariances, given all frames of their sequences.
 
-    Parameters
-    ----------
-    mean : ndarray of shape (n_frames, K)
-        Posterior means of the frames by themselves, with the prior N(0, I). NaN for
-        frames without a fit.
-    covariance : ndarray of shape (n_frames, K, K)
-        Posterior covariances.
-    time, groups
-        As in `checked_times` and `group_numbers`.
-    max_gap : int
-        As in `sequences_of`.
-    max_iter, tol
-        As in `estimated_dynamics`.
-
-    Returns
-    -------
-    mean : ndarray of shape (n_frames, K)
-        Posterior means. Those that came, if the frames show no dynamics.
-    covariance : ndarray of shape (n_frames, K, K)
-        Posterior covariances.
-    time_scales : ndarray of shape (K,) or (0,)
-        ``-1 / log |l|`` of the eigenvalues l of the transition, in units of time, the
-        longest first; infinite where |l| is one or more. Empty without dynamics.
+    Means (n_frames, K), NaN for frames without a fit, and covariances (n_frames, K, K)
+    are those of the frames by themselves, with the prior N(0, I). They are returned as
+    they came if the frames show no dynamics. The time scales (K,) or (0,) are ``-1 /
+    log |l|`` of the eigenvalues l of the transition, the longest first, infinite where
+    |l| >= 1.
     """
     times, numbers = checked_times(time, len(mean)), group_numbers(groups, len(mean))
     sequences, unit = sequences_of(times, numbers, max_gap)
@@ -140,29 +122,11 @@ def sequences_of(
     time: NDArray, groups: NDArray | None, max_gap: int
 ) -> tuple[list[tuple[NDArray, NDArray]], float]:
     """
-    Return the sequences of a table.
+    Return the rows and steps of each sequence, and the time of a step (the median).
 
-    Parameters
-    ----------
-    time : ndarray of shape (n_rows,)
-        Times of the rows. Within a group they rise from row to row.
-    groups : ndarray of int, shape (n_rows,), or None
-        Numbers of the groups; None for one. No sequence goes from one to another.
-    max_gap : int
-        After a gap of more steps a new sequence begins.
-
-    Returns
-    -------
-    sequences : list of (ndarray of int, ndarray of int), shape (n,) each
-        Numbers of the rows of each sequence, in order of time, and the step of time of
-        each row, from zero. Steps without a row are gaps.
-    unit : float
-        The time of a step: the median time between rows.
-
-    Raises
-    ------
-    ValueError
-        If times do not rise, or no group has two rows.
+    Times (n_rows,) rise within each of the groups (n_rows,), which are numbered, or
+    None for one. A gap of more than max_gap steps begins a new sequence. Steps count
+    from zero. Raises ValueError if times do not rise, or if no group has two rows.
     """
     if groups is None:
         groups = np.zeros(len(time), dtype=int)
@@ -244,23 +208,8 @@ def estimated_dynamics(
     """
     Estimate the autoregression of sequences by expectation maximisation.
 
-    Parameters
-    ----------
-    sequences : sequence of Observations
-        Sequences that follow the same autoregression, of states (x_t, u) with
-        intercepts.
-    max_iter : int
-        Largest number of iterations.
-    tol : float
-        The iteration ends when no posterior mean changes by more than this.
-    intercepts : bool
-        Whether the states of the sequences are (x_t, u).
-
-    Returns
-    -------
-    Dynamics or None
-        The autoregression of the states. None if the sequences show no dynamics
-        (`_shrunk_regression`).
+    With intercepts the states of the sequences are (x_t, u). The iteration ends when no
+    posterior mean changes by more than tol. Returns None if there are no dynamics.
     """
     K = sequences[0].information.shape[1] // (1 + intercepts)
     options = sequences, max_iter, tol, intercepts

@@ -70,23 +70,9 @@ class CalibratedSearch(FrameSearch):
         self, products: FrameSums, noise: float, motion: NDArray
     ) -> tuple[NDArray, NDArray]:
         """
-        Search from the cameras reversed in depth, too, and return the better cameras.
+        Return the better ones of cameras (n, 2, 3) and those reversed in depth.
 
-        Parameters
-        ----------
-        products : FrameSums
-            Sums of the frames for the shapes in `shared`.
-        noise : float
-            Noise variance.
-        motion : ndarray of shape (n_frames, 2, 3)
-            Cameras that see the shapes as they were given.
-
-        Returns
-        -------
-        motion : ndarray of shape (n_frames, 2, 3)
-            The better cameras.
-        better : ndarray of bool, shape (n_frames,)
-            Which of them are new.
+        Both are searched from. Also returned is which of them are new (n,).
         """
         M = frames_last(motion @ self.space.T)
         problem = self.problem(products, np.full(len(motion), noise))

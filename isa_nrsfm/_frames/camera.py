@@ -10,39 +10,15 @@ DEGENERATE_MEAN = 0.2
 
 def rigid_cameras(W: NDArray, mean_shape: NDArray) -> NDArray:
     """
-    Return for each frame the affine camera that best sees the mean shape.
+    Return affine cameras (n, 2, 3) of least squares for W (2 n, J) and a shape (J, 3).
 
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix, rows centred.
-    mean_shape : ndarray of shape (n_points, 3)
-        Centred.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2, 3)
-        Cameras M_i that minimise ``||W_i - M_i B_0||_F``; those of least norm where
-        the mean shape is flat.
+    They are those of least norm where the mean shape is flat.
     """
     return (W @ np.linalg.pinv(mean_shape, rcond=1e-10).T).reshape(-1, 2, 3)
 
 
 def mean_view(motion: NDArray) -> NDArray | None:
-    """
-    Return the mean camera, or None where the cameras have no common view.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    ndarray of shape (2, 3) or None
-        The mean, unless its smaller singular value is below 0.2 of the root mean
-        square of a camera's row.
-    """
+    """Return the mean (2, 3) of cameras (n, 2, 3); None if they have no common view."""
     mean = motion.mean(axis=0)
     smaller = np.linalg.svd(mean, compute_uv=False)[1]
     root_mean_square = np.sqrt(np.mean(np.sum(motion**2, axis=(1, 2))) / 2)
@@ -51,21 +27,11 @@ def mean_view(motion: NDArray) -> NDArray | None:
 
 def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
     """
-    Return a camera that sees shapes as the table shows them.
+    Return a camera (2, 3) that sees shapes as the table shows them.
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras in the canonical space, each divided by the size of its frame.
-    sizes : ndarray of shape (n_frames,)
-        Sizes of the frames.
-
-    Returns
-    -------
-    ndarray of shape (2, 3)
-        The mean camera times the root mean square size of the frames. If the cameras
-        have no common view, the view along the third axis of the canonical space takes
-        its place, each axis scaled by its root mean square length in the cameras.
+    It is the mean of the cameras (n, 2, 3), divided by the sizes (n,) of their frames,
+    times the root mean square size. If they have no common view, it is the view along
+    the third axis, each axis scaled by its root mean square length in the cameras.
     """
     camera = mean_view(motion)
     if camera is None:

@@ -177,19 +177,10 @@ def turning(M: NDArray) -> NDArray:
 
 def rotated(M: NDArray, turns: NDArray) -> NDArray:
     """
-    Return cameras times rotations, ``M exp(hat(w))``.
+    Return cameras (2, 3, n) times rotations by vectors w (3, n), ``M exp(hat(w))``.
 
-    Parameters
-    ----------
-    M : ndarray of shape (2, 3, n_frames)
-        M.
-    turns : ndarray of shape (3, n_frames)
-        Rotation vectors w, in radians.
-
-    Returns
-    -------
-    ndarray of shape (2, 3, n_frames)
-        Rows ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2``, t = |w|.
+    Rows are ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2`` with t =
+    |w|.
     """
     angle = np.sqrt(np.einsum("an,an->n", turns, turns))
     along = np.einsum("ran,an->rn", M, turns)[:, None]
@@ -201,40 +192,16 @@ def rotated(M: NDArray, turns: NDArray) -> NDArray:
 
 
 def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return the orthonormal rows nearest to cameras, and their scales.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    rows : ndarray of shape (n_frames, 2, 3)
-        Their polar factors.
-    scales : ndarray of shape (n_frames,)
-        Means of their singular values.
-    """
+    """Return the orthonormal rows (n, 2, 3) nearest to cameras, and scales (n,)."""
     rows, values, _ = polar(motion)
     return rows, values.mean(axis=1)
 
 
 def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return rotations (n_frames, 3, 3) and scales of calibrated cameras.
+    Return rotations (n, 3, 3) and scales (n,) of calibrated cameras (n, 2, 3).
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Scaled orthonormal rows; NaN where a frame has no camera.
-
-    Returns
-    -------
-    rotations : ndarray of shape (n_frames, 3, 3)
-        Rotations of determinant one; the first two rows are those of the cameras.
-    scales : ndarray of shape (n_frames,)
-        Their scales.
+    NaN where a frame has no camera.
     """
     dtype = motion.dtype
     motion = motion.astype(np.float64)  # squares may leave the range of float32

@@ -87,24 +87,11 @@ def coefficient_posterior(
     refined: bool = False,
 ) -> CoefficientPosterior:
     """
-    Return the posterior of the coefficients of frames.
+    Return the posterior of the coefficients of frames for cameras M (2, 3, n).
 
-    Parameters
-    ----------
-    products : FrameSums
-        Sums of the frames for the shapes.
-    M : ndarray of shape (2, 3, n_frames)
-        Cameras.
-    noise : float or ndarray of shape (n_frames,)
-        s2.
-    refined : bool, default=False
-        Whether to make one step of iterative refinement. Without it rounding errors
-        would count where they are divided by a tiny noise variance.
-
-    Returns
-    -------
-    CoefficientPosterior
-        The posterior.
+    The noise variances are one number or (n,). With refined, a step of iterative
+    refinement keeps rounding errors small where they are divided by a tiny noise
+    variance.
     """
     H = products.gram.energies(camera_gram(M))
     seen = np.einsum("kari,rai->ki", products.cross, M)

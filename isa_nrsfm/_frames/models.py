@@ -80,25 +80,10 @@ class FrameMap(NamedTuple):
         self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
         """
-        Return cameras, coefficients and their standard deviations for the new shapes.
+        Return cameras, coefficients and standard deviations for the new shapes.
 
-        Parameters
-        ----------
-        motion : ndarray of shape (n_frames, 2, 3)
-            Cameras.
-        alpha : ndarray of shape (n_frames, n_components)
-            Coefficients.
-        covariance : ndarray of shape (n_frames, n_components, n_components) or None
-            Their covariances; None where they are not known.
-
-        Returns
-        -------
-        motion : ndarray of shape (n_frames, 2, 3)
-            New cameras.
-        alpha : ndarray of shape (n_frames, n_components)
-            New coefficients.
-        deviation : ndarray of shape (n_frames, n_components)
-            Their standard deviations, to first order. NaN without covariances.
+        The arrays are motion (n, 2, 3), alpha (n, K), covariance (n, K, K) or None.
+        Standard deviations (n, K) are to first order, NaN without covariances.
         """
         new, deviation, scale = self.coefficients(alpha, covariance)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
@@ -107,23 +92,7 @@ class FrameMap(NamedTuple):
     def coefficients(
         self, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """
-        Return coefficients, their standard deviations and the scales of the cameras.
-
-        Parameters
-        ----------
-        alpha, covariance
-            As of `apply`.
-
-        Returns
-        -------
-        alpha : ndarray of shape (n_frames, n_components)
-            New coefficients.
-        deviation : ndarray of shape (n_frames, n_components)
-            Their standard deviations, to first order. NaN without covariances.
-        scale : ndarray of shape (n_frames,)
-            Factors of the cameras.
-        """
+        """Return coefficients, standard deviations and scales (n,) of cameras."""
         mixed = self.mixing[:, 0] + alpha @ self.mixing[:, 1:].T
         scale = mixed[:, 0]
         new = mixed[:, 1:] / scale[:, None]
@@ -173,21 +142,10 @@ class RigidFrames(NamedTuple):
         """
         Return the camera of the rigid fit and the coefficients of least squares.
 
-        Parameters
-        ----------
-        tracks : ndarray of shape (n_frames, n_points, 2)
-            Tracks, in any place; NaN where a point is missing.
-        sizes : ndarray of shape (n_frames,)
-            Not used: the fit does not depend on the unit of a frame.
-        deviations : bool, default=True
-            Not used: there are none.
-
-        Returns
-        -------
-        Decomposition
-            ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or
-            zero where camera i does not see basis shape k at all; the least squares
-            solution of least norm otherwise.
+        ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or zero
+        where camera i does not see basis shape k at all. Otherwise the solution of
+        least norm. The other parameters are those of `PosteriorFrames.fit` and do not
+        matter.
         """
         n_frames, n_components = len(tracks), len(self.basis)
         fit = Decomposition(
@@ -205,11 +163,7 @@ class RigidFrames(NamedTuple):
         return fit
 
     def _separately(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """
-        Return the fit of complete frames, one coefficient at a time.
-
-        The results are motion (n, 2, 3), translation (n, 2) and alpha (n, K).
-        """
+        """Return motion, translation and alpha of complete frames (n, n_points, 2)."""
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
         motion = self._cameras(W, self.mean_shape)
@@ -297,20 +251,10 @@ class PosteriorFrames:
 
     def of_points(self, kept: NDArray) -> "PosteriorFrames":
         """
-        Return the model of frames that have only some of the points.
+        Return the model of frames that have only some of the points (n_points,).
 
         Complete frames of these points are fitted faster than frames of which the
-        others are missing, with the same cameras and coefficients.
-
-        Parameters
-        ----------
-        kept : ndarray of bool, shape (n_points,)
-            Which points.
-
-        Returns
-        -------
-        PosteriorFrames
-            The model. Its positions are images of the centroid of these points.
+        others are missing. Positions are images of the centroid of these points.
         """
         shapes = self.shapes[:, :, kept]
         return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
@@ -319,42 +263,16 @@ class PosteriorFrames:
         self, tracks: NDArray, sizes: NDArray, deviations: bool = True
     ) -> Decomposition:
         """
-        Return the most probable camera, position and coefficients.
+        Return the fit of tracks (n, n_points, 2), NaN where a point is missing.
 
-        Parameters
-        ----------
-        tracks : ndarray of shape (n_frames, n_points, 2)
-            Tracks, in any place; NaN where a point is missing.
-        sizes : ndarray of shape (n_frames,)
-            Sizes of the frames.
-        deviations : bool, default=True
-            Whether standard deviations are wanted. They are NaN otherwise.
-
-        Returns
-        -------
-        Decomposition
-            That of `fit_tracks`, in the gauge. With a robust loss the weights are
-            those of the residuals of the fit.
+        The sizes of the frames are (n,). Without deviations standard deviations are
+        NaN. With a robust loss the weights are those of the residuals of the fit.
         """
         unit = tracks / sizes[:, None, None]
         return self.shown(self.posterior(unit, covariances=deviations), sizes)
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
-        """
-        Take a fit of frames of size one to the units of the table and to the gauge.
-
-        Parameters
-        ----------
-        posterior : FramePosterior
-            The fit.
-        sizes : ndarray of shape (n_frames,)
-            Sizes of the frames.
-
-        Returns
-        -------
-        Decomposition
-            The same fit.
-        """
+        """Return a fit of frames of size one in units of the table and the gauge."""
         covariance = posterior.covariance
         motion, alpha, deviation = self.gauge.apply(
             posterior.motion,
@@ -368,36 +286,18 @@ class PosteriorFrames:
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """
-        Return the fit of prepared frames, before the gauge.
+        Return the fit of prepared frames of size one, before the gauge.
 
-        Parameters
-        ----------
-        block : FrameTracks
-            Frames of size one, by points or directions as the shapes are. Their weights
-            are zero or one.
-
-        Returns
-        -------
-        FramePosterior
-            The fit, that of `posterior`.
+        They are given by points or directions, as the shapes are. Weights are zero or
+        one.
         """
         return fit_frames(block, self._search, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """
-        Compute the standard deviations of the depths of the points of frames.
+        Compute standard deviations (n, n_points) of the depths of points.
 
-        Parameters
-        ----------
-        tracks : ndarray of shape (n_frames, n_points, 2)
-            Tracks, in any place; NaN where a point is missing.
-        sizes : ndarray of shape (n_frames,)
-            Sizes of the frames.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_points)
-            In the units of the tracks. Only for calibrated cameras.
+        Tracks and sizes are those of `fit`. Only for calibrated cameras.
         """
         found = self.posterior(tracks / sizes[:, None, None], covariances=False)
         return sizes[:, None] * depth_deviations(
@@ -412,20 +312,10 @@ class PosteriorFrames:
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
         """
-        Return the fit of frames, before the gauge.
+        Return the fit of tracks of frames of size one, before the gauge.
 
-        Parameters
-        ----------
-        tracks : ndarray of shape (n_frames, n_points, 2)
-            Tracks of frames of size one.
-        covariances : bool, default=True
-            Whether covariances are wanted.
-
-        Returns
-        -------
-        FramePosterior
-            The fit. With a robust loss the weights are those of the residuals, as far
-            as the points that have weights determine a camera.
+        With a robust loss the weights are those of the residuals, as far as the points
+        that have weights determine a camera.
         """
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)

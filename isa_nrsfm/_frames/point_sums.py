@@ -161,19 +161,9 @@ class FrameSums(NamedTuple):
 
     def positions(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """
-        Return where frames show the origin of the shapes, by least squares.
+        Return where frames show the origin of the shapes (n, 2), by least squares.
 
-        Parameters
-        ----------
-        motion : ndarray of shape (n_frames, 2, 3)
-            Cameras.
-        alpha : ndarray of shape (n_frames, n_components)
-            Coefficients.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, 2)
-            ``mean_i - M_i sum_k c_ik mean_ik`` with ``c = (1, alpha)``.
+        It is ``mean_i - M_i sum_k c_ik mean_ik`` for motion (n, 2, 3) and alpha (n, K).
         """
         middle = np.einsum("kai,ki->ai", self.shape_centroid, with_one(alpha.T))
         return (self.centroid - np.einsum("ira,ai->ri", motion, middle)).T
@@ -224,18 +214,8 @@ def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks
     """
     Return tracks with the frame index last, centred over the points of each frame.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks, centred or not. Points of weight zero may have any coordinates, also
-        NaN.
-    weights : ndarray of shape (n_frames, n_points), optional
-        Not negative, zero for points that are missing; by default all are 1.
-
-    Returns
-    -------
-    FrameTracks
-        The tracks.
+    Tracks are (n_frames, n_points, 2). Weights (n_frames, n_points) are non-negative,
+    by default 1. Points of weight zero may have any coordinates, also NaN.
     """
     n_frames, n_points, _ = tracks.shape
     centred = np.array(tracks.transpose(1, 2, 0), dtype=np.float64, order="C")
@@ -306,21 +286,7 @@ class ShapeProducts:
 
 
 def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
-    """
-    Return the sums over the points of frames.
-
-    Parameters
-    ----------
-    tracks : FrameTracks
-        The frames.
-    shapes : ShapeProducts
-        Mean shape and basis shapes.
-
-    Returns
-    -------
-    FrameSums
-        With one Gram matrix for all frames where all weights are 1.
-    """
+    """Return the sums over the points of frames; complete ones share a Gram matrix."""
     weighted, W, centroid, weight, energy = tracks
     n_shapes, _, n_points = shapes.shapes.shape
     rows = shapes.rows
@@ -347,23 +313,11 @@ def _pair_products(rows: NDArray) -> NDArray:
 
 def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Return shapes in the coordinates of space in which they are white.
+    Return shapes (n_shapes, 3, n_points) that are white, and the map T (3, 3) to them.
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes, rows centred.
-
-    Returns
-    -------
-    white : ndarray of shape (n_shapes, 3, n_points)
-        ``T B_k``. A row is zero in all shapes if all are flat along it, and in the mean
-        shape if that one is flat along it.
-    space : ndarray of shape (3, 3)
-        T such that ``sum_k T B_k B_k^T T^T`` is the identity, with zeros on the
-        diagonal where all shapes are flat. The sum is the second moment of a shape
-        whose coefficients are N(0, I). The axes are the principal axes of the mean
-        shape ``T B_0``.
+    ``sum_k T B_k B_k^T T^T``, the second moment of shapes whose coefficients are N(0,
+    I), is the identity, with zeros on the diagonal where all shapes are flat. The axes
+    are the principal axes of the mean shape. Its rows are zero where it is flat itself.
     """
     across = np.concatenate(list(shapes), axis=1)
     U, size, _ = np.linalg.svd(across, full_matrices=False)
@@ -378,20 +332,11 @@ def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
 
 def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     """
-    Return for each frame whether the points that it sees determine a camera.
+    Return which frames (n,) have points that determine a camera.
 
-    Parameters
-    ----------
-    products : FrameSums
-        Sums of the frames for `whitened` shapes, each with its own Gram matrix.
-    mean_shape : ndarray of shape (3, n_points)
-        B_0 of these shapes.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_frames,)
-        Whether the frame has points, and these extend along each direction along which
-        the mean shape as a whole extends: LEAST_COVER of its variance or more.
+    They extend along each direction along which the mean shape (3, n_points) extends:
+    LEAST_COVER of its variance or more. The sums are those for `whitened` shapes, each
+    frame with its own Gram matrix.
     """
     variance = np.einsum("aj,aj->a", mean_shape, mean_shape) / mean_shape.shape[1]
     inside = variance > 0

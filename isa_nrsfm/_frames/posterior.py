@@ -26,21 +26,10 @@ EQUAL = 1e-10
 
 def frame_search(camera: str, shapes: NDArray, misfit: float = 1.0) -> FrameSearch:
     """
-    Return the search for cameras of a model that see given shapes.
+    Return the search for cameras of a model that see shapes (n_shapes, 3, n_points).
 
-    Parameters
-    ----------
-    camera : {"affine", "weak_perspective", "orthographic"}
-        Model of the cameras. Orthographic ones have the scale one.
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes, rows centred, scaled such that alpha ~ N(0, I).
-    misfit : float, default=1.0
-        As in `CalibratedSearch`.
-
-    Returns
-    -------
-    FrameSearch
-        The search. It serves all tables.
+    Rows are centred, and scaled such that alpha ~ N(0, I). The search serves all
+    tables.
     """
     if camera == "affine":
         return AffineSearch(shapes)
@@ -58,26 +47,11 @@ def fit_tracks(
     covariances: bool = True,
 ) -> FramePosterior:
     """
-    Return the most probable camera, position and coefficients of each frame.
+    Return the fit of tracks (n_frames, n_points, 2), NaN where a point is missing.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks, in any place; NaN where a point is missing.
-    search : FrameSearch
-        The search for the shapes.
-    noise : float or ndarray of shape (n_frames,)
-        Variance of a coordinate, in squared units of the tracks. At least 1e-13 of the
-        energy of a frame is taken.
-    weights : ndarray of shape (n_frames, n_points), optional
-        Not negative, zero for missing points; by default 1 for all that are not NaN.
-    initial, starts, covariances
-        As in `fit_frames`.
-
-    Returns
-    -------
-    FramePosterior
-        The best fit of each frame, as of `fit_frames`.
+    The noise variance is one number or (n_frames,); at least 1e-13 of the energy of a
+    frame is taken. Weights (n_frames, n_points) are by default 1 for all points that
+    are not NaN. The other parameters are those of `fit_frames`.
     """
     tracks = np.asarray(tracks)
     n_frames = len(tracks)
@@ -127,8 +101,8 @@ def fit_frames(
     initial : ndarray of shape (n_frames, n_components), optional
         Coefficients to start from, by default zeros.
     starts : ndarray of shape (n_starts, n_components), optional
-        Coefficients to start from besides these, `spread_starts` for instance, for
-        frames whose first fit is much worse than the noise explains.
+        Coefficients to start from besides these, for frames whose first fit is much
+        worse than the noise explains.
     covariances : bool, default=True
         Whether covariances are wanted. The rest of the fit is the same without them.
     rough : bool, default=False
@@ -137,16 +111,13 @@ def fit_frames(
     Returns
     -------
     FramePosterior
-        The best fit of each frame. It does not depend on the other frames beyond
-        rounding errors. It is NaN for frames whose points of positive weight do not
-        determine a camera (`determines_camera`), such as fewer than four points of a
-        solid.
+        The best fit of each frame, independent of the others. NaN for frames whose
+        points do not determine a camera, such as fewer than four points of a solid.
 
     Notes
     -----
-    Along a direction in which all shapes are flat, affine cameras are zero. If only the
-    mean shape is flat, coefficients of zero can be a saddle point of the objective:
-    rounding decides where the search goes from there, and further starts help.
+    If only the mean shape is flat, coefficients of zero can be a saddle point: rounding
+    decides where the search goes from there, and further starts help.
     """
     n_frames, n_components = len(frames.weight), search.shared.n_components
     noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
@@ -199,20 +170,9 @@ def fit_frames(
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
     """
-    Return coefficients far from zero and from each other (farthest point sampling).
+    Return at most n_starts rows of alpha (n, K) far from zero and from each other.
 
-    Parameters
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients of many frames; rows with NaN are left out.
-    n_starts : int
-        How many are wanted.
-
-    Returns
-    -------
-    ndarray of shape (n_starts, n_components)
-        Rows of alpha, fewer if there are not as many different ones, each the one
-        farthest from zero and from those before it.
+    Farthest point sampling, of rows without NaN.
     """
     alpha = alpha[np.isfinite(alpha).all(axis=1)]
     # Squared distance from zero and from the rows chosen so far

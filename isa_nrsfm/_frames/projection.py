@@ -18,26 +18,11 @@ def reprojection_error(
     alpha: NDArray,
 ) -> float:
     """
-    Return the inverse SNR of the images of shapes.
+    Return the inverse SNR of the images of shapes (n_shapes, 3, n_points).
 
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    position : ndarray of shape (n_frames, 2)
-        Images of the origin.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    float
-        ``||W - W_hat||_F^2 / ||W||_F^2`` over the points that are seen, with the images
-        W_hat of the shapes, and each frame of W below centred.
+    It is ``||W - W_hat||_F^2 / ||W||_F^2`` over the seen points, each frame of W below
+    centred. Rows are blocks of frames (n, 2, n_points), NaN where a point is missing.
+    Motion (n, 2, 3), position (n, 2) and alpha (n, K) are those of all frames.
     """
     stacked = shapes.reshape(-1, shapes.shape[2])
     found = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
@@ -49,9 +34,9 @@ def _energies(
     rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
 ) -> tuple[float, float]:
     """
-    Return the energy of the residuals of frames, and that of the frames.
+    Return the energies of the residuals of a block, and of its centred frames.
 
-    The shapes are stacked (3 n_components + 3, n_points), rows (n_frames, 2, n_points).
+    The shapes are stacked (3 n_shapes, n_points).
     """
     images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
     images += position[:, :, None]
@@ -74,25 +59,10 @@ def distances(
     alpha: NDArray,
 ) -> NDArray:
     """
-    Return how far the points of frames are from a model of them.
+    Return distances (n, J) of points (n, J, 2) from a model, NaN for missing ones.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks; NaN where a point is missing.
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    translation : ndarray of shape (n_frames, 2)
-        Positions.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points)
-        Distances in the images; NaN where a point is missing.
+    The model is shapes (K + 1, 3, J), motion (n, 2, 3), translation (n, 2), alpha (n,
+    K).
     """
     stacked = shapes.transpose(0, 2, 1)
     model = project(compose(stacked[0], stacked[1:], alpha), motion, translation)
@@ -101,20 +71,9 @@ def distances(
 
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
     """
-    Return the motion of the mean shape and the basis shapes.
+    Return ``(1, alpha_i) (x) M_i`` (2 n, 3 K + 3) of motion (n, 2, 3), alpha (n, K).
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (2 * n_frames, 3 * n_components + 3)
-        ``(1, alpha_i) (x) M_i``, whose product with the stacked shapes
-        (3 * n_components + 3, n_points) is the measurement matrix.
+    Its product with the stacked shapes (3 K + 3, n_points) is the measurement matrix.
     """
     c = np.concatenate([np.ones((len(alpha), 1)), alpha], axis=1)
     return np.einsum("ik,irc->irkc", c, motion).reshape(2 * len(alpha), -1)
@@ -122,41 +81,17 @@ def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
 
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     """
-    Return the shape of each frame, the mean plus the weighted basis shapes.
+    Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, n_points, 3).
 
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0.
-    basis : ndarray of shape (n_components, n_points, 3)
-        B_k.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 3)
-        ``B_0 + sum_k alpha_ik B_k``.
+    Arrays are mean_shape (n_points, 3), basis (K, n_points, 3) and alpha (n, K).
     """
     return mean_shape + np.tensordot(alpha, basis, axes=1)
 
 
 def project(shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
     """
-    Return the image of shapes in affine cameras.
+    Return the images (n, n_points, 2) of shapes (n, n_points, 3) in affine cameras.
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_frames, n_points, 3)
-        Shapes.
-    motion : ndarray of shape (n_frames, 2, 3) or (2, 3)
-        Cameras.
-    translation : ndarray of shape (n_frames, 2) or (2,)
-        Images of the origin.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points, 2)
-        Tracks.
+    Motion is (n, 2, 3) or (2, 3), translation (n, 2) or (2,).
     """
     return shapes @ np.swapaxes(motion, -1, -2) + np.expand_dims(translation, -2)

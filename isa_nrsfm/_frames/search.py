@@ -175,27 +175,10 @@ class FrameSearch:
         rough: bool = False,
     ) -> FramePosterior:
         """
-        Return the minima that frames reach from given coefficients.
+        Return the minima that frames reach from coefficients initial (n, K).
 
-        Parameters
-        ----------
-        products : FrameSums
-            Sums of the frames for the shapes in `shared`.
-        variance : ndarray of shape (n_frames,)
-            Noise variances.
-        initial : ndarray of shape (n_frames, n_components)
-            Coefficients to start from.
-        max_steps : int
-            The most steps.
-        covariances : bool, default=True
-            Whether covariances are wanted.
-        rough : bool, default=False
-            Whether cameras need not be those of the lowest minimum.
-
-        Returns
-        -------
-        FramePosterior
-            The minima, for the original shapes.
+        The sums of the frames are those for the shapes in `shared`; the noise variances
+        are (n,). If it is rough, cameras need not be those of the lowest minimum.
         """
         problem = self.problem(products, variance)
         start = self.evaluate(problem, self.start(problem, initial.T))
@@ -267,24 +250,9 @@ class FrameSearch:
         """
         Minimise the objectives of frames.
 
-        Parameters
-        ----------
-        problem : FrameProblem
-            The frames.
-        state : State
-            Where the search starts.
-        max_steps : int
-            The most steps.
-        limit : ndarray of shape (n_frames,), optional
-            The search of a frame is given up where the predicted gain is so small that
-            its objective will not fall below its limit.
-
-        Returns
-        -------
-        position : ndarray of shape (..., n_frames)
-            The last iterates.
-        converged : ndarray of bool, shape (n_frames,)
-            Whether they have converged.
+        The search of a frame is given up where the predicted gain is so small that its
+        objective will not fall below its limit (n,). Returned are the last iterates
+        (..., n) and which have converged (n,).
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)

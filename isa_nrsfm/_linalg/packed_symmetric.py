@@ -78,21 +78,10 @@ def packed_products(A: NDArray, B: NDArray) -> NDArray:
 
 def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Solve symmetric positive definite systems of equations.
+    Solve ``A x = b`` for packed positive definite A (n_pairs, n) and b (k, n).
 
-    Parameters
-    ----------
-    A : ndarray of shape (k * (k + 1) / 2, n)
-        Symmetric matrices, packed.
-    b : ndarray of shape (k, n)
-        Right sides.
-
-    Returns
-    -------
-    x : ndarray of shape (k, n)
-        ``A x = b``. Unknowns that are left out are zero.
-    positive : ndarray of bool, shape (n,)
-        Whether all pivots are positive, that is, A is positive definite.
+    Returned are x (k, n), zero for unknowns that are left out, and whether all pivots
+    are positive (n,), that is, A is positive definite.
     """
     k, n = b.shape
     diagonal, positive = A[diagonal_of(A)], np.ones(n, dtype=bool)
@@ -122,26 +111,13 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray]:
 
 def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     """
-    Sweep rows of symmetric matrices, in place.
+    Sweep rows of packed symmetric matrices (n_pairs, n), in place.
 
     For ``[[C, G^T], [G, A]]``, with A the rows from the first to sweep on, that leaves
     ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
-    SWEEP operator", The American Statistician 33, 1979).
-
-    Parameters
-    ----------
-    packed : ndarray of shape (n_pairs, n)
-        Symmetric matrices, packed, A positive definite.
-    first : int, default=0
-        The first row that is swept. All after it are, too.
-
-    Returns
-    -------
-    log_determinant : ndarray of shape (n,)
-        Sum of the logarithms of the positive pivots, ``log det A``.
-    positive : ndarray of bool, shape (n,)
-        Whether all pivots are positive. Where one is not, its row and its column are
-        zero in the end.
+    SWEEP operator", The American Statistician 33, 1979). Returned are the sums of the
+    logarithms of the positive pivots, ``log det A`` (n,), and whether all pivots are
+    positive (n,).
     """
     rows = packed_rows(packed)
     k, n = len(rows), packed.shape[1]

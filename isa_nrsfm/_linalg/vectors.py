@@ -17,41 +17,21 @@ LANES = 16
 
 def in_lanes(frames: NDArray) -> NDArray:
     """
-    Return numbers of frames, the last one repeated up to a multiple of `LANES`.
+    Return numbers of frames (n,), the last one repeated up to a multiple of `LANES`.
 
     In arrays with the frame as the last index, the numbers that are found for a frame
     then do not depend on how many frames there are, to the last bit. Frames that come
     several times stay equal, and may be written to the same place.
-
-    Parameters
-    ----------
-    frames : ndarray of int, shape (n_frames,)
-        Numbers of frames.
-
-    Returns
-    -------
-    ndarray of int, shape (n_filled,)
-        The numbers, none for none.
     """
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 
 
 def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
     """
-    Return what belongs to some of the frames.
+    Return the values (..., n_taken) of some frames, of values (..., n_frames).
 
-    Parameters
-    ----------
-    values : ndarray of shape (..., n_frames)
-        Numbers of all frames.
-    frames : ndarray of int, shape (n_taken,), or slice
-        The frames.
-
-    Returns
-    -------
-    ndarray of shape (..., n_taken)
-        Their numbers, with the frame as the last axis in memory, too. Sums are rounded
-        by that order. Indexing with an array would put the frame first.
+    The frame stays the last axis in memory: sums are rounded by that order. Indexing
+    with an array would put the frame first.
     """
     if isinstance(frames, slice):
         return values[..., frames]
@@ -60,55 +40,23 @@ def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
 
 def frames_last(motion: NDArray) -> NDArray:
     """
-    Return matrices with the frame as the last index.
+    Return matrices (n, a, b) as (a, b, n), with long rows over the frames in memory.
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, a, b)
-        A matrix for each frame, such as a camera.
-
-    Returns
-    -------
-    ndarray of shape (a, b, n_frames)
-        The same, with long rows over the frames in memory: `motion` itself where it
-        comes from `frames_first`, and a copy otherwise.
+    What comes from `frames_first` is not copied.
     """
     return np.ascontiguousarray(motion.transpose(1, 2, 0))
 
 
 def frames_first(M: NDArray) -> NDArray:
-    """
-    Return matrices with the frame as the first index.
-
-    Parameters
-    ----------
-    M : ndarray of shape (a, b, n_frames)
-        A matrix for each frame.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, a, b)
-        A view of them. `frames_last` takes it back without a copy.
-    """
+    """Return a view (n, a, b) of matrices (a, b, n)."""
     return M.transpose(2, 0, 1)
 
 
 def orientations(rows: NDArray) -> NDArray:
     """
-    Return a sign for each row: that of its third moment.
+    Return a sign for each row (n_rows, n_entries): that of its third moment.
 
-    The sign does not depend on the order of the entries. Where the third moment
-    vanishes the entry of largest magnitude decides, in the order of the entries.
-
-    Parameters
-    ----------
-    rows : ndarray of shape (n_rows, n_entries)
-        Rows, each known up to its sign.
-
-    Returns
-    -------
-    ndarray of shape (n_rows,)
-        1.0 or -1.0.
+    Where the third moment vanishes the entry of largest magnitude decides.
     """
     largest = np.abs(rows).max(axis=1, keepdims=True)
     scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
@@ -120,21 +68,10 @@ def orientations(rows: NDArray) -> NDArray:
 
 def polar(matrices: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
-    Return the polar decompositions ``A = P O`` of matrices.
+    Return polar decompositions ``A = P O`` of matrices (..., m, d), ``m <= d``.
 
-    Parameters
-    ----------
-    matrices : ndarray of shape (..., m, d)
-        Matrices A with ``m <= d``.
-
-    Returns
-    -------
-    rows : ndarray of shape (..., m, d)
-        O, the matrices with orthonormal rows that are nearest to A.
-    values : ndarray of shape (..., m)
-        Singular values of A, the eigenvalues of P.
-    axes : ndarray of shape (..., m, m)
-        Eigenvectors of P, in the columns.
+    O (..., m, d) are the nearest orthonormal rows. The singular values (..., m) of A
+    are the eigenvalues of P, whose eigenvectors (..., m, m) are in columns.
     """
     U, values, Vt = np.linalg.svd(matrices, full_matrices=False)
     return U @ Vt, values, U
