@@ -3,10 +3,10 @@ Choosing the number of basis shapes
 ===================================
 
 More basis shapes always reduce the reprojection error of the fitted points, but not the
-error of held-out points. `AffineNRSfM.score` measures the latter: the points are divided
-into five parts, and each is predicted from the others, frame by frame. The score is
-minus the error relative to the energy of the points. `AffineNRSfMCV` also holds out
-frames, so shapes are evaluated on frames that they were not fitted to.
+error of held-out points. `AffineNRSfM.score` measures the latter: the points are
+divided into five parts, and each is predicted from the others, frame by frame. The
+score is minus the error relative to the energy of the points. `AffineNRSfMCV` also
+holds out frames, so shapes are evaluated on frames that they were not fitted to.
 """
 
 import warnings
@@ -83,8 +83,8 @@ print('"auto" finds', len(auto.basis_))
 # Diagnostics
 # -----------
 #
-# `AffineNRSfM.diagnostics` measures how well the table determines a fit, and warns if it
-# does not. With five basis shapes, two directions of the coefficients may well be
+# `AffineNRSfM.diagnostics` measures how well the table determines a fit, and warns if
+# it does not. With five basis shapes, two directions of the coefficients may well be
 # noise: their reliability, the share of their variance that is neither uncertainty nor
 # noise that the shapes have followed, is zero.
 

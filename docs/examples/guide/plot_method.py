@@ -85,14 +85,15 @@ print(f"{display.off_block_share:.1%} of the squares outside the blocks")
 # Refinement
 # ----------
 #
-# In a subspace, camera and coefficient have to be separated: the motion of subspace k is that of the rigid part times a coefficient, after the right 3x3
-# transformation. The paper finds it, and refines the basis shapes with the rigid
-# cameras held. But faces also deform along their rigid shape, so the rigid cameras are
-# not the true cameras, and the basis shapes are biased.
+# In a subspace, camera and coefficient have to be separated: the motion of subspace k
+# is that of the rigid part times a coefficient, after the right 3x3 transformation. The
+# paper finds it, and refines the basis shapes with the rigid cameras held. But faces
+# also deform along their rigid shape, so the rigid cameras are not the true cameras,
+# and the basis shapes are biased.
 #
-# The *joint refinement*, the default, optimises cameras, shapes and noise together, with
-# the coefficients integrated out. Its objective never increases. Affine cameras can
-# absorb part of a deformation; weak-perspective cameras cannot.
+# The *joint refinement*, the default, optimises cameras, shapes and noise together,
+# with the coefficients integrated out. Its objective never increases. Affine cameras
+# can absorb part of a deformation; weak-perspective cameras cannot.
 
 cases = {
     "none": {"refinement": None},
@@ -107,5 +108,5 @@ for name, options in cases.items():
     print(f"{name:27} {model.inverse_snr_:10.4%} {error:9.2%}")
 
 # %%
-# The joint fit finds the span of the basis shapes. Any mixing of them fits equally well;
-# :doc:`plot_independence` shows how it is selected.
+# The joint fit finds the span of the basis shapes. Any mixing of them fits equally
+# well; :doc:`plot_independence` shows how it is selected.

@@ -54,9 +54,9 @@ for name, each in (("weak perspective", model), ("affine", affine)):
 # -------------------
 #
 # `canonical_pose` turns a shape upright. For :doc:`known layouts </skeletons>` set the
-# scheme; for others give pairs of points, such as ``left_right=[(right_eye, left_eye)], up=[(chin, nose)],
-# front=[(ears, nose)]``. The mean shape of affine cameras is white; the Euclidean one
-# is a face.
+# scheme; for others give pairs of points, such as ``left_right=[(right_eye, left_eye)],
+# up=[(chin, nose)], front=[(ears, nose)]``. The mean shape of affine cameras is white;
+# the Euclidean one is a face.
 
 upright = canonical_pose(model.mean_shape_, scheme="ibug-68").shape
 _, axes = plt.subplots(1, 4, figsize=(9, 3), layout="constrained")
@@ -77,9 +77,9 @@ for k, (shape, what) in enumerate(
 # looks up, roll where it is turned clockwise in the image (:doc:`/conventions`). The
 # true angles are those of the true face, upright by the same definition.
 #
-# Bars, which are hardly visible, are two standard deviations. They come from the posterior
-# of the rotation of a frame, for the given shapes; only calibrated cameras have them.
-# :doc:`/questions` has their accuracy on other faces.
+# Bars, which are hardly visible, are two standard deviations. They come from the
+# posterior of the rotation of a frame, for the given shapes; only calibrated cameras
+# have them. :doc:`/questions` has their accuracy on other faces.
 
 poses = frame_poses(model, faces.data)
 turn = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
@@ -110,4 +110,5 @@ print("in truth:         ", true[:5].round(1))
 
 # %%
 # How large each frame is in the image, ``poses.scale``, over the unit in millimetres is
-# pixels a millimetre. If the focal length is known, it gives the distance of the camera.
+# pixels a millimetre. If the focal length is known, it gives the distance of the
+# camera.

@@ -71,8 +71,9 @@ display = ConfusionMatrixDisplay.from_predictions(
 display.figure_.set_layout_engine("constrained")
 
 # %%
-# Each coefficient belongs to a basis shape that can be inspected. Eta squared is the share of the variance of a coefficient that lies
-# between the expressions. These are the two with the largest, and their basis shapes.
+# Each coefficient belongs to a basis shape that can be inspected. Eta squared is the
+# share of the variance of a coefficient that lies between the expressions. These are
+# the two with the largest, and their basis shapes.
 
 model = search.best_estimator_[0]
 eta_squared = association(model.alpha_, labels, random_state=0).statistic

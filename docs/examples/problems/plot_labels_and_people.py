@@ -38,8 +38,8 @@ for label, y, column in (("gesture", hands.labels, 0), ("person", people, 1)):
 #
 # Eta squared is the share of the variance of a coefficient that lies between the
 # gestures. For the p-values labels are permuted among people, and in blocks of frames
-# within them, because the frames of a video are similar. `between_share` is the share of
-# the variance between people: about zero if they do not differ.
+# within them, because the frames of a video are similar. `between_share` is the share
+# of the variance between people: about zero if they do not differ.
 
 found = association(model.alpha_, hands.labels, people, random_state=0)
 share = between_share(model.alpha_, people)

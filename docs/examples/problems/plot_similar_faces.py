@@ -27,9 +27,9 @@ tracks = np.concatenate([first.tracks, again])
 X = tracks.reshape(len(tracks), -1)
 
 # %%
-# Coefficients of unit variance have equal weight in the distance, but a coefficient that
-# the points of a frame hardly determine should have less weight. Division by the mean of
-# `alpha_std_` achieves this.
+# Coefficients of unit variance have equal weight in the distance, but a coefficient
+# that the points of a frame hardly determine should have less weight. Division by the
+# mean of `alpha_std_` achieves this.
 
 model = AffineNRSfM(K, random_state=0).fit(X)
 alpha = model.alpha_ / np.sqrt(np.mean(model.alpha_std_**2, axis=0))
