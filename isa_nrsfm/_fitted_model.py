@@ -13,50 +13,17 @@ from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
 from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
-from isa_nrsfm._tables.layout import (
-    Layout,
-    table_to_tracks,
-    tracks_to_table,
-)
+from isa_nrsfm._tables.layout import Layout, table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import Table
 from isa_nrsfm._tables.visibility import centred_frames, seen_points
-
-# Number of parts of the points that are held out in turn, and the fixed random seed of
-# the partition.
-N_FOLDS = 5
-FOLD_SEED = 0
-# Largest variance of a held-out point due to the camera, relative to that of the noise.
-# In 12 scenes of 120 frames, two frames that show six of 23 points multiply the error
-# by 1.5 to 52 without a limit, and by 1.0 to 1.8 with this one. With 20 % of all points
-# missing it changes the error by at most 1.2 %; a limit of 1 changes it by up to 21 %.
-MOST_LEVERAGE = 2.0
-
-
-class ReadyFrames(NamedTuple):
-    """
-    Frames that are usable, centred and measured.
-
-    Attributes
-    ----------
-    usable : ndarray of bool, shape (n_frames,)
-        Which frames of a table they are.
-    centred : ndarray of shape (n_usable, n_points, 2)
-        Their centred tracks, NaN where a point is not seen.
-    translation : ndarray of shape (n_usable, 2)
-        What was subtracted.
-    sizes : ndarray of shape (n_usable,)
-        Their sizes.
-    """
-
-    usable: NDArray
-    centred: NDArray
-    translation: NDArray
-    sizes: NDArray
 
 
 class TableModel(NamedTuple):
     """
-    What the fit of a new table depends on: model of a frame, shapes and layout.
+    All that the fit of a new table depends on: model of a frame, shapes and layout.
+
+    Methods whose names begin with an underscore take some rows (n, 2 * n_points) of a
+    table. Results are NaN for rows with too few points.
 
     Attributes
     ----------
@@ -83,115 +50,135 @@ class TableModel(NamedTuple):
 
     @one_blas_thread
     def decompose(self, table: Table, deviations: bool = True) -> Decomposition:
-        """
-        Return cameras, positions and coefficients of the frames of a table.
+        """Return cameras, positions and coefficients of the frames of a table.
 
         Without deviations the standard deviations of the coefficients are NaN.
         """
         K = len(self.basis)
-        shapes = ((2, 3), (2,), (K,), (K,))
-        fit = partial(_fit, model=self, dtype=table.dtype, deviations=deviations)
-        return Decomposition(*table.blocks.collect(fit, shapes, table.dtype))
+        fit = partial(self._fit_rows, dtype=table.dtype, deviations=deviations)
+        found = table.blocks.collect(fit, ((2, 3), (2,), (K,), (K,)), table.dtype)
+        return Decomposition(*found)
 
     @one_blas_thread
     def posterior(self, table: Table) -> FramePosterior:
-        """
-        Return the fit of each frame by itself, of size one and before the gauge.
+        """Return the fit of each frame by itself, of size one and before the gauge.
 
-        There coefficients have the prior N(0, I). NaN for frames that are not usable.
-        Only for `PosteriorFrames`.
+        There coefficients have the prior N(0, I). Only for `PosteriorFrames`.
         """
-        found = table.blocks.map(partial(_posterior, model=self))
+        found = table.blocks.map(self._posterior)
         return FramePosterior(*map(np.concatenate, zip(*found, strict=True)))
 
     @one_blas_thread
     def reconstruct(
         self, table: Table, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
-        """
-        Return the shapes of the frames of a table.
+        """Return the shapes (n_frames, n_points, 3) of the frames of a table.
 
-        Parameters
-        ----------
-        table : Table
-            The table.
-        metric : DeformationMetric or None
-            The metric of space in which shapes are Euclidean; None for affine shapes.
-        scaled : bool
-            Whether Euclidean shapes have the sizes that an orthographic camera shows.
-
-        Returns
-        -------
-        ndarray of shape (n_frames, n_points, 3)
-            The shapes.
+        They are Euclidean in a metric of space; with `scaled` they have the sizes that
+        an orthographic camera shows.
         """
-        shape = partial(
-            _shapes, model=self, metric=metric, scaled=scaled, dtype=table.dtype
-        )
-        return table.blocks.collect(shape, (self.mean_shape.shape,), table.dtype)[0]
+        shapes = partial(self._shapes, metric=metric, scaled=scaled, dtype=table.dtype)
+        return table.blocks.collect(shapes, (self.mean_shape.shape,), table.dtype)[0]
 
     @one_blas_thread
     def depth_deviations(self, table: Table) -> NDArray:
-        """Compute standard deviations of the depths of points (n_frames, n_points)."""
-        found = partial(_depth_deviations, model=self, dtype=table.dtype)
+        """Return standard deviations of the depths of points (n_frames, n_points)."""
+        found = partial(self._depth_deviations, dtype=table.dtype)
         return table.blocks.collect(found, (self.mean_shape.shape[:1],), table.dtype)[0]
 
     @one_blas_thread
     def reproject(self, table: Table) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
-        image = partial(_images, model=self, dtype=table.dtype)
-        return table.blocks.collect(image, ((table.n_columns,),), table.dtype)[0]
+        images = partial(self._images, dtype=table.dtype)
+        return table.blocks.collect(images, ((table.n_columns,),), table.dtype)[0]
 
     @one_blas_thread
     def distances(self, table: Table) -> NDArray:
-        """Return the lengths of residuals (n_frames, n_points) of frames of size one.
-
-        NaN where a point is missing, and for frames that are not usable.
-        """
-        found = partial(_distances, model=self)
-        return np.concatenate(list(table.blocks.map(found)))
+        """Return lengths of residuals (n_frames, n_points) of frames of size one."""
+        return table.blocks.joined(self._distances)
 
     @one_blas_thread
     def held_out_error(self, table: Table) -> float:
         """Return the inverse SNR of points held out of the fit of their frame."""
-        energies = table.blocks.map(partial(_held_out, model=self))
-        noise, signal = np.sum(list(energies), axis=0)
+        noise, signal = np.sum(list(table.blocks.map(self._held_out)), axis=0)
         return float(noise / signal) if signal > 0 else float("nan")
 
-    def tracks(self, rows: NDArray) -> NDArray:
+    def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
         tracks = table_to_tracks(rows, self.layout)
         return clean_tracks(tracks, self.layout, self.names)
 
-    def ready(self, tracks: NDArray) -> ReadyFrames:
-        """Return the usable ones of tracks (n, n_points, 2), ready for the fit."""
+    def _ready(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return which tracks are usable; these centred, their centres and sizes."""
         centred, report = centred_frames(tracks)
         usable = report.usable
         if not usable.all():
             centred, report = centred[usable], report.of_frames(usable)
         translation, sizes = report.translation, report.size
-        if self.robust and len(centred):
+        robust = isinstance(self.frames, PosteriorFrames)
+        if robust and self.frames.loss != "linear" and len(centred):
             centred, translation = robustly_centred(tracks[usable])
             sizes = robust_sizes(centred)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
-        return ReadyFrames(usable, centred, translation, sizes)
+        return usable, centred, translation, sizes
 
-    @property
-    def robust(self) -> bool:
-        """Whether points far from the model count less."""
-        frames = self.frames
-        return isinstance(frames, PosteriorFrames) and frames.loss != "linear"
+    def _fit_rows(
+        self, rows: NDArray, dtype: Any, deviations: bool = False
+    ) -> Decomposition:
+        """Return the fit of some rows."""
+        usable, centred, translation, sizes = self._ready(self._tracks(rows))
+        fit = self.frames.fit(centred, sizes, deviations)
+        fit = fit._replace(translation=fit.translation + translation)
+        return Decomposition(*(_of_all(each, usable).astype(dtype) for each in fit))
 
+    def _posterior(self, rows: NDArray) -> FramePosterior:
+        """Return the fit of some rows, of size one and before the gauge."""
+        assert isinstance(self.frames, PosteriorFrames)
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        whole = FramePosterior.unknown(len(rows), len(self.basis))
+        whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
+        return whole
 
-def _fit(
-    rows: NDArray, model: TableModel, dtype: Any, deviations: bool = False
-) -> Decomposition:
-    """Return the fit of some rows (n, 2 * n_points); NaN for those not usable."""
-    ready = model.ready(model.tracks(rows))
-    fit = model.frames.fit(ready.centred, ready.sizes, deviations)
-    fit = fit._replace(translation=fit.translation + ready.translation)
-    return Decomposition(*(_of_all(each, ready.usable).astype(dtype) for each in fit))
+    def _shapes(
+        self, rows: NDArray, metric: DeformationMetric | None, scaled: bool, dtype: Any
+    ) -> tuple[NDArray]:
+        """Return the shapes (n, n_points, 3) of some rows."""
+        motion, _, alpha, _ = self._fit_rows(rows, dtype)
+        if metric is None:
+            return (compose(self.mean_shape, self.basis, alpha),)
+        found = euclidean_frames(metric, motion, alpha, self.mean_shape, self.basis)
+        sizes = found.scales[:, None, None] if scaled else 1.0
+        return ((sizes * found.shapes).astype(dtype, copy=False),)
+
+    def _depth_deviations(self, rows: NDArray, dtype: Any) -> tuple[NDArray]:
+        """Return standard deviations of depths (n, n_points) in some rows."""
+        assert isinstance(self.frames, PosteriorFrames)
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        found = self.frames.depth_deviations(centred, sizes)
+        return (_of_all(found, usable).astype(dtype, copy=False),)
+
+    def _images(self, rows: NDArray, dtype: Any) -> tuple[NDArray]:
+        """Return the images (n, 2 * n_points) of the fitted shapes of some rows."""
+        motion, translation, alpha, _ = self._fit_rows(rows, dtype)
+        shapes = compose(self.mean_shape, self.basis, alpha)
+        return (tracks_to_table(project(shapes, motion, translation), self.layout),)
+
+    def _distances(self, rows: NDArray) -> NDArray:
+        """Return the lengths of the residuals (n, n_points) of some rows."""
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        fit = self.frames.fit(centred, sizes, False)
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        off = centred - project(shapes, fit.motion, fit.translation)
+        return _of_all(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
+
+    def _held_out(self, rows: NDArray) -> tuple[float, float]:
+        """Return the energies of `held_out_energies` for some rows."""
+        tracks = self._tracks(rows)
+        usable, _, _, sizes = self._ready(tracks)
+        return held_out_energies(
+            self.frames, self.mean_shape, self.basis, tracks[usable], sizes
+        )
 
 
 def _of_all(values: NDArray, usable: NDArray) -> NDArray:
@@ -201,67 +188,6 @@ def _of_all(values: NDArray, usable: NDArray) -> NDArray:
     whole = np.full((len(usable), *values.shape[1:]), np.nan)
     whole[usable] = values
     return whole
-
-
-def _posterior(rows: NDArray, model: TableModel) -> FramePosterior:
-    """Return the fit of rows (n, 2 * n_points) by themselves, before the gauge."""
-    assert isinstance(model.frames, PosteriorFrames)
-    ready = model.ready(model.tracks(rows))
-    found = model.frames.posterior(ready.centred / ready.sizes[:, None, None])
-    whole = FramePosterior.unknown(len(rows), len(model.basis))
-    whole.put(ready.usable, found)
-    return whole
-
-
-def _shapes(
-    rows: NDArray,
-    model: TableModel,
-    metric: DeformationMetric | None,
-    scaled: bool,
-    dtype: Any,
-) -> tuple[NDArray]:
-    """Return the shapes (n, n_points, 3) of some rows (n, 2 * n_points)."""
-    motion, _, alpha, _ = _fit(rows, model, dtype)
-    if metric is None:
-        return (compose(model.mean_shape, model.basis, alpha),)
-    frames = euclidean_frames(metric, motion, alpha, model.mean_shape, model.basis)
-    shapes = frames.shapes
-    if scaled:
-        shapes = frames.scales[:, None, None] * shapes
-    return (shapes.astype(dtype, copy=False),)
-
-
-def _depth_deviations(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
-    """Compute standard deviations of depths (n, n_points) in some rows."""
-    assert isinstance(model.frames, PosteriorFrames)
-    ready = model.ready(model.tracks(rows))
-    found = model.frames.depth_deviations(ready.centred, ready.sizes)
-    return (_of_all(found, ready.usable).astype(dtype, copy=False),)
-
-
-def _images(rows: NDArray, model: TableModel, dtype: Any) -> tuple[NDArray]:
-    """Return the images (n, 2 * n_points) of the fitted shapes of some rows."""
-    motion, translation, alpha, _ = _fit(rows, model, dtype)
-    shapes = compose(model.mean_shape, model.basis, alpha)
-    return (tracks_to_table(project(shapes, motion, translation), model.layout),)
-
-
-def _distances(rows: NDArray, model: TableModel) -> NDArray:
-    """Return the lengths of the residuals (n, n_points) of some rows."""
-    ready = model.ready(model.tracks(rows))
-    fit = model.frames.fit(ready.centred, ready.sizes, False)
-    shapes = compose(model.mean_shape, model.basis, fit.alpha)
-    off = ready.centred - project(shapes, fit.motion, fit.translation)
-    return _of_all(np.linalg.norm(off, axis=2) / ready.sizes[:, None], ready.usable)
-
-
-def _held_out(rows: NDArray, model: TableModel) -> tuple[float, float]:
-    """Return the energies of `held_out_energies` for some rows (n, 2 * n_points)."""
-    tracks = model.tracks(rows)
-    ready = model.ready(tracks)
-    return held_out_energies(
-        model.frames, model.mean_shape, model.basis, tracks[ready.usable], ready.sizes
-    )
 
 
 def held_out_energies(
@@ -297,20 +223,18 @@ def held_out_energies(
         ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the points, each
         divided by the squared size of its frame. Points are left out if the others of
         the frame do not determine its fit, or if in a frame with missing points the
-        noise variance of their prediction exceeds `MOST_LEVERAGE` that of a point, for
-        an affine camera of the mean shape. Otherwise a few frames that show hardly
-        enough points would decide. The limit does not depend on the basis shapes, so
-        that scores of different K are of the same points.
+        camera, an affine one of the mean shape, adds more than twice the noise variance
+        to their prediction. Otherwise a few frames with hardly enough points would
+        decide. The limit does not depend on the basis shapes, so that scores of
+        different K are of the same points.
     """
-    n_points = tracks.shape[1]
-    folds = np.random.RandomState(FOLD_SEED).permutation(n_points) % N_FOLDS
+    folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
     seen = seen_points(tracks)
     # Complete frames are fitted without the points, others with gaps in their place.
-    complete = None
-    if isinstance(frames, PosteriorFrames) and frames.loss == "linear" and seen.all():
-        complete = frames
+    complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
+    complete = complete and bool(seen.all())
     noise = signal = 0.0
-    for fold in range(N_FOLDS):
+    for fold in range(5):
         held = folds == fold
         # Fit without the held-out points
         visible = np.where(held[:, None], np.nan, tracks)
@@ -318,25 +242,31 @@ def held_out_energies(
         usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
         if not len(usable):
             continue
-        origin = np.zeros(3), np.zeros((len(basis), 3))  # of mean and basis shapes
-        if complete is not None:
-            others = complete.of_points(~held)
-            fit = others.fit(tracks[usable][:, ~held], sizes[usable], False)
-            origin = mean_shape[~held].mean(axis=0), basis[:, ~held].mean(axis=1)
+        mean, others = mean_shape[held], basis[:, held]
+        if complete:
+            assert isinstance(frames, PosteriorFrames)
+            kept = frames.of_points(~held)  # their centroid is the origin
+            fit = kept.fit(tracks[usable][:, ~held], sizes[usable], False)
+            mean = mean - mean_shape[~held].mean(axis=0)
+            others = others - basis[:, ~held].mean(axis=1, keepdims=True)
         else:
             fit = frames.fit(visible[usable], sizes[usable], False)
         # Prediction of the held-out points, and its error
-        at_origin = mean_shape[held] - origin[0], basis[:, held] - origin[1][:, None]
-        shapes = compose(*at_origin, fit.alpha)
-        model = project(shapes, fit.motion, fit.translation)
+        predicted = project(
+            compose(mean, others, fit.alpha), fit.motion, fit.translation
+        )
         part = tracks[usable]
         centre = np.nanmean(part, axis=1, keepdims=True)
         weight = sizes[usable, None, None] ** -2.0
-        counted = seen[np.ix_(usable, held)] & np.isfinite(model).all(axis=2)
+        counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
         some = ~seen[usable].all(axis=1)
+        # In 12 scenes of 120 frames, two frames that show six of 23 points multiply the
+        # error by 1.5 to 52 without a limit, and by 1.0 to 1.8 with this one. With 20 %
+        # of all points missing it changes the error by at most 1.2 %; a limit of 1
+        # changes it by up to 21 %.
         leverage = _camera_leverage(mean_shape, seen[usable[some]] & ~held)
-        counted[some] &= leverage[:, held] <= MOST_LEVERAGE
-        noise += np.sum((weight * (part[:, held] - model) ** 2)[counted])
+        counted[some] &= leverage[:, held] <= 2.0
+        noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
         signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
     return float(noise), float(signal)
 
