@@ -41,9 +41,9 @@ from isa_nrsfm._gauge.canonical import (
     image_energies,
     mode_covariance,
     reorder_blocks,
+    rigid_gauge,
 )
 from isa_nrsfm._gauge.independent import independent_gauge
-from isa_nrsfm._gauge.rigid import rigid_gauge
 from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.options import JointOptions
@@ -370,7 +370,7 @@ def _paper_frames(
         return _table_model(estimator, table, frames, mean_shape, basis)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
-    gauge = rigid_gauge(
+    gauge, frames = rigid_gauge(
         shapes[0].T,
         shapes[1:].transpose(0, 2, 1),
         table.sizes,
@@ -381,7 +381,7 @@ def _paper_frames(
     estimator._model = fitted(gauge.mean_shape, gauge.basis)
     estimator.mode_covariance_ = reorder_blocks(paper.mode_covariance, gauge.order)
     estimator.n_iter_ = paper.n_iter
-    return gauge.frames
+    return frames
 
 
 def _joint_frames(
@@ -418,7 +418,7 @@ def _joint_frames(
             "determine a camera: their visible points are coplanar. Remove these rows."
         )
     # Gauge of shapes, cameras and coefficients
-    gauge = independent_gauge(
+    gauge, frame_map = independent_gauge(
         shapes,
         motion,
         alpha,
@@ -426,7 +426,7 @@ def _joint_frames(
         estimator.camera,
         float(table.sizes[0]) if estimator.camera == "orthographic" else None,
     )
-    frames = replace(frames, gauge=gauge.frames)
+    frames = replace(frames, gauge=frame_map)
     share = table.n_seen / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)

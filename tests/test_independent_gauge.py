@@ -78,12 +78,12 @@ def regauged(fit, seed=1, shift=0.05):
 
 def canonical(fit, independence="shapes"):
     """Return the canonical fit, and the standard deviations for unit covariances."""
-    gauge = independent_gauge(*fit, independence)
+    gauge, frames = independent_gauge(*fit, independence)
     n_frames, n_components = fit.alpha.shape
     covariance = np.broadcast_to(
         np.eye(n_components), (n_frames,) + 2 * (n_components,)
     )
-    motion, alpha, deviation = gauge.frames.apply(fit.motion, fit.alpha, covariance)
+    motion, alpha, deviation = frames.apply(fit.motion, fit.alpha, covariance)
     shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
     return Fit(shapes.transpose(0, 2, 1), motion, alpha), deviation
 
@@ -110,7 +110,7 @@ class TestSameFit:
         frames = [each.frames().transpose(0, 2, 1) for each in (fit, result)]
         assert affine_shape_error(*frames) < 1e-10
         # The affinity is that of the map.
-        space = independent_gauge(*fit, independence).frames.space
+        space = independent_gauge(*fit, independence)[1].space
         scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
         scales /= np.linalg.norm(result.frames(), axis=(1, 2))
         assert_allclose(
@@ -261,11 +261,11 @@ class TestCalibratedCameras:
     """Space may only be turned, and orthographic cameras absorb no scales."""
 
     def canonical(self, fit, independence, camera, unit=None):
-        gauge = independent_gauge(*fit, independence, camera, unit)
+        gauge, frames = independent_gauge(*fit, independence, camera, unit)
         covariance = np.broadcast_to(np.eye(3), (60, 3, 3))
-        motion, alpha, _ = gauge.frames.apply(fit.motion, fit.alpha, covariance)
+        motion, alpha, _ = frames.apply(fit.motion, fit.alpha, covariance)
         shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
-        return Fit(shapes.transpose(0, 2, 1), motion, alpha), gauge.frames.space
+        return Fit(shapes.transpose(0, 2, 1), motion, alpha), frames.space
 
     @BOTH
     @EACH
@@ -328,7 +328,7 @@ class TestStandardDeviations:
     @EACH
     def test_are_those_of_random_coefficients(self, independence):
         fit = random_fit()
-        frames = independent_gauge(*fit, independence).frames
+        frames = independent_gauge(*fit, independence)[1]
         rng = np.random.default_rng(3)
         root = 0.03 * rng.normal(size=(60, 3, 3))
         covariance = root @ root.swapaxes(1, 2)
@@ -357,7 +357,7 @@ class TestStandardDeviations:
         moved = np.stack(slopes, axis=2) / (2 * step) @ root
         other = regauged(fit)
         deviations = [
-            independent_gauge(*one, "shapes").frames.apply(
+            independent_gauge(*one, "shapes")[1].apply(
                 one.motion, one.alpha, each @ each.swapaxes(1, 2)
             )[2]
             for one, each in ((fit, root), (other, moved))
@@ -454,5 +454,5 @@ class TestDegenerate:
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         assert_allclose(result.alpha.std(axis=0), 1)
         # No frame is turned inside out, and none changes its scale.
-        space = independent_gauge(*fit, independence).frames.space
+        space = independent_gauge(*fit, independence)[1].space
         assert_allclose(space @ fit.frames(), result.frames(), atol=1e-9)

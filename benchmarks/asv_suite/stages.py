@@ -273,7 +273,7 @@ class Gauge(Stage):
         truth = self.table.truth
         if not hasattr(truth, "basis"):
             return np.nan
-        gauge = self.run()
+        gauge, _ = self.run()
         return basis_similarity(
             truth.basis,
             gauge.basis,

@@ -5,17 +5,25 @@ of the basis shapes are free. Here they are fixed. The sign of depth is fixed by
 convention only: a table does not tell an object from its mirror image.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera import mean_view
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import orientations
 
-# Frames that are taken together where much is computed of each.
-BLOCK_FRAMES = 4096
+
+class Gauge(NamedTuple):
+    """Canonical shapes."""
+
+    mean_shape: NDArray  # (n_points, 3), in the canonical space
+    basis: NDArray  # (n_components, n_points, 3), in canonical order and scale
+    order: NDArray  # (n_components,), index of each basis shape in the given basis
+    factors: NDArray  # (n_components,), their factors, zero for those without motion
 
 
 def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
@@ -35,7 +43,7 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
         Orthogonal matrix A such that shapes ``S A^T`` and cameras ``M A^T`` are
         canonical. The x and y axes are the orthonormal pair nearest to the rows of the
         mean camera. Where the cameras have no common view, x, y and z are the principal
-        axes of ``sum_i M_i^T M_i``. The third moment of depth is not negative.
+        axes of ``sum_i M_i^T M_i``. The third moment of depth is non-negative.
     """
     view = mean_view(cameras)
     if view is None:
@@ -51,22 +59,12 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
 
 def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     """
-    Return the affinity of space that makes the mean shape white and seen from front.
+    Return the affinity A (3, 3) of space that makes the mean shape white.
 
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0, centred.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, each divided by the size of its frame.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        A such that shapes ``B A^T`` and cameras ``M A^-1`` are canonical. The mean of
-        ``b b^T`` over the points of the mean shape is the identity (with zeros along
-        directions in which it is flat). In that white space A is the rotation or
-        reflection of `canonical_rotation`.
+    Shapes become ``B A^T`` and cameras (n_frames, 2, 3), each divided by the size of
+    its frame, ``M A^-1``. The mean of ``b b^T`` over the points of the mean shape (J,
+    3) is the identity, with zeros along directions in which it is flat. In that space A
+    is the rotation or reflection of `canonical_rotation`.
     """
     variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
     inside = variance > 1e-18 * variance[-1]
@@ -81,48 +79,14 @@ def euclidean_space(
     mean_shape: NDArray, motion: NDArray, size: float | None
 ) -> NDArray:
     """
-    Return the scaled rotation of space that shows the mean shape from front.
+    Return the scaled rotation or reflection (3, 3) of `canonical_rotation`.
 
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0, centred.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Calibrated cameras, each divided by the size of its frame.
-    size : float or None
-        Factor by which shapes are multiplied. None makes the mean square of the
-        coordinates of the mean shape one.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        A positive multiple of the orthogonal matrix of `canonical_rotation`.
+    Shapes are multiplied by `size`. None makes the mean square of the coordinates of
+    the mean shape (J, 3) one. Cameras (n_frames, 2, 3) are calibrated.
     """
     if size is None:
         size = 1.0 / (np.sqrt(np.mean(mean_shape**2)) or 1.0)
     return size * canonical_rotation(mean_shape, motion)
-
-
-class Gauge(NamedTuple):
-    """
-    Canonical shapes.
-
-    Attributes
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        Mean shape in the canonical space.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes in the canonical space, order and scale.
-    order : ndarray of int, shape (n_components,)
-        Index of each basis shape in the given basis.
-    factors : ndarray of shape (n_components,)
-        Factor by which each was multiplied, zero for those without motion.
-    """
-
-    mean_shape: NDArray
-    basis: NDArray
-    order: NDArray
-    factors: NDArray
 
 
 def canonical_gauge(
@@ -152,37 +116,73 @@ def canonical_gauge(
     -------
     Gauge
         The shapes in that space. The basis is sorted by decreasing energy in the
-        images, ``sum_i ||alpha_ik M_i B_k||_F^2``. Its scales and signs are such that
-        the coefficients have unit variance over the frames (unit mean square where they
-        do not vary) and a third moment that is not negative. A basis shape without
-        motion becomes zero.
+        images, ``sum_i ||alpha_ik M_i B_k||_F^2``. It is scaled such that coefficients
+        have unit variance over the frames (unit mean square where they do not vary) and
+        a non-negative third moment. A basis shape without motion becomes zero.
     """
     energy = image_energies(motion, basis, alpha)
     order = np.argsort(-energy, kind="stable")
     rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
     # Others hold only rounding errors.
     moving = energy > OF_RANKS**2 * rigid
-    sizes = coefficient_sizes(alpha)
-    factors = np.where(moving, orientations(alpha.T) * sizes, 0.0)
+    factors = np.where(moving, orientations(alpha.T) * coefficient_sizes(alpha), 0.0)
     scaled = factors[:, None, None] * basis
     return Gauge(mean_shape @ space.T, scaled[order] @ space.T, order, factors[order])
 
 
-def coefficient_sizes(alpha: NDArray) -> NDArray:
+def rigid_gauge(
+    mean_shape: NDArray,
+    basis: NDArray,
+    sizes: NDArray,
+    fitted: Callable[[NDArray, NDArray], Decomposition],
+    *,
+    camera: str,
+    dtype: Any,
+) -> tuple[Gauge, Decomposition]:
     """
-    Return the sizes of coefficients that become one.
+    Return the gauge of the paper's pipeline, and the fit of the frames in it.
+
+    It is the gauge of the fit of the frames by the points that they show. With missing
+    points that is not the one of completed frames.
 
     Parameters
     ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (n_components,)
-        Their standard deviations over the frames, or roots of their mean squares where
-        they do not vary.
+    mean_shape : ndarray of shape (n_points, 3)
+        B_0, centred.
+    basis : ndarray of shape (n_components, n_points, 3)
+        Basis shapes.
+    sizes : ndarray of shape (n_frames,)
+        Sizes of the frames.
+    fitted : callable
+        Returns the fit of the frames for a mean shape and a basis.
+    camera : {"affine", "weak_perspective", "orthographic"}
+        The camera model.
+    dtype : dtype
+        Type of the numbers that the shapes are rounded to.
     """
+    order, frames = np.arange(len(basis)), fitted(mean_shape, basis)
+    # One scaling is enough, unless frames have fewer points than coefficients need.
+    for _ in range(50):
+        motion = frames.motion / sizes[:, None, None]
+        if camera == "affine":
+            space = canonical_space(mean_shape, motion)
+        else:
+            size = 1.0 if camera == "orthographic" else None
+            space = euclidean_space(mean_shape, motion, size)
+        gauge = canonical_gauge(mean_shape, basis, motion, frames.alpha, space)
+        order = order[gauge.order]
+        mean_shape, basis = gauge.mean_shape.astype(dtype), gauge.basis.astype(dtype)
+        frames = fitted(mean_shape, basis)
+        # Coefficients follow the scales of the basis shapes, but for frames that leave
+        # some of them open: of these the solution of least norm is another one then.
+        off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
+        if np.abs(off).max(initial=0.0) <= 1e-6:
+            break
+    return Gauge(mean_shape, basis, order, gauge.factors), frames
+
+
+def coefficient_sizes(alpha: NDArray) -> NDArray:
+    """Return standard deviations (K,) of alpha (I, K), or RMS where they are zero."""
     deviation = alpha.std(axis=0)
     constant = deviation <= 1e-12 * np.abs(alpha).max(axis=0)
     return np.where(constant, np.sqrt(np.mean(alpha**2, axis=0)), deviation)
@@ -190,21 +190,10 @@ def coefficient_sizes(alpha: NDArray) -> NDArray:
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
     """
-    Return how much each basis shape moves the points in the images.
+    Return the energies of basis shapes in the images, ``sum_i ||alpha_ik M_i B_k||^2``.
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (n_components,)
-        ``sum_i ||alpha_ik M_i B_k||_F^2``.
+    Cameras are (n_frames, 2, 3), basis shapes (n_components, n_points, 3), coefficients
+    (n_frames, n_components), energies (n_components,).
     """
     cameras = motion.transpose(0, 2, 1) @ motion
     weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
@@ -213,25 +202,15 @@ def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
 
 def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
     """
-    Return the mode covariance matrix of given cameras and coefficients.
+    Return the mode covariance matrix of cameras (I, 2, 3) and coefficients (I, K).
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-
-    Returns
-    -------
-    ndarray of shape (3 * n_components, 3 * n_components)
-        ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``. This is the covariance
-        over the images of Brandt et al. (2018), section 3.3, if the motion has block
-        structure.
+    ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``, of shape (3K, 3K), is the
+    covariance over the images of Brandt et al. (2018), section 3.3, if the motion has
+    block structure.
     """
     total = np.zeros((3 * alpha.shape[1],) * 2)
-    for start in range(0, len(alpha), BLOCK_FRAMES):
-        part = slice(start, start + BLOCK_FRAMES)
+    for start in range(0, len(alpha), 4096):  # blocks limit memory
+        part = slice(start, start + 4096)
         blocks = np.einsum("ik,irc->irkc", alpha[part], motion[part])
         blocks = blocks.reshape(-1, len(total))
         total += blocks.T @ blocks
@@ -239,20 +218,6 @@ def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
 
 
 def reorder_blocks(matrix: NDArray, order: NDArray) -> NDArray:
-    """
-    Return a matrix with its 3x3 blocks in another order.
-
-    Parameters
-    ----------
-    matrix : ndarray of shape (3 * n_blocks, 3 * n_blocks)
-        The matrix.
-    order : ndarray of int, shape (n_blocks,)
-        Index of each block in the given matrix.
-
-    Returns
-    -------
-    ndarray of shape (3 * n_blocks, 3 * n_blocks)
-        The matrix with rows and columns rearranged.
-    """
+    """Return a matrix of 3x3 blocks with its rows and columns of blocks in an order."""
     index = (3 * order[:, None] + np.arange(3)).ravel()
     return matrix[np.ix_(index, index)]

@@ -11,55 +11,18 @@ frame. It does not determine their basis. Three changes fit equally well:
   coordinates.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.models import FrameMap
-from isa_nrsfm._gauge.canonical import canonical_gauge, canonical_space, euclidean_space
+from isa_nrsfm._gauge.canonical import (
+    Gauge,
+    canonical_gauge,
+    canonical_space,
+    euclidean_space,
+)
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_RANKS
 from isa_nrsfm.isa._shared_mixing import independent_coefficients, shared_mixing
-
-
-class GaugeOptions(NamedTuple):
-    """
-    What steers the choice of the independent basis.
-
-    ``python -m benchmarks.sensitivity gauge`` shows half and twice of each.
-
-    Attributes
-    ----------
-    max_shifts : int
-        Largest number of alternations of the shifts u and v.
-    smallest_scale : float
-        If the scale of a frame gets below this share of the mean, v stays zero.
-    """
-
-    max_shifts: int = 200
-    smallest_scale: float = 0.1
-
-
-GAUGE_OPTIONS = GaugeOptions()
-
-
-class IndependentGauge(NamedTuple):
-    """
-    Canonical shapes with an independent basis.
-
-    Attributes
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        Mean shape in the space of `canonical_space`.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes, ordered, scaled and signed as by `canonical_gauge`.
-    frames : FrameMap
-        Map of cameras and coefficients of frames to these shapes.
-    """
-
-    mean_shape: NDArray
-    basis: NDArray
-    frames: FrameMap
 
 
 def independent_gauge(
@@ -69,8 +32,7 @@ def independent_gauge(
     independence: str | None,
     camera: str = "affine",
     unit: float | None = None,
-    options: GaugeOptions = GAUGE_OPTIONS,
-) -> IndependentGauge:
+) -> tuple[Gauge, FrameMap]:
     """
     Return the independent basis of a fit.
 
@@ -86,33 +48,30 @@ def independent_gauge(
         Whether the basis shapes are to be independent over the points or their
         coefficients over the frames; None takes the principal axes of the deformation.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        What cameras are: affinities of space, or with calibrated ones only rotations,
-        fit equally well. Scales of orthographic cameras absorb nothing.
+        The camera model: affinities of space, or with calibrated cameras only
+        rotations, fit equally well. Scales of orthographic cameras absorb nothing.
     unit : float, optional
-        What a unit of the shapes becomes with calibrated cameras, as of
-        `euclidean_space`.
-    options : GaugeOptions
-        What steers the choice.
+        The `size` of `euclidean_space`, with calibrated cameras.
 
     Returns
     -------
-    IndependentGauge
-        The basis, and the map of the frames to it.
+    gauge : Gauge
+        The canonical shapes, with factors relative to the mixed basis.
+    frames : FrameMap
+        Map of cameras and coefficients of frames to these shapes.
     """
     # The shifts u and v, then the affinity of space.
-    shift, motion, alpha = _centred(shapes, motion, alpha, camera, options)
+    shift, motion, alpha = _centred(shapes, motion, alpha, camera)
     shapes = np.tensordot(shift, shapes, 1)
     space = canonical_space(shapes[0].T, motion)
     white = shapes[1:].transpose(0, 2, 1) @ space.T
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
     # The mixing of the basis shapes, then their order, scale and signs.
-    mixing: NDArray
     if independence == "shapes":
         mixing = shared_mixing(white)
     elif independence == "coefficients":
-        unmixing = independent_coefficients(alpha)
-        mixing = np.linalg.inv(unmixing).T
+        mixing = np.linalg.inv(independent_coefficients(alpha)).T
     else:
         mixing = _principal_axes(white, alpha)
     basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
@@ -123,9 +82,7 @@ def independent_gauge(
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
     coefficients = np.linalg.inv(shift).T
     coefficients[1:] = scale[:, None] * (unmixing @ coefficients[1:])[gauge.order]
-    return IndependentGauge(
-        gauge.mean_shape, gauge.basis, FrameMap(coefficients, space)
-    )
+    return gauge, FrameMap(coefficients, space)
 
 
 def _centred(
@@ -133,7 +90,6 @@ def _centred(
     motion: NDArray,
     alpha: NDArray,
     camera: str,
-    options: GaugeOptions,
 ) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
@@ -153,7 +109,7 @@ def _centred(
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=OF_RANKS), 1)
     first = total = _mean_shift(alpha)
     moved, scale = alpha - first[0, 1:], np.ones(len(alpha))
-    for _ in range(0 if camera == "orthographic" else options.max_shifts):
+    for _ in range(0 if camera == "orthographic" else 200):
         # v, from the current shapes: <B_k, dual> is the part of B_k along B_0.
         current = np.tensordot(total, shapes, 1)
         if camera == "affine":
@@ -173,10 +129,9 @@ def _centred(
         moved = moved - mean[0, 1:]
         total = mean @ along @ total
         change = np.abs(mean[0, 1:]) + np.abs(along[1:, 0])
-        if np.max(change, initial=0.0) <= OF_DIFFERENCES * max(
-            1.0, np.abs(moved).max()
-        ):
-            if scale.min() < options.smallest_scale * scale.mean():
+        rounding = OF_DIFFERENCES * max(1.0, np.abs(moved).max())
+        if np.max(change, initial=0.0) <= rounding:
+            if scale.min() < 0.1 * scale.mean():
                 break
             return total, motion * scale[:, None, None], moved
     return first, motion, alpha - first[0, 1:]
@@ -195,10 +150,8 @@ def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
     The basis is (K, n_points, 3) in the white space, alpha is (n_frames, K).
     """
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
-    variance = np.where(
-        variance > OF_RANKS**2 * max(variance[-1], 1e-300), variance, 1.0
-    )
+    variance[variance <= OF_RANKS**2 * max(variance[-1], 1e-300)] = 1.0
     root = (axes * np.sqrt(variance)) @ axes.T
     flat = root @ basis.reshape(len(basis), -1)
-    _, directions = np.linalg.eigh(flat @ flat.T)
+    directions: NDArray = np.linalg.eigh(flat @ flat.T)[1]
     return directions[:, ::-1].T @ root
