@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_array_equal
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
@@ -29,7 +30,7 @@ def test_true_and_false_are_no_numbers(value):
 def test_rows_of_arrays_and_dataframes():
     X = np.arange(12.0).reshape(6, 2)
     assert number_of_rows(X) == number_of_rows(pd.DataFrame(X)) == 6
-    np.testing.assert_array_equal(taken_rows(pd.DataFrame(X), [1, 4]), X[[1, 4]])
+    assert_array_equal(taken_rows(pd.DataFrame(X), [1, 4]), X[[1, 4]])
     assert is_pandas_na(pd.NA)
     assert not is_pandas_na(None)
 

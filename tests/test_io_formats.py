@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS
+from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm.io import (
     FORMATS,
@@ -57,9 +58,7 @@ def test_files_read_back_as_they_were_written(name, tmp_path):
     assert find_format(path) == format
     landmarks = read_landmarks(path)
     assert landmarks.format == format
-    np.testing.assert_allclose(
-        tracks_of(landmarks), EXPECTED.get(name, TRACKS), rtol=1e-12
-    )
+    assert_allclose(tracks_of(landmarks), EXPECTED.get(name, TRACKS), rtol=1e-12)
     assert not landmarks.failed.any()
     again = FORMATS[format].read(path)
     pd.testing.assert_frame_equal(again.points, landmarks.points)
@@ -104,31 +103,23 @@ def test_openface_keeps_what_it_says_of_frames(tmp_path):
         lines[2] = lines[2].replace(f",{number},", f",{text},")
     path.write_text("\n".join(lines) + "\n")
     landmarks = read_landmarks(path)
-    np.testing.assert_array_equal(landmarks.failed, success == 0)
+    assert_array_equal(landmarks.failed, success == 0)
     points = tracks_of(landmarks)
     assert np.isnan(points[1]).all()
-    np.testing.assert_array_equal(points[2:], TRACKS[2:])
+    assert_array_equal(points[2:], TRACKS[2:])
     frames = landmarks.frames
-    assert list(frames)[:6] == [
-        "frame",
-        "face_id",
-        "timestamp",
-        "confidence",
-        "success",
-        "gaze_0_x",
-    ]
+    first = "frame face_id timestamp confidence success gaze_0_x"
+    assert list(frames)[:6] == first.split()
     assert {"AU01_r", "pose_Rx", "p_0"} <= set(frames)
     assert not {"X_0", "eye_lmk_x_0", "eye_lmk_X_0"} & set(frames)
     assert list(frames["frame"]) == list(range(1, 13))
     assert frames["frame"].dtype == frames["success"].dtype == np.int64
-    np.testing.assert_array_equal(
-        landmarks.confidence, np.tile(confidence[:, None], (1, 8))
-    )
+    assert_array_equal(landmarks.confidence, np.tile(confidence[:, None], (1, 8)))
     sure = read_landmarks(path, min_confidence=confidence[4])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.isnan(tracks_of(sure)).all(axis=(1, 2)), confidence < confidence[4]
     )
-    np.testing.assert_array_equal(sure.failed, landmarks.failed)
+    assert_array_equal(sure.failed, landmarks.failed)
 
 
 def test_several_faces_in_a_frame_keep_their_rows(tmp_path):
@@ -137,7 +128,7 @@ def test_several_faces_in_a_frame_keep_their_rows(tmp_path):
     table["frame"], table["face_id"] = np.arange(12) // 2, np.arange(12) % 2
     table.to_csv(path, index=False)
     landmarks = read_landmarks(path)
-    np.testing.assert_array_equal(tracks_of(landmarks), TRACKS)
+    assert_array_equal(tracks_of(landmarks), TRACKS)
     assert list(landmarks.frames["face_id"]) == [0, 1] * 6
 
 
@@ -164,7 +155,7 @@ def test_pyfeat_has_empty_cells_where_no_face_is(detector, tmp_path):
     tracks[3] = np.nan
     path = files.write_pyfeat(tmp_path / "a.csv", tracks, detector=detector)
     landmarks = read_landmarks(path)
-    np.testing.assert_allclose(tracks_of(landmarks), tracks)
+    assert_allclose(tracks_of(landmarks), tracks)
     assert list(np.flatnonzero(landmarks.failed)) == [3]
     assert list(landmarks.frames["input"]) == ["video, first.mp4"] * 12
     assert "z_0" not in landmarks.frames
@@ -177,7 +168,7 @@ def test_shares_of_the_image_become_pixels(tmp_path):
     with pytest.raises(ValueError, match=r"shares of the image's width.*--image-size"):
         read_landmarks(path)
     landmarks = read_landmarks(path, image_size=files.IMAGE_SIZE)
-    np.testing.assert_allclose(tracks_of(landmarks), MESH)
+    assert_allclose(tracks_of(landmarks), MESH)
     assert list(landmarks.frames["code"]) == ["000", "001", "002", "003"]
     for size in (640, (640, 0), (640, 480, 3), ("a", "b"), (np.nan, 480)):
         with pytest.raises(ValueError, match="image_size must be a width and a height"):
@@ -192,7 +183,7 @@ def test_hands_are_read_as_mediapipe_when_named(tmp_path):
     path = files.write_mesh(tmp_path / "a.csv", hands)
     assert find_format(path) == "table"
     landmarks = read_landmarks(path, "mediapipe", image_size=(640, 480))
-    np.testing.assert_allclose(tracks_of(landmarks), hands)
+    assert_allclose(tracks_of(landmarks), hands)
 
 
 def test_pts_files_are_read_in_the_order_of_names(tmp_path):
@@ -201,7 +192,7 @@ def test_pts_files_are_read_in_the_order_of_names(tmp_path):
     (folder / "._image_001.pts").write_text("not one")
     (folder / "inner").mkdir()
     landmarks = read_landmarks(folder)
-    np.testing.assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
+    assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
     assert list(landmarks.frames["file"][-2:]) == ["image_011.pts", "last.PTS"]
     assert landmarks.confidence is None
 
@@ -215,10 +206,7 @@ def test_pts_files_are_read_in_the_order_of_names(tmp_path):
         ("1 2\n3 4\n", "expected 'version: 1'"),
         ("version: 1\nn_points: 1\n{\n1 b\n}", "'b'"),
         ("version: 1\nn_points: 1\n{\n1 1_0\n}", "got '1_0'"),
-        (
-            "version: 1\nn_points: 1\n{\n1 inf\n}",
-            "b.pts: .* be finite; got 'inf'",
-        ),
+        ("version: 1\nn_points: 1\n{\n1 inf\n}", "b.pts: .* be finite; got 'inf'"),
         ("version: 1\nn_points: 2\n{\n1 2\n3 4\n}", "a.pts has 8 points, b.pts has 2"),
     ],
 )
@@ -238,42 +226,41 @@ def test_wflw_keeps_boxes_and_attributes(tmp_path):
     frames = landmarks.frames
     assert list(frames["image"]) == [f"37--Soccer/37_Soccer_{i}.jpg" for i in range(4)]
     assert list(frames.iloc[0, 1:5]) == [10, 20, 210, 220]
-    assert list(frames.columns[5:]) == [
-        "pose",
-        "expression",
-        "illumination",
-        "make_up",
-        "occlusion",
-        "blur",
-    ]
+    attributes = "pose expression illumination make_up occlusion blur"
+    assert list(frames.columns[5:]) == attributes.split()
     assert list(frames.iloc[0, 5:]) == [0, 1, 0, 0, 1, 0]
 
 
-def test_deeplabcut_finds_each_animal(tmp_path):
+def pair_with_gaps():
+    """Return two individuals, of whom frames 4 and 6 lack some, and the rows."""
     pair = np.stack([TRACKS, TRACKS + 100], axis=1)
-    pair[2, 0] = np.nan
-    pair[5] = np.nan
-    frame = files.deeplabcut_frame(
-        pair, np.linspace(0, 1, 12), individuals=["mouse 1", "mouse 2"]
-    )
-    landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", frame))
-    frames = landmarks.frames
-    expected = [(i, f"mouse {k}") for i in range(12) for k in (1, 2)]
-    expected.remove((2, "mouse 1"))
-    expected.remove((5, "mouse 2"))
-    expected[expected.index((5, "mouse 1"))] = (5, None)
-    names = individuals_of(landmarks)
-    assert list(zip(frames["frame"], names, strict=True)) == expected
-    rows = pair[
-        [i for i, _ in expected], [int(name == "mouse 2") for _, name in expected]
-    ]
-    np.testing.assert_allclose(tracks_of(landmarks), rows)
-    assert list(np.flatnonzero(landmarks.failed)) == [expected.index((5, None))]
+    pair[4] = np.nan
+    pair[6, 1] = np.nan
+    rows = [(i, k) for i in range(12) for k in (0, 1) if (i, k) not in ((6, 1), (4, 1))]
+    return pair, *map(list, zip(*rows, strict=True))
+
+
+def assert_rows(landmarks, names):
+    """Assert that landmarks are those of `pair_with_gaps`."""
+    pair, frame, individual = pair_with_gaps()
+    assert_allclose(tracks_of(landmarks), pair[frame, individual])
+    expected = [names[k] for k in individual]
+    expected[frame.index(4)] = None
+    assert individuals_of(landmarks) == expected
+    assert list(landmarks.frames["frame"]) == frame
+    assert list(np.flatnonzero(landmarks.failed)) == [frame.index(4)]
     assert landmarks.point_names == tuple(files.BODYPARTS)
     assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
-    np.testing.assert_allclose(
-        landmarks.confidence["snout"], np.linspace(0, 1, 12)[frames["frame"]]
-    )
+
+
+def test_deeplabcut_finds_each_animal(tmp_path):
+    pair, frame, _ = pair_with_gaps()
+    names = ["mouse 1", "mouse 2"]
+    likelihood = np.linspace(0, 1, 12)
+    table = files.deeplabcut_frame(pair, likelihood, individuals=names)
+    landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", table))
+    assert_rows(landmarks, names)
+    assert_allclose(landmarks.confidence["snout"], likelihood[frame])
 
 
 def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
@@ -288,7 +275,7 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
     ):
         frame.index = index
         landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", frame))
-        np.testing.assert_allclose(tracks_of(landmarks), expected)
+        assert_allclose(tracks_of(landmarks), expected)
         assert landmarks.confidence is None
         assert list(landmarks.frames) == ["image"]
         assert landmarks.frames["image"][0] == "labeled-data/reach/img000.png"
@@ -316,7 +303,7 @@ def test_further_columns_of_lightning_pose_are_left_aside(name, tmp_path):
     frame[("DLC_resnet50_mice", "set", "")] = "train"
     path = files.write_deeplabcut(tmp_path / name, frame)
     landmarks = read_landmarks(path, min_confidence=0.5)
-    np.testing.assert_allclose(tracks_of(landmarks), TRACKS)
+    assert_allclose(tracks_of(landmarks), TRACKS)
 
 
 def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
@@ -332,7 +319,7 @@ def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
     path = files.write_deeplabcut(tmp_path / "a.csv", both)
     with pytest.warns(UserWarning, match="points corner belong to no animal"):
         landmarks = read_landmarks(path)
-    np.testing.assert_allclose(tracks_of(landmarks), TRACKS)
+    assert_allclose(tracks_of(landmarks), TRACKS)
     files.write_deeplabcut(path, both.rename(columns={"single": "mouse 2"}))
     with pytest.raises(ValueError, match="'mouse' and 'mouse 2' have different"):
         read_landmarks(path)
@@ -359,34 +346,20 @@ def test_bad_deeplabcut_columns_are_named(change, message, tmp_path):
     ids=str,
 )
 def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
-    pair = np.stack([TRACKS, TRACKS + 100], axis=1)
-    pair[4] = np.nan
-    pair[6, 1] = np.nan
+    pair, frame, track = pair_with_gaps()
     scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
     path = files.write_sleap(
         tmp_path / "a.analysis.h5", pair, order=order, named=named, scores=scores
     )
     landmarks = read_landmarks(path)
-    expected = [(i, k) for i in range(12) for k in (0, 1)]
-    expected.remove((6, 1))
-    expected.remove((4, 1))
-    frame, track = map(list, zip(*expected, strict=True))
-    np.testing.assert_array_equal(tracks_of(landmarks), pair[frame, track])
-    np.testing.assert_array_equal(landmarks.confidence, scores[frame, track])
-    names = [("a", "b")[k] for k in track]
-    names[expected.index((4, 0))] = None
-    assert individuals_of(landmarks) == names
-    assert list(landmarks.frames["frame"]) == frame
-    known = [name is not None for name in names]
-    np.testing.assert_allclose(
-        landmarks.frames["instance_score"][known],
-        scores.mean(axis=2)[frame, track][known],
-    )
+    assert_rows(landmarks, "ab")
+    assert_array_equal(landmarks.confidence, scores[frame, track])
+    of_instances = scores.mean(axis=2)[frame, track]
+    of_instances[frame.index(4)] = np.nan
+    assert_allclose(landmarks.frames["instance_score"], of_instances)
     sure = read_landmarks(path, min_confidence=0.5)
-    np.testing.assert_array_equal(
-        np.isnan(tracks_of(sure)[..., 0]),
-        np.isnan(pair[frame, track][..., 0]) | (scores[frame, track] < 0.5),
-    )
+    lost = np.isnan(pair[frame, track][..., 0]) | (scores[frame, track] < 0.5)
+    assert_array_equal(np.isnan(tracks_of(sure)[..., 0]), lost)
 
 
 def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
@@ -399,7 +372,7 @@ def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
     landmarks = read_landmarks(path, min_confidence=0.2)
     shown = np.delete(np.arange(12), 4)
     expected = np.where(scores[..., None] < 0.2, np.nan, pair)[shown]
-    np.testing.assert_array_equal(tracks_of(landmarks), expected.reshape(22, 8, 2))
+    assert_array_equal(tracks_of(landmarks), expected.reshape(22, 8, 2))
     assert individuals_of(landmarks) == ["a", "b"] * 11
     assert list(landmarks.frames["frame"]) == list(np.repeat(shown, 2))
     assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
@@ -413,7 +386,7 @@ def test_points_without_a_confidence_are_kept(tmp_path):
     )
     landmarks = read_landmarks(path, min_confidence=0.5)
     assert "individual" not in landmarks.frames
-    np.testing.assert_array_equal(
+    assert_array_equal(
         np.isnan(tracks_of(landmarks)).all(axis=(1, 2)), np.arange(12) == 0
     )
     assert not landmarks.failed.any()
@@ -449,7 +422,7 @@ def test_coco_has_a_row_for_each_person(tmp_path):
     frames = landmarks.frames
     # In the order of the images 3, 5, 7 and 9, and last the image without anybody.
     order = [1, 2, 3, 0, *range(4, 12)]
-    np.testing.assert_array_equal(tracks_of(landmarks)[:-1], tracks[order])
+    assert_array_equal(tracks_of(landmarks)[:-1], tracks[order])
     assert list(frames["image_id"]) == [3, 3, 5, 7, *[9] * 8, 11]
     assert list(frames["annotation_id"][:-1]) == [100 + i for i in order]
     assert list(frames["file_name"][[0, 12]]) == ["000000000003.jpg", "empty.jpg"]
@@ -469,10 +442,10 @@ def test_coco_categories_are_not_mixed(tmp_path):
     with pytest.raises(ValueError, match="person, hand have different keypoints"):
         read_landmarks(path)
     people = read_landmarks(path, category="person")
-    np.testing.assert_array_equal(tracks_of(people), TRACKS)
+    assert_array_equal(tracks_of(people), TRACKS)
     hands = read_landmarks(path, category="hand")
     assert hands.failed.sum() == 11
-    np.testing.assert_array_equal(tracks_of(hands)[0], [[1, 2], [3, 4]])
+    assert_array_equal(tracks_of(hands)[0], [[1, 2], [3, 4]])
     with pytest.raises(ValueError, match=r"no category 'cat'.* there are person, hand"):
         read_landmarks(path, category="cat")
 
@@ -488,8 +461,8 @@ def test_coco_results_have_confidences(tmp_path):
     landmarks = read_landmarks(path)
     expected = TRACKS.copy()
     expected[0, 0] = np.nan
-    np.testing.assert_array_equal(tracks_of(landmarks), expected)
-    np.testing.assert_array_equal(landmarks.confidence, rows[..., 2])
+    assert_array_equal(tracks_of(landmarks), expected)
+    assert_array_equal(landmarks.confidence, rows[..., 2])
     assert list(landmarks.frames["image_id"])[:2] == ["0.jpg", "1.jpg"]
     assert list(landmarks.points)[:2] == ["x_0", "y_0"]
     content[3]["category_id"] = 2
@@ -539,7 +512,7 @@ def test_tables_keep_options_of_their_own(tmp_path):
     landmarks = read_landmarks(path, columns="a#,b#", missing="zeros")
     expected = TRACKS.copy()
     expected[2, 3] = np.nan
-    np.testing.assert_array_equal(tracks_of(landmarks), expected)
+    assert_array_equal(tracks_of(landmarks), expected)
     assert list(landmarks.frames["id"])[:2] == ["000", "001"]
     with pytest.raises(ValueError, match=r"a\.tsv cannot be read as table"):
         read_landmarks(path)
@@ -625,9 +598,7 @@ def test_mediapipe_results_become_pixels(part):
         landmarker_result(part, shares[2:], visibility=0.75),
     ]
     landmarks = from_mediapipe(iter(results), sizes)
-    np.testing.assert_allclose(
-        tracks_of(landmarks)[[0, 1, 3]], shares * sizes[[0, 0, 2], None]
-    )
+    assert_allclose(tracks_of(landmarks)[[0, 1, 3]], shares * sizes[[0, 0, 2], None])
     assert list(landmarks.failed) == [False, False, True, False]
     assert list(landmarks.frames["frame"]) == [0, 0, 1, 2]
     assert list(landmarks.frames["individual"].isna()) == [False, False, True, False]
@@ -677,14 +648,7 @@ class Variable:
 
 def movement_dataset(plural, order=(0, 1, 2, 3)):
     """Return a dataset of two mice, as movement names it now and did before."""
-    keypoint, individual = (
-        ("keypoints", "individuals")
-        if plural
-        else (
-            "keypoint",
-            "individual",
-        )
-    )
+    keypoint, individual = "keypoint" + "s" * plural, "individual" + "s" * plural
     dims = ["time", "space", keypoint, individual]
     coords = {
         "time": np.arange(12) / 30,
@@ -707,17 +671,17 @@ def movement_dataset(plural, order=(0, 1, 2, 3)):
 def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
     landmarks = from_movement(movement_dataset(plural, order))
     rows = np.stack([TRACKS, TRACKS + 100], axis=1).reshape(24, 8, 2)
-    np.testing.assert_allclose(tracks_of(landmarks), np.delete(rows, 7, axis=0))
+    assert_allclose(tracks_of(landmarks), np.delete(rows, 7, axis=0))
     assert list(landmarks.frames["individual"][:2]) == ["id_0", "id_1"]
-    np.testing.assert_allclose(landmarks.frames["time"][:3], [0, 0, 1 / 30])
+    assert_allclose(landmarks.frames["time"][:3], [0, 0, 1 / 30])
     assert landmarks.confidence.iloc[0, 1] == pytest.approx(2 / 191)
     swapped = movement_dataset(plural, order)
     swapped["position"].coords["space"].values = np.array(["y", "x"])
-    np.testing.assert_array_equal(
+    assert_array_equal(
         tracks_of(from_movement(swapped))[..., ::-1], tracks_of(landmarks)
     )
     one = from_movement(movement_dataset(plural, order), individual="id_1")
-    np.testing.assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
+    assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
     assert list(np.flatnonzero(one.failed)) == [3]
 
 

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from damage import as_json, damaged_array, damaged_tree, pick
 from layers import slow_after
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -165,7 +166,7 @@ def assert_same(loaded, saved):
     for name, value in expected.items():
         if isinstance(value, np.random.RandomState):
             found[name], value = found[name].get_state(), value.get_state()
-        np.testing.assert_equal(found[name], value)
+        assert_equal(found[name], value)
         if isinstance(value, np.ndarray):
             assert type(found[name]) is np.ndarray
             assert found[name].dtype == value.dtype
@@ -186,7 +187,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
     few = table[:6]
     for method in ("decompose", "reproject", "score", "transform"):
         found, expected = getattr(loaded, method)(few), getattr(model, method)(few)
-        np.testing.assert_equal(found, expected)
+        assert_equal(found, expected)
         assert str(getattr(found, "dtype", "")) == str(getattr(expected, "dtype", ""))
     names = model.get_feature_names_out().tolist()
     assert loaded.get_feature_names_out().tolist() == names
@@ -194,7 +195,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
     if hasattr(model, "alpha_std_"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            np.testing.assert_equal(loaded.diagnostics(), model.diagnostics())
+            assert_equal(loaded.diagnostics(), model.diagnostics())
     with zipfile.ZipFile(path) as file:
         assert {Path(name).suffix for name in file.namelist()} == {".npy"}
     with np.load(path, allow_pickle=False) as file:
@@ -209,8 +210,8 @@ def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     loaded = load_model(path)
     assert str(clone(loaded).get_params()) == str(clone(model).get_params())
     basis = model.basis_
-    np.testing.assert_array_equal(clone(loaded).fit(table).basis_, basis)
-    np.testing.assert_array_equal(loaded.fit(table).basis_, basis)
+    assert_array_equal(clone(loaded).fit(table).basis_, basis)
+    assert_array_equal(loaded.fit(table).basis_, basis)
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -219,7 +220,7 @@ def test_strategies_of_users_are_named_and_not_stored(name, fitted, path):
     save_model(model, path)
     save_model(load_model(path), path)
     loaded = load_model(path)
-    np.testing.assert_array_equal(loaded.isa_.components_, model.isa_.components_)
+    assert_array_equal(loaded.isa_.components_, model.isa_.components_)
     with pytest.raises(ValueError, match=rf"test_io_models\.{name}\. .* only its name"):
         loaded.fit(TABLE)
     loaded.set_params(isa=PooledFastICA(n_init=1)).fit(TABLE)
@@ -234,7 +235,7 @@ def test_a_state_of_random_numbers_goes_on_where_it_was(path):
     loaded = load_model(path)
     assert_same(loaded, model)
     draws = random.standard_normal(9)
-    np.testing.assert_array_equal(loaded.random_state.standard_normal(9), draws)
+    assert_array_equal(loaded.random_state.standard_normal(9), draws)
     other = np.random.RandomState(np.random.PCG64(0))
     with pytest.raises(ValueError, match=r"random_state is of type .* cannot hold"):
         save_model(model.set_params(random_state=other), path)
@@ -360,7 +361,7 @@ def test_damaged_bytes_are_found(model, path):
         except (ValueError, OSError):
             refused += 1
         else:  # what zip archives have twice
-            np.testing.assert_array_equal(loaded.transform(TABLE[:3]), expected)
+            assert_array_equal(loaded.transform(TABLE[:3]), expected)
     assert refused > 90
 
 
@@ -415,7 +416,7 @@ def test_saved_models_load_for_good(name, path):
     assert found.keys() == expected.keys()
     for key, values in expected.items():
         largest = np.nanmax(np.abs(values), initial=0.0)
-        np.testing.assert_allclose(found[key], values, rtol=0, atol=1e-6 * largest)
+        assert_allclose(found[key], values, rtol=0, atol=1e-6 * largest)
     assert np.isfinite(model.score(table))
     assert model.reconstruct(table).shape == (4, 14, 3)
     save_model(model, path)

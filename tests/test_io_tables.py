@@ -5,6 +5,7 @@ import os
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_array_equal
 
 from isa_nrsfm.io import LandmarkTable, landmark_table, read_table, write_table
 
@@ -49,7 +50,7 @@ def test_text_stays_as_it_is_written(write):
     assert list(table["id"]) == ["007", "None"]
     assert list(table["AU01_r"]) == ["0.50", ""]
     assert list(table["x0"]) == ["1.5", "1_0"]
-    np.testing.assert_array_equal(table["y0"], [20.0, np.nan])
+    assert_array_equal(table["y0"], [20.0, np.nan])
     assert table["nose_x"].isna().all()
 
 
@@ -122,7 +123,7 @@ def test_landmarks_and_other_columns_are_separated(frame):
     assert isinstance(table, LandmarkTable)
     assert list(table.points) == NAMES
     assert list(table.other) == ["id"]
-    np.testing.assert_array_equal(table.points, frame[NAMES])
+    assert_array_equal(table.points, frame[NAMES])
     pd.testing.assert_frame_equal(table.other, frame[["id"]])
     assert (table.points.dtypes == np.float64).all()
 
@@ -150,7 +151,7 @@ def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
     points = landmark_table(frame, missing="zeros").points
     missing = np.zeros(points.shape, dtype=bool)
     missing[0, 2:4] = True
-    np.testing.assert_array_equal(points.isna(), missing)
+    assert_array_equal(points.isna(), missing)
     with pytest.raises(ValueError, match='None or "zeros"; got 0'):
         landmark_table(frame, missing=0)
 
@@ -160,8 +161,8 @@ def test_numbers_of_all_kinds_become_floats(frame):
     frame["y0"] = pd.Series(["1", " 2.5 ", "", "nan", None], dtype=object)
     frame["x1"] = frame["x1"].astype(np.float32)
     points = landmark_table(frame).points
-    np.testing.assert_array_equal(points["x0"], [1, np.nan, 3, 4, 5])
-    np.testing.assert_array_equal(points["y0"], [1, 2.5, np.nan, np.nan, np.nan])
+    assert_array_equal(points["x0"], [1, np.nan, 3, 4, 5])
+    assert_array_equal(points["y0"], [1, 2.5, np.nan, np.nan, np.nan])
     assert (points.dtypes == np.float64).all()
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from landmark_files import openface_names
 
 from isa_nrsfm._tables.column_names import names_layout, parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import (
@@ -11,20 +12,6 @@ from isa_nrsfm.io._landmark_columns import (
 )
 
 N_POINTS = 9
-
-
-def openface_names():
-    """Return the header of an OpenFace 2 file with all its outputs."""
-    names = ["frame", "face_id", "timestamp", "confidence", "success"]
-    names += [f"gaze_{eye}_{axis}" for eye in (0, 1) for axis in "xyz"]
-    names += ["gaze_angle_x", "gaze_angle_y"]
-    names += [f"eye_lmk_{axis}_{j}" for axis in "xyXYZ" for j in range(56)]
-    names += [f"pose_{kind}{axis}" for kind in "TR" for axis in "xyz"]
-    names += [f"{axis}_{j}" for axis in "xyXYZ" for j in range(68)]
-    names += ["p_scale", "p_rx", "p_ry", "p_rz", "p_tx", "p_ty"]
-    names += [f"p_{j}" for j in range(34)]
-    names += [f"AU{unit:02d}_r" for unit in range(17)]
-    return names + [f"AU{unit:02d}_c" for unit in range(18)]
 
 
 def named(template, axes="xy", points=range(N_POINTS)):

@@ -156,7 +156,7 @@ def _common_bodyparts(
     if others and _UNIQUE in parts and set(parts[_UNIQUE]) != set(parts[others[0]]):
         warn_caller(
             f"the points {', '.join(parts.pop(_UNIQUE))} belong to no animal "
-            f"(individual {_UNIQUE!r}) and are left out",
+            f"(individual {_UNIQUE!r}) and are left out"
         )
     first, *rest = parts
     for name in rest:
