@@ -74,7 +74,7 @@ def run(args: Namespace, warned: list[str]) -> str:
 
 
 def _content(output: Path, content: str | None) -> str:
-    """Return what is to be written, and check that the suffix fits."""
+    """Return the content to write, and check that the suffix fits."""
     suffix = output.suffix.lower()
     if content is None:
         found = [name for name, suffixes in SUFFIXES.items() if suffix in suffixes]

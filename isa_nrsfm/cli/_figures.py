@@ -4,6 +4,7 @@ import contextlib
 import io
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -69,17 +70,17 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
     for number, label in enumerate(asked.labels, 1):
         figures[f"label_{number}.png"] = (
             f"coefficients by {label.name}",
-            lambda fit, label=label: _by_label(fit, label),
+            partial(_by_label, label),
         )
         if label.is_of_classes(12):
             figures[f"label_{number}_shapes.png"] = (
                 f"mean shape of each {label.name}, and of all frames in grey",
-                lambda fit, label=label: _shapes_by_label(fit, label),
+                partial(_shapes_by_label, label),
             )
     if asked.times is not None:
         figures["time.png"] = (
             "coefficients in time, with one standard deviation",
-            lambda fit: _in_time(fit, asked),
+            partial(_in_time, asked),
         )
     return figures
 
@@ -112,7 +113,7 @@ def _shown_as_warning(name: str) -> Iterator[None]:
         warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
 
 
-def _by_label(fit: Fit, label: Label) -> CoefficientsDisplay:
+def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
     """Draw the coefficients by a label."""
     alpha = fit.estimator.alpha_
     return CoefficientsDisplay(
@@ -123,7 +124,7 @@ def _by_label(fit: Fit, label: Label) -> CoefficientsDisplay:
     ).plot(kind=label.kind)
 
 
-def _in_time(fit: Fit, asked: Columns) -> CoefficientsDisplay:
+def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
     """Draw the coefficients in time, smoothed ones if there are any."""
     alpha = fit.estimator.alpha_
     deviation = getattr(fit.estimator, "alpha_std_", None)
@@ -138,7 +139,7 @@ def _in_time(fit: Fit, asked: Columns) -> CoefficientsDisplay:
     ).plot(kind="time")
 
 
-def _shapes_by_label(fit: Fit, label: Label) -> BasisShapeDisplay:
+def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
     """Draw the mean shape of each class over that of all frames."""
     whole = BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)

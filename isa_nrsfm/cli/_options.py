@@ -156,14 +156,27 @@ def listed_names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
 
 
-def _option(help: str, metavar: str = "", **settings: Any) -> dict[str, Any]:
+# How the values of options are read, by their names in the help; others are texts.
+TYPES: dict[str, Callable[[str], Any]] = {
+    **dict.fromkeys(("FILE", "DIR", "TABLE", "MODEL"), a_path),
+    "COLUMN=REGEX": row_rule,
+    "CONFIDENCE": float,
+    "K": numbers_of_shapes,
+    "LAYOUT": skeleton_name,
+    "MODES": number_of_modes,
+    "N": int,
+    "NAMES": listed_names,
+    "NUMBER": positive_number,
+    "POINT,POINT": point_pair,
+    "SEED": whole_number(0, 2**32 - 1),
+    "STARTS": whole_number(1),
+    "WIDTHxHEIGHT": image_size,
+}
+
+
+def _option(help: str, metavar: str, **settings: Any) -> dict[str, Any]:
     """Return the arguments of `add_argument` for an option with a value."""
-    return settings | {"help": help} | ({"metavar": metavar} if metavar else {})
-
-
-def _file(help: str, metavar: str = "FILE", **settings: Any) -> dict[str, Any]:
-    """Return the arguments of `add_argument` for a path."""
-    return _option(help, metavar, type=a_path, **settings)
+    return {"help": help, "metavar": metavar, "type": TYPES.get(metavar)} | settings
 
 
 def _flag(help: str) -> dict[str, Any]:
@@ -180,16 +193,16 @@ def _list(help: str, metavar: str, **settings: Any) -> dict[str, Any]:
 def _choice(help: str, choices: tuple[str, ...]) -> dict[str, Any]:
     """Return the arguments of `add_argument` for a choice, whose first one is taken."""
     help = f"{help} (default: {choices[0]})"
-    return _option(help, choices=choices, default=choices[0])
+    return {"help": help, "choices": choices, "default": choices[0]}
 
 
 # Arguments without a leading -- in the command line.
 POSITIONAL = ("table", "model")
 SHORT = {"output": "-o", "n_components": "-k"}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "model": _file("model.npz, written by fit", "MODEL"),
+    "model": _option("model.npz, written by fit", "MODEL"),
     # The table.
-    "table": _file(
+    "table": _option(
         "a .csv, .tsv or .parquet file, or a file or folder of another format", "TABLE"
     ),
     "format": _option(
@@ -211,20 +224,17 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "leave out the rows in which the column matches the regular expression, such "
         "as 'name=^ir' for names that begin with ir",
         "COLUMN=REGEX",
-        type=row_rule,
     ),
     "zeros_missing": _flag("treat points at exactly (0, 0) as missing"),
     "min_confidence": _option(
         "treat points with a lower confidence as missing; the scale is that of the "
         "program that wrote the table",
-        "NUMBER",
-        type=float,
+        "CONFIDENCE",
     ),
     "image_size": _option(
         "size of the images in pixels, such as 1920x1080: MediaPipe writes coordinates "
         "as fractions of it",
         "WIDTHxHEIGHT",
-        type=image_size,
     ),
     "points": _option(
         "fit only some of the points: inner leaves out the visible outline of a face, "
@@ -233,28 +243,30 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "POINTS",
     ),
     # What is written.
-    "output": _file("folder for the results, created if absent", "DIR", required=True),
+    "output": _option(
+        "folder for the results, created if absent", "DIR", required=True
+    ),
     "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
     "std": _flag(
         "add the standard deviation of each coefficient, in columns such as alpha_1_std"
     ),
-    "viewer": _file("write a page that shows the new frames in 3D (.html)"),
-    "edges": _file(
+    "viewer": _option("write a page that shows the new frames in 3D (.html)", "FILE"),
+    "edges": _option(
         "the lines between points in the viewer and the figures: a .csv file without "
         "header, with the names of two points per line, or of three for a surface; "
-        "'none' draws only points (default: the lines of a known layout)"
+        "'none' draws only points (default: the lines of a known layout)",
+        "FILE",
     ),
     "skeleton": _option(
         "the layout of the points, if names, number and order of the points do not "
         f"determine it: {', '.join(SKELETON_NAMES)}, or the config.yaml of DeepLabCut",
-        "NAME",
-        type=skeleton_name,
+        "LAYOUT",
     ),
-    "origin": _option(
-        "where y is zero: upper in images, whose y points down, lower if y points up "
-        "(default: auto, lower for faces that would be upside down)",
-        choices=["auto", "upper", "lower"],
-    ),
+    "origin": {
+        "help": "where y is zero: upper in images, whose y points down, lower if y "
+        "points up (default: auto, lower for faces that would be upside down)",
+        "choices": ["auto", "upper", "lower"],
+    },
     # Other columns.
     "label": _list(
         "a class or a number for each frame, such as an expression or an age: reports "
@@ -272,17 +284,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "add the distance of two points in the 3D shape of each frame to alpha.csv, in "
         "units of the distance between the outer corners of the eyes",
         "POINT,POINT",
-        type=point_pair,
     ),
     "unit": _option(
         "two points whose distance in the mean shape is the unit of --distance",
         "POINT,POINT",
-        type=point_pair,
     ),
     "length": _option(
         "the length of that unit, such as 90 for millimetres (default: 1)",
         "NUMBER",
-        type=positive_number,
         default=1.0,
     ),
     "time": _option(
@@ -293,7 +302,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "fps": _option(
         "frames per second, if the rows are the frames of a video, instead of --time",
         "NUMBER",
-        type=positive_number,
     ),
     # The method.
     "n_components": _option(
@@ -301,7 +309,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "one is used that best predicts held-out points of held-out frames; auto uses "
         "as many as the table determines, at most twelve",
         "K",
-        type=numbers_of_shapes,
         default="3",
     ),
     "camera": _choice(
@@ -317,8 +324,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "n_init": _option(
         "number of random starts (default: 16 of pooled, 30 of fast)",
-        "N",
-        type=whole_number(1),
+        "STARTS",
     ),
     "block_recovery": _choice(
         "algorithm that finds the block structure", BLOCK_RECOVERIES
@@ -343,35 +349,30 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "random_state": _option(
         "seed of the random starts (default: 0)",
         "SEED",
-        type=whole_number(0, 2**32 - 1),
         default=0,
     ),
     "n_jobs": _option(
         "processes for the random starts, -1 for all processors (default: 1)",
         "N",
-        type=int,
     ),
     # Export.
-    "content": _option(
-        "what to write, if the suffix leaves it open: pdm for a point distribution "
-        "model as .mat (M, V and E) or .npz",
-        choices=list(SUFFIXES),
-    ),
+    "content": {
+        "help": "contents of the file, if the suffix leaves it open: pdm for a point "
+        "distribution model as .mat (M, V and E) or .npz",
+        "choices": list(SUFFIXES),
+    },
     "n_modes": _option(
         "modes of the point distribution model: their number, or the share of the "
         "variance that they explain, such as 0.98 (default: number of basis shapes)",
-        "N",
-        type=number_of_modes,
+        "MODES",
     ),
     "names": _option(
         "for .html and .glb, names of the basis shapes, with commas between them",
         "NAMES",
-        type=listed_names,
     ),
     "n_frames": _option(
         "for .html, the largest number of frames that are shown (default: 1000)",
         "N",
-        type=int,
     ),
     "mirrored": _flag("take the mirror image in depth, which has the same images"),
 }

@@ -4,7 +4,7 @@ import json
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PAGE = "report.html"
-# The files of every fit, and what is in them: the first clause in the text.
+# The files of every fit and their contents, of which the text has the first clause.
 RESULTS = {
     PAGE: "this report with its figures, for any browser",
     "model.npz": "the fitted model, for isa-nrsfm transform",
@@ -100,7 +100,7 @@ def write_results(
     )
     energy, error, _ = frame_energies(X, fitted_table(estimator, fit), estimator.layout)
     cameras["inverse_snr"] = error / energy
-    camera = None
+    camera: Literal["weak_perspective"] | None = None
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:
             with warnings.catch_warnings():

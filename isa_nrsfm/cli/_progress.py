@@ -23,7 +23,7 @@ def shown_progress(
     program: str, since: float, shortest: float = SHORTEST
 ) -> Iterator[None]:
     """
-    Show every few seconds on the standard error what was last printed.
+    Repeat the last printed line every few seconds on the standard error.
 
     Nothing of the block reaches the standard output. On a terminal whole lines are
     shown at once; those that end with a carriage return are shown only in turn.

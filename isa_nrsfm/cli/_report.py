@@ -58,9 +58,9 @@ def quality_report(
 ) -> dict[str, Any]:
     """Describe how well a model explains a table."""
     explained = fitted_table(estimator, fit)
-    options = {"layout": estimator.layout, "scale_frames": estimator.frames_scaled_}
+    layout, scaled = estimator.layout, estimator.frames_scaled_
     return {
-        "inverse_snr": inverse_snr(X, explained, **options),
+        "inverse_snr": inverse_snr(X, explained, layout=layout, scale_frames=scaled),
         "held_out_error": -estimator.score(X),
         "rms_point_error": np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2)),
     }

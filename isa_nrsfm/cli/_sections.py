@@ -162,8 +162,8 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
         [name, content.partition(";")[0].partition(": the image")[0]]
         for name, content in report["files"].items()
     ]
-    listed = {"Files": [f"in {folder}", Cells([], described)]}
-    return text_of(fit_title(report), fit_sections(report) | listed)
+    listed: Sections = {"Files": [f"in {folder}", Cells([], described)]}
+    return text_of(fit_title(report), {**fit_sections(report), **listed})
 
 
 def write_page(folder: Path, report: dict[str, Any]) -> None:
@@ -268,7 +268,7 @@ def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
 
 
 def _camera_section(model: dict[str, Any]) -> list[str | Cells]:
-    """Return the camera model, the certainty of the depth, and what to try next."""
+    """Return the camera model, the certainty of the depth, and advice."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
     if model["depth_advice"]:
         title = (

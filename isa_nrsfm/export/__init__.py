@@ -1,9 +1,8 @@
 """Fitted models as files for other programs.
 
-Shape models for MATLAB, OpenFace and own code, animated shapes for programs that show
-glTF, a page for a browser that lets anybody look at them, and what people measure: head
-pose and distances. Shapes are Euclidean ones
-as far as the cameras tell them (`isa_nrsfm.calibration`), upright and frontal.
+Shape models for MATLAB, OpenFace and other code, animated shapes in glTF, a page that
+shows them in any browser, head poses and distances. Shapes are Euclidean if the cameras
+determine them (`isa_nrsfm.calibration`), upright and frontal.
 """
 
 from typing import TYPE_CHECKING

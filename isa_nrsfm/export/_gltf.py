@@ -88,7 +88,7 @@ def write_glb(
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras of a model with affine ones. "weak_perspective"
+        Camera model for a model with affine cameras. "weak_perspective"
         writes Euclidean shapes, None affine ones, which look like those of figures. A
         model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
@@ -111,7 +111,7 @@ def write_glb(
     Warns
     -----
     UserWarning
-        If the cameras turn too little to tell the metric.
+        If the cameras turn too little to determine the metric.
 
     See Also
     --------

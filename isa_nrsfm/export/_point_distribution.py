@@ -88,7 +88,7 @@ def point_distribution_model(
         Number of modes, or a share of the variance, between 0 and 1, of which as few
         modes are taken as have it. None takes as many as there are basis shapes.
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras of a model with affine ones. "weak_perspective"
+        Camera model for a model with affine cameras. "weak_perspective"
         takes the Euclidean shapes of the frames, as `AffineNRSfM.reconstruct` has them,
         aligned by rotations and scales. None takes the affine shapes as they are. A
         model with calibrated cameras has Euclidean shapes, which are aligned likewise.
@@ -116,7 +116,7 @@ def point_distribution_model(
     Warns
     -----
     UserWarning
-        If the cameras turn too little to tell the metric.
+        If the cameras turn too little to determine the metric.
 
     See Also
     --------
@@ -170,8 +170,8 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     pdm : PointDistributionModel
         The model.
     path : str or path-like
-        The file. Its suffix tells the format: ``.txt`` is the text that OpenFace and
-        the CLM framework read, ``.mat`` has the variables M, V and E of their MATLAB
+        The file. Its suffix determines the format: ``.txt`` is the text of OpenFace and
+        the CLM framework, ``.mat`` has the variables M, V and E of their MATLAB
         code, ``.npz`` has the arrays of the named tuple. An existing file is replaced.
 
     Raises

@@ -27,7 +27,7 @@ class FramePoses(NamedTuple):
     Attributes
     ----------
     yaw : ndarray of shape (n_frames,)
-        In degrees, as of `isa_nrsfm.calibration.view_angles`, like all three: zero for
+        In degrees, defined by `isa_nrsfm.calibration.view_angles`: zero for
         a frontal, upright object. Positive where it is turned to the viewer's right.
     pitch : ndarray of shape (n_frames,)
         In degrees; positive where it looks up.
@@ -75,8 +75,7 @@ def frame_poses(
     X : array-like of shape (n_frames, 2 * n_points), default=None
         A table with the points of the fitted one. By default the fitted table.
     camera : {"weak_perspective"}, default="weak_perspective"
-        What took the images, for a model that was fitted with affine cameras. One with
-        calibrated cameras knows it.
+        Camera model for a model with affine cameras. Calibrated cameras have their own.
     edges : "auto", str, Skeleton or None, default="auto"
         The layout of the points or its name; otherwise it is recognised.
     origin : {"auto", "upper", "lower"}, default="auto"
@@ -163,7 +162,7 @@ def point_distances(
     length : float, default=1.0
         Their distance, for instance 90 for millimetres.
     camera : {"weak_perspective"}, default="weak_perspective"
-        As of `frame_poses`.
+        Camera model for a model with affine cameras.
 
     Returns
     -------
@@ -174,7 +173,7 @@ def point_distances(
     ------
     ValueError
         If there is no such point, if `length` is not positive, if `unit` is not given
-        and the points are not those of a face, or as of `frame_poses`.
+        and the points are not those of a face, or if `frame_poses` raises it.
 
     Examples
     --------

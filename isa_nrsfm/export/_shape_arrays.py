@@ -16,7 +16,7 @@ from isa_nrsfm.export._names import names_of_components, suffix_of
 
 class ShapeArrays(NamedTuple):
     """
-    What a fit has found, as arrays.
+    The arrays of a fitted model.
 
     The image of frame i is ``(mean_shape + tensordot(alpha[i], basis, 1)) @
     motion[i].T + translation[i]``.
@@ -59,7 +59,7 @@ class ShapeArrays(NamedTuple):
 
 def shape_arrays(model: Any) -> ShapeArrays:
     """
-    Return what a fitted model has found, as arrays.
+    Return the arrays of a fitted model.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def shape_arrays(model: Any) -> ShapeArrays:
 
 def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
     """
-    Write what a fitted model has found for NumPy or for MATLAB.
+    Write the arrays of a fitted model for NumPy or for MATLAB.
 
     Parameters
     ----------

@@ -2,7 +2,7 @@
 
 In that space x points right, y down and z away from the viewer, who sees the object
 from the front. Its lengths and angles are those of the object as far as the cameras of
-the fitted table tell them. Models with calibrated cameras have Euclidean shapes as they
+the fitted table determine them. Calibrated cameras have Euclidean shapes as they
 are, which are only turned.
 """
 
@@ -78,7 +78,7 @@ def upright_space(
         raise ValueError(f'camera must be "weak_perspective" or None; got {camera!r}')
     check_frames_kept(model, "exporting shapes")
     fitted, metric = model.camera_, None
-    told: str | None = camera if fitted == "affine" else fitted
+    known: str | None = camera if fitted == "affine" else fitted
     certainty = frames_of(model).certainty
     if camera is not None and not certainty.determined:
         warn_caller(certainty.advice)
@@ -110,7 +110,7 @@ def upright_space(
         transform = MIRROR @ transform
     # Rotations stay rotations.
     image_axes[2, 2] = image_axes[1, 1] * np.sign(np.linalg.det(transform))
-    return UprightSpace(told, metric, transform, image_axes, layout)
+    return UprightSpace(known, metric, transform, image_axes, layout)
 
 
 def upright_frames(

@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from importlib.resources import files
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,7 @@ from isa_nrsfm.export._upright import (
 )
 from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
 
-# More labels than this cannot be told apart by their colours.
+# The colours of more labels than this look alike.
 MOST_LABELS = 30
 UNLABELLED = "(no label)"
 ABOUT = {
@@ -88,17 +88,17 @@ def write_viewer(
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
-        What is known of the cameras of a model with affine ones. "weak_perspective"
+        Camera model for a model with affine cameras. "weak_perspective"
         shows Euclidean shapes, None affine ones, which look like those of figures. A
         model with calibrated cameras has Euclidean shapes. If their depth is not
-        determined the page says so, and None avoids the warning.
+        determined, the page has a note, and None avoids the warning.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
         for a y that points up. "auto" is "lower" where a face or a body would stand on
         its head otherwise.
     mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table as well; the
-        page can do it, too.
+        Whether to take the mirror image in depth, which fits the table as well. The
+        page has a switch for it.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def write_viewer(
     Warns
     -----
     UserWarning
-        If the cameras turn too little to tell the metric.
+        If the cameras turn too little to determine the metric.
 
     See Also
     --------
@@ -122,10 +122,10 @@ def write_viewer(
     -----
     Euclidean basis shapes of affine cameras are the least squares fit to the shapes of
     the frames; those of calibrated cameras are the model's. Rows of which too little is
-    seen are not shown; the page says how many are.
+    seen are not shown; the page has their number.
     """
     suffix_of(path, [".html", ".htm"])
-    if not isinstance(n_frames, Integral) or n_frames < 0:
+    if not isinstance(cast(Any, n_frames), Integral) or n_frames < 0:
         raise ValueError(
             f"n_frames must be a whole number of at least 0; got {n_frames!r}"
         )

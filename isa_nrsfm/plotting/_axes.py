@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Vermilion, blue and black of the palette of Okabe and Ito, which people with any kind
-# of colour vision can tell apart; grey for what is only there to compare with.
+# of colour vision can distinguish; grey for comparison.
 PLUS_COLOUR = "#D55E00"
 MINUS_COLOUR = "#0072B2"
 OBSERVED_COLOUR = "black"

@@ -1,4 +1,4 @@
-"""The mean shape and what each basis shape does to it, from two sides."""
+"""The mean shape and its drift along each basis shape, from two sides."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class BasisShapeDisplay:
     between the shapes at both ends of the drift. Shapes of more than 400 points are
     drawn as two clouds on either side of the mean, without arrows. All are drawn to
     one scale, except basis shapes that drift out of all proportion: those are smaller,
-    and the title says by how much. It is recommended to use `from_estimator` to create
+    and the title has the factor. It is recommended to use `from_estimator` to create
     the display.
 
     Parameters
@@ -271,7 +271,7 @@ class BasisShapeDisplay:
         n_std : float or array-like of shape (n_drawn,), default=2.0
             How far the shapes drift to both sides, in standard deviations of the
             coefficients. An array has a number for each basis shape that is drawn, to
-            show weak ones larger; the titles then tell it.
+            show weak ones larger; the titles have the numbers.
         components : array-like of int, default=None
             The basis shapes to draw. By default all of them.
         n_columns : int, default=None
@@ -408,7 +408,7 @@ class BasisShapeDisplay:
 
 
 def drift_labels(amplitudes: NDArray) -> tuple[str, str]:
-    """Return what the legend calls the two ends of the drift."""
+    """Return the names of the two ends of the drift, for the legend."""
     if amplitudes.ndim:
         return "negative end of the drift", "positive end of the drift"
     size = f"{amplitudes:g} standard deviations"

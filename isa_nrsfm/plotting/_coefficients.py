@@ -42,12 +42,12 @@ class CoefficientsDisplay:
         Their standard deviations.
     y : array-like of shape (n_frames,), default=None
         A label for each frame: classes, or a number. Of more than 50 classes those with
-        the most frames are drawn, and the title says so.
+        the most frames are drawn, which the title mentions.
     time : array-like of shape (n_frames,), default=None
         Times of the frames. By default their numbers.
     groups : array-like of shape (n_frames,), default=None
         Videos or people: a curve does not go from one to another. Of more than 50 those
-        with the most frames are drawn in time, and the title says so.
+        with the most frames are drawn in time, which the title mentions.
     label : str, default=None
         What `y` is, for the axis. By default "label".
     component_names : list of str of length n_components, default=None
@@ -162,7 +162,7 @@ class CoefficientsDisplay:
         sklearn.exceptions.NotFittedError
             If the estimator is not fitted.
         ValueError
-            As of `CoefficientsDisplay` and `plot`.
+            If `CoefficientsDisplay` or `plot` refuses an argument.
         """
         check_is_fitted(estimator, "alpha_" if X is None else None)
         if X is None:
@@ -192,7 +192,7 @@ class CoefficientsDisplay:
             Axes to draw on. By default a new figure.
         kind : {"auto", "classes", "number", "time"}, default="auto"
             Box plots for each class of `y`, points against the numbers of `y`, or
-            curves in time. "auto" is what `y` is, and "time" without `y`.
+            curves in time. "auto" is the kind of `y`, and "time" without `y`.
 
         Returns
         -------
@@ -225,15 +225,15 @@ class CoefficientsDisplay:
         divided = {"classes": self.y, "number": None, "time": self.groups}[found]
         n_groups = 0 if divided is None else len(np.unique(divided))
         if n_groups > MOST_GROUPS:
-            what = "groups" if found == "time" else "classes"
-            title = f"the {MOST_GROUPS} of {n_groups} {what} with the most frames"
+            parts = "groups" if found == "time" else "classes"
+            title = f"the {MOST_GROUPS} of {n_groups} {parts} with the most frames"
             self.axes_[0].set_title(title, loc="left", fontsize="medium")
         time_label = "frame" if self.time is None else "time"
         self.axes_[-1].set_xlabel(time_label if found == "time" else self.label)
         return self
 
     def _kind(self, kind: str) -> Kind:
-        """Return what to draw."""
+        """Return the kind of figure."""
         if kind == "time" or (kind == "auto" and self.y is None):
             return "time"
         if self.y is None:
@@ -266,7 +266,7 @@ class CoefficientsDisplay:
 
     def _draw_number(self, axes: Any, k: int) -> None:
         """Draw the frames as points against their number."""
-        _scatter(axes, self.y, self.alpha[:, k])
+        _scatter(axes, np.asarray(self.y), self.alpha[:, k])
 
     def _draw_time(self, axes: Any, k: int) -> None:
         """Draw a curve, broken at gaps and groups, with a band of one deviation."""

@@ -1,4 +1,4 @@
-"""Scores by the number of basis shapes, with what was chosen."""
+"""Scores by the number of basis shapes, with the chosen one."""
 
 from __future__ import annotations
 

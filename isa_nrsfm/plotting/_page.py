@@ -31,7 +31,7 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     Blocks are (n_shapes, n_points, 3), the mean shape alone comes first. Limits
     (n_blocks, 3, 2) have the same proportions in all blocks and one scale, except for
     blocks whose extent, relative to that of the first one, is more than twice the
-    median: reduction (n_blocks,) tells how many times smaller they are drawn.
+    median: they are drawn smaller by the factors reduction (n_blocks,).
     """
     low = np.array([block.min(axis=(0, 1)) for block in blocks])
     high = np.array([block.max(axis=(0, 1)) for block in blocks])

@@ -1,4 +1,4 @@
-"""Observed points of some frames, and what the model makes of them."""
+"""Observed and reprojected points of some frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Known layouts of landmarks: what joins the points, left and right, which way is up.
+"""Known layouts of landmarks: lines between points, left and right, which way is up.
 
 The layouts are those of face, hand and body trackers and of annotated data sets.
 `SKELETONS` has them by name, `find_skeleton` recognises the one of a table, and

@@ -27,7 +27,7 @@ HAND_21 = Skeleton(
         *(f"thumb_{joint}" for joint in ("cmc", "mcp", "ip", "tip")),
         *(f"{f}_{joint}" for f in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
     ),
-    # Which side is seen, and of which hand, no table of one hand says.
+    # A table of one hand does not determine the side that is seen, nor which hand.
     up=((0, 9),),
 )
 

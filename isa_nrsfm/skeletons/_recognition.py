@@ -43,7 +43,7 @@ LONGEST_OF_OTHERS = 0.7
 # Of two layouts of faces with short edges that one is taken whose edges are so many
 # times shorter: mean faces of 68 points have edges 1.28 to 1.55 times as long in the
 # wrong order as in their own. Bodies of 17 points in the order of COCO have short edges
-# in that of Human3.6M, too, and are not told apart.
+# in that of Human3.6M and are not distinguished.
 CLEARLY = {"face": 1.15}
 
 _SIDE_LETTER = re.compile(r"^([LR])(?=[A-Z][a-z])")
@@ -196,13 +196,13 @@ def _named(skeletons: Sequence[Skeleton], names: Sequence[str]) -> Skeleton | No
 
 
 def _plain(name: str) -> str:
-    """Return what matters of the name of a point."""
+    """Return the letters and digits of the name of a point, sides spelled out."""
     spelled = _SIDE_LETTER.sub(lambda match: _SIDE_WORDS[match[1]], name.strip())
     return "".join(letter for letter in spelled.lower() if letter.isalnum())
 
 
 def numbered(names: Sequence[str]) -> bool:
-    """Tell whether names are numbers in turn, with nothing or one word before them."""
+    """Return whether names are numbers in turn, after the same word or nothing."""
     matches = [_NUMBERED.fullmatch(name.strip()) for name in names]
     found = [match for match in matches if match is not None]
     if len(found) < len(names) or len({match[1] for match in found}) > 1:

@@ -1,4 +1,4 @@
-"""What is known of a layout of landmarks."""
+"""A layout of landmarks."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ Pairs = tuple[tuple[int, int], ...]
 @dataclass(frozen=True)
 class Skeleton:
     """
-    A layout of landmarks: names, what joins the points, left and right, the pose.
+    A layout of landmarks: names, lines between points, left and right, the pose.
 
     Points are named by their index in the layout. Left and right are those of the
     person or animal, not of the viewer.
@@ -46,7 +46,7 @@ class Skeleton:
     front : tuple of pairs of int, default=()
         A point and one in front of it, likewise.
     across : tuple of pairs of int, default=()
-        Pairs of a right and a left point that tell the axis across, where not all of
+        Pairs of a right and a left point that determine the axis across, if not all of
         `right` and `left` are to be taken, as those of arms and legs.
     contour : tuple of int, default=()
         Points that annotators place on the visible outline, such as the jaw of a face.
