@@ -109,5 +109,5 @@ off = np.std(image - X[0].reshape(-1, 2)) / auto.scales_[0]
 print(f"image of frame 0: off by {off:.3f} of the size of the object")
 
 # %%
-# An object and its mirror image in depth have the same images: `AffineNRSfM.mirror`
+# An object and its mirror image in depth have the same images: `AffineNRSfM.mirrored`
 # selects the other one. Units and conventions are in :doc:`/conventions`.
