@@ -216,23 +216,6 @@ class TestIdentities:
 
 
 class TestInvariances:
-    def test_rotation_of_single_frames(self, faces):
-        result, other = run(faces, 3), run(rotate_frames(faces, 1), 3)
-        assert_allclose(other.mean_shape, result.mean_shape, atol=1e-9)
-        assert_same_basis(other.basis, result.basis, atol=1e-6)
-        assert_allclose(other.mode_covariance, result.mode_covariance, atol=1e-8)
-
-    def test_order_of_frames(self, faces):
-        result, other = run(faces, 3), run(permute_frames(faces, 1)[0], 3)
-        assert_allclose(other.mean_shape, result.mean_shape, atol=1e-9)
-        assert_same_basis(other.basis, result.basis, atol=1e-6)
-
-    def test_order_of_points(self, faces):
-        order = np.random.default_rng(1).permutation(40)
-        result, other = run(faces, 3), run(faces[:, order], 3)
-        assert_allclose(other.mean_shape, result.mean_shape[order], atol=1e-9)
-        assert_same_basis(other.basis, result.basis[:, order], atol=1e-6)
-
     @pytest.mark.filterwarnings("ignore:FastICA did not converge")
     @pytest.mark.parametrize(
         "isa",
