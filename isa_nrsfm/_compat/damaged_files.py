@@ -10,31 +10,11 @@ def reading(
     path: str | os.PathLike[str], what: str, expected: str | None = None
 ) -> Iterator[None]:
     """
-    Name the file in whatever the reading of it raises, as a ValueError.
+    Name the file in any error of reading it; errors of content become ValueErrors.
 
     Which errors damaged content makes h5py, pyarrow, zipfile, json and others raise is
-    not documented, and there are many kinds. What the reader itself finds wrong may be
-    raised within, without the path.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    what : str
-        What it is read as.
-    expected : str, optional
-        What such a file must have.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    ValueError
-        If the content cannot be read. The cause is the error of the library.
-    OSError
-        If the system does not open or read the file; it is named.
+    not documented, and there are many kinds. A reader raises its own without the path.
+    `what` is the kind of file, `expected` its required content.
     """
     try:
         yield

@@ -9,25 +9,10 @@ from numpy.typing import NDArray
 
 def array_in(content: bytes) -> NDArray:
     """
-    Return the array of numbers that bytes in NumPy's format hold.
+    Return the array of numbers in bytes of NumPy's format.
 
-    NumPy itself makes room for whatever shape the header names.
-
-    Parameters
-    ----------
-    content : bytes
-        The header and the numbers.
-
-    Returns
-    -------
-    ndarray
-        The array.
-
-    Raises
-    ------
-    ValueError
-        If the bytes hold objects, or more or fewer numbers than the header says. What
-        else is wrong with a header leads to errors of NumPy.
+    NumPy itself makes room for any shape that the header names. Raise if the bytes hold
+    objects, or more or fewer numbers than the header has.
     """
     stored = io.BytesIO(content)
     version = np.lib.format.read_magic(stored)

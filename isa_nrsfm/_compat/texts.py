@@ -5,20 +5,9 @@ def as_utf8(text: str) -> str:
     r"""
     Return a text that can be written as UTF-8.
 
-    Parameters
-    ----------
-    text : str
-        The text. Python marks each byte of a file's name that is not UTF-8 by a lone
-        surrogate, a character that no encoding has (PEP 383).
+    Python marks each byte of a file's name that is not UTF-8 by a lone surrogate, a
+    character that no encoding has (PEP 383). It becomes six characters:
 
-    Returns
-    -------
-    str
-        The text, with such characters as Python writes them: a byte 0xFF becomes the
-        six characters ``\udcff``.
-
-    Examples
-    --------
     >>> import os
     >>> from isa_nrsfm._compat.texts import as_utf8
     >>> print(as_utf8("café " + os.fsdecode(b"caf\xe9")))

@@ -52,40 +52,15 @@ def find_landmark_columns(
     """
     Find the landmark columns among the columns of a table.
 
-    Parameters
-    ----------
-    names : iterable of str
-        All column names of the table.
-    columns : str or sequence of str, optional
-        Patterns of the x and the y columns in turn, such as ``"x_#,y_#"``. Several
-        pairs are put one after the other. Without it, the table must have exactly one
-        set of landmarks of at least `MIN_POINTS` points.
+    `columns` are patterns of the x and the y columns in turn, such as ``"x_#,y_#"``.
+    Several pairs are put one after the other. Without it, the table must have exactly
+    one set of landmarks of at least `MIN_POINTS` points. Numbered points are in the
+    order of their numbers, others in that of their x columns.
 
-    Returns
-    -------
-    LandmarkColumns
-        The points in the order of their numbers, or if they are named, in the order
-        of their x columns in the table.
-
-    Raises
-    ------
-    ValueError
-        If there is no set of landmarks or more than one, if a point has only one of
-        the two coordinates, or if two columns are named as the same coordinate.
-
-    Warns
-    -----
-    UserWarning
-        If patterns with wildcards match only a part of a set of landmarks.
-
-    Examples
-    --------
     >>> from isa_nrsfm.io._landmark_columns import find_landmark_columns
     >>> names = ["file"] + [f"{a}_{j}" for a in "xy" for j in range(8)]
     >>> find_landmark_columns(names).interleaved[:4]
     ['x_0', 'y_0', 'x_1', 'y_1']
-    >>> find_landmark_columns(names, columns="x_#,y_#").pattern
-    'x_#,y_#'
     """
     names = list(names)
     if columns is not None:

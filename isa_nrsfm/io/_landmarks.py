@@ -99,37 +99,14 @@ def assemble(
     skeleton: Skeleton | None = None,
 ) -> Landmarks:
     """
-    Put landmarks together in the one form that all readers return.
+    Put landmarks together in the one form that all readers return, and check them.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The points, NaN where missing.
-    point_names : sequence of str, length n_points, or None
-        Names of the points. None for numbers from 0, with columns ``x_0, y_0``, ....
-    frames : DataFrame of shape (n_frames, n_other), or dict of columns
-        Further columns of each frame. An index is replaced.
-    format : str
-        Name of the format.
-    columns : sequence of str, length 2 * n_points, optional
-        Names of the columns. By default those of the points with ``_x`` and ``_y``.
-    confidence : ndarray of shape (n_frames, n_points), optional
-        Confidences of the points.
-    failed : ndarray of bool, shape (n_frames,), optional
-        Frames in which tracking failed. Frames without points are added.
-    skeleton : Skeleton, optional
-        Edges between the points. By default those of the layout that the format or
-        the names of the points determine.
-
-    Returns
-    -------
-    Landmarks
-        The landmarks.
-
-    Raises
-    ------
-    ValueError
-        If there is no frame, a coordinate is infinite, or two columns have one name.
+    `tracks` (n_frames, n_points, 2) are NaN where points are missing. Points whose
+    names are None have numbers from 0 and columns ``x_0, y_0``, ...; the columns of
+    others are by default their names with ``_x`` and ``_y``. `frames` has further
+    columns of each frame, `confidence` is (n_frames, n_points). Frames without points
+    are added to those that `failed`. The skeleton is by default that of the layout that
+    the format or the names of the points determine.
     """
     pd = import_optional("pandas", extra="io")
     n_frames, n_points, _ = tracks.shape
@@ -185,28 +162,8 @@ def assemble_individuals(
 
     A single individual has a row in every frame. Of several, those without a visible
     point have none. A frame in which nobody is seen has one row without points.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_individuals, n_points, 2)
-        The points, NaN where missing.
-    names : sequence or None
-        Names of the individuals. None for a table without the column ``individual``.
-    point_names : sequence of str, length n_points
-        Names of the points.
-    frames : dict of sequence, length n_frames
-        Columns that describe frames.
-    confidence : ndarray of shape (n_frames, n_individuals, n_points), optional
-        Confidences of the points.
-    of_instances : dict of ndarray of shape (n_frames, n_individuals), optional
-        Columns that describe individuals in frames.
-    **known : object
-        Parameters of `assemble`.
-
-    Returns
-    -------
-    Landmarks
-        The rows by frames, in a frame by individuals.
+    `tracks` are (n_frames, n_individuals, n_points, 2), `confidence` and the arrays in
+    `of_instances` have its first axes. Without names there is no column ``individual``.
     """
     if tracks.shape[1] == 0:
         raise ValueError("expected points of one individual or more; got none")

@@ -83,32 +83,10 @@ def read_columns(
     """
     Read columns of a csv file whose lines must all be of the same length.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    leave_out : re.Pattern or collection of str, optional
-        Columns that are not read, by an expression for their names or by the names.
-    numbers : collection of str
-        Columns that must hold numbers only. Empty cells are NaN.
-    text : collection of str, optional
-        Columns that stay as they are written. All others become numbers if all their
-        cells are.
-    n_header : int, default=1
-        Number of lines before the first row.
-    names : sequence of str, optional
-        Names of the columns. By default those of the first line, without blanks.
-
-    Returns
-    -------
-    DataFrame
-        The columns, in the order of the file.
-
-    Raises
-    ------
-    ValueError
-        If there is no row, if lines are not of the same length, if a cell of `numbers`
-        is no number, or if there is a null character.
+    Columns in `leave_out`, a collection or an expression for their names, are not read.
+    Those in `numbers` must hold numbers, empty cells are NaN. Those in `text` stay as
+    they are written. All others become numbers if all their cells are. `names` are by
+    default those of the first line; `n_header` lines come before the first row.
     """
     pd = import_optional("pandas", extra="io")
     names = header_names(path) if names is None else names

@@ -27,25 +27,9 @@ class StoredFrame(NamedTuple):
 
 def read_stored_frame(path: Path, key: str) -> StoredFrame:
     """
-    Read the columns of numbers of a table that pandas has stored.
+    Read the columns of numbers of a table that pandas has stored in an HDF5 file.
 
-    Parameters
-    ----------
-    path : Path
-        The HDF5 file.
-    key : str
-        The name of the table.
-
-    Returns
-    -------
-    StoredFrame
-        The table, without columns that hold something else than numbers.
-
-    Raises
-    ------
-    ValueError
-        If there is no such table in the file, or it does not fit together. Damaged
-        files lead to errors of h5py and pickle, too.
+    Damaged files lead to errors of h5py and pickle.
     """
     h5py = import_optional("h5py", extra="h5")
     with h5py.File(path, "r") as file:
