@@ -22,8 +22,8 @@ from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
-from isa_nrsfm._prepare.checks import check_names, check_size
-from isa_nrsfm._prepare.layout_check import warn_if_other_layout
+from isa_nrsfm._prepare.checks import check_names
+from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.layout import (
     LAYOUTS,
     Layout,
@@ -33,7 +33,7 @@ from isa_nrsfm._tables.layout import (
     tracks_to_table,
     weighting_sizes,
 )
-from isa_nrsfm._tables.sources import checked_range, unmasked
+from isa_nrsfm._tables.sources import Table, checked_range, unmasked
 from isa_nrsfm.baselines._orthographic_frames import fit_orthographic
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
@@ -133,15 +133,19 @@ class ShapeSequenceNRSfM(
             points or frames for `n_components`, a frame whose points are all equal, or
             column names that contradict `layout`.
         """
-        tracks = self._tracks(X, reset=True)
-        check_names(getattr(self, "feature_names_in_", None), self.layout)
-        check_size(len(tracks), tracks.shape[1], self.n_components)
-        centred, translation = centred_tracks(tracks)
-        warn_if_other_layout(
-            tracks_to_table(tracks, self.layout), self.layout, self.scale_frames
+        X = self._checked(X, reset=True)
+        names = getattr(self, "feature_names_in_", None)
+        check_names(names, self.layout)
+        table = scaled_table(
+            Table.in_memory(X),
+            self.n_components,
+            layout=self.layout,
+            names=names,
+            scale_frames=self.scale_frames,
+            robust=False,
         )
-        sizes = weighting_sizes(centred, self.scale_frames)
-        W = measurement_matrix(centred / sizes[:, None, None])
+        sizes = table.sizes
+        W = table.rows.whole().reshape(2 * len(X), -1).astype(np.float64)
 
         cameras, shapes = self._factorise(W)
         signs = camera_signs(cameras) if self.ordered else shape_signs(shapes)
@@ -159,14 +163,14 @@ class ShapeSequenceNRSfM(
         # Without the scaling of frames the shapes have the unit of the table.
         self._unit = 1.0 if self.scale_frames else float(sizes[0])
         scales = (sizes / self._unit)[:, None, None]
-        dtype = tracks.dtype
+        dtype = X.dtype
         self.mean_shape_ = (self._unit * mean_shape).astype(dtype)
         self.basis_ = (self._unit * basis).astype(dtype)
         self.shapes_ = (self._unit * shapes).astype(dtype)
         self.motion_ = (scales * cameras).astype(dtype)
-        self.translation_ = translation.astype(dtype)
+        self.translation_ = table.translation.astype(dtype)
         self.noise_variance_ = self._unit**2 * max(float(noise), LEAST_NOISE)
-        self.alpha_ = self._decompose(tracks).alpha
+        self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self
 
@@ -228,7 +232,7 @@ class ShapeSequenceNRSfM(
             cameras differ from `motion_`, which belong to `shapes_`.
         """
         check_is_fitted(self)
-        return self._decompose(self._tracks(X, reset=False))
+        return self._decompose(self._checked(X, reset=False))
 
     def reconstruct(self, X: Any) -> NDArray:
         """
@@ -272,8 +276,8 @@ class ShapeSequenceNRSfM(
         tags.transformer_tags.preserves_dtype = ["float64", "float32"]
         return tags
 
-    def _tracks(self, X: Any, reset: bool) -> NDArray:
-        """Return the tracks of a valid table without missing points."""
+    def _checked(self, X: Any, reset: bool) -> NDArray:
+        """Return a valid table without missing points."""
         fewest = 2 if reset else 1
         X = validate_data(
             self,
@@ -293,10 +297,11 @@ class ShapeSequenceNRSfM(
                 f"{missing.sum()} missing value(s) in {len(rows)} of {len(X)} row(s), "
                 f"the first is row {rows[0]}: leave such rows out, or use AffineNRSfM"
             )
-        return table_to_tracks(X, self.layout)
+        return X
 
-    def _decompose(self, tracks: NDArray) -> Decomposition:
-        """Return camera and coefficients of each frame of valid tracks."""
+    def _decompose(self, X: NDArray) -> Decomposition:
+        """Return camera and coefficients of each frame of a valid table."""
+        tracks = table_to_tracks(X, self.layout)
         centred, translation = centred_tracks(tracks)
         sizes = np.full(len(tracks), self._unit)
         if self.scale_frames:
