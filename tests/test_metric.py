@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
-    anisotropy,
     mean_gram,
     metric_quadric,
     symmetric_power,
@@ -115,74 +113,6 @@ class TestMetricQuadric:
         assert_allclose(
             metric_quadric(np.concatenate([motion, *nothing])), metric_quadric(motion)
         )
-
-
-class TestAnisotropy:
-    @pytest.mark.parametrize("seed", range(3))
-    def test_of_weak_perspective_cameras_is_zero_in_any_coordinates(self, seed):
-        rng = np.random.default_rng(seed)
-        motion = weak_perspective(rng)
-        assert anisotropy(motion) < 1e-7
-        assert anisotropy(motion @ affinity(rng)) < 1e-7
-
-    @pytest.mark.parametrize("cameras", ["noisy", "lorentz"])
-    def test_by_the_singular_values_in_the_metric(self, cameras):
-        # Of least squares in the space in which the cameras see all directions alike;
-        # that of the Lorentz cameras is indefinite.
-        rng = np.random.default_rng(0)
-        motion = noisy_cameras(rng) if cameras == "noisy" else lorentz_cameras(rng)
-        white = motion @ np.linalg.inv(symmetric_power(mean_gram(motion), 0.5))
-        stretch, axes = np.linalg.eigh(least_squares_metric(white))
-        assert (stretch[0] > 0) == (cameras == "noisy")
-        stretch = np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)
-        s1, s2 = np.linalg.svd(white @ axes * np.sqrt(stretch), compute_uv=False).T
-        expected = np.sqrt(np.mean(((s1**2 - s2**2) / (s1**2 + s2**2)) ** 2))
-        assert 0.1 < expected < 0.9
-        assert anisotropy(motion) == pytest.approx(expected, rel=1e-9)
-
-    @pytest.mark.parametrize("squeeze", [0.9, 0.5])
-    def test_of_images_that_are_squeezed_along_any_axis(self, squeeze):
-        # The axis is different in each image, so that no metric of space explains it.
-        rng = np.random.default_rng(1)
-        cameras = Rotation.random(5000, random_state=2).as_matrix()[:, :2]
-        squeezed = np.array([[1.0], [squeeze]]) * cameras
-        expected = (1 - squeeze**2) / (1 + squeeze**2)
-        motion = rolled_and_scaled(rng, squeezed)
-        assert anisotropy(motion) == pytest.approx(expected, rel=0.02)
-
-    def test_does_not_depend_on_roll_and_unit_of_the_frames(self):
-        rng = np.random.default_rng(4)
-        motion = noisy_cameras(rng)
-        other = 10 * rolled_and_scaled(rng, motion, 1.0)
-        assert anisotropy(other) == pytest.approx(anisotropy(motion), rel=1e-9)
-
-    @pytest.mark.parametrize("stretch", [1.0, 30.0])
-    def test_does_not_depend_on_the_affinity(self, stretch):
-        rng = np.random.default_rng(4)
-        motion = noisy_cameras(rng) @ np.diag([1.0, 1.0, stretch])
-        other = anisotropy(motion @ affinity(rng))
-        assert other == pytest.approx(anisotropy(motion), rel=1e-6)
-
-    def test_is_zero_where_the_metric_is_not_determined(self):
-        rng = np.random.default_rng(6)
-        same = np.repeat(rng.standard_normal((1, 2, 3)), 10, axis=0)
-        assert anisotropy(same) == 0.0
-        assert anisotropy(weak_perspective(rng, 2)) == 0.0
-
-    def test_without_cameras_the_metric_is_not_determined(self):
-        assert anisotropy(np.zeros((5, 2, 3))) == 0.0
-
-    def test_of_cameras_that_see_a_line_is_one(self):
-        rng = np.random.default_rng(8)
-        axes = rng.standard_normal((30, 1, 3))
-        motion = rng.standard_normal((30, 2, 1)) * axes
-        assert anisotropy(motion) == pytest.approx(1.0)
-
-    @pytest.mark.parametrize("value", [np.nan, 0.0])
-    def test_leaves_out_frames_without_camera(self, value):
-        motion = noisy_cameras(np.random.default_rng(9))
-        more = np.concatenate([motion, np.full((3, 2, 3), value)])
-        assert anisotropy(more) == pytest.approx(anisotropy(motion))
 
 
 class TestParts:

@@ -11,7 +11,6 @@ from isa_nrsfm._linalg.vectors import frames_last
 from isa_nrsfm._metric_upgrade.minimisation import (
     STRETCH_OF_START,
     exponential,
-    refine_fit,
     refine_metric,
     safe_start,
 )
@@ -22,7 +21,6 @@ from isa_nrsfm._metric_upgrade.residuals import (
     _linearised,
     _normal_equations,
     fit_at,
-    frame_blocks,
     orthonormality,
     strain_basis,
 )
@@ -134,11 +132,8 @@ class TestParts:
         n = BLOCK_FRAMES + 10
         motion, alpha = rng.standard_normal((n, 2, 3)), rng.standard_normal((n, 2))
         strain = 0.1 * strain_basis(camera)[:2]
-        blocks = frame_blocks(motion, alpha)
-        assert [part.shape[-1] for part, _ in blocks] == [BLOCK_FRAMES, 10]
-        whole = fit_at(blocks, np.eye(3), strain, camera)
-        backwards = frame_blocks(motion[::-1], alpha[::-1])
-        turned = fit_at(backwards, np.eye(3), strain, camera)
+        whole = fit_at(motion, alpha, np.eye(3), strain, camera)
+        turned = fit_at(motion[::-1], alpha[::-1], np.eye(3), strain, camera)
         assert whole.n_frames == turned.n_frames == n
         assert whole.cost == pytest.approx(turned.cost, rel=1e-12)
         scale = np.abs(whole.curvature).max()
@@ -165,13 +160,20 @@ class TestParts:
         assert stretch[0] / stretch[-1] <= STRETCH_OF_START * (1 + 1e-9)
 
 
+def refined(motion, Q, camera, alpha=None, ridge=0.0):
+    """Return the minimum that a metric without strains leads to."""
+    alpha = np.zeros((len(motion), 0)) if alpha is None else alpha
+    start = fit_at(motion, alpha, Q, np.zeros((alpha.shape[1], 3, 3)), camera)
+    return refine_metric(motion, alpha, start, camera, ridge)
+
+
 class TestRefineMetric:
     @both_cameras
     @pytest.mark.parametrize("seed", range(10))
     @pytest.mark.parametrize("spread", [None, 0.3, 0.05])
     def test_exact_cameras_from_a_bad_start(self, seed, camera, spread):
         motion, affinity = exact_cameras(seed, camera, spread=spread)
-        fit = refine_metric(motion, safe_start(motion, bad_start(seed), camera), camera)
+        fit = refined(motion, safe_start(motion, bad_start(seed), camera), camera)
         metric = affinity @ fit.Q @ fit.Q.T @ affinity.T
         assert_allclose(metric * 3 / np.trace(metric), np.eye(3), atol=1e-8)
         assert fit.cost < 1e-20
@@ -180,7 +182,7 @@ class TestRefineMetric:
     def test_result_does_not_depend_on_the_start(self, camera):
         motion = noisy_cameras(0, camera)
         costs = [
-            refine_metric(motion, safe_start(motion, bad_start(s), camera), camera).cost
+            refined(motion, safe_start(motion, bad_start(s), camera), camera).cost
             for s in range(10)
         ]
         assert costs[0] > 0.1
@@ -192,7 +194,7 @@ class TestRefineMetric:
         rng = np.random.default_rng(1)
         motion, alpha = noisy_cameras(1, camera), rng.standard_normal((30, 2))
         start = safe_start(motion, np.eye(3), camera)
-        fit = refine_metric(motion, start, camera, alpha, ridge=ridge)
+        fit = refined(motion, start, camera, alpha, ridge=ridge)
         here = fit.cost + ridge * np.sum(fit.strain**2)
         args = (camera, alpha, fit.strain, ridge)
         assert objective(motion, fit.Q, *args) == pytest.approx(here, rel=1e-9)
@@ -211,21 +213,14 @@ class TestRefineMetric:
     def test_going_on_from_a_rough_fit_ends_at_the_minimum(self):
         rng = np.random.default_rng(4)
         motion, alpha = noisy_cameras(4, "weak_perspective"), rng.random((30, 1))
-        whole = refine_metric(motion, np.eye(3), "weak_perspective", alpha, 0.5)
-        blocks = frame_blocks(motion, alpha)
-        start = fit_at(blocks, np.eye(3), np.zeros((1, 3, 3)), "weak_perspective")
-        rough = refine_fit(blocks, start, "weak_perspective", 0.5, 1e-2)
-        fine = refine_fit(blocks, rough, "weak_perspective", 0.5)
+        whole = refined(motion, np.eye(3), "weak_perspective", alpha, 0.5)
+        camera = "weak_perspective"
+        start = fit_at(motion, alpha, np.eye(3), np.zeros((1, 3, 3)), camera)
+        rough = refine_metric(motion, alpha, start, camera, 0.5, shortest_step=1e-2)
+        fine = refine_metric(motion, alpha, rough, camera, 0.5)
         assert np.abs(rough.strain - whole.strain).max() > 1e-7
         assert_allclose(fine.strain, whole.strain, atol=1e-8)
         assert fine.cost == pytest.approx(whole.cost, rel=1e-9)
-
-    def test_converges_where_residuals_are_large(self):
-        # Gauss-Newton steps alone leave a hundred times as much.
-        motion = noisy_cameras(0, "weak_perspective")
-        fit = refine_metric(motion, np.eye(3), "weak_perspective", max_steps=16)
-        assert fit.cost > 0.1
-        assert_allclose(fit.gradient, 0, atol=1e-8)
 
     def test_orthographic_minimum_is_that_of_the_linear_equations(self):
         # Where their solution is positive definite, as it is here.
@@ -236,7 +231,7 @@ class TestRefineMetric:
         equations = [np.einsum("ia,ib->iab", a, b).reshape(-1, 9) for a, b in pairs]
         linear = np.linalg.lstsq(np.vstack(equations), np.repeat([1.0, 0.0], 40))[0]
         start = np.linalg.inv(affinity)
-        fit = refine_metric(motion, start, "orthographic")
+        fit = refined(motion, start, "orthographic")
         assert fit.cost > 0.1
         assert_allclose((fit.Q @ fit.Q.T).ravel(), linear, rtol=1e-7)
 
@@ -248,7 +243,7 @@ class TestRefineMetric:
         motion = turns[:, :2] + noise * rng.standard_normal((n, 2, 3))
         assert metric_quadric(motion) is None
         camera = "weak_perspective"
-        fit = refine_metric(motion, safe_start(motion, np.eye(3), camera), camera)
+        fit = refined(motion, safe_start(motion, np.eye(3), camera), camera)
 
         def cost(entries):
             root = entries.reshape(3, 3)
@@ -261,7 +256,7 @@ class TestRefineMetric:
     def test_never_worse_than_the_linear_solution(self):
         motion = noisy_cameras(3, "weak_perspective")
         linear = metric_quadric(motion)
-        fit = refine_metric(motion, safe_start(motion, linear, "weak_perspective"),
+        fit = refined(motion, safe_start(motion, linear, "weak_perspective"),
                             "weak_perspective")  # fmt: skip
         gram = frames_last(motion @ linear @ motion.transpose(0, 2, 1))
         before = np.sum(orthonormality(gram, "weak_perspective") ** 2)
@@ -270,6 +265,6 @@ class TestRefineMetric:
     def test_condition_number(self):
         camera = "weak_perspective"
         turns = Rotation.random(3000, random_state=0).as_matrix()[:, :2]
-        fit = refine_metric(turns, np.eye(3), camera)
+        fit = refined(turns, np.eye(3), camera)
         assert fit.condition_number == pytest.approx(1, abs=0.1)
-        assert refine_metric(turns[:2], np.eye(3), camera).condition_number == np.inf
+        assert refined(turns[:2], np.eye(3), camera).condition_number == np.inf

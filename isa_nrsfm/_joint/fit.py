@@ -127,7 +127,7 @@ def fit_jointly(
     ratio = fit.camera_noise_ratio
     spectrum = Spectrum.of(table, len(paper_shapes) - 1)
     fit, least_noise, right = judged(first, fit, start, cameras, spectrum)
-    refined = partial(_refined, cameras=cameras, least_noise=least_noise)
+    refined = partial(JointProblem.refined, cameras=cameras, least_noise=least_noise)
     if right:
         problems = [replace(each, penalty=0.0) for each in problems]
         if not sampled:  # for a right model a smaller tolerance is safe
@@ -202,9 +202,8 @@ def _problems(
     # Each number that is fitted lowers the objective by about one by chance. Steps on a
     # sample end when they gain less than 3 % of that for all shapes together.
     chance = 0.03 * frames.coordinates(paper_shapes).size
-    samples = replace(problem, thorough=False)
     problems = [
-        samples.part(part, tol=max(settings.tol, chance / len(part)))
+        problem.part(part, tol=max(settings.tol, chance / len(part)))
         for part in table.sample.parts
     ]
     return [*problems, problem], seen
@@ -234,9 +233,9 @@ def _first_fit(
         max_iter = min(max_iter, 60)
     if not problem.thorough:  # only the better one goes on
         few = min(max_iter, 5)
-        raced = [_refined(problem, each, affine, max_iter=few) for each in states]
+        raced = [problem.refined(each, affine, max_iter=few) for each in states]
         states = [_least(raced).state]
-    other = _least(_refined(problem, s, affine, max_iter=max_iter) for s in states)
+    other = _least(problem.refined(s, affine, max_iter=max_iter) for s in states)
     ratio = fit.left / min(other.left, fit.left)
     if camera == "affine":
         return other._replace(camera_noise_ratio=ratio), rigid
@@ -254,12 +253,12 @@ def _continued_fit(
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
     n_steps = min(settings.options.catching_up, settings.max_iter)
-    fitted = _calibrated_fit if cameras.calibrated else _refined
+    fitted = _calibrated_fit if cameras.calibrated else JointProblem.refined
     fits: list[tuple[JointFit, JointState]] = []
     for start in starts:
         state = given = _aligned_start(problem, start)
         if fits:
-            tried = _refined(problem, state, cameras, max_iter=n_steps)
+            tried = problem.refined(state, cameras, max_iter=n_steps)
             gained = tried.history[len(tried.history) // 2] - tried.value
             if tried.value - min(fit.value for fit, _ in fits) > gained:
                 continue
@@ -275,10 +274,14 @@ def _aligned_start(problem: JointProblem, start: Start) -> JointState:
     state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
     if start.calibrated_first and not CAMERAS[camera].calibrated:
         # As many steps as starts of the search make
-        max_iter = min(30, problem.settings.max_iter)
-        calibrated = "weak_perspective"
+        settings, calibrated = problem.settings, "weak_perspective"
         state = problem.aligned(state, calibrated)
-        state = problem.refined(state, CAMERAS[calibrated], max_iter=max_iter).state
+        state = problem.refined(
+            state,
+            CAMERAS[calibrated],
+            max_iter=min(30, settings.max_iter),
+            tol=settings.tol,
+        ).state
     return problem.aligned(state, camera)
 
 
@@ -294,29 +297,13 @@ def _calibrated_fit(
     least_noise: float | None = None,
 ) -> JointFit:
     """Return the fit of calibrated cameras in which no frame is reversed in depth."""
-    fit = _refined(problem, state, cameras, least_noise)
+    fit = problem.refined(state, cameras, least_noise)
     for _ in range(5 if problem.thorough else 0):
         state, n_reversed = problem.reversed_back(fit.state, cameras)
         if not n_reversed:
             break
-        fit = _refined(problem, state, cameras, least_noise)
+        fit = problem.refined(state, cameras, least_noise)
     return fit
-
-
-def _refined(
-    problem: JointProblem,
-    state: JointState,
-    cameras: CameraModel,
-    least_noise: float | None = None,
-    max_iter: int | None = None,
-    tol: float | None = None,
-) -> JointFit:
-    """Return the refinement of a state, with a smaller tolerance for small tables."""
-    if tol is None:
-        tol = problem.settings.tol * (0.1 if problem.thorough else 1.0)
-    return problem.refined(
-        state, cameras, least_noise=least_noise, max_iter=max_iter, tol=tol
-    )
 
 
 def judged(
@@ -370,7 +357,7 @@ def unregularised(
     steps = min(60, max_iter)
     for _ in range(max_iter // steps):
         before = state.noise
-        fit = _refined(problem, state, cameras, NOISE_FLOOR, max_iter=steps)
+        fit = problem.refined(state, cameras, NOISE_FLOOR, max_iter=steps)
         state = fit.state
         if state.noise > 0.95 * before:
             break

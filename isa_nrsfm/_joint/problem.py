@@ -1,7 +1,7 @@
 """The joint fit as a problem: frames, penalty, and how long to iterate."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -90,9 +90,9 @@ class JointProblem:
     penalty: NDArray | float = 0.0
 
     def part(self, chosen: NDArray, tol: float) -> "JointProblem":
-        """Return the problem of some of the frames, with another tolerance."""
-        settings = self.settings._replace(tol=tol)
-        return replace(self, frames=self.frames.take(chosen), settings=settings)
+        """Return the problem of a sample of the frames, with another tolerance."""
+        frames, settings = self.frames.take(chosen), self.settings._replace(tol=tol)
+        return JointProblem(frames, settings, False, self.penalty)
 
     @property
     def mean_square(self) -> float:
@@ -144,16 +144,18 @@ class JointProblem:
         self,
         state: JointState,
         cameras: CameraModel,
-        *,
         least_noise: float | None = None,
         max_iter: int | None = None,
         tol: float | None = None,
     ) -> JointFit:
         """Return the joint refinement of a state, by default with the settings.
 
-        The default of `least_noise` is that of a model that may be wrong.
+        The default of `least_noise` is that of a model that may be wrong. That of `tol`
+        is a tenth of the user's for small tables.
         """
         settings, likelihood = self.settings, self.likelihood
+        if tol is None:
+            tol = settings.tol * (0.1 if self.thorough else 1.0)
         if cameras.name != "affine":
             likelihood = MarginalLikelihood(
                 likelihood.frames, self.penalty, self.frames.totals, EXTENT_WEIGHT
@@ -166,7 +168,7 @@ class JointProblem:
             cameras,
             least_noise=least_noise,
             max_iter=settings.max_iter if max_iter is None else max_iter,
-            tol=settings.tol if tol is None else tol,
+            tol=tol,
             on_step=settings.on_step,
         )
 

@@ -136,7 +136,7 @@ def refine_joint(
         if not iterate.gradient @ direction < 0:
             memory.clear()
             direction = -iterate.precondition(iterate.gradient)
-        reached, step = _line_search(likelihood, iterate, direction, floor)
+        reached, step = _line_search(iterate, direction)
         if reached is None:
             if not memory:  # the gradient itself fails: rounding errors are left
                 small_steps = 2
@@ -181,7 +181,8 @@ class _Iterate:
         floor: float,
     ):
         passed = likelihood(*state)
-        self.state, self.cameras = state, cameras
+        self.likelihood, self.cameras = likelihood, cameras
+        self.state, self.floor = state, floor
         self.M = frames_last(state.motion)
         self.n_seen = likelihood.n_seen
         self.value = passed.value
@@ -229,14 +230,15 @@ class _Iterate:
             vector[-1],
         )
 
-    def moved(self, step: NDArray, floor: float) -> JointState:
-        """Return the state after a step; the noise variance is at least floor."""
+    def moved(self, step: NDArray) -> "_Iterate":
+        """Return the iterate after a step; the noise variance is at least floor."""
         shapes, steps, noise = self.split(step)
-        return JointState(
+        state = JointState(
             self.state.shapes + shapes,
             frames_first(self.cameras.moved(self.M, steps)),
-            max(self.state.noise * np.exp(noise), floor),
+            max(self.state.noise * np.exp(noise), self.floor),
         )
+        return _Iterate(self.likelihood, self.cameras, state, self.floor)
 
 
 def regular(curvature: NDArray) -> NDArray:
@@ -268,10 +270,7 @@ def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
 
 
 def _line_search(
-    likelihood: MarginalLikelihood,
-    iterate: _Iterate,
-    direction: NDArray,
-    floor: float,
+    iterate: _Iterate, direction: NDArray
 ) -> tuple[_Iterate | None, NDArray]:
     """Return the first iterate that meets the Armijo condition, and the step to it.
 
@@ -286,8 +285,7 @@ def _line_search(
     )
     while length > 1e-8:
         step = length * direction
-        state = iterate.moved(step, floor)
-        reached = _Iterate(likelihood, iterate.cameras, state, floor)
+        reached = iterate.moved(step)
         if reached.value <= iterate.value + 1e-4 * length * slope:
             # The lower bound may have shortened the change of the noise.
             step[-1] = np.log(reached.state.noise / iterate.state.noise)

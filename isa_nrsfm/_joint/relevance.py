@@ -38,7 +38,8 @@ def relevant_components(
         basis = np.tensordot(axes.T, state.shapes[1:], 1)
         shapes = np.concatenate([state.shapes[:1], basis])
         start = state._replace(shapes=shapes)
-        state = part.refined(start, cameras, max_iter=30).state
+        tol = part.settings.tol
+        state = part.refined(start, cameras, max_iter=30, tol=tol).state
         C, images = _image_moments(state)
         energy = np.diagonal(images)
         if not energy.any():

@@ -167,9 +167,9 @@ def settled(
 
     With the large noise of a start the prior would make basis shapes vanish.
     """
-    unpenalised = replace(problem, penalty=0.0)
-    state = unpenalised.refined(state, cameras, max_iter=HELD_STEPS).state
-    return with_prior(problem, state)
+    free, tol = replace(problem, penalty=0.0), problem.settings.tol
+    fit = free.refined(state, cameras, max_iter=HELD_STEPS, tol=tol)
+    return with_prior(problem, fit.state)
 
 
 def best_starts(
@@ -198,12 +198,8 @@ def best_starts(
         Shapes, cameras of all frames, and noise: three starts of small tables, one of
         others.
     """
-    frames, options, thorough = (
-        problem.frames,
-        problem.settings.options,
-        problem.thorough,
-    )
-    factors = table.factors
+    frames, options = problem.frames, problem.settings.options
+    factors, thorough = table.factors, problem.thorough
     # Frames that are compared: evenly from the most to the least rigid one
     rows = frames.coordinates(table.sample.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))

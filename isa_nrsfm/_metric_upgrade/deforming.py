@@ -7,11 +7,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import polar
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm._metric_upgrade.minimisation import exponential, refine_fit
+from isa_nrsfm._metric_upgrade.minimisation import exponential, refine_metric
 from isa_nrsfm._metric_upgrade.residuals import (
+    CameraModel,
     MetricFit,
     fit_at,
-    frame_blocks,
     strain_basis,
 )
 from isa_nrsfm._metric_upgrade.rigid import (
@@ -25,32 +25,6 @@ from isa_nrsfm._metric_upgrade.rigid import (
 # Bound on the eigenvalues of the strain of a frame. Unusual coefficients then stretch
 # no direction by more than exp(1 / 2).
 LARGEST_STRAIN = 1.0
-
-
-class StrainOptions(NamedTuple):
-    """
-    How the strains of `deformation_metric` are fitted.
-
-    Attributes
-    ----------
-    deviation : float
-        Prior standard deviation of an entry of E_k: its first value, and its upper
-        bound. Larger strains are taken for errors of the affine cameras.
-    max_rounds : int
-        Rounds of estimating the two variances.
-    settled : float
-        Their convergence tolerance: the largest change of a logarithm.
-    rough_step : float
-        Convergence tolerance of the metric in these rounds, as `shortest_step`.
-    """
-
-    deviation: float = 0.3
-    max_rounds: int = 15
-    settled: float = 0.05
-    rough_step: float = 1e-4
-
-
-STRAIN_OPTIONS = StrainOptions()
 
 
 class DeformationMetric(NamedTuple):
@@ -277,58 +251,39 @@ def euclidean_frames(
     return frames
 
 
-def fit_strain(
-    cameras: NDArray,
-    alpha: NDArray,
-    rigid: MetricFit,
-    options: StrainOptions = STRAIN_OPTIONS,
-) -> MetricFit:
-    """
-    Return the metric with strains, with the ridge of maximal evidence.
+def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
+    """Return the metric with strains, with the ridge of maximal evidence.
 
-    Parameters
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Usable cameras.
-    alpha : ndarray of shape (n_frames, n_components)
-        Their coefficients.
-    rigid : MetricFit
-        The fit without strains.
-    options : StrainOptions
-        How the strains are fitted.
-
-    Returns
-    -------
-    MetricFit
-        The fit with strains.
+    Usable cameras are (n_frames, 2, 3), coefficients (n_frames, n_components). The fit
+    starts from that without strains.
     """
-    size = len(strain_basis("weak_perspective"))
+    camera: CameraModel = "weak_perspective"
+    size = len(strain_basis(camera))
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)
-    variance = options.deviation**2
-    blocks = frame_blocks(cameras, alpha)
+    # Larger strains than these are taken for errors of the affine cameras.
+    variance = most_variance = 0.3**2
     none = np.zeros((alpha.shape[1], 3, 3))
-    fit = fit_at(blocks, rigid.Q, none, "weak_perspective")
-    for _ in range(options.max_rounds):
+    fit = fit_at(cameras, alpha, rigid.Q, none, camera)
+    for _ in range(15):
         ridge = noise / variance
-        fit = refine_fit(blocks, fit, "weak_perspective", ridge, options.rough_step)
+        fit = refine_metric(cameras, alpha, fit, camera, ridge, 1e-4)
         # Curvature in the strains, with the common metric eliminated (a Schur
         # complement), and the effective number of strain parameters from it.
         mixed = fit.curvature[:size, size:]
         inverse = np.linalg.pinv(fit.curvature[:size, :size], hermitian=True)
         own = fit.curvature[size:, size:] - mixed.T @ inverse @ mixed
-        values = np.linalg.eigvalsh(own)
-        values = np.maximum(values, 0.0)
+        values = np.maximum(np.linalg.eigvalsh(own), 0.0)
         n_effective = float(np.sum(values / (values + ridge)))
         # The two variances: sums of squares over effective numbers (MacKay).
         freedom = max(n_equations - size - n_effective, 0.1 * n_equations)
         previous = noise, variance
         noise = max(fit.cost / freedom, OF_DIFFERENCES**2)
         variance = np.sum(fit.strain**2) / max(n_effective, 1e-3)
-        variance = np.clip(variance, OF_DIFFERENCES, options.deviation**2)
-        if np.abs(np.log([noise, variance]) - np.log(previous)).max() < options.settled:
+        variance = np.clip(variance, OF_DIFFERENCES, most_variance)
+        if np.abs(np.log([noise, variance]) - np.log(previous)).max() < 0.05:
             break
-    return refine_fit(blocks, fit, "weak_perspective", ridge)
+    return refine_metric(cameras, alpha, fit, camera, ridge)
 
 
 def _rotations_to_mean(shapes: NDArray, mean_shape: NDArray) -> NDArray:

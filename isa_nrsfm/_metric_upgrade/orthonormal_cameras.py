@@ -9,19 +9,10 @@ from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
+from isa_nrsfm._metric_upgrade.minimisation import levenberg_marquardt
 
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3
-# Steps from each start before the starts are compared. The best of the about twenty
-# starts then leads to the least cost, or close to it.
-ROUGH_STEPS = 8
-# Levenberg-Marquardt damping, relative to the mean curvature: the first value, the
-# factors after a step that succeeds and one that fails, and the bounds.
-FIRST_DAMPING = 1e-3
-EASED, RAISED = 0.1, 4.0
-SMALLEST_DAMPING, LARGEST_DAMPING = 1e-10, 1e8
-# Convergence tolerance: gain of a step relative to the cost.
-LEAST_GAIN = 1e-9
 # Errors of covariance C of the rows r1 and r2 raise the expected cost, to first order,
 # by 4 r1 C r1 + 4 r2 C r2 + 2 (r1 C r1 + r2 C r2). On average over all cameras that is
 # 4 tr C. C is the noise variance times Q^T Q.
@@ -149,7 +140,7 @@ def orthonormal_mixture(
     max_iter: int = 200,
 ) -> tuple[NDArray, float]:
     """
-    Return a mixture of columns whose rows are most nearly orthonormal.
+    Return a mixture of columns whose rows are most nearly orthonormal, and its cost.
 
     Parameters
     ----------
@@ -157,8 +148,8 @@ def orthonormal_mixture(
         Columns of a motion factor, about as long as columns of cameras.
     mixing : ndarray of shape (n_before, 3)
         The best mixture of the first columns, to start from. If these are three, each
-        triple of the columns is a start, too.
-    penalty : ndarray of shape (n_columns, n_columns), optional
+        triple of the columns is a start as well.
+    penalty : ndarray of shape (n_rows, n_columns), optional
         L, for a penalty of ``||L Q||_F^2``.
     max_iter : int, default=200
         The most Levenberg-Marquardt steps.
@@ -173,98 +164,56 @@ def orthonormal_mixture(
     """
     n = basis.shape[1]
     L = np.zeros((0, n)) if penalty is None else penalty
+
+    def evaluated(Q: NDArray) -> tuple[float, NDArray, NDArray]:
+        residuals, J = _linearised(Q, basis, L)
+        return float(residuals @ residuals), J.T @ J, J.T @ residuals
+
+    def minimised(Q: NDArray, max_steps: int) -> tuple[NDArray, float]:
+        return levenberg_marquardt(
+            evaluated,
+            Q,
+            lambda Q, step: Q + step.reshape(Q.shape),
+            max_steps=max_steps,
+            least_gain=1e-9,
+        )
+
     start = np.vstack([mixing, np.zeros((n - len(mixing), 3))])
     if len(mixing) == 3 < n <= 3 + STEP:
+        # The best of about twenty starts after some steps leads to the least cost, or
+        # close to it.
         triples = [np.column_stack(triple) for triple in combinations(np.eye(n), 3)]
-        starts = np.stack([start, *triples])
-        found, cost = _minimised(starts, basis, L, ROUGH_STEPS)
-        start = found[np.argmin(cost)]
-    found, cost = _minimised(start[None], basis, L, max_iter)
-    return found[0], float(cost[0])
+        rough = [minimised(each, 8) for each in (start, *triples)]
+        start, _ = min(rough, key=lambda found: found[1])
+    return minimised(start, max_iter)
 
 
 def orthonormality_residuals(cameras: NDArray) -> NDArray:
-    """
-    Return how far the rows of cameras are from orthonormal ones.
+    """Return how far the rows of cameras (n, 2, 3) are from orthonormal: (3, n).
 
-    Parameters
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    ndarray of shape (3, n_frames)
-        ``|r1|^2 - 1``, ``|r2|^2 - 1`` and ``sqrt(2) r1 . r2``: the sum of their squares
-        is ``||R_i R_i^T - I||_F^2``.
+    These are ``|r1|^2 - 1``, ``|r2|^2 - 1`` and ``sqrt(2) r1 . r2``: the sum of their
+    squares is ``||R_i R_i^T - I||_F^2``.
     """
     r1, r2 = cameras[:, 0], cameras[:, 1]
     across = np.sqrt(2.0) * np.vecdot(r1, r2)
     return np.stack([np.vecdot(r1, r1) - 1.0, np.vecdot(r2, r2) - 1.0, across])
 
 
-def _minimised(
-    Q: NDArray, basis: NDArray, L: NDArray, max_iter: int
-) -> tuple[NDArray, NDArray]:
+def _linearised(Q: NDArray, basis: NDArray, L: NDArray) -> tuple[NDArray, NDArray]:
+    """Return residuals (n,) whose squares add up to the cost, and their derivatives.
+
+    The derivatives (n, 3 * n_columns) are those in the entries of Q.
     """
-    Return mixtures at local minima of the cost, and their costs.
-
-    Levenberg-Marquardt steps are made from all starts at once. Mixtures Q are
-    (n_starts, n_columns, 3), costs (n_starts,), L is (n_rows, n_columns).
-    """
-    n = Q[0].size
-    residuals, J = _residuals(Q, basis, L), _derivatives(Q, basis, L)
-    cost = np.vecdot(residuals, residuals)
-    damping, running = np.full(len(Q), FIRST_DAMPING), np.ones(len(Q), dtype=bool)
-    for _ in range(max_iter):
-        # Damped step.
-        curvature = J.swapaxes(1, 2) @ J
-        scale = damping * np.trace(curvature, axis1=1, axis2=2) / n
-        slope = J.swapaxes(1, 2) @ residuals[..., None]
-        # Where the curvature is zero, any damping makes the matrix invertible.
-        scale = np.where(scale > 0, scale, 1.0)
-        step = np.linalg.solve(curvature + scale[:, None, None] * np.eye(n), slope)
-        moved = Q - step.reshape(Q.shape)
-        rest = _residuals(moved, basis, L)
-        reached = np.vecdot(rest, rest)
-        # Accept it where the cost falls.
-        better = running & (reached < cost)
-        gain = np.where(better, cost - reached, np.inf)
-        ended = better & ((reached < OF_STEPS**2) | (gain <= LEAST_GAIN * cost))
-        damping = np.where(
-            better, np.maximum(EASED * damping, SMALLEST_DAMPING), RAISED * damping
-        )
-        Q = np.where(better[:, None, None], moved, Q)
-        residuals = np.where(better[:, None], rest, residuals)
-        cost = np.where(better, reached, cost)
-        running &= ~ended & (damping < LARGEST_DAMPING)
-        if not running.any():
-            break
-        if better.any():
-            J = _derivatives(Q, basis, L)
-    return Q, cost
-
-
-def _residuals(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
-    """Return the residuals (n_starts, n) whose squares add up to the cost."""
     n_frames = len(basis) // 2
-    cameras = (basis @ Q).reshape(-1, 2, 3)
-    residuals = orthonormality_residuals(cameras).reshape(3, len(Q), n_frames)
-    residuals = residuals.swapaxes(0, 1).reshape(len(Q), -1) / np.sqrt(n_frames)
-    return np.concatenate([residuals, (L @ Q).reshape(len(Q), -1)], axis=1)
-
-
-def _derivatives(Q: NDArray, basis: NDArray, L: NDArray) -> NDArray:
-    """Return the derivatives (n_starts, n, 3 n_columns) of `_residuals` in Q."""
-    n_frames = len(basis) // 2
-    P = basis.reshape(n_frames, 2, -1, 1)
-    R = (basis @ Q).reshape(len(Q), n_frames, 2, 1, 3)
-    p1, p2, r1, r2 = P[:, 0], P[:, 1], R[:, :, 0], R[:, :, 1]
-    across = np.sqrt(2.0) * (p1 * r2 + p2 * r1)
-    rows = np.stack([2.0 * p1 * r1, 2.0 * p2 * r2, across], axis=1)
-    rows = rows.reshape(len(Q), 3 * n_frames, -1) / np.sqrt(n_frames)
-    prior = np.broadcast_to(np.kron(L, np.eye(3)), (len(Q), 3 * len(L), Q[0].size))
-    return np.concatenate([rows, prior], axis=1)
+    P, R = basis.reshape(n_frames, 2, -1, 1), (basis @ Q).reshape(n_frames, 2, 1, 3)
+    p1, p2, r1, r2 = P[:, 0], P[:, 1], R[:, 0], R[:, 1]
+    residuals = orthonormality_residuals(R[:, :, 0]).ravel() / np.sqrt(n_frames)
+    rows = np.stack([2.0 * p1 * r1, 2.0 * p2 * r2, np.sqrt(2.0) * (p1 * r2 + p2 * r1)])
+    rows = rows.reshape(3 * n_frames, -1) / np.sqrt(n_frames)
+    return (
+        np.concatenate([residuals, (L @ Q).ravel()]),
+        np.concatenate([rows, np.kron(L, np.eye(3))]),
+    )
 
 
 def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -291,19 +240,10 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def principal_columns(W: NDArray) -> NDArray:
-    """
-    Return the columns of the motion factor of a measurement matrix.
+    """Return the motion factor (2 * n_frames, rank) of W (2 * n_frames, n_points).
 
-    Parameters
-    ----------
-    W : ndarray of shape (2 * n_frames, n_points)
-        Measurement matrix.
-
-    Returns
-    -------
-    ndarray of shape (2 * n_frames, rank)
-        Its left singular vectors, those of the largest singular values first, as long
-        as columns of cameras are on average.
+    These are the left singular vectors, those of the largest singular values first, as
+    long as columns of cameras are on average.
     """
     square, V = np.linalg.eigh(W.T @ W)
     kept = np.flatnonzero(square > OF_STEPS * square[-1])[::-1]

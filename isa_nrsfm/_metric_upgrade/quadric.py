@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
 
-# Linear equations determine their unknowns if the smallest singular value is above this
-# share of the largest.
-SMALLEST_SINGULAR_VALUE = 1e-6
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
 # where the cameras hardly show the depth, which noise then stretches without limit.
 LARGEST_STRETCH = 20.0
@@ -55,25 +52,14 @@ def conformal_equations(cameras: NDArray) -> NDArray:
     """
     Return the linear equations of weak-perspective cameras for the metric of space.
 
-    Parameters
-    ----------
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Rows m1 and m2.
-
-    Returns
-    -------
-    ndarray of shape (2 * n_frames, 6)
-        Coefficients of ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the six
-        unknowns of G, see `symmetric_matrix`. Turning a frame in its image plane turns
-        the two into each other.
+    For cameras (n_frames, 2, 3) with rows m1 and m2 these are the coefficients (2 *
+    n_frames, 6) of ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the six unknowns
+    of G, see `symmetric_matrix`. Turning a frame in its image plane turns the two into
+    each other.
     """
     m1, m2 = np.moveaxis(cameras, 1, 0)
-    return np.vstack(
-        [
-            _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2),
-            2 * _quadratic_terms(m1, m2),
-        ]
-    )
+    alike = _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2)
+    return np.vstack([alike, 2 * _quadratic_terms(m1, m2)])
 
 
 def _quadratic_terms(a: NDArray, b: NDArray) -> NDArray:
@@ -93,36 +79,12 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     """
     Find the symmetric G under which the cameras are weak-perspective ones.
 
-    The rows m1 and m2 of each camera, divided by its norm, should satisfy
-    ``m1 G m1^T = m2 G m2^T`` and ``m1 G m2^T = 0``: homogeneous linear equations in
-    six unknowns, solved by least squares. Their weights are such that turning a frame
-    in its image plane changes nothing. To exclude G = 0 the mean of ``m1 G m1^T + m2 G
-    m2^T`` is fixed. With a fixed norm of G instead, a G along a direction that the
-    cameras hardly see would nearly solve the equations.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        The affine cameras.
-
-    Returns
-    -------
-    ndarray of shape (3, 3) or None
-        G, positive definite, the mean of ``m1 G m1^T + m2 G m2^T`` being one. None if
-        the equations do not determine it, or if it is not safely positive definite.
-    """
-    G = _least_squares_quadric(motion)
-    if G is None:
-        return None
-    eigenvalues = np.linalg.eigvalsh(G)
-    # Eigenvalues of G are squares of the stretches of space.
-    return G if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None
-
-
-def _least_squares_quadric(motion: NDArray) -> NDArray | None:
-    """Return G (3, 3) of `metric_quadric`, positive definite or not.
-
-    Cameras are (n_frames, 2, 3). None if the equations do not determine G.
+    The rows m1 and m2 of each camera (n_frames, 2, 3), divided by its norm, should
+    satisfy ``m1 G m1^T = m2 G m2^T`` and ``m1 G m2^T = 0``: homogeneous linear
+    equations in six unknowns, solved by least squares. To exclude G = 0 the mean of
+    ``m1 G m1^T + m2 G m2^T`` is fixed to one. With a fixed norm of G instead, a G along
+    a direction that the cameras hardly see would nearly solve the equations. None is
+    returned if they do not determine G, or if it is not safely positive definite.
     """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)
@@ -138,41 +100,9 @@ def _least_squares_quadric(motion: NDArray) -> NDArray | None:
     unknowns, _, _, singular_values = np.linalg.lstsq(
         equations @ traceless, -equations @ trace / 3
     )
-    if (
-        len(singular_values) < 5
-        or singular_values[-1] <= SMALLEST_SINGULAR_VALUE * singular_values[0]
-    ):
+    if len(singular_values) < 5 or singular_values[-1] <= 1e-6 * singular_values[0]:
         return None
-    return whitening @ symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
-
-
-def anisotropy(motion: NDArray) -> float:
-    """
-    Return how far cameras are from weak-perspective ones, whatever the affinity.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        The affine cameras.
-
-    Returns
-    -------
-    float
-        Root mean square over the cameras of ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and
-        s2 the singular values of the camera in the metric of `metric_quadric`, from 0
-        for scaled orthographic cameras to 1. Stretches of that metric are limited to
-        `LARGEST_STRETCH`. Zero where the metric is not determined.
-    """
-    motion = motion[np.isfinite(motion).all(axis=(1, 2)) & motion.any(axis=(1, 2))]
-    if not len(motion):
-        return 0.0
-    # In the space in which the cameras see all directions alike.
-    motion = motion @ np.linalg.pinv(symmetric_power(mean_gram(motion), 0.5))
-    G = _least_squares_quadric(motion)
-    if G is None:
-        return 0.0
-    stretch, axes = np.linalg.eigh(G)
-    G = (axes * np.maximum(stretch, stretch[-1] / LARGEST_STRETCH**2)) @ axes.T
-    gram = motion @ G @ motion.transpose(0, 2, 1)
-    xx, xy, yy = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
-    return float(np.sqrt(np.mean(((xx - yy) ** 2 + 4 * xy**2) / (xx + yy) ** 2)))
+    G = whitening @ symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
+    # Eigenvalues of G are squares of the stretches of space.
+    eigenvalues = np.linalg.eigvalsh(G)
+    return G if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None

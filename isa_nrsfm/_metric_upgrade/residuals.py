@@ -25,7 +25,6 @@ from isa_nrsfm._linalg.vectors import frames_last
 
 CameraModel = Literal["orthographic", "weak_perspective"]
 CAMERA_MODELS = ("orthographic", "weak_perspective")
-Block = tuple[NDArray, NDArray]
 
 # Frames taken at a time, for which all that a step needs stays in the cache.
 BLOCK_FRAMES = 2048
@@ -79,16 +78,8 @@ def strain_basis(camera: CameraModel) -> NDArray:
     """
     Return an orthonormal basis of the strains that change the residuals.
 
-    Parameters
-    ----------
-    camera : {"orthographic", "weak_perspective"}
-        With weak-perspective cameras each frame has a scale of its own. A strain with a
-        trace only changes these scales.
-
-    Returns
-    -------
-    ndarray of shape (n_numbers, 3, 3)
-        Six symmetric matrices, or five without trace.
+    Six symmetric matrices for orthographic cameras. For weak-perspective ones five
+    without trace: a strain with a trace only changes the scales of the frames.
     """
     basis = np.zeros((6, 3, 3))
     diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
@@ -100,22 +91,13 @@ def strain_basis(camera: CameraModel) -> NDArray:
 
 def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
     """
-    Return how far the rows of cameras are from those of rotations.
+    Return how far the rows of cameras are from those of rotations: (n, n_frames).
 
-    Parameters
-    ----------
-    gram : ndarray of shape (2, 2, n_frames)
-        ``M_i G M_i^T``, the products of the rows in the metric, the frame last.
-    camera : {"orthographic", "weak_perspective"}
-        Whether the rows should be those of a rotation or of a scaled rotation.
-
-    Returns
-    -------
-    ndarray of shape (3, n_frames) or (2, n_frames)
-        For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i
-        G M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``,
-        with the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular
-        values of ``M_i Q``. Roll and scale of a frame do not change that norm.
+    With the products ``M_i G M_i^T`` (2, 2, n_frames) of the rows in the metric these
+    are for orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i
+    G M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``,
+    with the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular
+    values of ``M_i Q``. Roll and scale of a frame do not change that norm.
     """
     entries = np.tensordot(_patterns(camera), gram, 2)
     if camera == "orthographic":
@@ -135,9 +117,11 @@ def _patterns(camera: CameraModel) -> NDArray:
     return np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
 
 
-def frame_blocks(motion: NDArray, alpha: NDArray) -> list[Block]:
+def fit_at(
+    motion: NDArray, alpha: NDArray, Q: NDArray, strain: NDArray, camera: CameraModel
+) -> MetricFit:
     """
-    Return cameras and coefficients in blocks, the frame last.
+    Return how well a metric fits cameras.
 
     Parameters
     ----------
@@ -145,60 +129,27 @@ def frame_blocks(motion: NDArray, alpha: NDArray) -> list[Block]:
         Cameras, finite and not zero.
     alpha : ndarray of shape (n_frames, n_components)
         Coefficients of the strains.
-
-    Returns
-    -------
-    list of tuple of ndarray
-        Cameras M (2, 3, n) and coefficients (n_components, n) of n frames each.
-    """
-    parts = [
-        slice(start, start + BLOCK_FRAMES)
-        for start in range(0, len(motion), BLOCK_FRAMES)
-    ]
-    return [
-        (
-            frames_last(motion[part]),
-            np.ascontiguousarray(alpha[part].T),
-        )
-        for part in parts
-    ]
-
-
-def fit_at(
-    blocks: list[Block], Q: NDArray, strain: NDArray, camera: CameraModel
-) -> MetricFit:
-    """
-    Return how well a metric fits cameras.
-
-    Parameters
-    ----------
-    blocks : list of tuple of ndarray
-        Of `frame_blocks`.
     Q : ndarray of shape (3, 3)
         ``G = Q Q^T`` is the metric of frames without deformation.
     strain : ndarray of shape (n_components, 3, 3)
         E_k.
     camera : {"orthographic", "weak_perspective"}
-        What the cameras should be.
+        Model of the cameras.
 
     Returns
     -------
     MetricFit
         The metric, with its cost, curvature and gradient.
     """
-    parts = [
-        _normal_equations(alpha, *_linearised(Q.T @ M, strain, alpha, camera))
-        for M, alpha in blocks
-    ]
+    parts = []
+    for start in range(0, len(motion), BLOCK_FRAMES):
+        part = slice(start, start + BLOCK_FRAMES)
+        M, coefficients = frames_last(motion[part]), alpha[part].T
+        linearised = _linearised(Q.T @ M, strain, coefficients, camera)
+        parts.append(_normal_equations(coefficients, *linearised))
     costs, curvatures, gradients = zip(*parts, strict=True)
-    return MetricFit(
-        Q,
-        strain,
-        sum(alpha.shape[1] for _, alpha in blocks),
-        float(np.sum(costs)),
-        np.sum(curvatures, axis=0),
-        np.sum(gradients, axis=0),
-    )
+    curvature, gradient = np.sum(curvatures, axis=0), np.sum(gradients, axis=0)
+    return MetricFit(Q, strain, len(motion), sum(costs), curvature, gradient)
 
 
 def _linearised(
@@ -207,16 +158,8 @@ def _linearised(
     """
     Return residuals of cameras and their derivatives.
 
-    Parameters
-    ----------
-    MQ : ndarray of shape (2, 3, n_frames)
-        ``M_i Q``: cameras in the axes of the metric.
-    strain : ndarray of shape (n_components, 3, 3)
-        E_k.
-    alpha : ndarray of shape (n_components, n_frames)
-        Coefficients.
-    camera : {"orthographic", "weak_perspective"}
-        What the cameras should be.
+    Cameras in the axes of the metric, ``M_i Q``, are (2, 3, n_frames), coefficients
+    (n_components, n_frames).
 
     Returns
     -------
@@ -291,20 +234,9 @@ def _normal_equations(
         mixed = np.einsum("acn,bcn->abn", slopes, own_slopes) @ alpha.T
         curvature[0, :, 1:] = mixed.transpose(0, 2, 1)
         curvature[1:, :, 0] = mixed.transpose(2, 1, 0)
-        # Both factors are symmetric: each pair of coordinates, and each pair of
-        # coefficients, is multiplied once.
-        (a, b), numbers = _pairs(size)
-        (k, m), components = _pairs(n_components)
-        products = np.einsum("pcn,pcn->pn", own_slopes[a], own_slopes[b])
-        sums = products @ (alpha[k] * alpha[m]).T
-        curvature[1:, :, 1:] = sums[numbers[:, None], components[:, None, :, None]]
+        products = np.einsum("acn,bcn->abn", own_slopes, own_slopes)
+        pairs = (alpha[:, None] * alpha).reshape(n_components**2, -1)
+        own = (products @ pairs.T).reshape(size, size, n_components, n_components)
+        curvature[1:, :, 1:] = own.transpose(2, 0, 3, 1)
     cost = float(np.vdot(residuals, residuals))
     return cost, curvature.reshape(gradient.size, gradient.size), gradient.ravel()
-
-
-def _pairs(n: int) -> tuple[tuple[NDArray, NDArray], NDArray]:
-    """Return the pairs (a, b) with a <= b < n, and the index (n, n) of each pair."""
-    a, b = np.triu_indices(n)
-    where = np.empty((n, n), dtype=int)
-    where[a, b] = where[b, a] = np.arange(len(a))
-    return (a, b), where

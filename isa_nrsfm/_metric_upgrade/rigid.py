@@ -15,7 +15,12 @@ from isa_nrsfm._metric_upgrade.quadric import (
     metric_quadric,
     unit_cameras,
 )
-from isa_nrsfm._metric_upgrade.residuals import CAMERA_MODELS, CameraModel, MetricFit
+from isa_nrsfm._metric_upgrade.residuals import (
+    CAMERA_MODELS,
+    CameraModel,
+    MetricFit,
+    fit_at,
+)
 
 # Above this condition number the cameras hardly determine the metric. Rotations by
 # about five degrees have it.
@@ -242,29 +247,20 @@ def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
             "a metric upgrade needs cameras that together see three directions of "
             f"space; the {len(cameras)} usable cameras see {seen.sum()}"
         )
-    starts = [np.linalg.inv(gram), metric_quadric(cameras)]
-    fits = [
-        refine_metric(cameras, safe_start(cameras, start, camera), camera)
-        for start in starts
-        if start is not None
-    ]
+    no_alpha, no_strain = np.zeros((len(cameras), 0)), np.zeros((0, 3, 3))
+    fits = []
+    for G in (np.linalg.inv(gram), metric_quadric(cameras)):
+        if G is not None:
+            Q = safe_start(cameras, G, camera)
+            start = fit_at(cameras, no_alpha, Q, no_strain, camera)
+            fits.append(refine_metric(cameras, no_alpha, start, camera))
     return min(fits, key=lambda fit: fit.cost)
 
 
 def best_metric(motion: NDArray) -> NDArray:
-    """
-    Return Q with which cameras are most nearly scaled rotations.
+    """Return Q (3, 3) with which cameras (n, 2, 3) are most nearly scaled rotations.
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        That of `metric_upgrade`, or the identity where the cameras do not see three
-        directions of space.
+    It is the identity where they do not see three directions of space.
     """
     cameras, usable = usable_cameras(motion)
     try:
