@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.point_sums import frame_tracks
+from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks
@@ -171,4 +172,5 @@ def likelihood_of(tracks, weights, penalty, block_frames=2048):
     pieces = frame_tracks(tracks, weights).pieces(block_frames)
     blocks = [block for _, block in pieces]
     lengths = [len(block.weight) for block in blocks]
-    return MarginalLikelihood(FrameBlocks.of_blocks(blocks, lengths), penalty)
+    frames = JointFrames(FrameBlocks.of_blocks(blocks, lengths))
+    return MarginalLikelihood(frames, penalty)

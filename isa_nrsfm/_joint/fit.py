@@ -155,7 +155,7 @@ def fit_jointly(
     centred = shapes - shapes.mean(axis=2, keepdims=True)
     end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
     fit = fit._replace(state=end, camera_noise_ratio=ratio)
-    return fit, problem.frames, first.coefficients(state)
+    return fit, problem.frames, first.likelihood.coefficients(*state)
 
 
 def count_components(

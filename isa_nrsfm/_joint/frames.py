@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
-from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, totals
 from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.visibility import seen_points
+
+# Frames that are worked on at a time, so that their small matrices stay in the cache.
+BLOCK_FRAMES = 2048
 
 
 class WeightedRows(NamedTuple):
@@ -41,7 +43,7 @@ class JointFrames:
     Attributes
     ----------
     blocks : FrameBlocks
-        Blocks of FrameTracks.
+        Blocks of FrameTracks. All of them have weights, or none has.
     directions : ndarray of shape (n_directions, n_points) or None
         Orthonormal rows. Frames are given by their inner products with them, and by
         their energy. None if frames are given by their points.
@@ -57,8 +59,9 @@ class JointFrames:
 
     @cached_property
     def totals(self) -> tuple[float, float]:
-        """Number of coordinates that the frames show, and their energy."""
-        return totals(self.blocks)
+        """Number of coordinates of positive weight, and weighted energy."""
+        n_seen, square = np.sum(list(self.blocks.map(_totals)), axis=0)
+        return float(n_seen), float(square)
 
     @classmethod
     def from_points(cls, rows: FrameBlocks, complete: bool) -> Self:
@@ -96,6 +99,13 @@ class JointFrames:
         return type(self)(
             blocks.regrouped(joined_frames, BLOCK_FRAMES), self.directions
         )
+
+
+def _totals(block: FrameTracks) -> tuple[float, float]:
+    """Return the number of coordinates that a block shows, and its energy."""
+    weights = block.weights
+    points = block.weight.sum() if weights is None else np.count_nonzero(weights)
+    return 2.0 * points, block.energy.sum()
 
 
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:

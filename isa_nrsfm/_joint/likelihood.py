@@ -36,12 +36,9 @@ from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import FrameTracks, ShapeProducts, frame_sums
 from isa_nrsfm._joint.extents import extent_penalty
+from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_last
-from isa_nrsfm._tables.blocks import FrameBlocks
-
-# Frames that are worked on at a time, so that their small matrices stay in the cache.
-BLOCK_FRAMES = 2048
 
 
 class LikelihoodTerms(NamedTuple):
@@ -87,13 +84,11 @@ class MarginalLikelihood:
 
     Parameters
     ----------
-    frames : FrameBlocks
-        Blocks of FrameTracks. All of them have weights, or none has.
+    frames : JointFrames
+        The frames.
     penalty : float or ndarray of shape (n_components,)
         Regularisation weight: factor of ``sum_i tr H_i``, or one factor for the
         diagonal entry of each basis shape.
-    known : tuple of float, optional
-        `totals` of these blocks, if they have been computed already.
     extent_weight : float, default=0.0
         Weight of the prior of the extents, for each coordinate.
 
@@ -108,15 +103,10 @@ class MarginalLikelihood:
     """
 
     def __init__(
-        self,
-        frames: FrameBlocks,
-        penalty: NDArray | float,
-        known: tuple[float, float] | None = None,
-        extent_weight: float = 0.0,
+        self, frames: JointFrames, penalty: NDArray | float, extent_weight: float = 0.0
     ):
         self.frames, self.penalty, self.extent_weight = frames, penalty, extent_weight
-        self.n_frames = frames.n_frames
-        self.n_seen, self.square = totals(frames) if known is None else known
+        self.n_frames, (self.n_seen, self.square) = frames.n_frames, frames.totals
 
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
@@ -160,21 +150,7 @@ class MarginalLikelihood:
             penalty=self.penalty,
             tiny_noise=tiny_noise,
         )
-        return _joined(self.frames.map(over_block, motion))
-
-
-def totals(frames: FrameBlocks) -> tuple[float, float]:
-    """Return the number of coordinates that blocks of frames show, and their energy."""
-    n_seen, square = np.sum(list(frames.map(_totals)), axis=0)
-    return float(n_seen), float(square)
-
-
-def _totals(block: FrameTracks) -> tuple[float, float]:
-    """Return the number of coordinates that a block shows, and its energy."""
-    points = (
-        block.weight.sum() if block.weights is None else np.count_nonzero(block.weights)
-    )
-    return 2.0 * points, block.energy.sum()
+        return _joined(self.frames.blocks.map(over_block, motion))
 
 
 def _joined(parts: Iterable[LikelihoodTerms]) -> LikelihoodTerms:

@@ -14,8 +14,8 @@ from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.posterior import fit_frames, frame_search
 from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
-from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import BLOCK_FRAMES, MarginalLikelihood
+from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions
 from isa_nrsfm._joint.quasi_newton import JointFit, JointState, refine_joint
 from isa_nrsfm._paper.factors import Factorisation
@@ -103,12 +103,7 @@ class JointProblem:
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
         """The objective."""
-        frames = self.frames
-        return MarginalLikelihood(frames.blocks, self.penalty, frames.totals)
-
-    def coefficients(self, state: JointState) -> NDArray:
-        """Return the posterior means of the coefficients (n_frames, n_components)."""
-        return self.likelihood.coefficients(*state)
+        return MarginalLikelihood(self.frames, self.penalty)
 
     def aligned(self, state: JointState, camera: str) -> JointState:
         """Return a state with nearly optimal cameras for its centred shapes.
@@ -157,9 +152,7 @@ class JointProblem:
         if tol is None:
             tol = settings.tol * (0.1 if self.thorough else 1.0)
         if cameras.name != "affine":
-            likelihood = MarginalLikelihood(
-                likelihood.frames, self.penalty, self.frames.totals, EXTENT_WEIGHT
-            )
+            likelihood = MarginalLikelihood(self.frames, self.penalty, EXTENT_WEIGHT)
         if least_noise is None:
             least_noise = settings.options.least_noise
         return refine_joint(

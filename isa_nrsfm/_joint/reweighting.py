@@ -63,24 +63,21 @@ def reweighted(
     weights = WeightedRows.without(few_rows, left_out[few]).weights
     for _ in range(20):
         shapes, motion, variance = fit.state
-        alpha = problem.coefficients(fit.state)
+        alpha = problem.likelihood.coefficients(*fit.state)
         position = weighted.joined(partial(_positions, shapes=shapes), motion, alpha)
-        model = motion, position, alpha
-        distance = distances(
-            few_rows.transpose(0, 2, 1), shapes, *(part[few] for part in model)
-        )
-        distance /= _residual_deviations(
-            motion[few], alpha[few], shapes, weights, variance, cameras
-        )
+        model = motion, position, alpha, sizes
+        M, t, a, few_sizes = (part[few] for part in model)
+        distance = distances(few_rows.transpose(0, 2, 1), shapes, M, t, a)
+        distance /= _residual_deviations(M, a, shapes, weights, variance, cameras)
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
         new = partial(_weighted, shapes=shapes, loss=settings.loss, deviation=deviation)
-        change = max(weighted.map(partial(_change, new=new), *model, sizes))
+        change = max(weighted.map(partial(_change, new=new), *model))
         if change < 1e-2:
             break
         # Refinement with the new weights
-        weighted = rows.derive(new, *model, sizes)
-        weights = new(few_rows, *(part[few] for part in (*model, sizes))).weights
+        weighted = rows.derive(new, *model)
+        weights = new(few_rows, M, t, a, few_sizes).weights
         problem = replace(problem, frames=JointFrames.from_weighted(weighted))
         fit = refined(problem, fit.state)
     return fit, deviation**2

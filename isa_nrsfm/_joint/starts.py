@@ -265,7 +265,7 @@ def _first_state(
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
     """Return a state with its basis shapes mixed and scaled as the prior asks for."""
     shapes, motion, _ = state
-    alpha = problem.coefficients(state)
+    alpha = problem.likelihood.coefficients(*state)
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
     return state._replace(shapes=shapes)
 
