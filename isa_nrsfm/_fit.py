@@ -128,7 +128,7 @@ def fit_table(
     Returns
     -------
     Decomposition
-        The fit of the rows of the table; NaN for rows that show nothing.
+        The fit of the rows of the table; NaN for rows without points.
     """
     n_components = estimator.n_components
     if n_components == "auto":
@@ -183,10 +183,8 @@ def fit_ready_table(
         converged = fitted.converged
     else:
         assert paper is not None
-        frames, converged = (
-            _paper_frames(estimator, table, factors, paper),
-            paper.converged,
-        )
+        frames = _paper_frames(estimator, table, factors, paper)
+        converged = paper.converged
     if not converged:
         warn_caller(
             f"the refinement did not converge in max_iter={estimator.max_iter} steps; "
@@ -215,9 +213,8 @@ def fit_ready_table(
         (row,), (scale,) = nearest_calibrated(reference[None])
         reference = scale * row
     estimator.reference_motion_ = reference.astype(table.dtype)
-    estimator.reference_translation_ = frames.translation.mean(axis=0).astype(
-        table.dtype
-    )
+    centre = frames.translation.mean(axis=0)
+    estimator.reference_translation_ = centre.astype(table.dtype)
     if estimator.keep_frames:
         estimator._frame_sizes = table.of_all_rows(table.sizes)
     progress("gauge and coefficients")

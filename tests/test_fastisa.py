@@ -105,16 +105,6 @@ class TestOptimality:
         assert isa.log_likelihood_ == isa.log_likelihoods_[best]
         assert isa.n_iter_ == isa.n_iters_[best]
 
-    def test_most_starts_converge_with_few_samples(self):
-        n_iters = np.concatenate(
-            [
-                FastISA(n_init=8, random_state=seed).fit(few_samples(seed)).n_iters_
-                for seed in range(3)
-            ]
-        )
-        # A start that does not converge has taken all 500 steps of an iteration.
-        assert np.mean(n_iters < 500) > 0.7
-
 
 class TestInvariances:
     @pytest.mark.slow

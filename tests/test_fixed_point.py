@@ -176,23 +176,6 @@ class TestIterate:
         G = DENSITY.derivatives(u)[0] * Y @ Y.T / Z.shape[1]
         assert np.linalg.norm(G - G.T) < 1e-5 * np.linalg.norm(G)
 
-    def test_gradient_by_finite_differences(self):
-        # Turning any two rows of the result in their plane changes the likelihood in
-        # second order only.
-        Z = white_signals(0, 5000)
-        first = orthogonalise(np.eye(6) + 0.2 * starts(0, 1, 6))
-        W, _, _ = iterate(first, Z, 3, DENSITY, max_iter=500, tol=1e-13)
-        angle = 1e-3
-        for a in range(3):
-            for b in range(3, 6):
-                values = []
-                for t in (-angle, angle):
-                    R = np.eye(6)
-                    R[a, a] = R[b, b] = np.cos(t)
-                    R[a, b], R[b, a] = np.sin(t), -np.sin(t)
-                    values.append(log_likelihood(R @ W[0], Z, 3, DENSITY))
-                assert abs(values[1] - values[0]) / (2 * angle) < 1e-5
-
     def test_result_is_orthogonal_and_the_start_stays_as_it_is(self):
         Z, first = white_signals(0), starts(0, 3, 6)
         before = first.copy()
