@@ -115,8 +115,9 @@ class TableModel(NamedTuple):
         if not usable.all():
             centred, report = centred[usable], report.of_frames(usable)
         translation, sizes = report.translation, report.size
-        robust = isinstance(self.frames, PosteriorFrames)
-        if robust and self.frames.loss != "linear" and len(centred):
+        frames = self.frames
+        robust = isinstance(frames, PosteriorFrames) and frames.loss != "linear"
+        if robust and len(centred):
             centred, translation = robustly_centred(tracks[usable])
             sizes = robust_sizes(centred)
         if self.unit is not None:
