@@ -7,11 +7,9 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from scenes import measurements, random_cameras, random_rotation, random_scene
-from scipy.optimize import approx_fprime
+from scenes import measurements, random_cameras, random_rotation
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM
@@ -29,7 +27,6 @@ from isa_nrsfm.baselines._compressible import (
     chain_atoms,
     metric_correction,
 )
-from isa_nrsfm.baselines._orthographic_frames import fit_orthographic, quadratic_model
 from isa_nrsfm.baselines._pseudo_inverse import (
     least_norm_shapes,
     orthographic_cameras,
@@ -190,106 +187,6 @@ class TestNuclearNorm:
         assert converged
         assert self.solve(W, max_iter=n_iter, tol=1e-3)[1:] == (n_iter, True)
         assert not self.solve(W, max_iter=n_iter - 1, tol=1e-3)[2]
-
-
-class TestOrthographicFrames:
-    """Camera and coefficients of single frames for given shapes."""
-
-    def model(self, noise=0.0, variance=1e-12, n_frames=15, **scene):
-        """Return centred tracks, mean shape, basis and variance, and the truth."""
-        made = random_scene(
-            n_frames=n_frames, noise=noise, camera="orthographic", **scene
-        )
-        shapes = made.shapes.swapaxes(1, 2)
-        return (made.centred, shapes[0], shapes[1:], variance), made
-
-    def cost(self, given, i, camera, alpha):
-        tracks, mean_shape, basis, variance = given
-        rest = tracks[i] - compose(mean_shape, basis, alpha) @ camera.T
-        return np.sum(rest**2) + variance * np.sum(alpha**2)
-
-    def moved(self, camera, alpha, x):
-        return camera @ Rotation.from_rotvec(x[:3]).as_matrix(), alpha + x[3:]
-
-    def test_exact_frames(self):
-        given, truth = self.model(n_frames=200, deformation=0.15)
-        R, alpha = fit_orthographic(*given)
-        assert_allclose(R, truth.motion, atol=1e-7)
-        assert_allclose(alpha, truth.alpha, atol=1e-6)
-
-    @pytest.mark.parametrize("noise", [0.01, 0.3])
-    def test_minimum(self, noise):
-        given, _ = self.model(noise, noise**2)
-        cameras, alphas = fit_orthographic(*given)
-        gram = cameras @ cameras.swapaxes(1, 2)
-        assert_allclose(gram - np.eye(2), 0, atol=1e-14)
-        rng, origin = rng_of(2), np.zeros(6)
-        for i, (R, a) in enumerate(zip(cameras, alphas, strict=True)):
-
-            def of(x, i=i, R=R, a=a):
-                return self.cost(given, i, *self.moved(R, a, x))
-
-            assert_allclose(approx_fprime(origin, of, 1e-6), 0, atol=2e-4)
-            for size in (1e-3, 1e-2, 1e-1):
-                assert of(size * rng.normal(size=6)) > of(origin)
-
-    def test_derivatives(self):
-        given, _ = self.model(0.5, 0.3)
-        tracks, mean_shape, basis, variance = given
-        R, a = random_rotation(3)[:2], rng_of(2).normal(size=3)
-        shapes = np.concatenate([mean_shape[None], basis]).swapaxes(1, 2)
-        slope, curvature, scale = quadratic_model(
-            tracks[:1].swapaxes(1, 2), shapes, variance, R[None], a[None]
-        )
-
-        def of(x):
-            return self.cost(given, 0, *self.moved(R, a, x)) / 2
-
-        step = 1e-4
-        unit = step * np.eye(6)
-        gradient = [(of(e) - of(-e)) / (2 * step) for e in unit]
-        hessian = [
-            [of(e + f) - of(e - f) - of(f - e) + of(-e - f) for f in unit] for e in unit
-        ]
-        assert_allclose(slope[0], -np.array(gradient), rtol=1e-6)
-        assert_allclose(curvature[0], np.array(hessian) / (4 * step**2), atol=1e-5)
-        assert (scale > 0).all()
-
-    def test_frames_images_and_space(self):
-        given, _ = self.model(0.1, 0.01)
-        tracks, mean_shape, basis, variance = given
-        R, alpha = fit_orthographic(*given)
-        roll, turn = random_rotation(0, 2), random_rotation(0) @ np.diag([1.0, 1, -1])
-        for found, expected in (
-            (fit_orthographic(*given, batch=4), R),
-            (fit_orthographic(tracks @ roll.T, *given[1:]), roll @ R),
-            (
-                fit_orthographic(tracks, mean_shape @ turn.T, basis @ turn.T, variance),
-                R @ turn.T,
-            ),
-        ):
-            assert_allclose(found[0], expected, atol=1e-7)
-            assert_allclose(found[1], alpha, atol=1e-6)
-        single = fit_orthographic(tracks[3:4], *given[1:])
-        assert_allclose(single[0][0], R[3], atol=1e-7)
-        none = fit_orthographic(tracks[:0], *given[1:])
-        assert [part.shape for part in none] == [(0, 2, 3), (0, 3)]
-
-    def test_degenerate_shapes(self):
-        given, truth = self.model(deformation=0.0)
-        R, alpha = fit_orthographic(*given)
-        assert_allclose(R, truth.motion, atol=1e-7)
-        assert_array_equal(alpha, 0)
-        # A flat object and its image in the mirror of its plane look the same.
-        given, truth = self.model(deformation=0.0, extent=(1.0, 1.0, 0.0))
-        R, _ = fit_orthographic(*given)
-        assert_allclose(R[:, :, :2], truth.motion[:, :, :2], atol=1e-6)
-        signs = np.sign(np.vecdot(R[:, :, 2], truth.motion[:, :, 2]))[:, None]
-        assert_allclose(signs * R[:, :, 2], truth.motion[:, :, 2], atol=1e-6)
-        line = np.outer(given[1][:, 0], [1.0, 0.0])[None]
-        R, alpha = fit_orthographic(line, *self.model(variance=0.01)[0][1:])
-        assert_allclose(R[0] @ R[0].T, np.eye(2), atol=1e-14)
-        assert np.isfinite(alpha).all()
 
 
 class SparseScene(NamedTuple):

@@ -20,6 +20,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.models import Decomposition
+from isa_nrsfm._frames.posterior import fit_tracks, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names
@@ -34,7 +35,6 @@ from isa_nrsfm._tables.layout import (
     weighting_sizes,
 )
 from isa_nrsfm._tables.sources import Table, checked_range, unmasked
-from isa_nrsfm.baselines._orthographic_frames import fit_orthographic
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
     principal_shapes,
@@ -214,10 +214,11 @@ class ShapeSequenceNRSfM(
         Return camera and coefficients of each frame of a table.
 
         Each frame is fitted separately, by the principal shapes and an orthographic
-        camera. The fit minimises ``sum_j ||m_j - M_i (b_0j + sum_k alpha_ik b_kj) -
-        t_i||^2 / s_i^2 + noise_variance_ * ||alpha_i||^2``, where M_i has orthonormal
-        rows times the scale s_i of the frame. Without `scale_frames` s_i is one; with
-        it, s_i is the root mean square of the centred coordinates of the frame.
+        camera. The camera M_i maximises the likelihood with the coefficients integrated
+        out. The coefficients minimise ``sum_j ||m_j - M_i (b_0j + sum_k alpha_ik b_kj)
+        - t_i||^2 / s_i^2 + noise_variance_ * ||alpha_i||^2``. M_i has orthonormal rows
+        times the scale s_i of the frame: one, or with `scale_frames` the root mean
+        square of its centred coordinates. Frames without a unique camera are NaN.
 
         Parameters
         ----------
@@ -301,17 +302,19 @@ class ShapeSequenceNRSfM(
 
     def _decompose(self, X: NDArray) -> Decomposition:
         """Return camera and coefficients of each frame of a valid table."""
-        tracks = table_to_tracks(X, self.layout)
-        centred, translation = centred_tracks(tracks)
+        tracks = table_to_tracks(X, self.layout).astype(np.float64)
         sizes = np.full(len(tracks), self._unit)
         if self.scale_frames:
-            sizes = weighting_sizes(centred, True)
-        cameras, alpha = fit_orthographic(
-            centred / sizes[:, None, None],
-            self.mean_shape_.astype(np.float64) / self._unit,
-            self.basis_.astype(np.float64) / self._unit,
+            sizes = weighting_sizes(centred_tracks(tracks)[0], True)
+        shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
+        search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
+        fits = fit_tracks(
+            tracks / sizes[:, None, None],
+            search,
             self.noise_variance_ / self._unit**2,
+            covariances=False,
         )
-        motion = (sizes / self._unit)[:, None, None] * cameras
-        found = (motion, translation, alpha, np.full_like(alpha, np.nan))
-        return Decomposition(*(part.astype(tracks.dtype) for part in found))
+        motion = (sizes / self._unit)[:, None, None] * fits.motion
+        translation = sizes[:, None] * fits.translation
+        found = (motion, translation, fits.alpha, np.full_like(fits.alpha, np.nan))
+        return Decomposition(*(part.astype(X.dtype) for part in found))
