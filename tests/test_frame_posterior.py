@@ -162,6 +162,14 @@ class TestOptimum:
 
 
 class TestSpecial:
+    @pytest.mark.parametrize("n_frames", [30, 32])
+    def test_complete_frames_among_others(self, n_frames):
+        tracks, shapes, _ = random_scene(0, n_frames=32)
+        tracks[::7] = with_gaps(tracks[::7], 0)
+        expected = fit_posterior(tracks[:23], shapes, NOISE**2)
+        fits = fit_posterior(tracks[:n_frames], shapes, NOISE**2)
+        assert_array_equal(fits.motion[:23], expected.motion)
+
     def test_affinities_of_single_images_of_exact_tracks(self):
         tracks, shapes, (_, _, alpha) = random_scene(0, noise=0.0)
         A = np.random.default_rng(1).normal(size=(len(tracks), 2, 2))

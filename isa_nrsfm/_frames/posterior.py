@@ -64,7 +64,8 @@ def fit_tracks(
         if len(chosen):
             frames = in_lanes(chosen)
             own = None if complete[frames[0]] else weights[frames]
-            part = tracks if len(frames) == n_frames else tracks[frames]
+            whole = len(chosen) == len(frames) == n_frames
+            part = tracks if whole else tracks[frames]
             fit = fit_frames(
                 frame_tracks(part, own),
                 search,
