@@ -166,7 +166,7 @@ class RigidFrames(NamedTuple):
         """Return motion, translation and alpha of complete frames (n, n_points, 2)."""
         translation = np.einsum("ijc->ic", tracks) / tracks.shape[1]
         W = measurement_matrix(tracks - translation[:, None])
-        motion = self._cameras(W, self.mean_shape)
+        motion = CAMERAS[self.camera].nearest(rigid_cameras(W, self.mean_shape))
         n_components, n_points, _ = self.basis.shape
         stacked = self.basis.transpose(1, 0, 2).reshape(n_points, -1)
         P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
@@ -181,23 +181,18 @@ class RigidFrames(NamedTuple):
         alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
         return motion, translation, alpha
 
-    def _cameras(self, W: NDArray, mean_shape: NDArray) -> NDArray:
-        """Return cameras (n_frames, 2, 3) for W (2 n_frames, J) and a shape (J, 3)."""
-        motion = rigid_cameras(W, mean_shape)
-        return CAMERAS[self.camera].nearest(motion)
-
     def _together(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Return the fit of one frame (1, n_points, 2), all coefficients at once."""
         seen = seen_points(tracks[0])
         points, mean_shape = tracks[0, seen], self.mean_shape[seen]
         centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
-        W = (points - centre).T
-        motion = self._cameras(W, mean_shape - centroid)
+        motion = rigid_cameras((points - centre).T, mean_shape - centroid)
+        motion = CAMERAS[self.camera].nearest(motion)
         # Least squares for what the mean shape leaves of the frame
         basis = self.basis[:, seen]
         middles = basis.mean(axis=1)
         images = (basis - middles[:, None]) @ motion[0].T
-        rest = W.T - (mean_shape - centroid) @ motion[0].T
+        rest = points - centre - (mean_shape - centroid) @ motion[0].T
         alpha = np.linalg.lstsq(images.reshape(len(basis), -1).T, rest.ravel())[0]
         translation = centre - motion[0] @ (centroid + alpha @ middles)
         return motion, translation, alpha

@@ -1,12 +1,10 @@
 """Images of shapes, and how far they are from what frames show."""
 
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 
@@ -24,31 +22,17 @@ def reprojection_error(
     centred. Rows are blocks of frames (n, 2, n_points), NaN where a point is missing.
     Motion (n, 2, 3), position (n, 2) and alpha (n, K) are those of all frames.
     """
-    stacked = shapes.reshape(-1, shapes.shape[2])
-    found = rows.map(partial(_energies, shapes=stacked), motion, position, alpha)
+    found = rows.map(partial(_energies, shapes=shapes), motion, position, alpha)
     noise, signal = np.sum(list(found), axis=0)
     return float(noise / signal)
 
 
-def _energies(
-    rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
-) -> tuple[float, float]:
-    """
-    Return the energies of the residuals of a block, and of its centred frames.
-
-    The shapes are stacked (3 n_shapes, n_points).
-    """
-    images = (stacked_motion(motion, alpha) @ shapes).reshape(rows.shape)
-    images += position[:, :, None]
-    np.subtract(rows, images, out=images)
-    n_seen: Any = rows.shape[2]
-    if np.isnan(rows.sum()):
-        missing = np.isnan(rows)
-        n_seen = rows.shape[2] - missing.sum(axis=2)
-        rows, images = np.where(missing, 0.0, (rows, images))
-    total = rows.sum(axis=2, dtype=np.float64)
-    signal = energies(rows).sum() - (total * total / n_seen).sum()
-    return float(energies(images).sum()), float(signal)
+def _energies(rows: NDArray, *fit: NDArray, shapes: NDArray) -> tuple[float, float]:
+    """Return the energies of the residuals of a block, and of its centred frames."""
+    tracks = rows.transpose(0, 2, 1).astype(np.float64)
+    centred = tracks - np.nanmean(tracks, axis=1, keepdims=True)
+    rest = distances(tracks, shapes, *fit)
+    return float(np.nansum(rest**2)), float(np.nansum(centred**2))
 
 
 def distances(
