@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from scenes import random_rotation
 
 from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
@@ -248,21 +247,6 @@ class TestNoise:
 
 
 class TestWeights:
-    def test_ones_are_complete_frames(self):
-        scene = random_scene()
-        expected = scene.posterior()
-        got = scene._replace(weights=np.ones((6, 11))).posterior()
-        for one, other in zip(got, expected, strict=True):
-            assert_allclose(one, other, rtol=1e-10)
-
-    def test_are_inverse_variances(self):
-        scene = random_scene("weighted")
-        expected = scene.posterior(NOISE)
-        got = scene._replace(weights=3 * scene.weights).posterior(3 * NOISE)
-        assert_allclose(got.alpha, expected.alpha, rtol=1e-10)
-        assert_allclose(got.log_determinant, expected.log_determinant, rtol=1e-10)
-        assert_allclose(got.objective, 3 * expected.objective, rtol=1e-10)
-
     def test_points_without_weight_do_not_matter(self):
         scene = random_scene()
         kept = np.arange(11) % 3 > 0
@@ -274,36 +258,6 @@ class TestWeights:
         got = scene._replace(tracks=hidden, weights=weights).posterior()
         for one, other in zip(got, expected, strict=True):
             assert_allclose(one, other, rtol=1e-9)
-
-
-class TestInvariances:
-    def test_affinity_of_space(self):
-        scene = random_scene()
-        A = np.random.default_rng(1).normal(size=(3, 3))
-        M = np.einsum("rai,ab->rbi", scene.M, np.linalg.inv(A))
-        got = scene._replace(shapes=A @ scene.shapes, M=M).posterior()
-        for one, other in zip(got, scene.posterior(), strict=True):
-            assert_allclose(one, other, rtol=1e-8, atol=1e-10)
-
-    def test_rotation_of_the_coefficients(self):
-        scene = random_scene()
-        Q = random_rotation(1)
-        mixed = np.concatenate([scene.shapes[:1], np.tensordot(Q, scene.shapes[1:], 1)])
-        got, expected = scene._replace(shapes=mixed).posterior(), scene.posterior()
-        assert_allclose(Q.T @ got.alpha, expected.alpha, rtol=1e-9)
-        assert_allclose(got.objective, expected.objective, rtol=1e-10)
-        assert_allclose(got.log_determinant, expected.log_determinant, rtol=1e-10)
-        inverse = unpacked(got.inverse)[1:, 1:]
-        inverse = np.einsum("ka,kln,lb->abn", Q, inverse, Q)
-        assert_allclose(inverse, unpacked(expected.inverse)[1:, 1:], rtol=1e-8)
-
-    def test_rotation_of_images(self):
-        scene = random_scene()
-        R = random_rotation(1, 2)
-        M = np.einsum("sr,rai->sai", R, scene.M)
-        got = scene._replace(tracks=scene.tracks @ R.T, M=M).posterior()
-        for one, other in zip(got, scene.posterior(), strict=True):
-            assert_allclose(one, other, rtol=1e-9, atol=1e-12)
 
 
 class TestDegenerate:
