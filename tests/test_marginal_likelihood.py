@@ -349,13 +349,6 @@ class TestBlocks:
         whole = scene.at(PENALTY, block_frames=len(scene.tracks))
         assert_same(scene.at(PENALTY, block_frames=size), whole)
 
-    def test_default_size_is_passed(self):
-        # More frames than a block has: the cameras are dealt out in the right order.
-        scene = random_scene("complete", n_frames=4100, n_points=4, n_components=1)
-        whole = scene.at(PENALTY, block_frames=4100)
-        assert len(likelihood_of(scene.tracks, None, 0.0).frames.blocks.lengths) == 3
-        assert_same(scene.at(PENALTY), whole)
-
     @KINDS
     def test_memory_order_makes_no_difference(self, kind):
         scene = random_scene(kind)

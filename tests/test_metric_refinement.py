@@ -8,20 +8,18 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.vectors import frames_last
-from isa_nrsfm._metric_upgrade.minimisation import (
-    STRETCH_OF_START,
-    exponential,
-    refine_metric,
-    safe_start,
-)
 from isa_nrsfm._metric_upgrade.quadric import metric_quadric
-from isa_nrsfm._metric_upgrade.residuals import (
+from isa_nrsfm._metric_upgrade.refinement import (
     BLOCK_FRAMES,
     CAMERA_MODELS,
+    STRETCH_OF_START,
     _linearised,
     _normal_equations,
+    exponential,
     fit_at,
     orthonormality,
+    refine_metric,
+    safe_start,
     strain_basis,
 )
 

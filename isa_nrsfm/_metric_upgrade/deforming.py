@@ -7,16 +7,18 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import polar
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
-from isa_nrsfm._metric_upgrade.minimisation import exponential, refine_metric
-from isa_nrsfm._metric_upgrade.residuals import (
+from isa_nrsfm._metric_upgrade.refinement import (
     CameraModel,
     MetricFit,
+    exponential,
     fit_at,
+    refine_metric,
     strain_basis,
 )
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
     nearest_rotations,
+    of_all_frames,
     scaled,
     usable_cameras,
     warn_if_degenerate,
@@ -239,16 +241,8 @@ def euclidean_frames(
     shapes = seen @ rotations
     # The rotation nearest to the mean shape.
     turns = _rotations_to_mean(shapes, mean @ np.linalg.inv(metric.Q).T)
-
-    frames = EuclideanFrames(
-        np.full((len(usable), *mean.shape), np.nan),
-        np.full((len(usable), 3, 3), np.nan),
-        np.full(len(usable), np.nan),
-    )
-    frames.shapes[usable] = shapes @ turns
-    frames.rotations[usable] = rotations @ turns
-    frames.scales[usable] = scales
-    return frames
+    found = shapes @ turns, rotations @ turns, scales
+    return EuclideanFrames(*(of_all_frames(values, usable) for values in found))
 
 
 def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:

@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 from sklearn.utils import check_array
 
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
-from isa_nrsfm._metric_upgrade.minimisation import levenberg_marquardt
+from isa_nrsfm._metric_upgrade.refinement import levenberg_marquardt
 
 # Number of columns that are added at a time: a basis shape has three.
 STEP = 3

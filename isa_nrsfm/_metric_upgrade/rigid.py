@@ -9,17 +9,18 @@ from scipy import linalg
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import polar
-from isa_nrsfm._metric_upgrade.minimisation import refine_metric, safe_start
 from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,
     metric_quadric,
     unit_cameras,
 )
-from isa_nrsfm._metric_upgrade.residuals import (
+from isa_nrsfm._metric_upgrade.refinement import (
     CAMERA_MODELS,
     CameraModel,
     MetricFit,
     fit_at,
+    refine_metric,
+    safe_start,
 )
 
 # Above this condition number the cameras hardly determine the metric. Rotations by
@@ -169,12 +170,11 @@ def metric_upgrade(
         raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
     Q = scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
-    rotations = np.full((len(cameras), 3, 3), np.nan)
-    scales = np.full(len(cameras), np.nan)
-    rotations[usable], stretches = nearest_rotations(cameras[usable] @ Q)
-    scales[usable] = (
-        1.0 if camera == "orthographic" else np.trace(stretches, axis1=1, axis2=2) / 2
-    )
+    rotations, stretches = nearest_rotations(cameras[usable] @ Q)
+    scales = np.trace(stretches, axis1=1, axis2=2) / 2
+    if camera == "orthographic":
+        scales = np.ones(len(scales))
+    rotations, scales = (of_all_frames(each, usable) for each in (rotations, scales))
     warn_if_degenerate(fit.condition_number)
     return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
 
@@ -288,6 +288,13 @@ def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
     depth = np.cross(rows[:, 0], rows[:, 1])
     stretches = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
     return np.concatenate([rows, depth[:, None]], axis=1), stretches
+
+
+def of_all_frames(values: NDArray, usable: NDArray) -> NDArray:
+    """Return values (n_usable, ...) as (n_frames, ...), NaN for the other frames."""
+    found = np.full((len(usable), *values.shape[1:]), np.nan)
+    found[usable] = values
+    return found
 
 
 def warn_if_degenerate(condition_number: float) -> None:
