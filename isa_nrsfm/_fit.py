@@ -46,11 +46,11 @@ from isa_nrsfm._gauge.canonical import (
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.jackknife import depth_certainty
 from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._joint.quasi_newton import JointFit
 from isa_nrsfm._joint.sample_posterior import (
-    certainty_of,
     posterior_blocks,
     posterior_moments,
     shape_uncertainty,
@@ -403,7 +403,7 @@ def _joint_frames(
         estimator.camera,
     )
     if estimator.camera != "affine":
-        frames = replace(frames, certainty=certainty_of(frames, table.rows))
+        frames = replace(frames, certainty=depth_certainty(frames, table.rows))
         estimator.depth_uncertainty_ = frames.certainty.total
     posteriors = posterior_blocks(frames, tracks, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)

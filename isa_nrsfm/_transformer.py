@@ -18,7 +18,6 @@ from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._dynamics import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.depth import tilts
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
@@ -277,9 +276,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ndarray of shape (n_frames, 3, 3)
             Posterior covariances, in radians squared, of the rotation vectors w by
             which rotations R may be off: ``R exp(hat(w))``, w in the axes of the
-            shapes. They contain the uncertainty of coefficients and shapes, and treat
-            the misfit as common to many points. NaN for rows with too few visible
-            points.
+            shapes: those of the frame plus those of the shapes, from a jackknife over
+            groups of points. NaN for rows with too few visible points.
 
         Raises
         ------
@@ -290,18 +288,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.space, frames.certainty
         found = self._model.posterior(table)
-        covariance = found.turn_covariance
-        # Rotations that basis shapes contain, and the scale of the depth
+        covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:
-            covariance = covariance + np.einsum(
-                "ik,kalb,il->iab", found.alpha, certainty.turns, found.alpha
-            )
-        covariance = space @ covariance @ space.T
-        if np.isfinite(certainty.scale):
-            mean, _ = full_rotations(self.reference_motion_[None].astype(np.float64))
-            rotations, _ = full_rotations(found.motion @ space.T)
-            turned = tilts(rotations, mean[0])
-            covariance += certainty.scale**2 * turned[:, :, None] * turned[:, None]
+            R, _ = full_rotations(found.motion @ space.T)
+            covariance = covariance + R.transpose(0, 2, 1) @ certainty.turns @ R
         return np.asarray(covariance).astype(table.dtype, copy=False)
 
     def reconstruct(

@@ -2,13 +2,15 @@ import warnings
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._frames.depth import DepthCertainty, tilts
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._joint.extents import extent_penalty
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm._joint.jackknife import N_GROUPS, neighbours
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
@@ -130,7 +132,7 @@ class TestFrontalFaces:
     def test_the_page_claims_no_proportions(self, frontal, tmp_path):
         X, model = frontal
         write_viewer(model, tmp_path / "page.html", X=X, camera=None)
-        assert "The depth is not known" in (tmp_path / "page.html").read_text()
+        assert "The depth is not determined" in (tmp_path / "page.html").read_text()
 
     def test_affine_angles_are_withheld_likewise(self):
         X, *_ = faces_turned_by(2)
@@ -232,16 +234,33 @@ def test_orthographic_deviations_of_depths_are_the_errors():
     assert 0.3 < np.sqrt(np.mean(relative**2)) < 2
 
 
-def test_unmeasured_certainty_withholds_nothing():
+def test_unestimated_certainty_withholds_nothing():
     assert DepthCertainty().determined
-    assert not DepthCertainty(scale=0.5).determined
+    assert not DepthCertainty(turning=0.1, turns=0.01 * np.eye(3)).determined
+    assert DepthCertainty(turning=0.5, turns=0.01 * np.eye(3)).determined
 
 
-def test_tilts_leave_the_viewing_direction_out():
-    mean = Rotation.from_euler("y", 30, degrees=True).as_matrix()
-    turns = Rotation.from_euler("zx", [[40, 0], [0, 10]], degrees=True).as_matrix()
-    found = tilts(turns @ mean, mean)
-    assert_allclose(np.degrees(np.linalg.norm(found, axis=1)), [0, 10], atol=1e-6)
+def test_neighbours_are_groups_of_equal_size():
+    rng = np.random.default_rng(0)
+    centres = 10 * rng.normal(size=(3, N_GROUPS))
+    points = np.repeat(centres, 4, axis=1) + rng.normal(size=(3, 4 * N_GROUPS))
+    groups = neighbours(points)
+    assert_array_equal(groups, np.repeat(groups[::4], 4))
+    assert_array_equal(np.unique(groups), range(N_GROUPS))
+    assert_array_equal(np.bincount(neighbours(points[:, :17])), [4, 4, 3, 3, 3])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])
+def test_deviations_hold_for_a_body_that_deforms_further_than_the_model(camera):
+    scene = make_body_tracks(150, camera=camera, random_state=0)
+    X, model = scene.data, fitted(scene.data, 3, camera)
+    points = scene.shapes @ full_rotations(scene.motion)[0].transpose(0, 2, 1)
+    points *= full_rotations(scene.motion)[1][:, None, None]
+    off, error = error_of_depths(model, X, points)
+    assert error / 2 < model.depth_uncertainty_ < 2 * error
+    deviation = model.reconstruct(X, return_std=True)[1] * model.scales_[:, None]
+    assert 0.5 < np.sqrt(np.mean((off / deviation) ** 2)) < 2
 
 
 @pytest.mark.slow

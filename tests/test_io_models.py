@@ -108,6 +108,9 @@ def fitted(tmp_path_factory):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
             warnings.filterwarnings("ignore", "1 of 20 row.* show no point")
+            warnings.filterwarnings(
+                "ignore", "the depth of the shapes is not determined"
+            )
             model = AffineNRSfM(**parameters).fit(table)
         return (model.mirrored() if mirror else model), table
 

@@ -55,12 +55,10 @@ class CalibratedSearch(FrameSearch):
     scaled : bool
         Whether cameras have a scale of their own (weak perspective) or the scale one
         (orthographic).
-    misfit : float, default=1.0
-        Variance of the misfit that covariances contain, as a share of the noise.
     """
 
-    def __init__(self, shapes: NDArray, scaled: bool, misfit: float = 1.0):
-        self.model, self.misfit = CalibratedCameras(scaled), misfit
+    def __init__(self, shapes: NDArray, scaled: bool):
+        self.model = CalibratedCameras(scaled)
         axes, size, _ = np.linalg.svd(shapes[0], full_matrices=False)
         turned = axes.T @ shapes
         turned[0, size <= FLAT * size[0]] = 0.0
@@ -148,8 +146,7 @@ class CalibratedSearch(FrameSearch):
         (Q + Q C^T Y^-1 C Q)``. C is the coupling, and Y the Hessian by the camera with
         the coefficients eliminated.
         """
-        M, noise = position, self.misfit * problem.noise
-        problem = problem._replace(noise=noise)
+        M, noise = position, problem.noise
         posterior = _posterior(problem, M)
         _, through = self._coupling(problem, M, posterior)
         inverse = self.evaluate(problem, M).inverse()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.depth import NOT_MEASURED, DepthCertainty, depth_deviations
+from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty, depth_deviations
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.posterior import fit_frames, fit_tracks, frame_search
 from isa_nrsfm._frames.projection import distances
@@ -128,7 +128,7 @@ class RigidFrames(NamedTuple):
     @property
     def certainty(self) -> DepthCertainty:
         """Not measured: there is no noise variance."""
-        return NOT_MEASURED
+        return NOT_ESTIMATED
 
     def mirrored(self) -> "RigidFrames":
         """Return the model with shapes mirrored in depth."""
@@ -228,12 +228,12 @@ class PosteriorFrames:
     loss: str
     gauge: FrameMap
     camera: str = "affine"
-    certainty: DepthCertainty = NOT_MEASURED
+    certainty: DepthCertainty = NOT_ESTIMATED
 
     @cached_property
     def _search(self) -> FrameSearch:
         """The search for frames. It serves all tables."""
-        return frame_search(self.camera, self.shapes, self.certainty.misfit)
+        return frame_search(self.camera, self.shapes)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes, without what is computed from them."""
@@ -268,11 +268,15 @@ class PosteriorFrames:
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
-        covariance = posterior.covariance
+        covariance: NDArray | None = posterior.covariance
+        if posterior.covariance.shape[1] != len(self.shapes) - 1:
+            covariance = None
+        elif self.certainty.alpha is not None:
+            covariance = posterior.covariance + self.certainty.alpha
         motion, alpha, deviation = self.gauge.apply(
             posterior.motion,
             posterior.alpha,
-            covariance if covariance.shape[1] == len(self.shapes) - 1 else None,
+            covariance,
         )
         translation = posterior.translation * sizes[:, None]
         return Decomposition(

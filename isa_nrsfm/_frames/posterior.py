@@ -24,7 +24,7 @@ from isa_nrsfm._tables.visibility import seen_points
 EQUAL = 1e-10
 
 
-def frame_search(camera: str, shapes: NDArray, misfit: float = 1.0) -> FrameSearch:
+def frame_search(camera: str, shapes: NDArray) -> FrameSearch:
     """
     Return the search for cameras of a model that see shapes (n_shapes, 3, n_points).
 
@@ -33,7 +33,7 @@ def frame_search(camera: str, shapes: NDArray, misfit: float = 1.0) -> FrameSear
     """
     if camera == "affine":
         return AffineSearch(shapes)
-    return CalibratedSearch(shapes, camera == "weak_perspective", misfit)
+    return CalibratedSearch(shapes, camera == "weak_perspective")
 
 
 def fit_tracks(

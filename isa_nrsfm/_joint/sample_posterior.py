@@ -8,18 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.depth import MOST_FRAMES, DepthCertainty, depth_certainty
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.projection import distances, stacked_motion
+from isa_nrsfm._frames.projection import stacked_motion
 from isa_nrsfm._frames.search import FramePosterior
-from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._tables.blocks import FrameBlocks
-
-# Residuals that are longer, in standard deviations of a coordinate, are left out of the
-# uncertainty of fits with a robust loss: one of 3,000 points without outliers.
-OUTLYING = 4.0
 
 
 def posterior_blocks(
@@ -109,30 +102,3 @@ def shown_frames(
 def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
     """Return cameras, coefficients and the sum of their covariances of a block."""
     return posterior.motion, posterior.alpha, posterior.covariance.sum(axis=0)
-
-
-def certainty_of(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """Estimate the uncertainty of a fit with calibrated cameras, from its rows."""
-    n_frames = rows.n_frames
-    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
-    part = np.asarray(rows.take(chosen), dtype=np.float64)
-    tracks = part.transpose(0, 2, 1)
-    found = frames.posterior(tracks, covariances=False)
-    if frames.loss != "linear":  # without outliers
-        off = distances(tracks, frames.shapes, *found[:3])
-        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
-        part = np.where(outlying[:, None], np.nan, part)
-    known = np.isfinite(found.motion).all(axis=(1, 2))
-    return depth_certainty(
-        frames.shapes,
-        found.motion[known],
-        found.alpha[known],
-        part[known],
-        frames.noise_variance,
-        n_frames=n_frames,
-        extent_weight=EXTENT_WEIGHT,
-        basis_std=JOINT_OPTIONS.basis_std,
-        # The noise of a model that is right may be lower than the floor.
-        least_misfit=min(JOINT_OPTIONS.least_noise, frames.noise_variance),
-        free=frames.camera == "weak_perspective",
-    )

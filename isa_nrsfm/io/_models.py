@@ -253,8 +253,10 @@ def _check_shapes(values: dict[str, Any]) -> None:
         "coefficient_starts": (None, K),
         "mixing": (K + 1, K + 1),
         "space": (3, 3),
-        "certainty": (4,),
-        "turns": (K, 3, K, 3),
+        "certainty": (2,),
+        "turns": (3, 3),
+        "depth_variances": (P,),
+        "alpha_covariance": (K, K),
     }
     single = ("noise_variance", "unit", "n_features_in_", "n_iter_", "inverse_snr_")
     shapes |= dict.fromkeys(single, ())
@@ -289,8 +291,10 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "coefficient_starts": frames.starts,
         "mixing": frames.gauge.mixing,
         "space": frames.gauge.space,
-        "certainty": np.array(frames.certainty[:-1]),
+        "certainty": np.array(frames.certainty[:2]),
         "turns": frames.certainty.turns,
+        "depth_variances": frames.certainty.points,
+        "alpha_covariance": frames.certainty.alpha,
     }
 
 
@@ -298,7 +302,6 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
-    misfit, scale, points, total = entries["certainty"].tolist()
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -306,5 +309,10 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         loss=entries["loss"],
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
-        certainty=DepthCertainty(misfit, scale, points, total, entries["turns"]),
+        certainty=DepthCertainty(
+            *entries["certainty"].tolist(),
+            entries["turns"],
+            entries["depth_variances"],
+            entries["alpha_covariance"],
+        ),
     )

@@ -1,0 +1,175 @@
+"""Errors of a fit with calibrated cameras, by leaving out groups of its points.
+
+Deformation that K basis shapes do not explain is common to neighbouring points and to
+many frames, and part of it looks like a rotation. A posterior covariance with
+independent noise is therefore too small. The delete-a-group jackknife (Efron and Stein,
+The Annals of Statistics, 1981) needs no model of the noise: with fits without each of g
+groups of neighbouring points the variance of an estimate t is ::
+
+    (g - 1) / g sum_g (t_g - t)^2.
+
+The fits without a group do not have the prior of the extents. Depths that only this
+prior keeps in bounds differ between them.
+"""
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
+from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
+from isa_nrsfm._frames.models import PosteriorFrames
+from isa_nrsfm._frames.projection import distances
+from isa_nrsfm._joint.extents import EXTENT_WEIGHT
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
+from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._tables.blocks import FrameBlocks
+
+N_GROUPS = 5
+# Largest number of steps of a fit, and its convergence tolerance. Where the depth is
+# determined some 50 steps are enough.
+MOST_STEPS, TOL = 100, 1e-6
+# Frames and points of the fits.
+MOST_FRAMES, MOST_POINTS = 200, 200
+# Points of a frame that each fit needs.
+LEAST_SEEN = 4
+# Residuals that are longer, in standard deviations of a coordinate, are left out of the
+# fits of tables with a robust loss: one of 3,000 points without outliers.
+OUTLYING = 4.0
+
+
+def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
+    """
+    Estimate the errors of a fit from some of its frames (n_frames, 2, n_points).
+
+    The frames have size one, and NaN where a point is missing. The result has no
+    estimates if too few points or frames are left.
+    """
+    n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
+    chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
+    part = np.asarray(rows.take(chosen), dtype=np.float64)
+    tracks = part.transpose(0, 2, 1)
+    found = frames.posterior(tracks, covariances=False)
+    if frames.loss != "linear":
+        off = distances(tracks, frames.shapes, *found[:3])
+        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
+        part = np.where(outlying[:, None], np.nan, part)
+    points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
+    part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
+    left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
+    seen = np.isfinite(part).all(axis=1)
+    least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
+    known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= LEAST_SEEN)
+    if known.sum() < 2:
+        return NOT_ESTIMATED
+    fit = partial(
+        _Refit, frames, part[known], frames.shapes[:, :, points], found.motion[known]
+    )
+    whole = fit(np.ones(len(points), dtype=bool))
+    errors = [fit(~group).errors(whole) for group in left_out]
+    total, turns, variances, alpha = (
+        (N_GROUPS - 1) / N_GROUPS * np.sum(each, axis=0)
+        for each in zip(*errors, strict=True)
+    )
+    # Each point is left out of one of the fits
+    variances *= N_GROUPS / (N_GROUPS - 1)
+    nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
+    # Rotations out of the image plane; the coefficients cannot predict their rest.
+    mean_view = Rotation.from_matrix(whole.rotations).mean()
+    turning = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
+    rest = _unpredicted(turning[:, :2], whole.alpha)
+    freedom = max(len(rest) - whole.alpha.shape[1] - 1, 1)
+    return DepthCertainty(
+        float(np.sqrt(total)),
+        float(np.sqrt(np.sum(rest**2) / freedom)),
+        turns,
+        variances[nearest],
+        alpha,
+    )
+
+
+def neighbours(points: NDArray) -> NDArray:
+    """Assign points (3, n_points) to groups of equal size around distant points."""
+    centred = points.T - points.mean(axis=1)
+    centres = [np.argmax(np.sum(centred**2, axis=1))]
+    while len(centres) < N_GROUPS:
+        centres.append(np.argmax(cdist(centred, centred[centres]).min(axis=1)))
+    sizes = np.full(N_GROUPS, len(centred) // N_GROUPS)
+    sizes[: len(centred) % N_GROUPS] += 1
+    places = np.repeat(np.arange(N_GROUPS), sizes)
+    squares = cdist(centred, centred[centres][places], "sqeuclidean")
+    return places[linear_sum_assignment(squares)[1]]
+
+
+class _Refit:
+    """A fit of some of the points from the fit of all, by a few steps."""
+
+    def __init__(
+        self,
+        frames: PosteriorFrames,
+        rows: NDArray,
+        shapes: NDArray,
+        motion: NDArray,
+        kept: NDArray,
+    ):
+        rows, self.kept = rows[:, :, kept], kept
+        shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
+        complete = bool(np.isfinite(rows).all())
+        blocks = FrameBlocks.of_array(rows, len(rows))
+        blocks = JointFrames.from_points(blocks, complete).blocks
+        n_numbers, energy = totals(blocks)
+        penalty = n_numbers / (JOINT_OPTIONS.basis_std**2 * energy * len(rows))
+        likelihood = MarginalLikelihood(
+            blocks, penalty, (n_numbers, energy), EXTENT_WEIGHT * kept.all()
+        )
+        noise = frames.noise_variance
+        least_noise = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
+        state = refine_joint(
+            likelihood,
+            JointState(shapes, motion, noise),
+            CAMERAS[frames.camera],
+            least_noise=least_noise,
+            max_iter=MOST_STEPS,
+            tol=TOL,
+        ).state
+        self.rotations, scales = full_rotations(state.motion)
+        self.alpha = likelihood.coefficients(*state)
+        z = np.einsum("ia,kaj->ikj", self.rotations[:, 2], state.shapes)
+        z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", self.alpha, z[:, 1:]))
+        self.depths = z - z.mean(axis=1, keepdims=True)
+
+    def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray, NDArray]:
+        """
+        Compute squared differences from the fit of all points.
+
+        Relative square of the depths; mean products of the rotation vectors (3, 3);
+        mean squares of the depths (n_points,); mean products of the coefficients.
+        """
+        z = whole.depths[:, self.kept]
+        z = z - z.mean(axis=1, keepdims=True)
+        mirror = np.array([1.0, 1.0, np.sign(np.sum(self.depths * z))])
+        off = mirror[2] * self.depths - z
+        points = np.zeros(len(self.kept))
+        points[self.kept] = np.mean(off**2, axis=0)
+        # Rotations up to one of the object
+        turned = Rotation.from_matrix(mirror[:, None] * self.rotations * mirror)
+        rotations = Rotation.from_matrix(whole.rotations)
+        w = (turned * (turned.inv() * rotations).mean() * rotations.inv()).as_rotvec()
+        turns = w.T @ w / len(w)
+        turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
+        # Coefficients up to an affinity
+        rest = _unpredicted(whole.alpha, self.alpha)
+        relative = float(np.sum(off**2) / np.sum(z**2))
+        return relative, turns, points, rest.T @ rest / len(w)
+
+
+def _unpredicted(values: NDArray, alpha: NDArray) -> NDArray:
+    """Regress values (n, m) on alpha (n, K) and a constant; return the residuals."""
+    known = np.column_stack([np.ones(len(alpha)), alpha])
+    return np.asarray(values - known @ np.linalg.lstsq(known, values)[0])
