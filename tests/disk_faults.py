@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 # Operations that may fail, and those that clean up, during which one may be stopped.
-WRITING = ("replace", "rename", "link", "symlink", "mkdir", "chmod", "fsync", "open")
+WRITING = ("replace", "mkdir", "chmod", "fsync", "open")
 CLEANING = ("unlink", "remove", "rmdir")
 
 

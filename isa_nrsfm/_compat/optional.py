@@ -5,7 +5,7 @@ from typing import Any
 
 
 def import_optional(name: str, *, extra: str) -> Any:
-    """Import a module, or say which extra of the package installs it."""
+    """Import a module; the error names the extra of the package that installs it."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Arrays in NumPy's format that are not larger than what holds them."""
+"""Arrays in NumPy's format that are not larger than their file."""
 
 import io
 import math

@@ -28,7 +28,7 @@ _WFLW_LENGTHS = (
 
 
 def is_pts(path: Path) -> bool:
-    """Tell whether a file begins as .pts files do, or a folder has such files."""
+    """Return whether a file begins as .pts files do, or a folder has such files."""
     if path.is_dir():
         return any(_is_pts_name(file) for file in path.iterdir())
     return "".join(first_lines(path, 1)).lstrip().startswith("version")
@@ -64,7 +64,7 @@ def read_pts(path: Path) -> Landmarks:
 
 
 def is_wflw(path: Path) -> bool:
-    """Tell whether the first line has the fields of a WFLW list."""
+    """Return whether the first line has the fields of a WFLW list."""
     fields = "".join(first_lines(path, 1)).split()
     if len(fields) not in _WFLW_LENGTHS:
         return False
@@ -81,8 +81,8 @@ def read_wflw(path: Path) -> Landmarks:
 
     A line has 196 coordinates, x and y in turn, the box of the face (``x_min y_min
     x_max y_max``), six attributes that are 0 or 1 (pose, expression, illumination,
-    make-up, occlusion, blur) and the name of the image. Lists without box and
-    attributes are read, too.
+    make-up, occlusion, blur) and the name of the image. Box and attributes
+    may be missing.
     """
     rows: list[NDArray[np.float64]] = []
     images: list[str] = []
@@ -118,7 +118,7 @@ def read_wflw(path: Path) -> Landmarks:
 
 
 def _is_pts_name(file: Path) -> bool:
-    """Tell whether a file in a folder is one of points; hidden ones are not."""
+    """Return whether a file in a folder is a .pts file that is not hidden."""
     return file.suffix.lower() == ".pts" and not file.name.startswith(".")
 
 

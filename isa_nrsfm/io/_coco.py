@@ -16,7 +16,7 @@ _OF_IMAGE = ("file_name", "width", "height")
 
 
 def is_coco(path: Path) -> bool:
-    """Tell whether a file begins as a json object or list."""
+    """Return whether a file begins as a json object or list."""
     with path.open("rb") as file:
         return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
 

@@ -1,4 +1,4 @@
-"""Read the csv and h5 files of DeepLabCut, which Lightning Pose writes, too."""
+"""Read the csv and h5 files of DeepLabCut and Lightning Pose."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +22,7 @@ _UNIQUE = "single"
 
 
 def is_deeplabcut(path: Path) -> bool:
-    """Tell whether the header, or the group of an h5 file, is DeepLabCut's."""
+    """Return whether the header, or the group of an h5 file, is DeepLabCut's."""
     if path.suffix.lower() == ".csv":
         return _levels_of(header_rows(path, 4)) is not None
     return is_hdf5(path) and _KEY in root_groups(path)

@@ -36,7 +36,7 @@ class LandmarkFormat:
     title : str
         Which program or data set it belongs to.
     expected : str
-        What such a file must have.
+        Required content of such a file.
     suffixes : tuple of str
         Suffixes of its files in lower case; "/" for a folder of files.
     reader : str
@@ -56,7 +56,7 @@ class LandmarkFormat:
 
     def matches(self, path: "str | os.PathLike[str]") -> bool:
         """
-        Tell whether a file looks like one of this format, from its beginning.
+        Return whether a file begins like one of this format.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class LandmarkFormat:
         ------
         ValueError
             If the file is not of the format, or the format has no such option. The
-            message has the path and what was expected.
+            message has the path and the required content.
         OSError
             If the file cannot be opened.
         """
@@ -157,15 +157,15 @@ def read_landmarks(
     Returns
     -------
     Landmarks
-        The landmarks, with what is known of each frame. A frame in which tracking
+        The landmarks and further columns of each frame. A frame in which tracking
         failed is a row of NaN.
 
     Raises
     ------
     ValueError
         If the file is not of the format, if not exactly one format matches, or if an
-        option or the threshold does not apply. The message has the path and what was
-        expected.
+        option or the threshold does not apply. The message has the path and the
+        required content.
     OSError
         If the file cannot be opened.
 
@@ -257,7 +257,7 @@ def find_format(path: "str | os.PathLike[str]") -> str:
 
 
 def _suffix(path: Path) -> str:
-    """Return the suffix of a file in lower case, or what stands for a folder."""
+    """Return the suffix of a file in lower case; "/" for a folder."""
     return _FOLDER if path.is_dir() else path.suffix.lower()
 
 
@@ -269,7 +269,7 @@ def _check_exists(path: Path) -> None:
 
 
 def _listed(suffixes: tuple[str, ...]) -> str:
-    """Say which files have these suffixes."""
+    """List suffixes in words."""
     words = ["a folder" if suffix == _FOLDER else suffix for suffix in suffixes]
     return " or ".join(words)
 

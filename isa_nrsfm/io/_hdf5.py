@@ -17,7 +17,7 @@ LARGEST_RATIO = 1032
 
 
 def is_hdf5(path: Path) -> bool:
-    """Tell whether a file begins as HDF5 files do."""
+    """Return whether a file begins as HDF5 files do."""
     with path.open("rb") as file:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 

@@ -1,4 +1,4 @@
-"""What every reader of landmark formats returns."""
+"""The result of all readers of landmark formats."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,14 +28,14 @@ class Landmarks:
     ----------
     points : DataFrame of shape (n_frames, 2 * n_points)
         The landmarks, float64, columns x0, y0, x1, y1, ... under names such as
-        ``x_0, y_0`` or ``nose_x, nose_y``. In pixels, where the format does not say
-        otherwise. NaN marks a missing point.
+        ``x_0, y_0`` or ``nose_x, nose_y``. In pixels, unless the format has other
+        units. NaN marks a missing point.
     frames : DataFrame of shape (n_frames, n_other)
-        What the source says of each frame, such as its number, file or individual.
+        Further columns of the source, such as number, file or individual.
     confidence : DataFrame of shape (n_frames, n_points) or None
-        How sure the source is of each point, in its own scale, NaN where it does not
-        say. A confidence of the frame is that of all its points. None where the
-        format has no confidences.
+        Confidence of each point, in the scale of the source, NaN if it is not known. A
+        confidence of the frame is that of all its points. None for formats without
+        confidences.
     failed : ndarray of bool, shape (n_frames,)
         Frames in which tracking failed or found nothing. All their points are NaN.
     format : str
@@ -43,8 +43,8 @@ class Landmarks:
     point_names : tuple of str, length n_points
         Names of the points.
     skeleton : Skeleton or None
-        What joins the points, where the file says it, or the program that has written
-        it is known for one layout (`isa_nrsfm.skeletons`).
+        Edges between the points, if the file has them or the program that has written
+        it has one known layout (`isa_nrsfm.skeletons`).
     """
 
     points: "pd.DataFrame"

@@ -15,7 +15,7 @@ from sklearn.base import BaseEstimator
 from isa_nrsfm import isa
 
 Arrays = dict[str, NDArray]
-# What the model of a frame implies.
+# Attributes that the model of a frame implies.
 IMPLIED = ("camera_", "frames_scaled_")
 
 
@@ -96,7 +96,7 @@ def packed_parts(held: Any, prefix: str, arrays: Arrays) -> dict[str, Any]:
 
 
 def unpacked(value: Any, arrays: Arrays) -> Any:
-    """Return what a JSON value of `packed` stands for."""
+    """Return the parameter or attribute of a JSON value of `packed`."""
     match value:
         case None | bool() | int() | float() | str():
             return value

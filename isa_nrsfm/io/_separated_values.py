@@ -33,7 +33,7 @@ def first_lines(path: Path, n_lines: int) -> list[str]:
 
 
 def header_rows(path: Path, n_rows: int) -> list[list[str]]:
-    """Return the cells of the first rows of a csv file; fewer if it is none."""
+    """Return the cells of the first rows of a file; fewer if it is no csv file."""
     try:
         return list(csv.reader(first_lines(path, n_rows), strict=True))
     except csv.Error:

@@ -16,7 +16,7 @@ from isa_nrsfm.io._separated_values import header_names, read_columns
 from isa_nrsfm.skeletons import Skeleton, skeleton_of_names
 
 _DIMS = ("frame", "track", "node", "xy")
-# Where the file does not say: SLEAP's own order, and that of its older files
+# Without the attribute: SLEAP's own order, and that of its older files
 # for Python. They differ where there are more than two points.
 _ORDERS = (("track", "xy", "node", "frame"), ("frame", "node", "xy", "track"))
 _CSV_COLUMNS = ["track", "frame_idx", "instance.score"]
@@ -24,7 +24,7 @@ _NEEDED = frozenset({"tracks", "node_names", "track_names"})
 
 
 def is_sleap(path: Path) -> bool:
-    """Tell whether an h5 file has the datasets, or a csv file the header, of SLEAP."""
+    """Return whether a file has the datasets (h5) or the header (csv) of SLEAP."""
     if path.suffix.lower() == ".csv":
         return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
     return is_hdf5(path) and _NEEDED <= root_groups(path)
@@ -35,7 +35,7 @@ def read_sleap(path: Path) -> Landmarks:
     Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
 
     In an h5 file, ``tracks`` has the points, in the order of axes that its attribute
-    ``dims`` tells, and otherwise (track, xy, node, frame), as SLEAP writes it;
+    ``dims``, or without it (track, xy, node, frame), as SLEAP writes it;
     ``point_scores`` has their confidences, ``instance_scores`` those of the instances,
     and ``edge_names`` the pairs of nodes that the skeleton joins.
     A csv file has a row for each instance, ``track, frame_idx, instance.score`` and
@@ -124,7 +124,7 @@ def _stored(file: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
 
 
 def _named_dims(dataset: Any) -> tuple[str, ...] | None:
-    """Return the names of the axes that a dataset tells, or None."""
+    """Return the names of the axes in the attributes of a dataset, or None."""
     if "dims" not in dataset.attrs:
         return None
     named = json.loads(dataset.attrs["dims"])
@@ -136,7 +136,7 @@ def _named_dims(dataset: Any) -> tuple[str, ...] | None:
 def _scores(
     file: Any, name: str, dims_of_tracks: tuple[str, ...], shape: tuple[int, ...]
 ) -> NDArray[np.float64] | None:
-    """Return scores by frame, track and, of points, node; None where there are none."""
+    """Return scores by frame, track and, of points, node; None without a dataset."""
     if name not in file:
         return None
     stored = numbers_of(file, name)
@@ -153,7 +153,7 @@ def _scores(
 
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:
-    """Return what the dataset of edges joins, where there is one that is not empty."""
+    """Return the skeleton of the dataset of edges; None if it is empty or absent."""
     if "edge_names" not in file or not file["edge_names"].size:
         return None
     content = content_of(file, "edge_names")

@@ -114,18 +114,20 @@ def _open_parquet(files: list[Path]) -> StoredTable:
     """Return the table that parquet files hold."""
     parquet = import_optional("pyarrow.parquet", extra="parquet")
     types = import_optional("pyarrow.types", extra="parquet")
-    opened = [_opened_parquet(file, parquet.ParquetFile) for file in files]
-    names = [table.schema_arrow.names for table in opened]
-    _same_shape(files, names, "columns")
-    kinds = set()
-    for file, table in zip(files, opened, strict=True):
-        for field in table.schema_arrow:
+    opened, schemas, kinds = [], [], set()
+    for file in files:
+        with reading(file, PARQUET):
+            opened.append(parquet.ParquetFile(file))
+            schemas.append(opened[-1].schema_arrow)
+        for field in schemas[-1]:
             if not (types.is_floating(field.type) or types.is_integer(field.type)):
                 raise ValueError(
                     f"{file} must hold columns of numbers only; column {field.name!r} "
                     f"is of type {field.type}"
                 )
             kinds.add(str(field.type))
+    names = [schema.names for schema in schemas]
+    _same_shape(files, names, "columns")
     dtype = np.dtype(np.float32 if kinds == {"float"} else np.float64)
     parts = [
         (table.metadata.num_rows, _row_groups(file, table, dtype))
@@ -134,16 +136,8 @@ def _open_parquet(files: list[Path]) -> StoredTable:
     return StoredTable(parts, len(names[0]), dtype, np.array(names[0], dtype=object))
 
 
-def _opened_parquet(file: Path, open_file: Callable[[Path], Any]) -> Any:
-    """Return an open parquet file whose schema has been read."""
-    with reading(file, PARQUET):
-        table = open_file(file)
-        _ = table.schema_arrow
-        return table
-
-
 def _row_groups(file: Path, table: Any, dtype: Any) -> Callable[[int, int], NDArray]:
-    """Return what reads rows of a parquet file, only the groups that are needed."""
+    """Return a function that reads rows of a parquet file, by groups of rows."""
     sizes = [
         table.metadata.row_group(group).num_rows
         for group in range(table.metadata.num_row_groups)

@@ -54,7 +54,7 @@ def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
     Parameters
     ----------
     path : str or path-like
-        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) tells the format.
+        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) determines the format.
 
     Returns
     -------
@@ -66,7 +66,7 @@ def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
     ------
     ValueError
         If the suffix is unknown, or if the file is empty, has columns of the same
-        name, has lines of different length, or is not what its suffix says.
+        name, has lines of different length, or has another format than its suffix.
     OSError
         If the file cannot be opened.
 
@@ -112,7 +112,7 @@ def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
     frame : DataFrame
         The table.
     path : str or path-like
-        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) tells the format.
+        The file. Its suffix (``.csv``, ``.tsv``, ``.parquet``) determines the format.
 
     Raises
     ------
@@ -124,10 +124,10 @@ def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
     suffix = table_suffix(path)
     if suffix == ".parquet":
         import_optional("pyarrow", extra="parquet")
-        with whole_file(path) as file:
+    with whole_file(path) as file:
+        if suffix == ".parquet":
             frame.to_parquet(file, index=False)
-    else:
-        with whole_file(path) as file:
+        else:
             frame.to_csv(file, sep=_SEPARATORS[suffix], index=False)
 
 
@@ -149,7 +149,7 @@ def landmark_table(
     frame : DataFrame
         The table.
     columns : str or sequence of str, optional
-        The landmark columns, where their names alone do not say it: patterns of x and
+        The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
         any text.
     missing : {"zeros"}, optional
@@ -221,7 +221,7 @@ def read_named_columns(
 
 
 def table_suffix(path: "str | os.PathLike[str]") -> str:
-    """Return the suffix of a table's file, or raise if it is none of a table."""
+    """Return the suffix of a file, or raise if it is not that of a table."""
     suffix = Path(path).suffix
     if suffix.lower() not in TABLE_SUFFIXES:
         raise ValueError(
@@ -305,7 +305,15 @@ def as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     if types.is_numeric_dtype(column):
         values = column.to_numpy(dtype=np.float64, na_value=np.nan)
     else:
-        values = _parsed_cells(column)
+        text = column.astype(object).where(column.notna(), "").astype(str)
+        found = _parsed(text)
+        if found is None:
+            bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
+            raise ValueError(
+                f"column {column.name!r} should hold coordinates, but in row "
+                f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}"
+            )
+        values = found
     if np.isinf(values).any():
         row = int(np.flatnonzero(np.isinf(values))[0])
         raise ValueError(
@@ -313,16 +321,3 @@ def as_numbers(column: "pd.Series") -> NDArray[np.float64]:
             "(counted from 0)"
         )
     return values
-
-
-def _parsed_cells(column: "pd.Series") -> NDArray[np.float64]:
-    """Return the numbers in a column of objects, or say which cell is none."""
-    text = column.astype(object).where(column.notna(), "").astype(str)
-    values = _parsed(text)
-    if values is not None:
-        return values
-    bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
-    raise ValueError(
-        f"column {column.name!r} should hold coordinates, but in row {text.index[bad]} "
-        f"(counted from 0) it has {text.iloc[bad]!r}"
-    )
