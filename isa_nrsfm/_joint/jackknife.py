@@ -26,7 +26,7 @@ from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood, totals
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -121,13 +121,10 @@ class _Refit:
         rows, self.kept = rows[:, :, kept], kept
         shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
         complete = bool(np.isfinite(rows).all())
-        blocks = FrameBlocks.of_array(rows, len(rows))
-        blocks = JointFrames.from_points(blocks, complete).blocks
-        n_numbers, energy = totals(blocks)
+        part = JointFrames.from_points(FrameBlocks.of_array(rows, len(rows)), complete)
+        n_numbers, energy = part.totals
         penalty = n_numbers / (JOINT_OPTIONS.basis_std**2 * energy * len(rows))
-        likelihood = MarginalLikelihood(
-            blocks, penalty, (n_numbers, energy), EXTENT_WEIGHT * kept.all()
-        )
+        likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
         noise = frames.noise_variance
         least_noise = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
         state = refine_joint(
