@@ -3,10 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-# Cameras have a common view if the smaller singular value of their mean is at least
-# this share of the root mean square of a camera's row.
-DEGENERATE_MEAN = 0.2
-
 
 def rigid_cameras(W: NDArray, mean_shape: NDArray) -> NDArray:
     """
@@ -21,8 +17,9 @@ def mean_view(motion: NDArray) -> NDArray | None:
     """Return the mean (2, 3) of cameras (n, 2, 3); None if they have no common view."""
     mean = motion.mean(axis=0)
     smaller = np.linalg.svd(mean, compute_uv=False)[1]
+    # Relative to the root mean square of a camera's row
     root_mean_square = np.sqrt(np.mean(np.sum(motion**2, axis=(1, 2))) / 2)
-    return mean if smaller > DEGENERATE_MEAN * root_mean_square else None
+    return mean if smaller > 0.2 * root_mean_square else None
 
 
 def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:

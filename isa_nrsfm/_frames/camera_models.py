@@ -32,8 +32,6 @@ from isa_nrsfm._linalg.packed_symmetric import (
 )
 from isa_nrsfm._linalg.vectors import polar
 
-# Ridge of the curvature of calibrated cameras, relative to its mean diagonal.
-RIDGE = 1e-9
 # Largest rotation of a camera in one step, in radians, and largest change of the
 # logarithm of its scale.
 LARGEST_TURN = 1.0
@@ -128,7 +126,7 @@ class CalibratedCameras:
         """Return inverses (p, p, n); a scale without curvature does not move."""
         C = self.curvature(M, curvature)
         diagonal = diagonal_of(C)
-        C[diagonal[:3]] += RIDGE * C[diagonal[:3]].mean(axis=0)
+        C[diagonal[:3]] += 1e-9 * C[diagonal[:3]].mean(axis=0)
         return unpacked(invert_positive(C)[0])
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:

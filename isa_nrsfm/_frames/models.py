@@ -25,9 +25,6 @@ from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_size
 from isa_nrsfm._tables.layout import measurement_matrix
 from isa_nrsfm._tables.visibility import seen_points
 
-# A camera does not see a basis shape if its image has less than this share of the
-# energy ``||M||^2 ||B_k||^2``: such an image is rounding errors.
-UNSEEN = 1e-28
 # Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])
 
@@ -177,7 +174,7 @@ class RigidFrames(NamedTuple):
         images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
         energy = np.einsum("ikrd,ikrd->ik", images, images)
         largest = np.einsum("irc,irc,kdc,kdc->ik", motion, motion, R, R, optimize=True)
-        visible = energy > UNSEEN * largest
+        visible = energy > 1e-28 * largest  # less is rounding errors
         alpha = np.divide(along, energy, where=visible, out=np.zeros_like(along))
         return motion, translation, alpha
 

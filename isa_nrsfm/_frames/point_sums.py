@@ -14,7 +14,7 @@ arrays, so that each sum is one matrix product for all frames.
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,6 @@ TWICE = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 # Shapes are flat along a direction if they extend by less than this share of their
 # largest extent.
 FLAT = 1e-10
-# Frames whose points cover less than this share of the variance of the mean shape
-# along some direction do not determine a camera.
-LEAST_COVER = 1e-10
-# Ridge of ``S S^T``, as a share of the second moment of the shapes. It keeps cameras
-# finite for degenerate shapes, and is too small to change them for others.
-RIDGE = 1e-13
 
 
 class Gram:
@@ -131,9 +125,10 @@ class FrameTracks(NamedTuple):
 
     def take(self, frames: NDArray | slice) -> Self:
         """Return some of the frames."""
-        return type(self)(
-            *(None if each is None else of_frames(each, frames) for each in self)
+        parts: Any = (
+            each if each is None else of_frames(each, frames) for each in self
         )
+        return type(self)(*parts)
 
 
 class FrameSums(NamedTuple):
@@ -194,9 +189,9 @@ def affine_cameras(
     """
     T = products.gram.products(c)
     A = np.einsum("ki,kpi->pi", 0.5 * c, T)
-    # A ridge, relative to the moments of all shapes, for flat ones
+    # A ridge, relative to the moments of all shapes: cameras stay finite for flat ones
     moments = products.gram.pairs[diagonal_of(products.gram.pairs)][:, DIAGONAL]
-    A[DIAGONAL] += RIDGE * moments.sum(axis=0).mean(axis=0)
+    A[DIAGONAL] += 1e-13 * moments.sum(axis=0).mean(axis=0)
     inverse = inverse3(A)
     Y = np.einsum("ki,kari->rai", c, products.cross)
     M = np.einsum("rbi,bai->rai", Y, inverse)
@@ -240,10 +235,10 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
     """Return frames of several blocks, all with weights or none, as one block."""
     if len(parts) == 1:
         return parts[0]
-    fields = zip(*parts, strict=True)
-    return FrameTracks(
-        *(None if each[0] is None else np.concatenate(each, axis=-1) for each in fields)
-    )
+    joined: list[Any] = []
+    for each in zip(*parts, strict=True):
+        joined.append(None if each[0] is None else np.concatenate(each, axis=-1))
+    return FrameTracks(*joined)
 
 
 def _share(weight: NDArray) -> NDArray:
@@ -335,8 +330,8 @@ def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     Return which frames (n,) have points that determine a camera.
 
     They extend along each direction along which the mean shape (3, n_points) extends:
-    LEAST_COVER of its variance or more. The sums are those for `whitened` shapes, each
-    frame with its own Gram matrix.
+    1e-10 of its variance or more. The sums are those for `whitened` shapes, each frame
+    with its own Gram matrix.
     """
     variance = np.einsum("aj,aj->a", mean_shape, mean_shape) / mean_shape.shape[1]
     inside = variance > 0
@@ -345,4 +340,4 @@ def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     # Variance over the points of a frame, relative to that over all points
     seen = unpack3(products.gram.pairs[0] / weight)[inside][:, inside]
     cover = np.linalg.eigvalsh((seen.T * scale).swapaxes(1, 2) * scale)
-    return (products.weight > 0) & (cover > LEAST_COVER).all(axis=1)
+    return (products.weight > 0) & (cover > 1e-10).all(axis=1)

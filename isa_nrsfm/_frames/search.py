@@ -6,7 +6,7 @@ objective, so that this never rises, up to rounding. A frame leaves the problem 
 has ended: the others go on without it.
 """
 
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,6 @@ from isa_nrsfm._linalg.vectors import frames_first, in_lanes, of_frames
 MAX_STEPS = 60
 # With so much damping a step no longer moves, and the search of the frame ends.
 LARGEST_DAMPING = 1e8
-# The least noise variance, as a share of the energy of a frame.
-LEAST_NOISE = 1e-13
 
 
 class FramePosterior(NamedTuple):
@@ -66,8 +64,8 @@ class FramePosterior(NamedTuple):
         """Return fits of NaN, to be filled in, with or without covariances."""
         size = n_components if covariances else 0
         shapes = (2, 3), (2,), (n_components,), (size, size), (3, 3), ()
-        numbers = (np.full((n_frames, *shape), np.nan) for shape in shapes)
-        return cls(*numbers, np.zeros(n_frames, dtype=bool))
+        parts: list[Any] = [np.full((n_frames, *shape), np.nan) for shape in shapes]
+        return cls(*parts, converged=np.zeros(n_frames, dtype=bool))
 
     def take(self, frames: NDArray) -> Self:
         """Return the fits of some of the frames."""
@@ -203,7 +201,7 @@ class FrameSearch:
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
         """Return frames with noise variances (n,) that are not zero."""
-        noise = np.maximum(variance, LEAST_NOISE * products.energy)
+        noise = np.maximum(variance, 1e-13 * products.energy)
         return FrameProblem(products, np.where(noise > 0, noise, 1.0))
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:

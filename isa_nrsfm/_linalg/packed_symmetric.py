@@ -15,12 +15,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._linalg.rounding import OF_STEPS
+
 # Row and column of the packed entries of a 3x3 matrix, the way back, and the diagonal.
 ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 DIAGONAL = [0, 3, 5]
-# A pivot below this share of its diagonal entry before elimination is rounding error.
-SMALLEST_PIVOT = 1e-13
 
 
 def unpack3(packed: NDArray) -> NDArray:
@@ -149,7 +149,8 @@ def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDAr
 
     Matrices with a pivot left out become False in `positive` (n,), in place.
     """
-    kept = pivot > SMALLEST_PIVOT * diagonal
+    # Less, as a share of the entry before elimination, is rounding error.
+    kept = pivot > OF_STEPS * diagonal
     if kept.all():
         return 1.0 / pivot
     positive &= kept
