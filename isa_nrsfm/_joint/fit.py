@@ -2,12 +2,12 @@
 
 1. Starts with calibrated cameras (`starts`). The objective chooses the best of them.
 2. The fit of calibrated cameras, shapes and noise from these. While the model may be
-   wrong the noise variance has a floor: deformation that the basis shapes do not span
-   is not noise, and the fit would explain it by wrong depths and cameras.
+   wrong the noise variance has a floor. Otherwise deformation outside of the span of
+   the basis shapes would cause wrong depths and cameras.
 3. The fit of affine cameras, from the result of 2 and from the paper's result. The
    lower objective counts. For calibrated cameras it serves for comparison only.
-4. The judgement of the model. It is right if it leaves no more than the noise that the
-   spectrum tells. Then floor and prior are left out.
+4. The judgement of the model. It is right if its noise is at most that of the spectrum.
+   Then floor and prior are left out.
 
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
@@ -163,8 +163,7 @@ def count_components(
 ) -> int:
     """Return the number of basis shapes that a table supports, at least one.
 
-    They are those of a fit of the sample that are relevant. The arguments are those of
-    `fit_jointly`, with more basis shapes than are expected.
+    The arguments are as in `fit_jointly`, with more basis shapes than are expected.
     """
     problem = _problems(table, paper_shapes, settings)[0][0]
     fit, _ = _first_fit(problem, table, paper_shapes)

@@ -8,8 +8,8 @@ minus twice the log likelihood of all frames is, up to a constant ::
                        + log det(I + H_i / s2) ]
 
 with N the number of coordinates that were seen. The objective is that plus ``penalty
-* sum_i tr H_i``, minus twice the log prior of the basis shapes: it penalises what they
-move in the images. Calibrated cameras add the prior of the extents of the shapes
+* sum_i tr H_i``, minus twice the log prior of the basis shapes: it penalises their
+motion in the images. Calibrated cameras add the prior of the extents of the shapes
 (`extents`). So the objective is minus twice a log posterior.
 
 Positions are eliminated by least squares: tracks and shapes are centred over the seen
@@ -113,8 +113,8 @@ class MarginalLikelihood:
     ) -> LikelihoodTerms:
         """Return the terms at shapes (n_shapes, 3, n_points), M (n_frames, 2, 3), s2.
 
-        Added to the sums over the frames is what is common to all of them: ``N log
-        s2`` and its derivative, ``2 / s2 curvature B``, and the prior of the extents.
+        The terms common to all frames are added to their sums: ``N log s2`` and its
+        derivative, ``2 / s2 curvature B``, and the prior of the extents.
         """
         terms = self._sums(shapes, motion, noise)
         curvature = _kronecker_matrices(terms.shape_curvature, len(shapes))
@@ -154,7 +154,7 @@ class MarginalLikelihood:
 
 
 def _joined(parts: Iterable[LikelihoodTerms]) -> LikelihoodTerms:
-    """Add the sums of consecutive frames up, and join what each frame has."""
+    """Add the sums of consecutive frames, and concatenate the terms of each frame."""
     remaining, n_sums = iter(parts), 5
     first = next(remaining)
     sums: list[Any] = list(first[:n_sums])

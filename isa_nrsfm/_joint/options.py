@@ -1,11 +1,11 @@
-"""The limits that steer the joint fit."""
+"""Thresholds of the joint fit."""
 
 from typing import NamedTuple
 
 
 class JointOptions(NamedTuple):
     """
-    What steers the joint fit.
+    Thresholds of the joint fit.
 
     ``python -m benchmarks.sensitivity joint`` halves and doubles each number.
     `basis_std` matters most: a prior twice as wide raises the errors of motion capture

@@ -79,9 +79,9 @@ class JointProblem:
     settings : JointSettings
         How they are fitted.
     thorough : bool
-        Whether many starts are compared, as those of small tables are.
+        Whether many starts are compared, as for small tables.
     penalty : float or ndarray of shape (n_components,)
-        As of `MarginalLikelihood`.
+        Factor of the prior of the basis shapes, see `MarginalLikelihood`.
     """
 
     frames: JointFrames

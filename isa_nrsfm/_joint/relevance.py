@@ -1,4 +1,4 @@
-"""How many basis shapes a table supports: those that it determines.
+"""Number of basis shapes that a table determines.
 
 Each basis shape has a prior of its own: its 3J numbers, as the images show them, have
 the variance v_k. That variance is estimated (automatic relevance determination: MacKay,

@@ -160,5 +160,5 @@ def _weighted(
 def _change(
     before: WeightedRows, *fit: NDArray, new: Callable[..., WeightedRows]
 ) -> float:
-    """Return the largest difference of the weights of a fit from those before."""
+    """Return the largest change of the weights."""
     return float(np.abs(new(before.rows, *fit).weights - before.weights).max())

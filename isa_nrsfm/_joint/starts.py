@@ -1,13 +1,14 @@
-"""Where the joint fit starts: calibrated cameras, and the shapes that they see.
+"""Starts of the joint fit: calibrated cameras, and shapes that fit them.
 
 The cameras of a deforming object are linear combinations of few columns of the motion
-factor of its table (Xiao, Chai, Kanade 2006). The cost of such a mixture does not tell
-how many columns are needed: it always falls with more. So the rigid cameras are tried
+factor of its table (Xiao, Chai, Kanade 2006). The cost of such a mixture always falls
+with more columns, so it does not determine their number. The rigid cameras are tried
 first, then mixtures of more and more columns, until the objective of the fit rises.
 """
 
 from collections.abc import Iterator
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,7 @@ def mixed_cameras(
 
 
 def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
-    """Return shapes (n_components + 1, 3, n_points) for what calibrated cameras see.
+    """Return shapes (n_components + 1, 3, n_points) that fit calibrated cameras.
 
     The mean shape is that of least squares, ``(sum_i M_i^T M_i) B_0 = sum_i M_i^T
     W_i``, the others those of `extended_shapes`. Rows (n_frames, 2, n_points) are
@@ -110,7 +111,7 @@ def extended_shapes(
     rows: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray, n_more: int
 ) -> NDArray:
     """
-    Return fitted shapes, and further basis shapes along what they leave.
+    Return fitted shapes, and further basis shapes along the residuals.
 
     Parameters
     ----------
@@ -207,10 +208,7 @@ def best_starts(
     # No prior: with the large noise of a start it would make basis shapes vanish.
     part = replace(problem.part(few, tol=options.compared_tol), penalty=0.0)
     seen, n_components = rows[few], len(paper_shapes) - 1
-    trials = []
-
-    def value(trial: tuple[float, JointState, NDArray]) -> float:
-        return trial[0]
+    trials: list[tuple[float, JointState, NDArray]] = []
 
     def compare(motion: NDArray, shapes: NDArray) -> None:
         """Add a start after some steps of its shapes, with the cameras of all."""
@@ -237,12 +235,14 @@ def best_starts(
             before = trials[-1][0]
     # The best ones, with their cameras freed
     freed = []
-    for _, state, motion in sorted(trials, key=value)[: None if thorough else 1]:
+    for _, state, motion in sorted(trials, key=itemgetter(0))[
+        : None if thorough else 1
+    ]:
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
         motion[few] = fit.state.motion
         freed.append((fit.value, fit.state, motion))
-    freed.sort(key=value)
+    freed.sort(key=itemgetter(0))
     return [
         with_prior(problem, state._replace(motion=motion))
         for _, state, motion in freed[: 3 if thorough else 1]

@@ -1,1 +1,1 @@
-"""The Euclidean metric of space that cameras tell."""
+"""The Euclidean metric of space, from affine cameras."""

@@ -42,9 +42,9 @@ class DeformationMetric(NamedTuple):
         E_k, symmetric and without trace, for one unit of coefficient k: ``M_i Q
         exp(sum_k alpha_ik E_k / 2)`` is nearly two rows of a scaled rotation.
     residual : float
-        As in `MetricUpgrade`, with the strain.
+        Root mean square residual of the cameras, see `MetricUpgrade`, with the strain.
     condition_number : float
-        As in `MetricUpgrade`.
+        Condition number of the metric, see `MetricUpgrade`.
     """
 
     Q: NDArray
@@ -132,7 +132,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
-    # The symmetric Q is fit.Q times a rotation, which turns the strains, too.
+    # The symmetric Q is fit.Q times a rotation, which turns the strains as well.
     turn, Q = polar(fit.Q, side="left")
     strain = turn @ fit.strain @ turn.T
     Q = scaled(Q, cameras)
@@ -186,9 +186,9 @@ def euclidean_frames(
        only unusual coefficients, or a failed fit, exceed that.
     2. The camera is now nearly a scaled rotation. The smallest stretch in the image
        plane that makes it exactly one is moved to the shape.
-    3. The shape is rotated to be as near as possible to the mean shape. Images do not
-       tell whether the object or the camera turned, nor how much of a rotation is
-       deformation.
+    3. The shape is rotated to be as near as possible to the mean shape. Images do
+       not determine whether the object or the camera turned, nor how much of a rotation
+       is deformation.
 
     Examples
     --------

@@ -83,8 +83,8 @@ def orthonormal_cameras(
     that see all directions alike. The result does not change when frames are turned in
     their image planes.
 
-    Cameras of an object that deforms a lot are hard to tell from those of one that
-    turns and deforms otherwise: a low cost does not mean that they are right.
+    Large deformations are hard to distinguish from rotations: a low cost does not
+    imply that the cameras are right.
 
     References
     ----------

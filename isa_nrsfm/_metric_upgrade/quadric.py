@@ -1,10 +1,10 @@
-"""The metric of space that affine cameras show: where angles and lengths are true.
+"""The metric of space of affine cameras, in which angles and lengths are true.
 
 A factorisation into affine cameras and shapes is known up to one 3x3 affinity of
-space. If the cameras are scaled orthographic (weak perspective) ones in some metric of
-space, as those of small objects and square pixels are, they tell which (Tomasi, Kanade
-1992; Poelman, Kanade, "A paraperspective factorization method for shape and motion
-recovery", 1997).
+space. Cameras are scaled orthographic (weak perspective) in some metric of space if
+objects are small and pixels square. This condition determines the metric (Tomasi,
+Kanade 1992; Poelman, Kanade, "A paraperspective factorization method for shape and
+motion recovery", 1997).
 
 The metric is the symmetric matrix G: a root of it, ``G = Q Q^T``, takes cameras M to M
 Q, which are nearly scaled rotations. Q is known up to a rotation.

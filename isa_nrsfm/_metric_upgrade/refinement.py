@@ -53,7 +53,7 @@ class MetricFit(NamedTuple):
     n_frames : int
         Number of cameras.
     cost : float
-        Sum of the squared residuals, those of `orthonormality`.
+        Sum of the squared residuals of `orthonormality`.
     curvature : ndarray of shape (n_unknowns, n_unknowns)
         ``J^T J``, the Gauss-Newton approximation of half the Hessian. J are the
         derivatives of the residuals in the unknowns: the coordinates of E_0, E_1, ...
@@ -101,7 +101,7 @@ def strain_basis(camera: CameraModel) -> NDArray:
 
 def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
     """
-    Return how far the rows of cameras are from those of rotations: (n, n_frames).
+    Return the deviations (n, n_frames) of rows of cameras from rows of rotations.
 
     With the products ``M_i G M_i^T`` (2, 2, n_frames) of the rows in the metric these
     are for orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i
@@ -174,7 +174,7 @@ def _linearised(
     Returns
     -------
     residuals : ndarray of shape (n, n_frames)
-        As of `orthonormality`.
+        See `orthonormality`.
     slopes : ndarray of shape (n_numbers, n, n_frames)
         Derivatives in the coordinates of E_0 in `strain_basis`.
     own_slopes : ndarray of shape (n_numbers, n, n_frames)
@@ -227,14 +227,10 @@ def _linearised(
 def _normal_equations(
     alpha: NDArray, residuals: NDArray, slopes: NDArray, own_slopes: NDArray
 ) -> tuple[float, NDArray, NDArray]:
-    """
-    Return cost, curvature and gradient, as in `MetricFit`, from `_linearised`.
-
-    The shapes are those given there. `curvature` has the axes (k, a, m, b): coordinate
-    a of E_k and coordinate b of E_m.
-    """
+    """Return cost, curvature and gradient of `MetricFit` from `_linearised`."""
     n_components, size = len(alpha), len(slopes)
     rows = slopes.reshape(size, -1)
+    # Axes (k, a, m, b): coordinate a of E_k and coordinate b of E_m
     curvature = np.empty((1 + n_components, size, 1 + n_components, size))
     curvature[0, :, 0] = rows @ rows.T
     gradient = np.empty((1 + n_components, size))

@@ -47,18 +47,17 @@ class MetricUpgrade(NamedTuple):
         Scales of the cameras, not negative; all equal to one for orthographic cameras.
         NaN for frames without camera.
     residual : float
-        How far the cameras are from what they should be, zero for perfect ones: the
-        root mean square over the frames of ``(s1^2 - s2^2) / (s1^2 + s2^2)``, with s1
-        and s2 the singular values of ``motion_i @ Q``, for weak-perspective cameras,
-        and of ``||M_i Q Q^T M_i^T - I||_F`` for orthographic ones, at the Q that
-        minimises it.
+        Deviation from Euclidean cameras, zero for perfect ones. For weak-perspective
+        cameras it is the root mean square over the frames of ``(s1^2 - s2^2) / (s1^2 +
+        s2^2)``, with the singular values s1 and s2 of ``motion_i @ Q``. For
+        orthographic ones it is that of ``||M_i Q Q^T M_i^T - I||_F``.
     condition_number : float
-        How well the cameras determine Q: by how much errors of the cameras are
-        magnified in the direction of space that suffers most relative to the one that
-        suffers least. It is about one for cameras all round the object, 2.5 for a full
-        turn about an axis in the image, 4 for rotations of about 20 degrees, 14 for 10,
-        54 for 5, about twice as much where they are about one axis, and infinite where
-        Q is not determined, as for rotations about the viewing direction alone.
+        Largest over smallest amplification of errors of the cameras, over the
+        directions of space. It is about one for cameras all round the object, 2.5 for a
+        full turn about an axis in the image, 4 for rotations of about 20 degrees, 14
+        for 10, and 54 for 5. It is about twice as large for rotations about one axis,
+        and infinite if Q is not determined, as for rotations about the viewing
+        direction alone.
     """
 
     Q: NDArray
@@ -89,8 +88,8 @@ def metric_upgrade(
     """
     Find the coordinates of space in which affine cameras are Euclidean ones.
 
-    That is the 3x3 matrix Q with ``M_i Q = s_i R_i``, the first two rows of a rotation
-    times a scale, as far as there is one.
+    The 3x3 matrix Q makes ``M_i Q`` as nearly as possible ``s_i R_i``, the first two
+    rows of a rotation times a scale.
 
     Parameters
     ----------
@@ -98,16 +97,16 @@ def metric_upgrade(
         Affine cameras, such as `AffineNRSfM.motion_`. Those that are zero or NaN are
         left out.
     camera : {"weak_perspective", "orthographic"}, default="weak_perspective"
-        Whether each camera has a scale of its own or all have the same. The scales of
-        the cameras of a shape that deforms are a matter of convention: their common
-        scale can only be asked of cameras of a rigid shape.
+        Whether each camera has a scale of its own or all have the same. Only cameras of
+        a rigid shape can have a common scale: for a shape that deforms, scales are a
+        matter of convention.
 
     Returns
     -------
     MetricUpgrade
-        Named tuple of Q, rotations, scales, residual and condition_number. The cameras
-        do not tell Q from ``Q @ diag(1, 1, -1)``: the Q that is returned has a positive
-        determinant, `MetricUpgrade.mirrored` gives the other one.
+        Named tuple of Q, rotations, scales, residual and condition_number. Q and ``Q @
+        diag(1, 1, -1)`` fit the cameras equally well. The returned Q has a positive
+        determinant; `MetricUpgrade.mirrored` returns the other one.
 
     Raises
     ------
