@@ -29,8 +29,7 @@ from isa_nrsfm._tables.sources import (
     Table,
     checked_range,
     column_sample,
-    is_on_dask,
-    is_stored,
+    is_read_later,
     unmasked,
 )
 
@@ -554,11 +553,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         """
         if not reset:
             check_is_fitted(self)
-        if is_stored(X) or is_on_dask(X):
+        if is_read_later(X):
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
-            if is_on_dask(X):
-                return Table.on_dask(X)
-            return Table.stored(X, self.working_memory)
+            return Table.read_later(X, self.working_memory)
         least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
         X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
         checked_range(X)

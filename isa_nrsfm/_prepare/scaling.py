@@ -147,7 +147,12 @@ def scaled_table(
     check_frames(report, n_points)
     shown = report.n_seen > 0
     if not shown.all():
-        _warn_of_empty(shown)
+        if not shown.any():
+            raise ValueError(f"X shows no point: all {len(shown)} row(s) are NaN")
+        warn_caller(
+            f"{np.count_nonzero(~shown)} of {len(shown)} row(s) show no point and are "
+            f"left out of the fit, the first is row {shown.argmin()}",
+        )
         check_size(int(shown.sum()), n_points, n_components)
         blocks, report = blocks.subset(shown), report.of_frames(shown)
         visible, largest = visible[shown], largest[shown]
@@ -178,17 +183,6 @@ def scaled_table(
         n_points,
         float(np.sqrt(np.mean((spacing / size) ** 2))),
         dtype,
-    )
-
-
-def _warn_of_empty(shown: NDArray) -> None:
-    """Warn of rows that show no point, or refuse a table without any."""
-    if not shown.any():
-        raise ValueError(f"X shows no point: all of its {len(shown)} row(s) are NaN")
-    empty = ~shown
-    warn_caller(
-        f"{empty.sum()} of {len(empty)} row(s) show no point and are left out of the "
-        f"fit, the first is row {empty.argmax()}",
     )
 
 

@@ -27,7 +27,7 @@ class DaskBlocks(FrameBlocks):
     """
 
     def __init__(self, blocks: Sequence[Any], lengths: Sequence[int]):
-        filled = np.flatnonzero(lengths)
+        filled = np.flatnonzero(lengths).tolist()
         self.blocks = [blocks[number] for number in filled]
         super().__init__(
             self.blocks.__getitem__, [lengths[k] for k in filled], cached=False

@@ -9,26 +9,9 @@ from sklearn.utils import check_array, column_or_1d
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
     """
-    Return a column with one known entry for each frame.
+    Return a column with one entry for each frame: numbers, or names as str.
 
-    Parameters
-    ----------
-    name : str
-        What it is called in messages.
-    values : array-like of shape (n_frames,)
-        Numbers or names.
-    n_frames : int
-        Number of frames.
-
-    Returns
-    -------
-    ndarray of shape (n_frames,)
-        Numbers, or names as str.
-
-    Raises
-    ------
-    ValueError
-        If the length differs, or an entry is missing (None, NaN or NA).
+    Another length and missing entries (None, NaN or NA) are refused by `name`.
     """
     column = np.asarray(column_or_1d(values))
     if len(column) != n_frames:
@@ -50,7 +33,7 @@ def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
 
 
 def _is_missing(value: Any) -> bool:
-    """Tell whether an entry of a column is None, NaN, NaT or NA."""
+    """Return whether an entry of a column is None, NaN, NaT or NA."""
     try:
         return value is None or not bool(value == value)
     except TypeError:  # pandas.NA is neither true nor false
@@ -67,32 +50,13 @@ def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
 
 def checked_times(time: Any, n_rows: int) -> NDArray:
     """
-    Return the times of rows.
+    Return finite times of rows (n_rows,), dates and durations in seconds.
 
-    Parameters
-    ----------
-    time : array-like of shape (n_rows,) or None
-        Times; None for rows in order, one step apart.
-    n_rows : int
-        Number of rows.
-
-    Returns
-    -------
-    ndarray of shape (n_rows,)
-        The times.
-
-    Raises
-    ------
-    ValueError
-        If there is not one finite number for each row.
+    None stands for rows in order, one step apart.
     """
     if time is None:
         return np.arange(n_rows, dtype=float)
-    return _numbers(checked_column("time", time, n_rows))
-
-
-def _numbers(time: NDArray) -> NDArray:
-    """Return times as numbers: dates and durations in seconds."""
+    time = checked_column("time", time, n_rows)
     if time.dtype.kind in "mM":
         return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
     return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")

@@ -63,7 +63,7 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     chosen[spread(order, most)] = True
     fewest = min(200, most // 5)
     shown = sum(rows.map(_numbers_shown, chosen))
-    for point in np.flatnonzero(shown < fewest):
+    for point in np.flatnonzero(shown < fewest).tolist():
         seen = rows.joined(partial(_shows, point=point))
         showing = order[seen[order]]
         chosen[spread(showing, min(fewest, len(showing)))] = True

@@ -50,41 +50,33 @@ class Table(NamedTuple):
         return cls(blocks, X.shape[1], X.dtype)
 
     @classmethod
-    def stored(cls, X: Any, working_memory: float | None) -> "Table":
-        """Return a table that is read in blocks, using working_memory megabytes."""
-        _check_dimensions(X)
-        if working_memory is None:
-            working_memory = get_config()["working_memory"]
-        # A block needs at most eight times its own memory, copies included.
-        numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
-        length = max(int(numbers // max(X.shape[1], 1)), 1)
-        return cls._of_rows(FrameBlocks.of_stored(X, length), X)
+    def read_later(cls, X: Any, working_memory: float | None) -> "Table":
+        """
+        Return the table of a dask array, or one that is read in blocks.
 
-    @classmethod
-    def on_dask(cls, X: Any) -> "Table":
-        """Return the table of a dask array, whose chunks stay on dask's workers."""
-        _check_dimensions(X)
-        return cls._of_rows(DaskBlocks.of_chunks(X), X)
-
-    @classmethod
-    def _of_rows(cls, blocks: FrameBlocks, X: Any) -> "Table":
-        """Return the table of blocks of the rows of X, which are not checked yet."""
+        Chunks of dask stay on its workers; blocks use `working_memory` megabytes.
+        """
+        if X.ndim != 2:
+            raise ValueError(
+                f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
+                "a frame and two columns a point"
+            )
+        if is_on_dask(X):
+            blocks: FrameBlocks = DaskBlocks.of_chunks(X)
+        else:
+            if working_memory is None:
+                working_memory = get_config()["working_memory"]
+            # A block needs at most eight times its own memory, copies included.
+            numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
+            length = max(int(numbers // max(X.shape[1], 1)), 1)
+            blocks = FrameBlocks.of_stored(X, length)
         dtype = np.dtype(np.float32 if X.dtype == np.float32 else np.float64)
         return cls(blocks.derive(checked_rows), X.shape[1], dtype)
 
 
-def _check_dimensions(X: Any) -> None:
-    """Refuse arrays that are not tables."""
-    if X.ndim != 2:
-        raise ValueError(
-            f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
-            "a frame and two columns a point"
-        )
-
-
-def is_stored(X: Any) -> bool:
-    """Return whether a table is to be read block by block."""
-    return isinstance(X, np.memmap | StoredTable)
+def is_read_later(X: Any) -> bool:
+    """Return whether a table is not to be read at once."""
+    return is_on_dask(X) or isinstance(X, np.memmap | StoredTable)
 
 
 def is_on_dask(X: Any) -> bool:
@@ -187,12 +179,10 @@ class StoredTable:
         if not isinstance(rows, slice) or rows.step not in (None, 1):
             raise TypeError(f"rows must be a slice without steps; got {rows!r}")
         start, stop, _ = rows.indices(len(self))
-        found = []
-        begins = np.concatenate([[0], self._ends[:-1]])
+        found = [np.empty((0, self.shape[1]), dtype=self.dtype)]
+        begins = [0, *self._ends[:-1].tolist()]
         for begin, end, read in zip(begins, self._ends, self._read, strict=True):
             first, last = max(start, begin), min(stop, end)
             if first < last:
                 found.append(read(int(first - begin), int(last - begin)))
-        if not found:
-            return np.empty((0, self.shape[1]), dtype=self.dtype)
-        return np.concatenate(found).astype(self.dtype, copy=False)
+        return np.concatenate(found[1:] or found).astype(self.dtype, copy=False)
