@@ -12,7 +12,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera import DEGENERATE_MEAN
 from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,
     metric_quadric,
@@ -39,7 +38,7 @@ def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
-    if not shared[1] < DEGENERATE_MEAN * row <= shared[0]:
+    if not shared[1] < 0.2 * row <= shared[0]:  # as in `mean_view`
         left, _, right = np.linalg.svd(reference, full_matrices=False)
         return left @ right
     across = np.eye(3) - np.outer(right[0], right[0])
