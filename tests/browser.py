@@ -9,6 +9,8 @@ import shutil
 import signal
 import time
 
+import numpy as np
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = (
     "--headless",
@@ -108,6 +110,14 @@ class Browser:
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{code}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
+
+    def array(self, code):
+        """Return the value of an expression as points (n_points, 3)."""
+        return np.reshape(self.run(code), (-1, 3))
+
+    def click(self, name):
+        """Click an element."""
+        self.run(f"document.getElementById('{name}').click()")
 
     def wait(self, condition):
         """Wait until a condition is true."""

@@ -198,13 +198,3 @@ def test_a_model_of_other_points_is_refused(run, tracks, lost, tmp_path):
     code, out, _ = run("transform", folder / MODEL, openface, "-o", tmp_path / "a.csv")
     assert code == 0
     assert "1  without coefficients: tracking failed" in out
-
-
-def test_truncated_files_are_refused_in_one_line(run, tracks, tmp_path):
-    path, _, _ = write_openface(tmp_path, tracks, None)
-    path.write_bytes(path.read_bytes()[:-100])
-    code, out, err = run("fit", path, "-o", tmp_path / "results", *QUICK)
-    assert (code, out) == (1, "")
-    assert len(err.splitlines()) == 1
-    assert err.startswith(f"isa-nrsfm: error: {path} cannot be read as openface")
-    assert "line 41 has" in err

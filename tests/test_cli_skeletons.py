@@ -171,15 +171,6 @@ def test_what_does_not_fit_is_refused_before_the_fit(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
-def test_the_demo_takes_edges(run, tmp_path):
-    options = ["-o", tmp_path, "--no-figures", "--edges", "none", "--origin", "lower"]
-    code, report, _ = run("demo", *options)
-    assert code == 0
-    assert "--edges none --origin lower" in report
-    assert edges_of(tmp_path / "viewer.html") == (set(), [])
-
-
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory):
     scene = make_face_tracks(60, n_components=1, noise=0.01, random_state=0)
@@ -228,17 +219,6 @@ def test_points_are_named(run, faces, tmp_path, points, kept):
     expected = get_skeleton("ibug-68").subset(kept).edges.tolist()
     found, _ = edges_of(tmp_path / "viewer.html")
     assert found == {tuple(edge) for edge in expected}
-
-
-def test_points_by_their_names(run, bodies, tmp_path):
-    names = get_skeleton("coco-17").point_names
-    columns = [f"{name}_{axis}" for name in names for axis in "xy"]
-    path = write(bodies, tmp_path / "bodies.csv", columns)
-    options = ["--points", "without:left_eye-right_ear,0", "--no-figures", *QUICK]
-    code, report, _ = run("fit", path, "-o", tmp_path, *options)
-    assert code == 0
-    assert "12 points in the columns left_shoulder_x" in report
-    assert "points recognised as 12 points of coco-17" in report
 
 
 @pytest.mark.parametrize(

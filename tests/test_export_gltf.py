@@ -107,23 +107,19 @@ def test_weights_are_coefficients(written, make):
     assert mean[30, 2] > mean[0, 2]
 
 
-def test_names_are_those_of_points_and_basis_shapes(written):
-    extras = written(face_model()).mesh["extras"]
-    assert extras["targetNames"] == ["alpha_1", "alpha_2", "alpha_3"]
-    assert extras["pointNames"] == [str(j) for j in range(68)]
+def test_names_and_bounds_are_exact(written):
     names = ["jaw", "smile \u2013 wide", "brows"]
     assert written(face_model(), names=names).mesh["extras"]["targetNames"] == names
-
-
-def test_bounds_are_exact(written):
     read = written(face_model())
+    extras = read.mesh["extras"]
+    assert extras["targetNames"] == ["alpha_1", "alpha_2", "alpha_3"]
+    assert extras["pointNames"] == [str(j) for j in range(68)]
     primitive = read.primitive(4)
-    numbers = [primitive["attributes"]["POSITION"]]
-    numbers += [target["POSITION"] for target in primitive["targets"]]
-    for number in numbers:
-        accessor = read.document["accessors"][number]
-        assert_array_equal(accessor["min"], read.array(number).min(axis=0))
-        assert_array_equal(accessor["max"], read.array(number).max(axis=0))
+    for part in (primitive["attributes"], *primitive["targets"]):
+        accessor = read.document["accessors"][part["POSITION"]]
+        points = read.array(part["POSITION"])
+        assert_array_equal(accessor["min"], points.min(axis=0))
+        assert_array_equal(accessor["max"], points.max(axis=0))
 
 
 def test_normals_follow_the_morph_targets(written):
@@ -158,7 +154,7 @@ def test_the_animation_swings_each_basis_shape_in_turn(written):
     assert np.all(np.diff(firsts) > 0)
 
 
-def test_edges_are_lines_and_none_is_points_alone(written):
+def test_edges_are_lines_triangles_surfaces_and_none_is_points(written):
     edges = [[0, 1], [1, 2], [5, 9]]
     read = written(face_model(), edges=edges)
     points, *lines = read.mesh["primitives"]
@@ -168,16 +164,13 @@ def test_edges_are_lines_and_none_is_points_alone(written):
     assert drawn == [[[5, 9]], [[0, 1], [1, 2]]]
     names = [read.document["materials"][p["material"]]["name"] for p in lines]
     assert names == ["points and edges", "right"]
-    assert [
-        p["mode"] for p in written(face_model(), edges=None).mesh["primitives"]
-    ] == [0]
-
-
-def test_triangles_are_taken_as_they_are(written):
+    alone = written(face_model(), edges=None).mesh["primitives"]
+    assert [p["mode"] for p in alone] == [0]
     triangles = [[0, 36, 31], [2, 1, 0]]
     read = written(face_model(), edges=triangles)
-    indices = read.array(read.primitive(4)["indices"])
-    assert_array_equal(indices, np.ravel(triangles))
+    assert_array_equal(read.array(read.primitive(4)["indices"]), np.ravel(triangles))
+    edges = choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4).edges
+    assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
 
 
 @pytest.mark.parametrize(("n_points", "dtype"), [(65535, "<u2"), (65536, "<u4")])
@@ -208,8 +201,3 @@ def test_normals_of_points_without_triangles_look_at_the_viewer():
     shape = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5.0]])
     normals = vertex_normals(shape, np.array([[0, 2, 1]]))
     assert_allclose(normals, [[0, 0, -1], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
-
-
-def test_edges_of_triangles_are_their_sides_once():
-    edges = choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4).edges
-    assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]

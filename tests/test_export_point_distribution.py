@@ -207,6 +207,11 @@ def test_files_give_the_same_numbers_again(pdm, tmp_path, suffix):
     write_pdm(pdm, path)
     for written, read in zip(pdm, read_pdm(str(path)), strict=True):
         assert_array_equal(read, written)
+    if suffix == ".mat":  # as MATLAB code of OpenFace has them
+        shapes = {name: loadmat(path)[name].shape for name in "MVE"}
+        m = N_COMPONENTS
+        assert shapes == {"M": (204, 1), "V": (204, m), "E": (m, 1)}
+        assert_array_equal(loadmat(path)["M"][68:136, 0], pdm.mean[:, 1])
 
 
 def test_openface_reads_the_text(pdm, tmp_path):
@@ -221,16 +226,6 @@ def test_openface_reads_the_text(pdm, tmp_path):
     shape = (mean[:, 0] + components @ scores).reshape(3, 68).T
     assert_allclose(shape, pdm.mean + np.tensordot(scores, pdm.modes, 1))
     assert_array_equal(variances[0], pdm.eigenvalues)
-
-
-def test_matlab_code_has_its_variables(pdm, tmp_path):
-    path = tmp_path / "pdm.mat"
-    write_pdm(pdm, path)
-    variables = loadmat(path)
-    assert variables["M"].shape == (204, 1)
-    assert variables["V"].shape == (204, N_COMPONENTS)
-    assert variables["E"].shape == (N_COMPONENTS, 1)
-    assert_array_equal(variables["M"][68:136, 0], pdm.mean[:, 1])
 
 
 def test_texts_as_others_write_them_are_read(tmp_path):

@@ -24,8 +24,9 @@ def test_faces_stand_upright_and_look_at_the_viewer(camera, y_up):
     assert mean[NOSE, 2] < mean[[LEFT_JAW, RIGHT_JAW], 2].min()  # z points away
 
 
-def test_the_mean_face_has_its_true_proportions():
-    truth, model = faces(), face_model()
+@pytest.mark.parametrize("make", [face_model, calibrated_model])
+def test_the_mean_face_has_its_true_proportions(make):
+    truth, model = faces(), make()
     mean, _ = upright_basis(space_of(model), model)
     error = aligned(mean, truth.mean_shape) - truth.mean_shape
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
@@ -64,19 +65,16 @@ def test_frames_in_their_poses_have_the_images_of_the_model(make, mirrored, y_up
     assert_allclose(images, expected, atol=1e-9 * np.abs(expected).max())
 
 
-def test_mirrored_shapes_have_the_opposite_depth():
+@pytest.mark.parametrize(
+    ("options", "signs"),
+    [({"mirrored": True}, [1, 1, -1]), ({"origin": "lower"}, [1, -1, -1])],
+)
+def test_mirror_images_and_origins_change_signs(options, signs):
     model = blob_model()
     mean, basis = upright_basis(space_of(model), model)
-    mirrored = upright_basis(space_of(model, mirrored=True), model)
-    assert_allclose(mirrored[0], mean * [1, 1, -1], atol=1e-9)
-    assert_allclose(mirrored[1], basis * [1, 1, -1], atol=1e-9)
-
-
-def test_an_origin_below_turns_shapes_over():
-    model = blob_model()
-    upper, _ = upright_basis(space_of(model, origin="upper"), model)
-    lower, _ = upright_basis(space_of(model, origin="lower"), model)
-    assert_allclose(lower, upper * [1, -1, -1], atol=1e-9)
+    other = upright_basis(space_of(model, **options), model)
+    assert_allclose(other[0], mean * signs, atol=1e-9)
+    assert_allclose(other[1], basis * signs, atol=1e-9)
 
 
 def test_basis_shapes_are_the_least_squares_fit_to_the_frames():
@@ -131,13 +129,6 @@ class TestCalibratedCameras:
         expected = project(shapes, model.motion_, 0.0 * model.translation_)
         images = frames.scales[:, None, None] * images
         assert_allclose(images, expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_the_mean_face_of_calibrated_cameras_has_its_true_proportions():
-    truth, model = faces(), calibrated_model()
-    mean, _ = upright_basis(space_of(model), model)
-    error = aligned(mean, truth.mean_shape) - truth.mean_shape
-    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
 
 
 def test_calibrated_cameras_that_see_one_side_only_are_no_error(recwarn):

@@ -44,13 +44,13 @@ def page(tmp_path_factory):
 
 def test_sliders_move_the_points(browser, page):
     browser.open(page)
-    before = np.reshape(browser.run("viewer.points()"), (-1, 3))
+    before = browser.array("viewer.points()")
     browser.run("document.getElementById('weight-0').focus()")
     for _ in range(5):
         browser.press("PageUp", 33)
     weight = browser.run("viewer.state().weights[0]")
     assert weight > 1
-    after = np.reshape(browser.run("viewer.points()"), (-1, 3))
+    after = browser.array("viewer.points()")
     moved = np.linalg.norm(after - before, axis=1)
     assert moved[8] > 0.05  # the chin, as the jaw opens
     assert moved[27] < moved[8] / 2
@@ -58,8 +58,8 @@ def test_sliders_move_the_points(browser, page):
     assert browser.run("document.querySelector('.weight output').value") == (
         f"{weight:.2f}"
     )
-    browser.run("document.getElementById('reset').click()")
-    assert_allclose(np.reshape(browser.run("viewer.points()"), (-1, 3)), before)
+    browser.click("reset")
+    assert_allclose(browser.array("viewer.points()"), before)
 
 
 def test_a_page_asks_for_nothing_and_has_no_errors(browser, page):
@@ -95,9 +95,9 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
     box = browser.run(places)
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     points = browser.run("viewer.points()")
-    before = np.reshape(browser.run("viewer.projected()"), (-1, 3))
+    before = browser.array("viewer.projected()")
     browser.drag((x, y), (x + 60, y))
-    after = np.reshape(browser.run("viewer.projected()"), (-1, 3))
+    after = browser.array("viewer.projected()")
     assert after[30, 0] > before[30, 0] + 20  # the nose goes with the mouse
     assert browser.run("viewer.points()") == points
     assert browser.run("viewer.state().turn[0]") == pytest.approx(np.cos(0.6))
@@ -106,8 +106,8 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
         "Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-300
     )
     browser.wait("viewer.state().zoom > 1.2")
-    browser.run("document.getElementById('front').click()")
-    again = np.reshape(browser.run("viewer.projected()"), (-1, 3))
+    browser.click("front")
+    again = browser.array("viewer.projected()")
     assert_allclose(again, before, atol=1e-3)
 
 
@@ -143,10 +143,10 @@ def test_fingers_turn_and_pinch_the_shape(browser, page):
 def test_frames_play_and_stop(browser, page):
     browser.open(page)
     browser.run("document.getElementById('pace').value = '30'")
-    browser.run("document.getElementById('play').click()")
+    browser.click("play")
     browser.wait("viewer.state().frame >= 3")
     assert browser.run("document.getElementById('play').textContent") == "Pause"
-    browser.run("document.getElementById('play').click()")
+    browser.click("play")
     state = browser.run("viewer.state()")
     assert not state["playing"]
     model = face_model()
@@ -163,9 +163,9 @@ def test_a_frame_is_seen_as_by_its_camera(browser, page):
         "(() => { const slider = document.getElementById('frame'); slider.value = 7;"
         " slider.dispatchEvent(new Event('input')); })()"
     )
-    before = np.reshape(browser.run("viewer.projected()"), (-1, 3))[:, :2]
-    browser.run("document.getElementById('pose').click()")
-    seen = np.reshape(browser.run("viewer.projected()"), (-1, 3))[:, :2]
+    before = browser.array("viewer.projected()")[:, :2]
+    browser.click("pose")
+    seen = browser.array("viewer.projected()")[:, :2]
     row = int(np.linspace(0, N_FRAMES - 1, 60)[7])
     image = faces().clean[row]
 
@@ -213,7 +213,7 @@ def test_pages_fit_the_width_of_the_window(browser, page, width, mobile):
     )
     assert np.min(boxes) >= 0
     assert np.max(boxes) <= width
-    seen = np.reshape(browser.run("viewer.projected()"), (-1, 3))
+    seen = browser.array("viewer.projected()")
     assert seen[:, 0].min() >= 0
     assert seen[:, 0].max() <= width
 
@@ -227,7 +227,7 @@ def test_one_basis_shape_and_no_face(browser, tmp_path):
     assert browser.run("document.getElementById('frames').hidden")
     write_viewer(blob_model(), path, camera=None)
     browser.open(path.as_uri())
-    browser.run("document.getElementById('play').click()")
+    browser.click("play")
     browser.wait("viewer.state().frame >= 1")
     assert browser.complaints() == []
     assert browser.run("document.getElementById('posed').hidden")
@@ -273,7 +273,7 @@ def test_videos_play_at_true_speed(browser, tmp_path):
     browser.open(path.as_uri())
     assert browser.run("document.getElementById('pace').value") == "true"
     begun = browser.run("performance.now()")
-    browser.run("document.getElementById('play').click()")
+    browser.click("play")
     browser.wait("viewer.state().frame >= 5")
     passed = browser.run("performance.now()") - begun
     assert passed >= 5 * 50
