@@ -215,31 +215,27 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default="auto",
     ),
     "columns": _option(
-        "the landmark columns, if their names are ambiguous: patterns of x and y "
-        "columns in turn, # for a number, * for any text, such as 'x_#,y_#' or "
-        "'*.px,*.py'",
+        "patterns of the x and y columns, if their names are ambiguous: # for a "
+        "number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
         "PATTERN",
     ),
     "skip_rows": _list(
-        "leave out the rows in which the column matches the regular expression, such "
-        "as 'name=^ir' for names that begin with ir",
+        "leave out rows whose column matches the expression, such as 'name=^ir'",
         "COLUMN=REGEX",
     ),
     "zeros_missing": _flag("treat points at exactly (0, 0) as missing"),
     "min_confidence": _option(
-        "treat points with a lower confidence as missing; the scale is that of the "
-        "program that wrote the table",
+        "treat points with a lower confidence as missing",
         "CONFIDENCE",
     ),
     "image_size": _option(
-        "size of the images in pixels, such as 1920x1080: MediaPipe writes coordinates "
-        "as fractions of it",
+        "size of the images for MediaPipe, in pixels, such as 1920x1080",
         "WIDTHxHEIGHT",
     ),
     "points": _option(
-        "fit only some of the points: inner leaves out the visible outline of a face, "
-        "which slides over the surface as the head turns; otherwise names, numbers and "
-        "ranges such as nose,36-47, or without:0-16 for points to leave out",
+        "fit some of the points: inner (without the visible outline of a face, which "
+        "slides over the surface as the head turns), or names, numbers and ranges such "
+        "as nose,36-47 or without:0-16",
         "POINTS",
     ),
     # What is written.
@@ -252,9 +248,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "viewer": _option("write a page that shows the new frames in 3D (.html)", "FILE"),
     "edges": _option(
-        "the lines between points in the viewer and the figures: a .csv file without "
-        "header, with the names of two points per line, or of three for a surface; "
-        "'none' draws only points (default: the lines of a known layout)",
+        "lines to draw between points: a .csv file with the names of two points per "
+        "line, or of three for a surface; 'none' draws only points",
         "FILE",
     ),
     "skeleton": _option(
@@ -270,19 +265,18 @@ OPTIONS: dict[str, dict[str, Any]] = {
     # Other columns.
     "label": _list(
         "a class or a number for each frame, such as an expression or an age: reports "
-        "how each coefficient depends on it, and how well all coefficients predict it. "
-        "Whole numbers are classes unless given as COLUMN:number",
+        "the dependence of the coefficients on it. Whole numbers are classes unless "
+        "given as COLUMN:number",
         "COLUMN",
     ),
     "group": _option(
-        "people, videos or files: reports how much coefficients differ between and "
-        "within groups. Held-out frames come from other groups, and smoothing stops at "
-        "their borders",
+        "people, videos or files: reports the variance between and within groups. "
+        "Held-out frames come from other groups; smoothing stops at their borders",
         "COLUMN",
     ),
     "distance": _list(
-        "add the distance of two points in the 3D shape of each frame to alpha.csv, in "
-        "units of the distance between the outer corners of the eyes",
+        "add the distance of two points of the 3D shapes to alpha.csv, in units of the "
+        "distance between the outer corners of the eyes",
         "POINT,POINT",
     ),
     "unit": _option(
@@ -295,31 +289,29 @@ OPTIONS: dict[str, dict[str, Any]] = {
         default=1.0,
     ),
     "time": _option(
-        "times of the frames, numbers or dates that increase within each group: adds "
-        "smoothed coefficients",
+        "times of the frames, numbers or dates: adds smoothed coefficients",
         "COLUMN",
     ),
     "fps": _option(
-        "frames per second, if the rows are the frames of a video, instead of --time",
+        "instead of --time, the frames per second of a video",
         "NUMBER",
     ),
     # The method.
     "n_components": _option(
         "number of basis shapes (default: 3). Of several, such as 1-8 or 3,6,9, the "
-        "one is used that best predicts held-out points of held-out frames; auto uses "
-        "as many as the table determines, at most twelve",
+        "best in cross-validation is used; auto uses as many as the table determines, "
+        "at most twelve",
         "K",
         default="3",
     ),
     "camera": _choice(
-        "camera model: affine assumes nothing, weak_perspective a rotation and a scale "
-        "for each frame, orthographic one scale for all frames; with the last two, "
-        "shapes have true proportions",
+        "camera model: affine (no assumption), weak_perspective (a rotation and a "
+        "scale per frame), or orthographic (one scale). With the last two, shapes have "
+        "true proportions",
         CAMERA_NAMES,
     ),
     "isa": _choice(
-        "independent subspace analysis: pooled, FastICA whose components are pooled "
-        "into triples, or fast, FastISA from several starts",
+        "independent subspace analysis: FastICA with pooled components, or FastISA",
         ("pooled", "fast"),
     ),
     "n_init": _option(
@@ -330,21 +322,19 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "algorithm that finds the block structure", BLOCK_RECOVERIES
     ),
     "refinement": _choice(
-        "joint: refine cameras, coefficients and basis shapes together; alternating: "
-        "the refinement of the paper, with the cameras of the rigid part",
+        "joint: cameras, coefficients and basis shapes together; alternating: the "
+        "refinement of the paper, with cameras of the rigid part",
         (*REFINEMENTS, NONE),
     ),
     "independence": _choice(
-        "joint refinement: make the basis shapes independent over the points, or the "
-        "coefficients independent over the frames",
+        "joint refinement: independent basis shapes, or independent coefficients",
         (*INDEPENDENCE, NONE),
     ),
     "loss": _choice(
         "joint refinement: huber and cauchy limit the influence of outliers", LOSSES
     ),
     "no_scale_frames": _flag(
-        "weight frames by their size in the image, as orthographic cameras always do; "
-        "otherwise all frames have the same weight"
+        "weight frames by their size in the image, as orthographic cameras always do"
     ),
     "random_state": _option(
         "seed of the random starts (default: 0)",
@@ -362,18 +352,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "choices": list(SUFFIXES),
     },
     "n_modes": _option(
-        "modes of the point distribution model: their number, or the share of the "
+        "for a point distribution model, the number of modes, or the share of the "
         "variance that they explain, such as 0.98 (default: number of basis shapes)",
         "MODES",
     ),
     "names": _option(
-        "for .html and .glb, names of the basis shapes, with commas between them",
-        "NAMES",
+        "for .html and .glb, names of the basis shapes with commas", "NAMES"
     ),
-    "n_frames": _option(
-        "for .html, the largest number of frames that are shown (default: 1000)",
-        "N",
-    ),
+    "n_frames": _option("for .html, the largest number of frames (default: 1000)", "N"),
     "mirrored": _flag("take the mirror image in depth, which has the same images"),
 }
 # Where an option of one command differs from that of the others.
