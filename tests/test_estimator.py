@@ -22,6 +22,7 @@ from sklearn.pipeline import make_pipeline
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import robust_sizes
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
@@ -1338,7 +1339,7 @@ def test_outliers_are_no_components():
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
-@pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+@pytest.mark.parametrize("loss", LOSSES)
 def test_intervals_of_coefficients_hold(loss, camera):
     truth = make_nonrigid_tracks(200, 10, 2, camera=camera, random_state=0)
     rng = np.random.default_rng(0)

@@ -13,6 +13,7 @@ from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -23,7 +24,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]
-LOSSES = ["linear", "huber", "cauchy"]
 VARIANTS = [{"refinement": refinement} for refinement in REFINEMENTS] + [
     {"loss": loss} for loss in LOSSES[1:]
 ]

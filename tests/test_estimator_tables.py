@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 REAL_TABLES = [
@@ -347,7 +348,7 @@ def test_joint_refinement_of_a_rigid_object_with_noise():
     assert np.linalg.norm(model.basis_) < 0.02 * np.linalg.norm(model.mean_shape_)
 
 
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("loss", LOSSES[1:])
 def test_robust_fit_of_a_rigid_object(loss):
     rng = np.random.default_rng(0)
     tracks = seen(rng.normal(size=(20, 3)), cameras(rng, 40), rng)
@@ -357,7 +358,7 @@ def test_robust_fit_of_a_rigid_object(loss):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loss", ["huber", "cauchy"])
+@pytest.mark.parametrize("loss", LOSSES[1:])
 def test_robust_fit_of_the_shark(load_data, loss):
     # Most of its points hardly move: those that do are no outliers.
     tracks = real_tracks(load_data, "shark_torresani")[::8]

@@ -11,6 +11,7 @@ from scenes import random_rotation, with_gaps
 from isa_nrsfm._frames.camera_models import nearest_calibrated
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
 
@@ -321,7 +322,7 @@ class TestPosteriorFrames:
         assert_allclose(shown.alpha_std, expected, rtol=1e-7)
 
     @pytest.mark.parametrize("missing", [0.0, 0.3])
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_weights_of_a_robust_loss_agree_with_the_fit(self, loss, missing):
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, missing)
@@ -337,7 +338,7 @@ class TestPosteriorFrames:
 
     @pytest.mark.parametrize("point", [0, 7, 12])
     @pytest.mark.parametrize("size", [2.0, 20.0])
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_robust_loss_is_not_drawn_to_an_outlier(self, loss, size, point):
         frames, tracks = posterior_frames(0)
         expected = frames.posterior(tracks)
@@ -348,7 +349,7 @@ class TestPosteriorFrames:
         assert np.median(np.abs(drawn / deviation)) > 3
         assert np.abs(robust / deviation).max() < 2
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_a_point_that_does_not_belong_to_its_frame_is_as_if_missing(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[:, 7] = np.nan
@@ -360,7 +361,7 @@ class TestPosteriorFrames:
             assert_allclose(fitted.covariance, expected.covariance, atol=1e-6)
 
     @pytest.mark.parametrize("noise", [1e-12, 1e-24])
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_weights_of_a_wrong_model_leave_a_camera(self, loss, noise):
         frames, _ = posterior_frames(0, loss)
         frames = replace(frames, noise_variance=noise)
@@ -369,7 +370,7 @@ class TestPosteriorFrames:
         for part in frames.posterior(tracks)[:4]:
             assert np.isfinite(part).all()
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_points_far_from_the_others_count_where_these_tell_too_little(self, loss):
         # Three points near each other, and three far: no camera without the far ones.
         frames, tracks = posterior_frames(0, loss)
@@ -384,7 +385,7 @@ class TestPosteriorFrames:
         images = project(mean_shape[None], fitted.motion, fitted.translation)
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
 
-    @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES)
     def test_frames_are_separate(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks = with_gaps(tracks, 0.2)
@@ -396,7 +397,7 @@ class TestPosteriorFrames:
             for got, expected in zip(alone, together, strict=True):
                 assert_allclose(got[0], expected[i], rtol=1e-9, atol=1e-11)
 
-    @pytest.mark.parametrize("loss", ["linear", "huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES)
     def test_frames_that_show_too_little_are_nan(self, loss):
         frames, tracks = posterior_frames(0, loss)
         tracks[4, 1:] = np.nan

@@ -20,6 +20,7 @@ from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import Triplets, leading_triplets
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
@@ -467,7 +468,7 @@ class TestEquivariance:
 
 
 class TestNoiseVariance:
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_with_a_robust_loss(self, loss):
         tracks, _ = random_table(n_frames=150)
         got = fitted(tracks, loss=loss).noise_variance
@@ -480,7 +481,7 @@ class TestNoiseVariance:
         got = fitted(tracks, 5, loss="huber").noise_variance
         assert abs(got / DEVIATION**2 - 1) < 0.1
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_with_a_robust_loss_and_few_points(self, loss):
         tracks, _ = random_table(n_frames=300, n_points=8, n_components=1)
         got = fitted(tracks, 1, loss=loss).noise_variance
@@ -553,7 +554,7 @@ def spoilt(tracks, share=0.05, size=2.0):
 
 
 class TestRobustLoss:
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     @pytest.mark.parametrize(
         ("share", "size", "known"), [(0.05, 2.0, True), (0.01, 0.8, False)]
     )
@@ -570,7 +571,7 @@ class TestRobustLoss:
         # More of the noise is larger than it would be.
         assert 0.85 < result.noise_variance / DEVIATION**2 < 1.5
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_weights_agree_with_the_fit(self, loss, monkeypatch):
         seen = []
         weights = reweighting.frame_weights
@@ -586,7 +587,7 @@ class TestRobustLoss:
         assert np.abs(seen[-1] - seen[-2]).max() < 1e-2
         assert np.abs(seen[0] - seen[-1]).max() > 1e-2
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_clean_tables_are_fitted_nearly_as_well(self, loss):
         tracks, truth = random_table()
         shapes = frames_of(fitted(tracks, loss=loss), tracks)[1]
@@ -606,7 +607,7 @@ class TestRobustLoss:
         result = fitted(tracks, loss="huber", outliers=outliers)
         assert np.isfinite(result.shapes).all()
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_tables_without_noise(self, loss):
         tracks, truth = random_table(deviation=0.0)
         moved, where = spoilt(tracks)
@@ -655,7 +656,7 @@ class TestDegenerate:
             shapes = frames_of(result, tracks)[1]
             assert affine_shape_error(truth, shapes) < max(3 * deviation, 1e-4)
 
-    @pytest.mark.parametrize("loss", ["huber", "cauchy"])
+    @pytest.mark.parametrize("loss", LOSSES[1:])
     def test_rigid_objects_without_noise_and_a_robust_loss(self, loss):
         tracks, truth = random_table(deviation=0.0, n_components=0)
         result = fitted(tracks, 1, loss=loss)

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
+from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -114,7 +115,7 @@ class TestFit:
                 expected.score(X), rel=1e-8
             )
 
-    @pytest.mark.parametrize("loss", slow_after(1, ["huber", "cauchy"]))
+    @pytest.mark.parametrize("loss", slow_after(1, LOSSES[1:]))
     @pytest.mark.parametrize("limits", slow_after(1, [SAMPLED, Limits()]))
     @pytest.mark.parametrize("megabytes", slow_after(1, [0.1, 0.02, 1000]))
     def test_robust_losses(self, tmp_path, loss, limits, megabytes):
