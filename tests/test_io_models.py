@@ -206,6 +206,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
         assert sorted(["header", *header["arrays"]]) == sorted(file)
 
 
+@pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 @pytest.mark.parametrize("case", ["names", "alternating", "orthographic"])
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)
