@@ -10,7 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import make_face_tracks
 
 REAL_TABLES = [
     "akhter_drink",
@@ -63,27 +63,6 @@ def test_right_layout_gives_no_warning_and_the_wrong_one_does(load_data, name, r
     assert messages_of_fit(table, layout=right, scale_frames=scale_frames) == []
     (message,) = messages_of_fit(table, layout=wrong, scale_frames=scale_frames)
     assert message.startswith(f"layout='{right}' explains the table much better")
-
-
-@pytest.mark.parametrize("scale_frames", [True, False])
-@pytest.mark.parametrize("move", [[5000.0, 0.0], [-3000.0, 4000.0]])
-@pytest.mark.parametrize("name", ["ict_bu3dfe_like_68", "akhter_drink", "akhter_yoga"])
-def test_layout_is_judged_wherever_the_object_is(load_data, name, move, scale_frames):
-    tracks = real_tracks(load_data, name)
-    moved = tracks + np.array(move) * np.std(tracks[0]) / 100
-    params = {"scale_frames": scale_frames}
-    assert messages_of_fit(table_of(moved), **params) == []
-    assert len(messages_of_fit(table_of(moved, "planar"), **params)) == 1
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_synthetic_tables_in_the_wrong_layout_give_a_warning(seed):
-    for tracks in (
-        make_face_tracks(40, random_state=seed).tracks,
-        make_nonrigid_tracks(100, noise=0.02, random_state=seed).tracks,
-    ):
-        assert messages_of_fit(table_of(tracks)) == []
-        assert len(messages_of_fit(table_of(tracks, "planar"))) == 1
 
 
 # --- degenerate tables --------------------------------------------------------------
@@ -549,24 +528,3 @@ def test_one_basis_shape_needs_no_independence(load_data, name):
         for seed in (0, 1)
     ]
     assert_allclose(values, values[0], rtol=1e-5)
-
-
-def test_strategies_explain_more_than_a_rigid_shape_does(load_data):
-    table = table_of(real_tracks(load_data, "ict_bu3dfe_like_68")[::5])
-    values = [
-        AffineNRSfM(9, isa=isa, refinement="alternating", random_state=0)
-        .fit(table)
-        .inverse_snr_
-        for isa in (PooledFastICA(n_init=4), FastISA(n_init=4))
-    ]
-    rigid = make_rigid(table)
-    assert max(values) < 0.5 * rigid
-
-
-def make_rigid(table):
-    """Return the inverse SNR of a rigid object."""
-    tracks = table.reshape(len(table), -1, 2)
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    centred /= np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
-    S = np.linalg.svd(np.vstack(list(centred.transpose(0, 2, 1))), compute_uv=False)
-    return np.sum(S[3:] ** 2) / np.sum(S**2)

@@ -302,22 +302,6 @@ class TestOtherLayout:
             warnings.simplefilter("error")
             warn_if_other_layout(X, "interleaved", scale_frames)
 
-    @pytest.mark.parametrize(
-        "name",
-        [
-            "akhter_drink",
-            "akhter_yoga",
-            "faces_wild_68_combined",
-            "ict_bu3dfe_like_68",
-            "shark_torresani",
-        ],
-    )
-    def test_real_tables(self, load_data, name):
-        X = tracks_to_table(load_data(name)["W2d"])
-        warn_if_other_layout(X, "interleaved", True)
-        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
-            warn_if_other_layout(X, "planar", True)
-
     @pytest.mark.parametrize("scale_frames", [True, False])
     @pytest.mark.parametrize(("right", "wrong"), [LAYOUTS, LAYOUTS[::-1]])
     @pytest.mark.parametrize("missing", [0.1, 0.6])
@@ -340,12 +324,6 @@ class TestOtherLayout:
         warn_if_other_layout(X, right, scale_frames)
         with pytest.warns(UserWarning, match=f"layout='{right}' explains the table"):
             warn_if_other_layout(X, wrong, scale_frames)
-
-    def test_faces_that_hide_a_side(self, load_data):
-        X = tracks_to_table(load_data("muct_68")["W2d"])
-        warn_if_other_layout(X, "interleaved", True)
-        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
-            warn_if_other_layout(X, "planar", True)
 
     @pytest.mark.parametrize("seed", range(5))
     def test_generated_faces_with_missing_points(self, seed):

@@ -68,6 +68,7 @@ def independent_gauge(
     if camera != "affine":
         space = euclidean_space(shapes[0].T, motion, unit)
     # The mixing of the basis shapes, then their order, scale and signs.
+    mixing: NDArray
     if independence == "shapes":
         mixing = shared_mixing(white)
     elif independence == "coefficients":

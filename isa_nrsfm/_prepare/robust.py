@@ -6,6 +6,7 @@ falls with its distance from the model in units of the noise. Fit and weights al
 until they agree.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -21,7 +22,7 @@ from isa_nrsfm._tables.visibility import seen_points
 # squares if the noise is normal.
 TUNING = {"huber": 1.5011, "cauchy": 2.5486}
 # Weights by loss, functions of distances in standard deviations of a coordinate.
-WEIGHTS = {
+WEIGHTS: dict[str, Callable[[NDArray], NDArray]] = {
     "linear": np.ones_like,
     "huber": lambda distance: TUNING["huber"] / np.maximum(distance, TUNING["huber"]),
     "cauchy": lambda distance: 1.0 / (1.0 + (distance / TUNING["cauchy"]) ** 2),
