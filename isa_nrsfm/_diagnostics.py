@@ -102,21 +102,10 @@ class Diagnostics(NamedTuple):
 
 def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
     """
-    Return how far the fitted table determines a fit.
+    Return how far the fitted table determines a joint fit, with its frames kept.
 
-    Parameters
-    ----------
-    estimator : AffineNRSfM
-        A fitted estimator with the frames of its table and a noise variance.
-    distance : ndarray of shape (n_rows, n_points) or None
-        Lengths of the residuals of frames of size one, NaN where a point is missing.
-    rows : sequence of length n_rows
-        Names of the rows.
-
-    Returns
-    -------
-    Diagnostics
-        The figures, and what they mean.
+    `distance` (n_rows, n_points) are lengths of the residuals of frames of size one,
+    NaN where a point is missing, and `rows` are the names of the rows.
     """
     frames, sizes = estimator._model.frames, estimator._frame_sizes
     fitted = np.isfinite(sizes)

@@ -114,21 +114,11 @@ def fit_table(
     estimator: TableTransformer, source: Table, progress: FitProgress
 ) -> Decomposition:
     """
-    Fit a table, and set the attributes of an estimator.
+    Fit a table, and set the attributes of an estimator whose parameters are checked.
 
-    Parameters
-    ----------
-    estimator : TableTransformer
-        The estimator; its parameters are checked, and `isa_` is the unfitted strategy.
-    source : Table
-        The table.
-    progress : FitProgress
-        Called after each stage, and before each step of the joint refinement.
-
-    Returns
-    -------
-    Decomposition
-        The fit of the rows of the table; NaN for rows without points.
+    Its `isa_` is the unfitted strategy. `progress` is called after each stage, and
+    before each step of the joint refinement. Returns the fit of the rows of the table;
+    NaN for rows without points.
     """
     n_components = estimator.n_components
     if n_components == "auto":
@@ -146,24 +136,10 @@ def fit_ready_table(
     starts: Sequence[Start] = (),
 ) -> Decomposition:
     """
-    Fit a table that is checked, centred and scaled: stages 1 to 6.
+    Fit a table that is checked, centred and scaled, as in `fit_table`.
 
-    Parameters
-    ----------
-    estimator, progress
-        As in `fit_table`.
-    table : ScaledTable
-        The table.
-    n_components : int
-        K.
-    starts : sequence of Start, default=()
-        Starts of the joint refinement. By default it searches for them, from the result
-        of the paper's pipeline among others.
-
-    Returns
-    -------
-    Decomposition
-        As in `fit_table`.
+    `starts` are those of the joint refinement. By default it searches for them, from
+    the result of the paper's pipeline among others.
     """
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(estimator, table, n_components, progress)

@@ -203,31 +203,16 @@ def held_out_energies(
 
     The points are divided into five parts, the same for all frames and tables. Each
     part is predicted from the others, frame by frame: camera, position and coefficients
-    are fitted without it.
+    are fitted without it. Shapes are (n_points, 3), tracks (n_frames, n_points, 2) with
+    NaN where a point is missing.
 
-    Parameters
-    ----------
-    frames : RigidFrames or PosteriorFrames
-        The model of a frame.
-    mean_shape : ndarray of shape (n_points, 3)
-        Mean shape in the gauge of `frames`.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes in the gauge of `frames`.
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks, NaN where a point is missing.
-    sizes : ndarray of shape (n_frames,)
-        Sizes of the frames.
-
-    Returns
-    -------
-    noise, signal : float
-        ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the points, each
-        divided by the squared size of its frame. Points are left out if the others of
-        the frame do not determine its fit, or if in a frame with missing points the
-        camera, an affine one of the mean shape, adds more than twice the noise variance
-        to their prediction. Otherwise a few frames with hardly enough points would
-        decide. The limit does not depend on the basis shapes, so that scores of
-        different K are of the same points.
+    The energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the
+    points, each divided by the squared size of its frame. Points are left out if the
+    others of the frame do not determine its fit, or if in a frame with missing points
+    the camera, an affine one of the mean shape, adds more than twice the noise variance
+    to their prediction. Otherwise a few frames with hardly enough points would decide.
+    The limit does not depend on the basis shapes, so that scores of different K are of
+    the same points.
     """
     folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
     seen = seen_points(tracks)

@@ -25,28 +25,14 @@ def refine_alternating(
     """
     Return the blocks that explain most of the motion, each from several starts.
 
-    Parameters
-    ----------
-    products : MotionProducts
-        Products of the frames after ISA; consecutive signals form a subspace.
-    starts : ndarray of shape (n_blocks, n_starts, 3, 3)
-        Starts of each block. The best one after six steps is used.
-    max_iter : int
-        Largest number of steps of a block.
-    tol : float
-        Convergence tolerance: the share of its energy that a step gains.
+    Consecutive signals of the products form a subspace. Of the starts (n_blocks,
+    n_starts, 3, 3) the best one after six steps is used. A block has converged when a
+    step gains less than `tol` of its energy.
 
-    Returns
-    -------
-    E : ndarray of shape (n_blocks, 3, 3)
-        Blocks of unit norm, of arbitrary sign: ``M_ik ~ alpha_ik M_0^i E_k``. The zero
-        matrix for a subspace without motion.
-    energy : ndarray of shape (n_blocks,)
-        ``sum_i ||alpha_ik M_0^i E_k||^2``.
-    n_iter : int
-        Largest number of steps of a block.
-    converged : bool
-        Whether all blocks have converged.
+    Returns the blocks E (n_blocks, 3, 3) of unit norm and arbitrary sign, ``M_ik ~
+    alpha_ik M_0^i E_k``, zero for a subspace without motion; their energies ``sum_i
+    ||alpha_ik M_0^i E_k||^2`` (n_blocks,); the largest number of steps of a block; and
+    whether all blocks have converged.
     """
     E, energy = np.zeros((len(starts), 3, 3)), np.zeros(len(starts))
     n_iter, converged = 1, True

@@ -63,21 +63,9 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     Return for each subspace the matrix D_k that takes its motion to the rigid motion.
 
     D_k and alpha_k make ``sum_i ||M_ik D_k - alpha_ik M_0^i||_F^2`` small. With the
-    best alpha_k put in, this cost is a quadratic form in vec(D_k). The methods differ
-    in how they exclude ``D_k = 0``.
-
-    Parameters
-    ----------
-    products : MotionProducts
-        Products of the frames after ISA; consecutive signals form a subspace.
-    method : {"generalized_eigen", "eigen", "irls"}
-        See `AffineNRSfM`.
-
-    Returns
-    -------
-    ndarray of shape (n_blocks, 3, 3)
-        D_k with ``||D_k||_F = 1``, of arbitrary sign. The zero matrix for a subspace
-        without motion.
+    best alpha_k put in, this cost is a quadratic form in vec(D_k). The methods, one of
+    `BLOCK_RECOVERIES`, differ in how they exclude ``D_k = 0``. The result (n_blocks, 3,
+    3) has norm one and arbitrary sign; it is zero for a subspace without motion.
     """
     energy = products.rigid_energies()
     blocks = products.blocks()
@@ -117,23 +105,13 @@ def _explained(m: NDArray, energy: NDArray) -> NDArray:
 
 def lifted_moments(products: MotionProducts) -> NDArray:
     """
-    Return the second moments of the lifted motions.
+    Return the second moments ``sum_i L_i[a, m] L_i[b, n]`` of the lifted motions.
 
     The motion of a frame is lifted from the image to space by a regularised inverse of
     its rigid camera, ``L_i = (M_0^iT M_0^i + ridge I)^-1 M_0^iT M^i``, a 3 x n_signals
     matrix. If the motion of subspace k is ``alpha_ik M_0^i E_k``, the columns of L_i
     that belong to it are nearly ``alpha_ik E_k``, and the leading eigenvector of their
-    second moments is nearly E_k.
-
-    Parameters
-    ----------
-    products : MotionProducts
-        Products of the frames.
-
-    Returns
-    -------
-    ndarray of shape (3, 3, n_signals, n_signals)
-        ``sum_i L_i[a, m] L_i[b, n]`` at (a, b, m, n).
+    second moments is nearly E_k. The result is (3, 3, n_signals, n_signals).
     """
     n_frames, _, n_signals = products.cross.shape
     energy = products.rigid_energies()

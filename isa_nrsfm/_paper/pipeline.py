@@ -62,27 +62,9 @@ def run_paper_pipeline(
     """
     Run the stages of the paper after the factorisation.
 
-    Parameters
-    ----------
-    factors : Factorisation
-        Factors of the measurement matrix.
-    n_components : int
-        K.
-    isa : object
-        Strategy of independent subspace analysis; it is fitted here.
-    block_recovery : str
-        Method of `recover_blocks`.
-    refinement : {"alternating", None}
-        Whether the blocks are refined.
-    max_iter, tol : int, float
-        As in `refine_alternating`.
-    report : callable
-        Called with the name of each finished stage.
-
-    Returns
-    -------
-    PaperResult
-        The shapes.
+    The strategy `isa` is fitted here. `block_recovery` is a method of `recover_blocks`,
+    `refinement` is "alternating" or None, and `max_iter` and `tol` are those of
+    `refine_alternating`. `report` is called with the name of each finished stage.
     """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)

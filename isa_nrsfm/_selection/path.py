@@ -115,31 +115,10 @@ def walk(
     """
     Yield scores of rows that are held out, for more and more basis shapes.
 
-    Parameters
-    ----------
-    whole : Part
-        All of the table. Without the joint refinement no fit starts from another one.
-    candidates : sequence of int
-        Numbers of basis shapes, ascending.
-    splits : sequence of tuple of ndarray
-        Rows that are fitted, and rows that are held out.
-    scorer : callable
-        Scores a fitted estimator on the rows of a split that are held out.
-    any_basis : bool, default=False
-        Whether the score is the same for any basis of the deformations. Then no basis
-        is looked for that `independence` asks for.
-    n_jobs : int, default=None
-        Number of splits that are fitted at the same time, as in joblib.
-
-    Yields
-    ------
-    Row
-        Scores of each candidate.
-
-    Raises
-    ------
-    ValueError
-        If the rows that are fitted in a split are too few for one of the candidates.
+    Candidates are numbers of basis shapes, ascending. Each split has the rows that are
+    fitted and those that are held out. With `any_basis` the score is the same for any
+    basis of the deformations, and none is looked for. `n_jobs` splits are fitted at the
+    same time. Without the joint refinement no fit starts from another one.
     """
     estimator, _, table, _ = whole
     joint = estimator.refinement == "joint"

@@ -103,29 +103,10 @@ def iterate(
     With few samples the published iteration mostly ends in cycles. The step length of a
     start that cycles is halved, which does not change its fixed points.
 
-    Parameters
-    ----------
-    W : ndarray of shape (n_batch, n_signals, n_signals)
-        Orthogonal starts.
-    Z : ndarray of shape (n_signals, n_samples)
-        White signals.
-    subspace_size : int
-        Rows in a subspace.
-    density : SubspaceDensity
-        The model.
-    max_iter : int
-        Largest number of steps of a start.
-    tol : float
-        Convergence tolerance on `subspace_change` by a step of length 1.
-
-    Returns
-    -------
-    W : ndarray of shape (n_batch, n_signals, n_signals)
-        Last iterates.
-    n_iter : ndarray of int, shape (n_batch,)
-        Steps of each start.
-    converged : ndarray of bool, shape (n_batch,)
-        Whether each start has converged.
+    W (n_batch, n_signals, n_signals) are orthogonal starts, Z (n_signals, n_samples)
+    white signals. `tol` is the tolerance on `subspace_change` by a step of length 1.
+    Returns the last iterates, and for each start the number of steps and whether it has
+    converged.
     """
     W = W.copy()
     n_iter = np.zeros(len(W), dtype=int)

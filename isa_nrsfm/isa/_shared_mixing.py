@@ -35,24 +35,16 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     is maximised over all invertible W by Newton steps. Each density p_k is the
     likeliest of a few, with heavy or light tails.
 
-    Parameters
-    ----------
-    signals : ndarray of shape (n_signals, n_samples, size)
-        Each sample of a signal is a vector of `size` coordinates: basis shapes with
-        three coordinates a point, or coefficients with one coordinate a frame. They
-        are taken as centred: means are not removed.
-    n_starts : int, default=8
-        Number of orthogonal starts: a canonical one, and rotations of it.
+    Signals are (n_signals, n_samples, size): each sample is a vector of `size`
+    coordinates, such as the points of basis shapes (3) or the frames of coefficients
+    (1). Means are not removed. The orthogonal starts are a canonical one, and rotations
+    of it.
 
-    Returns
-    -------
-    ndarray of shape (n_signals, n_signals)
-        W, invertible: ``tensordot(W, signals, 1)`` are the independent signals, each
-        with mean square 1 over its ``n_samples * size`` numbers. They are sorted by
-        likelihood, the least Gaussian one first. The skewness of each, over all of its
-        numbers, is non-negative. Where the signals have a rank r below their
-        number, only the first r rows give independent signals. The other rows give
-        signals of zeros.
+    The independent signals ``tensordot(W, signals, 1)`` have mean square 1 over their
+    ``n_samples * size`` numbers, and non-negative skewness. They are sorted by
+    likelihood, the least Gaussian one first. Where the signals have a rank r below
+    their number, only the first r rows of the invertible matrix W (n_signals,
+    n_signals) give independent signals, the others signals of zeros.
 
     Notes
     -----
