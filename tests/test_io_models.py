@@ -89,7 +89,10 @@ CASES = {
     "OwnISA": ({"refinement": None, "isa": OWN["OwnISA"]}, TABLE),
     "OwnDensity": ({"refinement": None, "isa": OWN["OwnDensity"]}, TABLE),
 }
-pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),
+    pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -203,17 +203,17 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         if name in entries and entries[name] not in choices:
             raise ValueError(f"its {name} is not known: {entries[name]}")
     _check_shapes({**vars(estimator), **entries})
-    each_scaled = entries["each_scaled"] is True
     estimator._model = TableModel(
         _frame_model(entries),
         estimator.mean_shape_,
         estimator.basis_,
         entries["layout"],
         getattr(estimator, "feature_names_in_", None),
-        None if each_scaled else entries["unit"],
+        entries["unit"],
     )
     estimator._n_features_out = len(estimator.basis_)
-    estimator.camera_, estimator.frames_scaled_ = entries["camera"], each_scaled
+    estimator.camera_ = entries["camera"]
+    estimator.frames_scaled_ = entries["unit"] is None
     if entries["sizes"] is not None:
         estimator._frame_sizes = entries["sizes"]
     if header["set_output"] is not None:
@@ -277,8 +277,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
     entries = {
         "camera": frames.camera,
         "layout": model.layout,
-        "each_scaled": model.unit is None,
-        "unit": model.unit or 1.0,
+        "unit": model.unit,
         "sizes": vars(estimator).get("_frame_sizes"),
     }
     if isinstance(frames, RigidFrames):
@@ -302,6 +301,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
+    misfit, turning = entries["certainty"].tolist()
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -310,7 +310,8 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
         certainty=DepthCertainty(
-            *entries["certainty"].tolist(),
+            misfit,
+            turning,
             entries["turns"],
             entries["depth_variances"],
             entries["alpha_covariance"],
