@@ -301,7 +301,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
     """Return the model of a frame of `_frame_entries`."""
     if "loss" not in entries:
         return RigidFrames(entries["mean_shape"], entries["basis"], entries["camera"])
-    misfit, turning = entries["certainty"].tolist()
+    total, turning = entries["certainty"].tolist()
     return PosteriorFrames(
         shapes=entries["shapes"],
         noise_variance=entries["noise_variance"],
@@ -310,7 +310,7 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
         gauge=FrameMap(entries["mixing"], entries["space"]),
         camera=entries["camera"],
         certainty=DepthCertainty(
-            misfit,
+            total,
             turning,
             entries["turns"],
             entries["depth_variances"],
