@@ -232,11 +232,15 @@ def test_tables_that_show_too_little_are_refused(name, refinement):
         estimator(refinement=refinement).fit(table)
 
 
-def test_rows_are_counted_from_the_first_one_where_some_show_nothing():
+@pytest.mark.parametrize(
+    ("spoilt", "message"),
+    [(np.nan, "row 5 with 3 point"), (0.1, r"equal in 1 frame\(s\), .* row 5")],
+)
+def test_rows_are_counted_from_the_first_one_where_some_show_nothing(spoilt, message):
     tracks = COMPLETE.tracks.copy()
     tracks[[1, 2]] = np.nan
-    tracks[5, 3:] = np.nan
-    with pytest.raises(ValueError, match="the first is row 5 with 3 point"):
+    tracks[5, 3 if np.isnan(spoilt) else 0 :] = spoilt
+    with pytest.raises(ValueError, match=message):
         estimator().fit(tracks.reshape(90, -1))
 
 
