@@ -305,12 +305,11 @@ def _paper_result(
 ) -> PaperResult:
     """Return the result of the paper's pipeline, and set the fitted strategy."""
     estimator.isa_ = clone(estimator.isa_)
-    refinement, max_iter = estimator.refinement, estimator.max_iter
+    max_iter = estimator.max_iter if estimator.refinement else 0
     tol = PAPER_TOL if estimator.tol is None else estimator.tol
     with warnings.catch_warnings():
-        if refinement == "joint":
-            # It only starts from this result.
-            refinement, max_iter, tol = "alternating", 200, 1e-5
+        if estimator.refinement == "joint":  # it only starts from this result
+            max_iter, tol = 200, 1e-5
             if estimator.isa is None:
                 warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
         return run_paper_pipeline(
@@ -318,7 +317,6 @@ def _paper_result(
             n_components,
             estimator.isa_,
             block_recovery=estimator.block_recovery,
-            refinement=refinement,
             max_iter=max_iter,
             tol=tol,
             report=report,

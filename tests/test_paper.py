@@ -23,7 +23,6 @@ from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
 OPTIONS = {
     "block_recovery": "generalized_eigen",
-    "refinement": "alternating",
     "max_iter": 500,
     "tol": 1e-12,
 }
@@ -37,9 +36,11 @@ class Found(NamedTuple):
     converged: bool
 
 
-def run(W, K, isa=None, report=lambda stage: None, **options):
+def run(W, K, isa=None, report=lambda stage: None, refinement="alternating", **options):
     isa = PooledFastICA(n_init=3, random_state=0) if isa is None else isa
     options = {**OPTIONS, **options}
+    if refinement is None:
+        options["max_iter"] = 0
     shapes, *others = run_paper_pipeline(
         factorise(W, K), K, isa, report=report, **options
     )

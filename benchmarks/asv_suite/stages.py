@@ -78,7 +78,6 @@ def prepared(name):
         K,
         isa,
         block_recovery="generalized_eigen",
-        refinement="alternating",
         max_iter=200,
         tol=1e-5,
         report=lambda stage: None,

@@ -54,7 +54,6 @@ def run_paper_pipeline(
     isa: Any,
     *,
     block_recovery: str,
-    refinement: str | None,
     max_iter: int,
     tol: float,
     report: Callable[[str], None],
@@ -62,9 +61,9 @@ def run_paper_pipeline(
     """
     Run the stages of the paper after the factorisation.
 
-    The strategy `isa` is fitted here. `block_recovery` is a method of `recover_blocks`,
-    `refinement` is "alternating" or None, and `max_iter` and `tol` are those of
-    `refine_alternating`. `report` is called with the name of each finished stage.
+    The strategy `isa` is fitted here. `block_recovery` is a method of `recover_blocks`.
+    `max_iter` and `tol` are those of `refine_alternating`; zero steps leave it out.
+    `report` is called with the name of each finished stage.
     """
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
@@ -77,7 +76,7 @@ def run_paper_pipeline(
     products = products.rotated(components)
     E = np.linalg.pinv(recover_blocks(products, block_recovery), rcond=OF_RANKS)
     n_iter, converged = 1, True
-    if refinement == "alternating":
+    if max_iter:
         lifted = leading_blocks(moments, components.reshape(len(E), 3, -1))
         plain = np.broadcast_to(np.eye(3), (len(E), 1, 3, 3))
         starts = np.concatenate([E[:, None], lifted, plain], axis=1)
