@@ -7,9 +7,13 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
-from isa_nrsfm._frames.point_sums import ShapeProducts, frame_sums, frame_tracks
+from isa_nrsfm._frames.point_sums import (
+    ShapeProducts,
+    camera_gram,
+    frame_sums,
+    frame_tracks,
+)
 from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
 from isa_nrsfm._linalg.vectors import frames_first
 

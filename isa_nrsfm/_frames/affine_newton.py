@@ -24,10 +24,10 @@ still. The others are Newton steps, damped by ``H + s2 I``.
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.point_sums import (
     TWICE,
     affine_cameras,
+    camera_gram,
     seen_changes,
     whitened,
     with_one,

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.packed_symmetric import (
     COLUMNS,
+    DIAGONAL,
     ROWS,
-    diagonal_of,
     inverse3,
-    invert_positive,
     packed_products,
     unpack3,
     unpacked,
@@ -124,10 +123,21 @@ class CalibratedCameras:
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
         """Return inverses (p, p, n); a scale without curvature does not move."""
-        C = self.curvature(M, curvature)
-        diagonal = diagonal_of(C)
-        C[diagonal[:3]] += 1e-9 * C[diagonal[:3]].mean(axis=0)
-        return unpacked(invert_positive(C)[0])
+        C = unpacked(self.curvature(M, curvature))
+        turns = C[ROWS, COLUMNS]
+        turns[DIAGONAL] += 1e-9 * turns[DIAGONAL].mean(axis=0)
+        inverse = inverse3(turns)
+        if not self.scaled:
+            return inverse
+        # By the Schur complement d - c^T B^-1 c in [[B, c], [c^T, d]]
+        across, scale = C[:3, 3], C[3, 3]
+        turn = np.einsum("abn,bn->an", inverse, across)
+        rest = np.maximum(scale - np.einsum("an,an->n", across, turn), 1e-9 * scale)
+        rest = np.divide(1.0, rest, where=rest > 0, out=np.zeros_like(rest))
+        C[:3, :3] = inverse + rest * turn[:, None] * turn
+        C[:3, 3] = C[3, :3] = -rest * turn
+        C[3, 3] = rest
+        return C
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
         """Return vectors (p, n) times the inverse curvature."""
@@ -160,17 +170,14 @@ CAMERAS: dict[str, CameraModel] = {
 }
 
 
-def camera_gram(M: NDArray) -> NDArray:
-    """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
-    return np.einsum("rpi,rpi->pi", M[:, ROWS], M[:, COLUMNS])
-
-
 def turning(M: NDArray) -> NDArray:
     """Return ``M hat(e_c)`` (3, 2, 3, n), whose rows are ``m x e_c``."""
-    zero = np.zeros_like(M[:, 0])
     x, y, z = M[:, 0], M[:, 1], M[:, 2]
-    rows = [(zero, z, -y), (-z, zero, x), (y, -x, zero)]
-    return np.stack([np.stack(row, axis=1) for row in rows])
+    D = np.zeros((3, *M.shape))
+    D[0, :, 1], D[1, :, 0] = z, -z
+    D[0, :, 2], D[2, :, 0] = -y, y
+    D[1, :, 2], D[2, :, 1] = x, -x
+    return D
 
 
 def rotated(M: NDArray, turns: NDArray) -> NDArray:

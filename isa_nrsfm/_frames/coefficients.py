@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import camera_gram
-from isa_nrsfm._frames.point_sums import FrameSums, with_one
+from isa_nrsfm._frames.point_sums import FrameSums, camera_gram, with_one
 from isa_nrsfm._linalg.packed_symmetric import (
     diagonal_of,
     packed_rows,

@@ -178,6 +178,11 @@ def with_one(alpha: NDArray) -> NDArray:
     return np.concatenate([np.ones((1, alpha.shape[1])), alpha])
 
 
+def camera_gram(M: NDArray) -> NDArray:
+    """Return ``M^T M`` (6, n_frames) of cameras (2, 3, n_frames), packed."""
+    return np.einsum("rpi,rpi->pi", M[:, ROWS], M[:, COLUMNS])
+
+
 def affine_cameras(
     products: FrameSums, c: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:

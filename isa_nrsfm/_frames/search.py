@@ -65,7 +65,7 @@ class FramePosterior(NamedTuple):
         size = n_components if covariances else 0
         shapes = (2, 3), (2,), (n_components,), (size, size), (3, 3), ()
         parts: list[Any] = [np.full((n_frames, *shape), np.nan) for shape in shapes]
-        return cls(*parts, converged=np.zeros(n_frames, dtype=bool))
+        return cls._make([*parts, np.zeros(n_frames, dtype=bool)])
 
     def take(self, frames: NDArray) -> Self:
         """Return the fits of some of the frames."""

@@ -32,9 +32,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import camera_gram
 from isa_nrsfm._frames.coefficients import coefficient_posterior
-from isa_nrsfm._frames.point_sums import FrameTracks, ShapeProducts, frame_sums
+from isa_nrsfm._frames.point_sums import (
+    FrameTracks,
+    ShapeProducts,
+    camera_gram,
+    frame_sums,
+)
 from isa_nrsfm._joint.extents import extent_penalty
 from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
 from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked

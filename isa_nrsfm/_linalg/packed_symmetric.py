@@ -29,8 +29,30 @@ def unpack3(packed: NDArray) -> NDArray:
 
 
 def inverse3(packed: NDArray) -> NDArray:
-    """Return the inverses (3, 3, n) of positive semidefinite matrices (6, n)."""
-    return unpack3(invert_positive(packed)[0])
+    """
+    Return the inverses (3, 3, n) of positive semidefinite matrices (6, n).
+
+    Those of singular ones are generalised inverses, with a row and a column of zeros
+    for each coordinate that the ones before it determine.
+    """
+    a, d, e, b, f, c = packed
+    # R = L^-1 of the Cholesky factor L
+    R = np.zeros((3, 3, packed.shape[-1]))
+    R[0, 0] = x = _inverse_root(a, a)
+    xy, xz = d * x, e * x  # the first column of L
+    R[1, 1] = y = _inverse_root(b - xy * xy, b)
+    yz = (f - xz * xy) * y
+    R[2, 2] = z = _inverse_root(c - xz * xz - yz * yz, c)
+    R[1, 0] = -xy * x * y
+    R[2, 0] = -(xz * x + yz * R[1, 0]) * z
+    R[2, 1] = -yz * y * z
+    return np.einsum("can,cbn->abn", R, R)
+
+
+def _inverse_root(pivot: NDArray, diagonal: NDArray) -> NDArray:
+    """Return ``pivot^(-1/2)`` (n,), zero where the pivot is rounding error."""
+    kept = pivot > OF_STEPS * diagonal
+    return kept / np.sqrt(np.where(kept, pivot, 1.0))
 
 
 def pair_indices(k: int) -> tuple[NDArray, NDArray]:
