@@ -58,7 +58,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     found = frames.posterior(tracks, covariances=False)
     if frames.loss != "linear":
         off = distances(tracks, frames.shapes, *found[:3])
-        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
+        outlying: NDArray = off > OUTLYING * np.sqrt(frames.noise_variance)
         part = np.where(outlying[:, None], np.nan, part)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
