@@ -58,12 +58,12 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     found = frames.posterior(tracks, covariances=False)
     if frames.loss != "linear":
         off = distances(tracks, frames.shapes, *found[:3])
-        outlying: NDArray = off > OUTLYING * np.sqrt(frames.noise_variance)
+        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
         part = np.where(outlying[:, None], np.nan, part)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
-    seen = np.isfinite(part).all(axis=1)
+    seen: NDArray = np.isfinite(part).all(axis=1)
     least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= LEAST_SEEN)
     if known.sum() < 2:
