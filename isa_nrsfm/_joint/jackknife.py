@@ -63,7 +63,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
-    seen: NDArray = np.isfinite(part).all(axis=1)
+    seen = np.asarray(np.isfinite(part).all(axis=1))
     least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= LEAST_SEEN)
     if known.sum() < 2:
