@@ -17,8 +17,7 @@ Write ``P_k = B_k W^T``, ``H_kl = <M B_k, M B_l>`` and c = (1, a). Half the grad
     H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k^T.
 
 The first step from a start takes ``H + s2 I`` in its place, half the Hessian with the
-camera held: f falls, as the camera that is best for the new coefficients is better
-still. The others are Newton steps, damped by ``H + s2 I``.
+camera held: f falls. The others are Newton steps, damped by ``H + s2 I``.
 """
 
 import numpy as np
@@ -41,16 +40,7 @@ from isa_nrsfm._linalg.packed_symmetric import (
 
 
 class AffineSearch(FrameSearch):
-    """
-    The search for affine cameras and coefficients of frames, for given shapes.
-
-    The coordinates of the search are those of `whitened`.
-
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes, rows centred.
-    """
+    """The search for affine cameras of shapes (K + 1, 3, J), which it whitens."""
 
     first_steps = 5
     rough_steps = 2
@@ -95,8 +85,7 @@ class AffineSearch(FrameSearch):
 def _held(
     problem: FrameProblem, alpha: NDArray, T: NDArray, M: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """
-    Return ``H + s2 I`` (n_pairs, n), packed, and minus half the gradient (K, n).
+    """Return packed ``H + s2 I`` (n_pairs, n) and minus half the gradient (K, n).
 
     T and the cameras M are those of `affine_cameras` for alpha (K, n).
     """

@@ -42,19 +42,10 @@ REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 
 
 class CalibratedSearch(FrameSearch):
-    """
-    The search for calibrated cameras of frames, for given shapes.
+    """The search for calibrated cameras of shapes (K + 1, 3, J), rows centred.
 
-    The coordinates of the search are the principal axes of the mean shape, the thinnest
-    one last.
-
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes, rows centred.
-    scaled : bool
-        Whether cameras have a scale of their own (weak perspective) or the scale one
-        (orthographic).
+    Its coordinates are the principal axes of the mean shape, the thinnest one last.
+    Cameras are `scaled` (weak perspective) or have the scale one (orthographic).
     """
 
     def __init__(self, shapes: NDArray, scaled: bool):
@@ -67,11 +58,7 @@ class CalibratedSearch(FrameSearch):
     def reversed_cameras(
         self, products: FrameSums, noise: float, motion: NDArray
     ) -> tuple[NDArray, NDArray]:
-        """
-        Return the better ones of cameras (n, 2, 3) and those reversed in depth.
-
-        Both are searched from. Also returned is which of them are new (n,).
-        """
+        """Return the better of cameras (n, 2, 3) and reversed ones, and their mask."""
         M = frames_last(motion @ self.space.T)
         problem = self.problem(products, np.full(len(motion), noise))
         # The cameras may not be at their minimum yet. Compare minima with minima. With
@@ -84,11 +71,9 @@ class CalibratedSearch(FrameSearch):
         return motion, better
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
-        """
-        Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
+        """Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 
-        Of two candidates, the nearest camera and that of `_completed`, the one with the
-        lower objective is taken.
+        The better one of the nearest camera and that of `_completed` is taken.
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
         starts = []
@@ -139,12 +124,10 @@ class CalibratedSearch(FrameSearch):
     def covariances(
         self, problem: FrameProblem, position: NDArray
     ) -> tuple[NDArray, NDArray]:
-        """
-        Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
+        """Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
 
-        They come from the inverse of the joint Hessian of camera and coefficients: ``s2
-        (Q + Q C^T Y^-1 C Q)``. C is the coupling, and Y the Hessian by the camera with
-        the coefficients eliminated.
+        With the coupling C and the Hessian Y by the camera, coefficients eliminated,
+        these come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``.
         """
         M, noise = position, problem.noise
         posterior = _posterior(problem, M)
@@ -176,10 +159,9 @@ class CalibratedSearch(FrameSearch):
     def _better_reversed(
         self, problem: FrameProblem, M: NDArray, max_steps: int
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """
-        Return the better ones of cameras (2, 3, n) and minima from reversed ones.
+        """Return the better of cameras (2, 3, n) and minima from reversed ones.
 
-        Also returned are which are new (n,), and which searches converged (n,).
+        Also returns masks of new cameras (n,) and of searches that converged (n,).
         """
         value = _value(problem, _posterior(problem, M))
         limit = value - 1e-10 * problem.energy
@@ -190,13 +172,11 @@ class CalibratedSearch(FrameSearch):
 
 
 def _completed(M: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return orthonormal rows and scales from the first two columns of affine cameras.
+    """Return orthonormal rows and scales from the first two columns of affine cameras.
 
-    The cameras (2, 3, n) belong to the principal axes of the mean shape. For thin
-    objects their third column, of the thinnest axis, is not determined. The first two
-    are ``U diag(s_1, s_2) V^T``. In a scaled rotation they go with the third column
-    ``+- sqrt(s_1^2 - s_2^2) u_2``. Its sign is taken from the affine camera.
+    For thin objects the third column of cameras (2, 3, n), of the thinnest axis, is not
+    determined. The first two are ``U diag(s_1, s_2) V^T``. In a scaled rotation the
+    third is ``+- sqrt(s_1^2 - s_2^2) u_2``, with the sign of the affine camera.
     """
     affine = frames_first(M)
     U, values, Vt = np.linalg.svd(affine[:, :, :2])

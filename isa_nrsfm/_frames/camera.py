@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 
 def rigid_cameras(W: NDArray, mean_shape: NDArray) -> NDArray:
-    """
-    Return affine cameras (n, 2, 3) of least squares for W (2 n, J) and a shape (J, 3).
+    """Return least squares affine cameras (n, 2, 3) of W (2 n, J) and a shape (J, 3).
 
     They are those of least norm where the mean shape is flat.
     """
@@ -23,12 +22,11 @@ def mean_view(motion: NDArray) -> NDArray | None:
 
 
 def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
-    """
-    Return a camera (2, 3) that sees shapes as the table shows them.
+    """Return a camera (2, 3) that sees shapes as the table shows them.
 
-    It is the mean of the cameras (n, 2, 3), divided by the sizes (n,) of their frames,
-    times the root mean square size. If they have no common view, it is the view along
-    the third axis, each axis scaled by its root mean square length in the cameras.
+    The mean of the cameras (n, 2, 3), divided by the sizes (n,) of their frames, times
+    the RMS size. If they have no common view, the view along the third axis, each axis
+    scaled by its RMS length in the cameras.
     """
     camera = mean_view(motion)
     if camera is None:

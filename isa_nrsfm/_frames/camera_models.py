@@ -1,10 +1,9 @@
 """Camera models: which 2x3 matrices a camera may be, and how to move among them.
 
-A camera M_i of a frame is a free 2x3 matrix (affine), the first two rows of a rotation
-times a scale (weak perspective), or such rows with a scale that is known
-(orthographic). All other modules treat cameras alike. They compute the derivative
-``G_i = dF/dM_i`` of an objective F and its curvature ``A_i`` by the rows of M_i. A
-model of cameras transforms both to its own parameters.
+A camera M_i is a free 2x3 matrix (affine), the first two rows of a rotation times a
+scale (weak perspective), or such rows with a known scale (orthographic). Other modules
+treat cameras alike: they compute the derivative ``G_i = dF/dM_i`` of an objective F and
+its curvature ``A_i`` by the rows of M_i. A model transforms both to its parameters.
 
 A step of a calibrated camera is a rotation vector w and a change l of the logarithm of
 its scale ::
@@ -37,8 +36,7 @@ LARGEST_TURN = 1.0
 
 
 class AffineCameras:
-    """
-    Free 2x3 matrices; the parameters are their entries, row by row.
+    """Free 2x3 matrices; the parameters are their entries, row by row.
 
     Attributes
     ----------
@@ -181,11 +179,9 @@ def turning(M: NDArray) -> NDArray:
 
 
 def rotated(M: NDArray, turns: NDArray) -> NDArray:
-    """
-    Return cameras (2, 3, n) times rotations by vectors w (3, n), ``M exp(hat(w))``.
+    """Return cameras (2, 3, n) times rotations by vectors w (3, n), ``M exp(hat(w))``.
 
-    Rows are ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2`` with t =
-    |w|.
+    Rows are ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2``, t = |w|.
     """
     angle = np.sqrt(np.einsum("an,an->n", turns, turns))
     along = np.einsum("ran,an->rn", M, turns)[:, None]
@@ -203,11 +199,7 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return rotations (n, 3, 3) and scales (n,) of calibrated cameras (n, 2, 3).
-
-    NaN where a frame has no camera.
-    """
+    """Return rotations (n, 3, 3) and scales (n,) of cameras (n, 2, 3), also NaN."""
     dtype = motion.dtype
     motion = motion.astype(np.float64)  # squares may leave the range of float32
     scales = np.sqrt(np.einsum("irc,irc->i", motion, motion) / 2)

@@ -25,16 +25,14 @@ from isa_nrsfm._linalg.packed_symmetric import (
 
 
 class CoefficientPosterior(NamedTuple):
-    """
-    Posterior of the coefficients of frames.
+    """Posterior of the coefficients of frames.
 
     Attributes
     ----------
     c : ndarray of shape (n_shapes, n_frames)
         One, and the posterior means of the coefficients.
     inverse : ndarray of shape (n_pairs, n_frames)
-        Minus Q, packed, with a row and a column for the mean shape as well. Those have
-        no meaning.
+        Minus Q, packed, with a meaningless row and column for the mean shape.
     objective : ndarray of shape (n_frames,)
         ``min_a ||W - M S(a)||^2 + s2 |a|^2``.
     log_determinant : ndarray of shape (n_frames,)
@@ -59,11 +57,7 @@ class CoefficientPosterior(NamedTuple):
         return self.objective - noise * np.einsum("ki,ki->i", self.alpha, self.alpha)
 
     def spread(self, noise: NDArray | float) -> NDArray:
-        """
-        Return ``tr(H s2 Q)``, the expected energy of posterior deviations in the image.
-
-        With ``H Q = I - s2 Q`` it is ``s2 (K - s2 tr Q)``.
-        """
+        """Return ``tr(H s2 Q) = s2 (K - s2 tr Q)``, the image's posterior variance."""
         diagonal = diagonal_of(self.inverse)[1:]
         return noise * (len(diagonal) + noise * self.inverse[diagonal].sum(axis=0))
 
@@ -85,12 +79,10 @@ def coefficient_posterior(
     *,
     refined: bool = False,
 ) -> CoefficientPosterior:
-    """
-    Return the posterior of the coefficients of frames for cameras M (2, 3, n).
+    """Return the posterior of the coefficients of frames for cameras M (2, 3, n).
 
-    The noise variances are one number or (n,). With refined, a step of iterative
-    refinement keeps rounding errors small where they are divided by a tiny noise
-    variance.
+    If `refined`, a step of iterative refinement keeps rounding errors small where they
+    are divided by a tiny noise variance.
     """
     H = products.gram.energies(camera_gram(M))
     seen = np.einsum("kari,rai->ki", products.cross, M)

@@ -1,9 +1,9 @@
 """Camera, position and coefficients of single frames for given shapes.
 
-Each frame is fitted by itself: the result of a frame does not depend on the others.
-There are two models of a frame. `RigidFrames`, the paper's, takes the camera of the
-mean shape alone, and then coefficients of least squares. `PosteriorFrames`, that of the
-joint refinement, takes the most probable camera and coefficients together.
+The result of a frame does not depend on the others. `RigidFrames`, the paper's model,
+takes the camera of the mean shape alone, then coefficients of least squares.
+`PosteriorFrames`, that of the joint refinement, takes the most probable camera and
+coefficients together.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -53,14 +53,13 @@ class Decomposition(NamedTuple):
 
 
 class FrameMap(NamedTuple):
-    """
-    Takes cameras and coefficients of frames to other shapes that fit equally well.
+    """Maps cameras and coefficients of frames to other shapes that fit equally well.
 
     Attributes
     ----------
     mixing : ndarray of shape (n_components + 1, n_components + 1)
-        Takes ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale, different for
-        each frame, goes to its camera.
+        Maps ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale, different for each
+        frame, goes to its camera.
     space : ndarray of shape (3, 3)
         Affinity of space, ``new shape = shape @ space.T``.
     """
@@ -76,11 +75,10 @@ class FrameMap(NamedTuple):
     def apply(
         self, motion: NDArray, alpha: NDArray, covariance: NDArray | None
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """
-        Return cameras, coefficients and standard deviations for the new shapes.
+        """Return cameras, coefficients and standard deviations for the new shapes.
 
-        The arrays are motion (n, 2, 3), alpha (n, K), covariance (n, K, K) or None.
-        Standard deviations (n, K) are to first order, NaN without covariances.
+        Motion is (n, 2, 3), alpha (n, K), covariance (n, K, K) or None. Standard
+        deviations (n, K) are to first order, NaN without covariances.
         """
         new, deviation, scale = self.coefficients(alpha, covariance)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
@@ -102,20 +100,17 @@ class FrameMap(NamedTuple):
 
 
 class RigidFrames(NamedTuple):
-    """
-    The paper's model of a frame: rigid camera, coefficients by least squares.
+    """The paper's model of a frame: rigid camera, coefficients by least squares.
 
     Attributes
     ----------
     mean_shape : ndarray of shape (n_points, 3)
         Centred.
     basis : ndarray of shape (n_components, n_points, 3)
-        Centred basis shapes, orthogonal to each other and to the mean shape as the
-        paper's are: ``B_k B_l^T = 0`` (3x3) for different k and l. The least squares
-        then separate where no point is missing.
+        Centred basis shapes, ``B_k B_l^T = 0`` (3x3) for different k and l, with the
+        mean shape as B_0. The least squares then separate where no point is missing.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        Model of the cameras. Calibrated ones are the nearest to the affine cameras of
-        the rigid fit. Orthographic ones have the scale one.
+        Calibrated cameras are the nearest to those of the rigid fit.
     """
 
     mean_shape: NDArray
@@ -136,13 +131,11 @@ class RigidFrames(NamedTuple):
     def fit(
         self, tracks: NDArray, sizes: NDArray, deviations: bool = True
     ) -> Decomposition:
-        """
-        Return the camera of the rigid fit and the coefficients of least squares.
+        """Return the camera of the rigid fit and the coefficients of least squares.
 
         ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or zero
         where camera i does not see basis shape k at all. Otherwise the solution of
-        least norm. The other parameters are those of `PosteriorFrames.fit` and do not
-        matter.
+        least norm. The other parameters of `PosteriorFrames.fit` do not matter.
         """
         n_frames, n_components = len(tracks), len(self.basis)
         fit = Decomposition(
@@ -197,8 +190,7 @@ class RigidFrames(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PosteriorFrames:
-    """
-    The joint refinement's model of a frame: its posterior, camera and coefficients.
+    """The joint refinement's model of a frame: its posterior, camera and coefficients.
 
     Attributes
     ----------
@@ -207,14 +199,12 @@ class PosteriorFrames:
     noise_variance : float
         Noise variance of a coordinate, for frames of size one.
     starts : ndarray of shape (n_starts, n_components)
-        Further coefficients to start from, for frames that the fit from zero explains
-        badly.
+        Further coefficients to start from if the fit from zero is bad.
     loss : {"linear", "huber", "cauchy"}
-        How points count that are far from the model.
+        Loss of the residuals.
     gauge : FrameMap
-        Takes cameras and coefficients to those of the public shapes.
+        Maps cameras and coefficients to those of the public shapes.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        Model of the cameras. Orthographic ones have the scale one.
     certainty : DepthCertainty
         Uncertainty of the fit of the shapes, with calibrated cameras.
     """
@@ -242,11 +232,10 @@ class PosteriorFrames:
         return replace(self, gauge=self.gauge._replace(space=space))
 
     def of_points(self, kept: NDArray) -> "PosteriorFrames":
-        """
-        Return the model of frames that have only some of the points (n_points,).
+        """Return the model of frames that have only some of the points (n_points,).
 
-        Complete frames of these points are fitted faster than frames of which the
-        others are missing. Positions are images of the centroid of these points.
+        It is faster than frames with missing points. Positions are images of the
+        centroid of these points.
         """
         shapes = self.shapes[:, :, kept]
         return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
@@ -254,11 +243,9 @@ class PosteriorFrames:
     def fit(
         self, tracks: NDArray, sizes: NDArray, deviations: bool = True
     ) -> Decomposition:
-        """
-        Return the fit of tracks (n, n_points, 2), NaN where a point is missing.
+        """Return the fit of tracks (n, J, 2), NaN where missing, of sizes (n,).
 
-        The sizes of the frames are (n,). Without deviations standard deviations are
-        NaN. With a robust loss the weights are those of the residuals of the fit.
+        With a robust loss the weights are those of the residuals of the fit.
         """
         unit = tracks / sizes[:, None, None]
         return self.shown(self.posterior(unit, covariances=deviations), sizes)
@@ -281,20 +268,14 @@ class PosteriorFrames:
         )
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
-        """
-        Return the fit of prepared frames of size one, before the gauge.
+        """Return the fit of prepared frames of size one, before the gauge.
 
-        They are given by points or directions, as the shapes are. Weights are zero or
-        one.
+        Points or directions, as the shapes are, with weights zero or one.
         """
         return fit_frames(block, self._search, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
-        """
-        Compute standard deviations (n, n_points) of the depths of points.
-
-        Tracks and sizes are those of `fit`. Only for calibrated cameras.
-        """
+        """Return standard deviations (n, J) of depths with calibrated cameras."""
         found = self.posterior(tracks / sizes[:, None, None], covariances=False)
         return sizes[:, None] * depth_deviations(
             self.shapes,
@@ -307,8 +288,7 @@ class PosteriorFrames:
         )
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
-        """
-        Return the fit of tracks of frames of size one, before the gauge.
+        """Return the fit of tracks of frames of size one, before the gauge.
 
         With a robust loss the weights are those of the residuals, as far as the points
         that have weights determine a camera.

@@ -7,9 +7,9 @@ matrices ``G_i,kl`` of the shapes over its points ::
     P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T,
     G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T.
 
-Here ``mean_i`` is the weighted mean of the frame's points, and ``mean_ik`` that of the
-points of shape k with the same weights. The index of the frame is the last one of all
-arrays, so that each sum is one matrix product for all frames.
+Here ``mean_i`` and ``mean_ik`` are the weighted means of the points of the frame and of
+shape k. The frame is the last index of all arrays, so that each sum is one matrix
+product for all frames.
 """
 
 from collections.abc import Iterator
@@ -40,8 +40,7 @@ FLAT = 1e-10
 
 
 class Gram:
-    """
-    The Gram matrices of shapes: one for all frames that are complete, or one for each.
+    """The Gram matrices of shapes: one for all complete frames, or one for each frame.
 
     Parameters
     ----------
@@ -64,10 +63,7 @@ class Gram:
         return 2.0 * np.take(flat, entries.reshape(-1, len(entries)), axis=0)
 
     def products(self, c: NDArray) -> NDArray:
-        """Return ``B_k S_i^T + S_i B_k^T`` (n_shapes, 6, n), ``S_i = sum_l c_il B_l``.
-
-        The coefficients c are (n_shapes, n); the products are packed.
-        """
+        """Return packed ``B_k S_i^T + S_i B_k^T`` (n_shapes, 6, n), c (n_shapes, n)."""
         return _times(self._full, c).reshape(len(c), 6, c.shape[1])
 
     def moments(self, C: NDArray) -> NDArray:
@@ -93,8 +89,7 @@ def _times(matrices: NDArray, vectors: NDArray) -> NDArray:
 
 
 class FrameTracks(NamedTuple):
-    """
-    Tracks with the frame index last, ready for products with any shapes.
+    """Tracks with the frame index last, ready for products with any shapes.
 
     Attributes
     ----------
@@ -104,10 +99,8 @@ class FrameTracks(NamedTuple):
         w_ij; None where all are 1.
     centroid : ndarray of shape (2, n_frames)
         ``mean_i``, the weighted mean of the points. Zero for frames without points.
-    weight : ndarray of shape (n_frames,)
-        ``sum_j w_ij``.
-    energy : ndarray of shape (n_frames,)
-        ``sum_j w_ij ||m_ij - mean_i||^2``.
+    weight, energy : ndarray of shape (n_frames,)
+        ``sum_j w_ij`` and ``sum_j w_ij ||m_ij - mean_i||^2``.
     """
 
     weighted: NDArray
@@ -132,15 +125,14 @@ class FrameTracks(NamedTuple):
 
 
 class FrameSums(NamedTuple):
-    """
-    Sums over the points of frames, with weights w_ij.
+    """Sums over the points of frames, with weights w_ij.
 
     Attributes
     ----------
     cross : ndarray of shape (n_shapes, 3, 2, n_frames)
-        ``P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T``.
+        ``P_ik``.
     gram : Gram
-        ``G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T``.
+        ``G_i,kl``.
     shape_centroid : ndarray of shape (n_shapes, 3, n_frames)
         ``mean_ik``, weighted means of the points of the shapes.
     centroid, weight, energy : ndarray
@@ -155,10 +147,9 @@ class FrameSums(NamedTuple):
     energy: NDArray
 
     def positions(self, motion: NDArray, alpha: NDArray) -> NDArray:
-        """
-        Return where frames show the origin of the shapes (n, 2), by least squares.
+        """Return positions ``mean_i - M_i sum_k c_ik mean_ik`` (n, 2).
 
-        It is ``mean_i - M_i sum_k c_ik mean_ik`` for motion (n, 2, 3) and alpha (n, K).
+        They are the images of the origin of the shapes, by least squares.
         """
         middle = np.einsum("kai,ki->ai", self.shape_centroid, with_one(alpha.T))
         return (self.centroid - np.einsum("ira,ai->ri", motion, middle)).T
@@ -186,11 +177,10 @@ def camera_gram(M: NDArray) -> NDArray:
 def affine_cameras(
     products: FrameSums, c: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """
-    Return the affine cameras of least squares for coefficients c (n_shapes, n).
+    """Return the affine cameras of least squares for coefficients c (n_shapes, n).
 
-    Returned are ``T_k = B_k S^T + S B_k^T`` (n_shapes, 6, n), packed, the inverse of
-    ``A = S S^T`` (3, 3, n), the cameras ``M = Y A^-1`` (2, 3, n) and ``<M, Y>`` (n,).
+    Returns ``T_k = B_k S^T + S B_k^T`` (n_shapes, 6, n), packed, the inverse of ``A = S
+    S^T`` (3, 3, n), the cameras ``M = Y A^-1`` (2, 3, n) and ``<M, Y>`` (n,).
     """
     T = products.gram.products(c)
     A = np.einsum("ki,kpi->pi", 0.5 * c, T)
@@ -211,11 +201,9 @@ def seen_changes(cross: NDArray, T: NDArray, M: NDArray) -> NDArray:
 
 
 def frame_tracks(tracks: NDArray, weights: NDArray | None = None) -> FrameTracks:
-    """
-    Return tracks with the frame index last, centred over the points of each frame.
+    """Return tracks (I, J, 2) with the frame index last, each frame centred.
 
-    Tracks are (n_frames, n_points, 2). Weights (n_frames, n_points) are non-negative,
-    by default 1. Points of weight zero may have any coordinates, also NaN.
+    Weights (I, J) are non-negative, by default 1. Points of weight zero may be NaN.
     """
     n_frames, n_points, _ = tracks.shape
     centred = np.array(tracks.transpose(1, 2, 0), dtype=np.float64, order="C")
@@ -252,14 +240,7 @@ def _share(weight: NDArray) -> NDArray:
 
 
 class ShapeProducts:
-    """
-    Products of shapes that all frames share, each computed when it is first needed.
-
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes, rows centred.
-    """
+    """Products of shapes (n_shapes, 3, J), rows centred, computed when first needed."""
 
     def __init__(self, shapes: NDArray):
         self.shapes = np.ascontiguousarray(shapes, dtype=np.float64)
@@ -331,12 +312,10 @@ def whitened(shapes: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
-    """
-    Return which frames (n,) have points that determine a camera.
+    """Return a mask (n,) of frames whose points determine a camera.
 
-    They extend along each direction along which the mean shape (3, n_points) extends:
-    1e-10 of its variance or more. The sums are those for `whitened` shapes, each frame
-    with its own Gram matrix.
+    They have 1e-10 or more of the variance of the mean shape (3, J) along each of its
+    directions. The sums are for `whitened` shapes, with a Gram matrix for each frame.
     """
     variance = np.einsum("aj,aj->a", mean_shape, mean_shape) / mean_shape.shape[1]
     inside = variance > 0

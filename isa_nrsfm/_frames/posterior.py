@@ -1,8 +1,8 @@
 """Camera, position and coefficients of single frames, for given shapes and noise.
 
-Each frame is fitted by itself, in blocks of frames, by the search for its model of the
-camera. The search starts from coefficients of zero. Frames whose objective is much
-larger than the noise explains start again from other coefficients.
+Frames are fitted in blocks by the search for their camera model, from coefficients of
+zero. Those whose objective is much larger than the noise explains start again from
+other coefficients.
 """
 
 import numpy as np
@@ -25,12 +25,7 @@ EQUAL = 1e-10
 
 
 def frame_search(camera: str, shapes: NDArray) -> FrameSearch:
-    """
-    Return the search for cameras of a model that see shapes (n_shapes, 3, n_points).
-
-    Rows are centred, and scaled such that alpha ~ N(0, I). The search serves all
-    tables.
-    """
+    """Return the search of a camera model for centred shapes with alpha ~ N(0, I)."""
     if camera == "affine":
         return AffineSearch(shapes)
     return CalibratedSearch(shapes, camera == "weak_perspective")
@@ -46,12 +41,10 @@ def fit_tracks(
     starts: NDArray | None = None,
     covariances: bool = True,
 ) -> FramePosterior:
-    """
-    Return the fit of tracks (n_frames, n_points, 2), NaN where a point is missing.
+    """Fit tracks (I, J, 2), NaN where a point is missing, as `fit_frames` does.
 
-    The noise variance is one number or (n_frames,); at least 1e-13 of the energy of a
-    frame is taken. Weights (n_frames, n_points) are by default 1 for all points that
-    are not NaN. The other parameters are those of `fit_frames`.
+    The noise variance is at least 1e-13 of the energy of a frame. Weights (I, J) are by
+    default 1 for all points that are not NaN.
     """
     tracks = np.asarray(tracks)
     n_frames = len(tracks)
@@ -88,37 +81,14 @@ def fit_frames(
     covariances: bool = True,
     rough: bool = False,
 ) -> FramePosterior:
-    """
-    Return the most probable camera, position and coefficients of each frame.
+    """Return the most probable camera, position and coefficients of each frame.
 
-    Parameters
-    ----------
-    frames : FrameTracks
-        The frames, by their points or by their products with directions.
-    search : FrameSearch
-        The search for the shapes, by points (centred) or directions as the frames.
-    noise : float or ndarray of shape (n_frames,)
-        Variance of a coordinate, in squared units of the tracks.
-    initial : ndarray of shape (n_frames, n_components), optional
-        Coefficients to start from, by default zeros.
-    starts : ndarray of shape (n_starts, n_components), optional
-        Coefficients to start from besides these, for frames whose first fit is much
-        worse than the noise explains.
-    covariances : bool, default=True
-        Whether covariances are wanted. The rest of the fit is the same without them.
-    rough : bool, default=False
-        Whether a few steps are enough, to cameras that are close to those of the fit.
+    Shapes of the search are by points (centred) or directions, as the frames. `initial`
+    (I, K) is by default zero. Frames whose fit is much worse than the noise explains
+    start again from each of `starts` (n_starts, K). `rough` ends after a few steps.
 
-    Returns
-    -------
-    FramePosterior
-        The best fit of each frame, independent of the others. NaN for frames whose
-        points do not determine a camera, such as fewer than four points of a solid.
-
-    Notes
-    -----
-    If only the mean shape is flat, coefficients of zero can be a saddle point: rounding
-    decides where the search goes from there, and further starts help.
+    Frames are independent, and NaN where points do not determine a camera. If only the
+    mean shape is flat, zero can be a saddle point: further starts help.
     """
     n_frames, n_components = len(frames.weight), search.shared.n_components
     noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
@@ -170,11 +140,7 @@ def fit_frames(
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
-    """
-    Return at most n_starts rows of alpha (n, K) far from zero and from each other.
-
-    Farthest point sampling, of rows without NaN.
-    """
+    """Return at most n_starts rows of alpha (n, K) by farthest point sampling."""
     alpha = alpha[np.isfinite(alpha).all(axis=1)]
     # Squared distance from zero and from the rows chosen so far
     distance = np.einsum("ik,ik->i", alpha, alpha)

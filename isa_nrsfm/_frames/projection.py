@@ -15,12 +15,10 @@ def reprojection_error(
     position: NDArray,
     alpha: NDArray,
 ) -> float:
-    """
-    Return the inverse SNR of the images of shapes (n_shapes, 3, n_points).
+    """Return the inverse SNR ``||W - W_hat||_F^2 / ||W||_F^2`` over the visible points.
 
-    It is ``||W - W_hat||_F^2 / ||W||_F^2`` over the seen points, each frame of W below
-    centred. Rows are blocks of frames (n, 2, n_points), NaN where a point is missing.
-    Motion (n, 2, 3), position (n, 2) and alpha (n, K) are those of all frames.
+    Frames of W, blocks (n, 2, J), are below centred. Motion (n, 2, 3), position (n, 2)
+    and alpha (n, K) are those of all frames, shapes (K + 1, 3, J).
     """
     found = rows.map(partial(_energies, shapes=shapes), motion, position, alpha)
     noise, signal = np.sum(list(found), axis=0)
@@ -42,40 +40,23 @@ def distances(
     translation: NDArray,
     alpha: NDArray,
 ) -> NDArray:
-    """
-    Return distances (n, J) of points (n, J, 2) from a model, NaN for missing ones.
-
-    The model is shapes (K + 1, 3, J), motion (n, 2, 3), translation (n, 2), alpha (n,
-    K).
-    """
+    """Return distances (n, J) of points (n, J, 2) from a model, NaN if missing."""
     stacked = shapes.transpose(0, 2, 1)
     model = project(compose(stacked[0], stacked[1:], alpha), motion, translation)
     return np.linalg.norm(tracks - model, axis=2)
 
 
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:
-    """
-    Return ``(1, alpha_i) (x) M_i`` (2 n, 3 K + 3) of motion (n, 2, 3), alpha (n, K).
-
-    Its product with the stacked shapes (3 K + 3, n_points) is the measurement matrix.
-    """
+    """Return the motion factor ``(1, alpha_i) (x) M_i`` (2 n, 3 K + 3)."""
     c = np.concatenate([np.ones((len(alpha), 1)), alpha], axis=1)
     return np.einsum("ik,irc->irkc", c, motion).reshape(2 * len(alpha), -1)
 
 
 def compose(mean_shape: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
-    """
-    Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, n_points, 3).
-
-    Arrays are mean_shape (n_points, 3), basis (K, n_points, 3) and alpha (n, K).
-    """
+    """Return the shapes of frames, ``B_0 + sum_k alpha_ik B_k`` (n, n_points, 3)."""
     return mean_shape + np.tensordot(alpha, basis, axes=1)
 
 
 def project(shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
-    """
-    Return the images (n, n_points, 2) of shapes (n, n_points, 3) in affine cameras.
-
-    Motion is (n, 2, 3) or (2, 3), translation (n, 2) or (2,).
-    """
+    """Return images (n, J, 2) of shapes (n, J, 3); motion (n, 2, 3) or (2, 3)."""
     return shapes @ np.swapaxes(motion, -1, -2) + np.expand_dims(translation, -2)

@@ -1,9 +1,8 @@
 """Newton's method for cameras and coefficients of many frames at once.
 
-Each frame has an objective of its own. The frame is the last index of all arrays. A
-step is damped where the Hessian is not positive definite or a step has raised the
-objective, so that this never rises, up to rounding. A frame leaves the problem when it
-has ended: the others go on without it.
+Each frame has an objective of its own. The frame is the last index of all arrays. Steps
+are damped where the Hessian is not positive definite or a step has raised the
+objective, so that this never rises, up to rounding. Frames leave when they have ended.
 """
 
 from typing import Any, NamedTuple, Self
@@ -23,8 +22,7 @@ LARGEST_DAMPING = 1e8
 
 
 class FramePosterior(NamedTuple):
-    """
-    Fits of frames; NaN for frames whose points do not determine a camera.
+    """Fits of frames; NaN for frames whose points do not determine a camera.
 
     Attributes
     ----------
@@ -33,18 +31,14 @@ class FramePosterior(NamedTuple):
     translation : ndarray of shape (n_frames, 2)
         Image of the origin of the shapes.
     alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    covariance : ndarray of shape (n_frames, n_components, n_components)
+    covariance : ndarray of shape (n_frames, n_components or 0, n_components or 0)
         Posterior covariance of alpha in the normal approximation at the optimum
-        (Laplace), with the uncertainty of camera and position. Of shape (n_frames, 0,
-        0) where covariances are not wanted.
+        (Laplace), with the uncertainty of camera and position.
     turn_covariance : ndarray of shape (n_frames, 3, 3)
         Posterior covariance of the rotation vectors w of ``M exp(hat(w))``, in radians
-        squared, with the uncertainty of the coefficients. NaN for affine cameras, and
-        where covariances are not wanted.
+        squared, with the uncertainty of the coefficients. NaN for affine cameras.
     objective : ndarray of shape (n_frames,)
-        ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2`` at the optimum. Its error is
-        below 1e-12 of the energy of the centred frame.
+        ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2``, to 1e-12 of the energy.
     converged : ndarray of bool, shape (n_frames,)
         Whether the last Newton step was below the convergence tolerance.
     """
@@ -94,8 +88,7 @@ class FrameProblem(NamedTuple):
 
 
 class State(NamedTuple):
-    """
-    The objectives of frames at some positions, and their derivatives.
+    """The objectives of frames at some positions, and their derivatives.
 
     Attributes
     ----------
@@ -138,15 +131,14 @@ class State(NamedTuple):
 
 
 class FrameSearch:
-    """
-    A search for cameras of one model that see given shapes, frame by frame.
+    """A search for cameras of one model that see given shapes, frame by frame.
 
     Parameters
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
         Mean shape and basis shapes in the coordinates of the search, rows centred.
     space : ndarray of shape (3, 3)
-        Takes the original shapes to these coordinates.
+        Maps the original shapes to these coordinates.
 
     Attributes
     ----------
@@ -172,11 +164,10 @@ class FrameSearch:
         covariances: bool = True,
         rough: bool = False,
     ) -> FramePosterior:
-        """
-        Return the minima that frames reach from coefficients initial (n, K).
+        """Return the minima that frames reach from coefficients initial (n, K).
 
-        The sums of the frames are those for the shapes in `shared`; the noise variances
-        are (n,). If it is rough, cameras need not be those of the lowest minimum.
+        The sums are those for the shapes in `shared`, the noise variances (n,). Rough
+        cameras need not be those of the lowest minimum.
         """
         problem = self.problem(products, variance)
         start = self.evaluate(problem, self.start(problem, initial.T))
@@ -245,12 +236,10 @@ class FrameSearch:
         max_steps: int,
         limit: NDArray | None = None,
     ) -> tuple[NDArray, NDArray]:
-        """
-        Minimise the objectives of frames.
+        """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
-        The search of a frame is given up where the predicted gain is so small that its
-        objective will not fall below its limit (n,). Returned are the last iterates
-        (..., n) and which have converged (n,).
+        A frame is given up where the predicted gain is so small that its objective will
+        not fall below its limit (n,).
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
@@ -292,11 +281,7 @@ class FrameSearch:
         return found, converged
 
     def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
-        """
-        Return damped Newton steps (p, n), and the damping (n,).
-
-        It is raised until the damped matrix is positive definite.
-        """
+        """Return Newton steps (p, n) and the damping (n,) that makes them definite."""
         damping = damping.copy()
         step, positive = state.newton_step(damping)
         failing = in_lanes(np.flatnonzero(~positive))

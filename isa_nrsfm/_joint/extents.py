@@ -1,16 +1,15 @@
 """Prior of the extents of the shapes, for calibrated cameras.
 
-Images of an object that hardly turns determine its depth only to second order. Depths
-that are c times as large, turned by angles that are c times smaller, have nearly the
-same images (bas-relief ambiguity: Belhumeur, Kriegman, Yuille, 1999). Whatever the
-model leaves of the images then decides on the depth. With the second moments ``G =
-sum_k B_k B_k^T`` of all shapes the objective contains ::
+Images of an object that hardly turns determine its depth only to second order: depths c
+times as large, turned by angles c times smaller, look nearly the same (bas-relief
+ambiguity: Belhumeur, Kriegman, Yuille, 1999). Unmodelled deformation then decides on
+the depth. With the second moments ``G = sum_k B_k B_k^T`` of all shapes the objective
+contains, for N coordinates, ::
 
     N weight (tr G / (3 det(G)^(1/3)) - 1),
 
-the ratio of the arithmetic to the geometric mean of the squared extents, for N
-coordinates. It is zero for shapes that extend alike in all directions, and grows with
-the number of coordinates as the misfit does: ``N log s2`` has to fall by as much.
+the ratio of the arithmetic to the geometric mean of the squared extents. It is zero for
+shapes that extend alike in all directions, and grows with N as the misfit does.
 """
 
 import numpy as np
@@ -26,10 +25,7 @@ FLAT = 1e-3
 
 
 def extent_penalty(shapes: NDArray, centred: bool = True) -> tuple[float, NDArray]:
-    """Compute the penalty of shapes (n_shapes, 3, n) and its gradient, for N weight 1.
-
-    Shapes that are not centred are centred first.
-    """
+    """Compute the penalty of shapes (n, 3, J) and its gradient, for N weight 1."""
     B = shapes if centred else shapes - shapes.mean(axis=2, keepdims=True)
     G = np.einsum("kaj,kbj->ab", B, B)
     mean = np.trace(G) / 3

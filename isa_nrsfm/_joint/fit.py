@@ -1,13 +1,12 @@
 """The joint fit: from the paper's result to the shapes of greatest likelihood.
 
-1. Starts with calibrated cameras (`starts`). The objective chooses the best of them.
-2. The fit of calibrated cameras, shapes and noise from these. While the model may be
-   wrong the noise variance has a floor. Otherwise deformation outside of the span of
-   the basis shapes would cause wrong depths and cameras.
-3. The fit of affine cameras, from the result of 2 and from the paper's result. The
-   lower objective counts. For calibrated cameras it serves for comparison only.
-4. The judgement of the model. It is right if its noise is at most that of the spectrum.
-   Then floor and prior are left out.
+1. Starts with calibrated cameras (`starts`); the objective chooses the best of them.
+2. The fit of calibrated cameras, shapes and noise, with a floor of the noise variance.
+   Otherwise unmodelled deformation would distort depths and cameras.
+3. The fit of affine cameras, from 2 and from the paper's result. The lower objective
+   counts. For calibrated cameras it serves for comparison only.
+4. The judgement. A model is right if its noise is at most that of the spectrum. Then
+   floor and prior are left out.
 
 Large tables take the first steps on a sample, and the last ones on all frames.
 """
@@ -31,20 +30,16 @@ from isa_nrsfm._linalg.rounding import OF_DISTANCES
 
 
 class Spectrum(NamedTuple):
-    """
-    Noise level and missing energy of a rank-(3K+3) model, from the singular values.
+    """Noise level and missing energy of a rank-(3K+3) model, from the singular values.
 
     Attributes
     ----------
     noise : float
-        Maximum likelihood estimate of the noise variance if the table without noise has
-        the rank 3K + 3, as a share of the mean square: the mean of the squared singular
-        values beyond (Tipping, Bishop, "Probabilistic principal component analysis",
-        1999, eq. 8). Zero if there are none.
+        Share of the mean square: the mean of the squared singular values beyond 3K + 3
+        (Tipping, Bishop, "Probabilistic principal component analysis", 1999, eq. 8).
     missing : float
-        Share of the energy beyond the K + 3 largest singular values. Each basis shape
-        takes at least one direction of the row space. For motion capture this is about
-        the share of the shapes that the best K basis shapes leave.
+        Share of the energy beyond the K + 3 largest singular values. For motion capture
+        about the share of the shapes that the best K basis shapes leave.
     """
 
     noise: float
@@ -66,19 +61,16 @@ class Spectrum(NamedTuple):
 
 
 class Start(NamedTuple):
-    """
-    Shapes and noise from which a joint fit may start, of a similar table.
+    """Shapes and noise of a similar table from which a joint fit may start.
 
     Attributes
     ----------
     shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape, and basis shapes as long as the standard deviation of their
-        coefficients.
+        Basis shapes are as long as the standard deviation of their coefficients.
     noise_variance : float
-        Variance of the noise of a coordinate.
+        Variance of a coordinate.
     calibrated_first : bool
-        Whether affine cameras are preceded by calibrated ones, as they are in the
-        search for starts. Has no meaning for calibrated cameras.
+        Whether a fit with calibrated cameras precedes that with affine ones.
     """
 
     shapes: NDArray
@@ -92,29 +84,12 @@ def fit_jointly(
     settings: JointSettings,
     starts: Sequence[Start] = (),
 ) -> tuple[JointFit, JointFrames, NDArray]:
-    """
-    Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
+    """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    Parameters
-    ----------
-    table : FactorisedTable
-        The table.
-    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes of the paper's pipeline.
-    settings : JointSettings
-        How the table is fitted.
-    starts : sequence of Start, default=()
-        Where the fit starts, instead of `paper_shapes` and the search for starts.
-
-    Returns
-    -------
-    fit : JointFit
-        Its shapes are centred, scaled and mixed such that alpha ~ N(0, I). The noise
-        variance is corrected for the unknowns of cameras and shapes.
-    frames : JointFrames
-        The frames as they were fitted in the end.
-    alpha : ndarray of shape (n_chosen, n_components)
-        Posterior means of the coefficients of the frames of the sample.
+    `paper_shapes` (K + 1, 3, J) are unused if `starts` are given. Returns the fit,
+    whose shapes are centred and mixed such that alpha ~ N(0, I) and whose noise is
+    corrected for degrees of freedom; the frames as fitted; and alpha (n_chosen, K) of
+    the sample.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1
@@ -163,7 +138,7 @@ def count_components(
 ) -> int:
     """Return the number of basis shapes that a table supports, at least one.
 
-    The arguments are as in `fit_jointly`, with more basis shapes than are expected.
+    Arguments as in `fit_jointly`, with more basis shapes than are expected.
     """
     problem = _problems(table, paper_shapes, settings)[0][0]
     fit, _ = _first_fit(problem, table, paper_shapes)
@@ -173,10 +148,10 @@ def count_components(
 def _problems(
     table: FactorisedTable, paper_shapes: NDArray, settings: JointSettings
 ) -> tuple[list[JointProblem], JointFrames | None]:
-    """Return the problems of larger and larger samples, and of all frames.
+    """Return the problems of growing samples and of all frames.
 
-    Of many points frames are completed and given by few directions. Where points are
-    missing or left out, the second result has the frames by the points that are seen.
+    Of many points frames are completed and given by directions. If points are missing
+    or left out, the second result holds the frames by their visible points.
     """
     n_shapes, _, n_points = paper_shapes.shape
     options, outliers = settings.options, table.outliers
@@ -211,10 +186,7 @@ def _problems(
 def _first_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
 ) -> tuple[JointFit, JointState]:
-    """Return the fit of the sample, with its ratio of noises, and one of its starts.
-
-    A calibrated and an affine fit are made in any case: the ratio needs both.
-    """
+    """Return the fit of the sample, with its ratio of noises, and one of its starts."""
     # Calibrated cameras, from the best starts
     settings, affine = problem.settings, CAMERAS["affine"]
     camera = settings.camera
@@ -246,8 +218,8 @@ def _continued_fit(
 ) -> tuple[JointFit, JointState]:
     """Return the fit from the best of given starts, and that start.
 
-    The first start is fitted. Each other one goes on only if it can catch up: it may
-    not lack more, after some steps, than the second half of them gained.
+    Starts after the first go on only if they can catch up: they may not lack more,
+    after some steps, than the second half of these gained.
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
@@ -312,19 +284,16 @@ def judged(
     cameras: CameraModel,
     spectrum: Spectrum,
 ) -> tuple[JointFit, float, bool]:
-    """
-    Decide whether K is sufficient and refit accordingly.
+    """Decide whether K is sufficient and refit accordingly.
 
     Returns the fit, its noise floor and the decision. A model is right if its residual
-    is no larger than the noise of the spectrum. Then the maximum of the likelihood
-    needs neither floor nor prior, and the fit without them is returned (released).
-    Deformation below the floor has vanished from the result, so that the released fit
-    is tried from the start of the fit as well.
+    is at most the noise of the spectrum. Then the fit is repeated without floor and
+    prior, also from its start: deformation below the floor has vanished from the
+    result.
 
-    A model that is not right has too few basis shapes, and cameras or depths explain
-    the deformation that is missing. Calibrated cameras are fitted again, with a floor
-    of the noise as high as that deformation. Orthographic ones, which have no scales
-    that could explain any of it, only if their noise is at the lower floor.
+    Otherwise there are too few basis shapes, and cameras or depths explain the missing
+    deformation. Calibrated cameras are fitted again, with a noise floor as high as that
+    deformation; orthographic ones only if their noise is at the lower floor.
     """
     options, mean_square = problem.settings.options, problem.mean_square
     least_noise = options.least_noise
@@ -368,14 +337,12 @@ def unregularised(
 def _freedom_correction(
     n_seen: NDArray, shape: tuple[int, int, int], n_pose: int
 ) -> float:
-    """
-    Return the number of seen coordinates N over the residual's degrees of freedom.
+    """Return the number of seen coordinates N over the residual's degrees of freedom.
 
-    Each frame has n_pose unknowns of camera and position. Coefficients are integrated
-    out and do not count. The n centred shapes of J points have
-    ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: n^2 of the mixing with
-    the mean shape and nine of the affinity of space, which share one scale. At least
-    ``N / 10`` degrees of freedom are assumed.
+    Each frame has n_pose unknowns; coefficients are integrated out. The n centred
+    shapes have ``3 n (J - 1)`` unknowns, less the ``n^2 + 8`` of the gauge: the mixing
+    and the affinity of space, which share one scale. At least ``N / 10`` degrees are
+    assumed.
     """
     n_shapes, _, n_points = shape
     n_frames, n_numbers = len(n_seen), 2.0 * n_seen.sum()

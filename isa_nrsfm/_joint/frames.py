@@ -1,9 +1,8 @@
 """Frames as the joint refinement passes over them: by points or by directions.
 
 The shapes of greatest likelihood are linear combinations of the rows of the measurement
-matrix. If no point is missing, the objective depends on a frame only through its
-energy and its inner products with directions that span the shapes. With these a pass
-over the frames costs the same for any number of points.
+matrix. If no point is missing, the objective depends on a frame only through its energy
+and its products with directions that span the shapes: cheap for any number of points.
 """
 
 from dataclasses import dataclass
@@ -37,16 +36,14 @@ class WeightedRows(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointFrames:
-    """
-    Frames of a table, ready for passes over them.
+    """Frames of a table, ready for passes over them.
 
     Attributes
     ----------
     blocks : FrameBlocks
         Blocks of FrameTracks. All of them have weights, or none has.
     directions : ndarray of shape (n_directions, n_points) or None
-        Orthonormal rows. Frames are given by their inner products with them, and by
-        their energy. None if frames are given by their points.
+        Orthonormal rows, or None if frames are given by their points.
     """
 
     blocks: FrameBlocks
@@ -75,10 +72,7 @@ class JointFrames:
 
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
-        """Return frames by their products with directions (n_directions, n_points).
-
-        The rows (n_frames, 2, n_points) are complete. Each direction has the sum zero.
-        """
+        """Return complete rows (I, 2, J) by products with directions of sum zero."""
         blocks = rows.derive(partial(_compressed_frames, directions=directions))
         return cls(blocks.regrouped(joined_frames, BLOCK_FRAMES), directions)
 
@@ -120,11 +114,7 @@ def _weighted_frames(block: WeightedRows) -> FrameTracks:
 
 
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
-    """Return complete frames (n_frames, 2, n_points) by their products with directions.
-
-    The directions take the place of points, whose centroid is zero. The number of
-    points and the energy are those of the frames themselves.
-    """
+    """Return complete frames (I, 2, J) with directions in the place of points."""
     n_frames, _, n_points = rows.shape
     products = (rows.reshape(2 * n_frames, -1) @ directions.T).reshape(n_frames, 2, -1)
     return FrameTracks(

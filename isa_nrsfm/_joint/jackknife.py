@@ -1,15 +1,14 @@
 """Errors of a fit with calibrated cameras, by leaving out groups of its points.
 
-Deformation that K basis shapes do not explain is common to neighbouring points and to
-many frames, and part of it looks like a rotation. A posterior covariance with
-independent noise is therefore too small. The delete-a-group jackknife (Efron and Stein,
-The Annals of Statistics, 1981) needs no model of the noise: with fits without each of g
-groups of neighbouring points the variance of an estimate t is ::
+Unmodelled deformation is common to neighbouring points and to many frames, and part of
+it looks like a rotation. A posterior covariance with independent noise is therefore too
+small. The delete-a-group jackknife (Efron and Stein, The Annals of Statistics, 1981)
+needs no model of the noise: from fits without each of g groups of neighbouring points
+the variance of an estimate t is ::
 
     (g - 1) / g sum_g (t_g - t)^2.
 
-The fits without a group do not have the prior of the extents. Depths that only this
-prior keeps in bounds differ between them.
+These fits do not have the prior of the extents, which would hide uncertain depths.
 """
 
 from functools import partial
@@ -45,11 +44,9 @@ OUTLYING = 4.0
 
 
 def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """
-    Estimate the errors of a fit from some of its frames (n_frames, 2, n_points).
+    """Estimate the errors of a fit from some of its frames (n_frames, 2, n_points).
 
-    The frames have size one, and NaN where a point is missing. The result has no
-    estimates if too few points or frames are left.
+    The result has no estimates if too few points or frames are left.
     """
     n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
@@ -142,8 +139,7 @@ class _Refit:
         self.depths = z - z.mean(axis=1, keepdims=True)
 
     def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray, NDArray]:
-        """
-        Compute squared differences from the fit of all points.
+        """Compute squared differences from the fit of all points.
 
         Relative square of the depths; mean products of the rotation vectors (3, 3);
         mean squares of the depths (n_points,); mean products of the coefficients.

@@ -1,28 +1,25 @@
 """Marginal likelihood of cameras and shapes, with the coefficients integrated out.
 
-The coefficients of a frame are drawn from ``N(0, I)``. Every coordinate has noise of
-variance s2. Write ``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then
-minus twice the log likelihood of all frames is, up to a constant ::
+Coefficients have the prior ``N(0, I)``, coordinates noise of variance s2. Write ``c =
+(1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then minus twice the log
+likelihood of all frames is, up to a constant ::
 
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
                        + log det(I + H_i / s2) ]
 
-with N the number of coordinates that were seen. The objective is that plus ``penalty
-* sum_i tr H_i``, minus twice the log prior of the basis shapes: it penalises their
-motion in the images. Calibrated cameras add the prior of the extents of the shapes
-(`extents`). So the objective is minus twice a log posterior.
+with N the number of coordinates that were seen. The objective adds ``penalty * sum_i tr
+H_i``, minus twice the log prior of the basis shapes, and with calibrated cameras the
+prior of the extents (`extents`).
 
 Positions are eliminated by least squares: tracks and shapes are centred over the seen
-points of each frame. Without weights all frames see all points, and the shapes that are
-passed have to be centred already.
+points of each frame. Without weights the given shapes have to be centred already.
 
 The gradient follows from the first two posterior moments of the coefficients, as in
 expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
 1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
 
-All terms are sums over blocks of frames: how the frames are split makes no difference
-but for rounding. The pass over a block works with the frame as the last index of all
-arrays, with cameras M and the gradient G by them (2, 3, n_frames).
+All terms are sums over blocks of frames. Inside a block the frame is the last index,
+with cameras M and the gradient G by them (2, 3, n_frames).
 """
 
 from collections.abc import Iterable
@@ -46,22 +43,21 @@ from isa_nrsfm._linalg.vectors import frames_last
 
 
 class LikelihoodTerms(NamedTuple):
-    """
-    The objective, its derivatives and posterior moments, from one pass over the frames.
+    """Objective, derivatives and posterior moments, from one pass over the frames.
 
     Attributes
     ----------
     value : float
         The objective.
     shape_gradient : ndarray of shape (n_shapes, 3, n_points)
-        Its derivative by the shapes.
+        Derivative by the shapes.
     noise_gradient : float
-        Its derivative by the logarithm of the noise variance.
+        Derivative by the logarithm of the noise variance.
     shape_curvature : ndarray of shape (n_points or 1, 3 * n_shapes, 3 * n_shapes)
         ``sum_i w_ij E_i (x) M_i^T M_i`` with the posterior second moments E_i of
-        (1, alpha). Times ``2 / s2`` it is the Hessian by point j of the shapes, with
-        the posterior and the positions held fixed. One matrix stands for all points
-        where all weights are one.
+        (1, alpha). Times ``2 / s2`` it is the Hessian by point j of the shapes,
+        posterior and positions held fixed. One matrix for all points if all weights are
+        one.
     residual : float
         Sum of squared residuals of the tracks at the posterior means.
     motion_gradient : ndarray of shape (2, 3, n_frames)
@@ -83,23 +79,19 @@ class LikelihoodTerms(NamedTuple):
 
 
 class MarginalLikelihood:
-    """
-    The objective and its derivatives, as a sum over blocks of frames.
+    """The objective and its derivatives, as a sum over blocks of frames.
 
     Parameters
     ----------
     frames : JointFrames
         The frames.
     penalty : float or ndarray of shape (n_components,)
-        Regularisation weight: factor of ``sum_i tr H_i``, or one factor for the
-        diagonal entry of each basis shape.
+        Factor of ``sum_i tr H_i``, or one for the diagonal entry of each basis shape.
     extent_weight : float, default=0.0
         Weight of the prior of the extents, for each coordinate.
 
     Attributes
     ----------
-    n_frames : int
-        Number of frames.
     n_seen : float
         Number of coordinates that were seen, N.
     square : float
@@ -115,11 +107,7 @@ class MarginalLikelihood:
     def __call__(
         self, shapes: NDArray, motion: NDArray, noise: float
     ) -> LikelihoodTerms:
-        """Return the terms at shapes (n_shapes, 3, n_points), M (n_frames, 2, 3), s2.
-
-        The terms common to all frames are added to their sums: ``N log s2`` and its
-        derivative, ``2 / s2 curvature B``, and the prior of the extents.
-        """
+        """Return the terms at shapes (n, 3, J), motion (I, 2, 3), noise variance s2."""
         terms = self._sums(shapes, motion, noise)
         curvature = _kronecker_matrices(terms.shape_curvature, len(shapes))
         columns = shapes.reshape(3 * len(shapes), -1).T[:, :, None]

@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 
 class JointOptions(NamedTuple):
-    """
-    Thresholds of the joint fit.
+    """Thresholds of the joint fit.
 
     ``python -m benchmarks.sensitivity joint`` halves and doubles each number.
     `basis_std` matters most: a prior twice as wide raises the errors of motion capture
@@ -18,41 +17,37 @@ class JointOptions(NamedTuple):
     ----------
     basis_std : float
         Prior of the basis shapes: standard deviation of the coordinates of the image of
-        a basis shape whose coefficient is one, as a share of the size of the frame
+        a basis shape with coefficient one, as a share of the size of the frame
         (``python -m benchmarks.accuracy prior``).
     least_noise : float
         Floor of the noise variance while the model may be wrong, as a share of the mean
         square of the tracks. Unmodelled deformation must be absorbed by the noise;
         otherwise it distorts the depths.
     right : float
-        A model is right if its noise variance is at most so many times that of the
-        spectrum. The ratio is 0.8 to 1.0 for artificial tables with the true K or more,
-        and 1.3 to 1.8 with fewer basis shapes. It is 1.9 and more for motion capture
-        and cloth, where K cuts a full spectrum off (``python -m benchmarks.accuracy
-        noise``).
-    cut_off : float
-        Floor of the noise variance for a model with too few basis shapes and calibrated
-        cameras, in shares of the energy beyond K + 3 singular values,
-    most_noise : float
-        but at most this share of the mean square: large motion adds to the spectrum.
+        Largest noise variance of a right model, in units of that of the spectrum. The
+        ratio is 0.8 to 1.0 for artificial tables with the true K or more, 1.3 to 1.8
+        with fewer basis shapes, and 1.9 and more for motion capture and cloth (``python
+        -m benchmarks.accuracy noise``).
+    cut_off, most_noise : float
+        Floor of the noise variance for calibrated cameras and too few basis shapes: a
+        multiple of the share of energy beyond K + 3 singular values, limited because
+        large motion adds to the spectrum.
     few_frames : int
-        Largest number of frames of a small table. Small tables, such as motion capture,
-        have several minima, and comparing them costs little. In large tables, and in
-        samples of them, all starts find the same minimum.
+        Largest number of frames of a small table, such as motion capture: it has
+        several minima. In large tables all starts find the same minimum.
     widths : tuple of int
-        Columns of the mixtures from which cameras start: three for the rigid object and
-        as many for each basis shape.
+        Columns of the mixtures from which cameras start, three for each shape.
     compared_tol : float
         Convergence tolerance of compared starts, for each frame. The objectives of
-        starts that lead to different minima differ by tens for each frame.
+        different minima differ by tens for each frame.
     catching_up : int
-        Steps after which a further start, of those that are given, is judged by
-        whether it can still become the best (``python -m benchmarks.choice``).
+        Steps after which a further given start must still be able to become the best
+        (``python -m benchmarks.choice``).
     many_points : int
         Frames with more points are given by directions.
     determined : float
-        A basis shape is relevant if the table determines this share of its numbers. On
-        artificial tables with 2 % noise true shapes have 0.998 and more, others 0.83
+        Least share of its numbers that the table determines of a relevant basis shape.
+        On artificial tables with 2 % noise true shapes have 0.998 and more, others 0.83
         and less (``python -m benchmarks.recovery components``).
     """
 

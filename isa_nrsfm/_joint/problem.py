@@ -25,26 +25,23 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 
 class FactorisedTable(NamedTuple):
-    """
-    A table that is ready for a fit.
+    """A table that is ready for a fit.
 
     Attributes
     ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), centred and each divided by its size;
-        NaN where a point is missing.
-    completed : FrameBlocks
-        The same frames with missing points, and outliers, filled in.
+    rows, completed : FrameBlocks
+        Centred frames (n_frames, 2, n_points) of size one, NaN where a point is
+        missing; and the same with missing points and outliers filled in.
     n_seen : ndarray of int, shape (n_frames,)
-        Number of points that each frame shows.
+        Number of visible points.
     outliers : ndarray of bool, shape (n_frames, n_points), or None
         Points that a robust loss leaves out at first; None for other losses.
     triplets : Triplets
         The 3K + 3 largest singular values of the completed table, and the rest.
     sample : Sample
-        The frames that the first steps are made on.
+        Frames of the first steps.
     factors : Factorisation
-        Of their measurement matrix.
+        Factors of the measurement matrix of the sample.
     """
 
     rows: FrameBlocks
@@ -69,15 +66,12 @@ class JointSettings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointProblem:
-    """
-    The objective of the joint fit of some frames, and the steps that minimise it.
+    """The objective of the joint fit of some frames, and the steps that minimise it.
 
     Attributes
     ----------
     frames : JointFrames
-        The frames.
     settings : JointSettings
-        How they are fitted.
     thorough : bool
         Whether many starts are compared, as for small tables.
     penalty : float or ndarray of shape (n_components,)
@@ -106,10 +100,7 @@ class JointProblem:
         return MarginalLikelihood(self.frames, self.penalty)
 
     def aligned(self, state: JointState, camera: str) -> JointState:
-        """Return a state with nearly optimal cameras for its centred shapes.
-
-        They come from a few steps of the search for each frame, not from the state.
-        """
+        """Return a state with nearly optimal cameras for its centred shapes."""
         shapes = state.shapes
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
@@ -123,8 +114,8 @@ class JointProblem:
     ) -> tuple[JointState, int]:
         """Return a state without frames that are reversed in depth, and their number.
 
-        The search for each frame is repeated from its camera reversed in depth. The
-        camera that it finds is taken where the objective is lower.
+        The search for each frame is repeated from its camera reversed in depth, and its
+        result taken where the objective is lower.
         """
         function = partial(
             _reversed_back,
@@ -145,8 +136,8 @@ class JointProblem:
     ) -> JointFit:
         """Return the joint refinement of a state, by default with the settings.
 
-        The default of `least_noise` is that of a model that may be wrong. That of `tol`
-        is a tenth of the user's for small tables.
+        By default `least_noise` is that of a model that may be wrong, and `tol` a tenth
+        of the user's for small tables.
         """
         settings, likelihood = self.settings, self.likelihood
         if tol is None:

@@ -1,10 +1,9 @@
 """Joint refinement: cameras, shapes and noise of greatest marginal likelihood.
 
-Cameras M_i, shapes B_0, ..., B_K and the noise variance are moved together by a limited
-memory quasi-Newton method (Nocedal, Wright, "Numerical optimization", 2006, section
-7.2). The initial inverse Hessian of each step is the inverse of the curvature that
-expectation maximisation uses, at the current iterate. A step without remembered pairs
-is thus a generalised step of expectation maximisation.
+All are moved together by a limited memory quasi-Newton method (Nocedal, Wright,
+"Numerical optimization", 2006, section 7.2). Its initial inverse Hessian is the inverse
+of the curvature of expectation maximisation at the current iterate. A step without
+remembered pairs is thus a generalised step of expectation maximisation.
 """
 
 from collections import deque
@@ -29,18 +28,7 @@ Memory = deque[tuple[NDArray, NDArray, float]]
 
 
 class JointState(NamedTuple):
-    """
-    Unknowns of the joint refinement.
-
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        B_0, ..., B_K.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-    noise : float
-        Variance of the noise of a coordinate.
-    """
+    """Shapes (n_shapes, 3, J), cameras (I, 2, 3) and noise variance of a coordinate."""
 
     shapes: NDArray
     motion: NDArray
@@ -48,28 +36,24 @@ class JointState(NamedTuple):
 
 
 class JointFit(NamedTuple):
-    """
-    Result of the joint refinement.
+    """Result of the joint refinement.
 
     Attributes
     ----------
     state : JointState
-        Where it ended.
     history : ndarray of shape (n_iter + 1,)
         The objective at the start and after each step; it never rises.
     gradient_norm : float
         ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D of the
-        approximate Hessian and the number N of coordinates. Its square is, up to a
-        factor of about two, the decrease of the objective for each coordinate that is
-        still possible.
+        approximate Hessian and the number N of coordinates. Its square is about half to
+        twice the decrease of the objective for each coordinate that is still possible.
     converged : bool
-        Whether it stopped by the convergence tolerance, not by the number of steps.
     left : float
-        The noise variance, or the mean square residual of the shapes with the posterior
-        means of the coefficients where that is larger.
+        The larger one of the noise variance and the mean square residual at the
+        posterior means of the coefficients.
     camera_noise_ratio : float
-        Of `fit_jointly`: noise variance with calibrated cameras divided by that with
-        affine ones, for the frames of the sample. NaN with given starts.
+        Noise variance with calibrated cameras divided by that with affine ones, for the
+        sample of `fit_jointly`. NaN with given starts.
     """
 
     state: JointState
@@ -95,31 +79,10 @@ def refine_joint(
     tol: float,
     on_step: Callable[[], None] | None = None,
 ) -> JointFit:
-    """
-    Minimise the objective of `MarginalLikelihood`.
+    """Minimise the objective of `MarginalLikelihood` from a start.
 
-    Parameters
-    ----------
-    likelihood : MarginalLikelihood
-        The objective.
-    start : JointState
-        The first iterate.
-    cameras : CameraModel
-        The cameras that are allowed, and how a step changes them.
-    least_noise : float
-        Lower bound of the noise variance, as a share of the mean square of the tracks.
-    max_iter : int
-        Largest number of steps.
-    tol : float
-        Convergence tolerance: the iteration ends when two consecutive steps each lower
-        the objective by less than tol times the number of frames.
-    on_step : callable, optional
-        Called before each step.
-
-    Returns
-    -------
-    JointFit
-        The result.
+    `least_noise` is a share of the mean square of the tracks. The iteration ends when
+    two consecutive steps each gain less than `tol` times the number of frames.
     """
     floor = least_noise * likelihood.square / likelihood.n_seen
     start = start._replace(noise=max(start.noise, floor))
@@ -166,11 +129,9 @@ def refine_joint(
 
 
 class _Iterate:
-    """
-    A state with the objective, its gradient and its approximate curvature there.
+    """A state with the objective, its gradient and its approximate curvature.
 
-    The unknowns as one vector: shapes, parameters of the cameras, and the logarithm of
-    the noise variance last.
+    The unknowns as one vector: shapes, parameters of the cameras, log noise variance.
     """
 
     def __init__(
@@ -204,11 +165,10 @@ class _Iterate:
         return np.linalg.inv(regular(by_shapes)), inverse
 
     def precondition(self, vector: NDArray) -> NDArray:
-        """
-        Return a vector times the inverse of the approximate Hessian.
+        """Return a vector times the inverse of the approximate Hessian.
 
-        The Hessian is ``2 / s2`` times the curvature by shapes and cameras, and N, the
-        number of coordinates, by ``log s2``. It has no blocks across these three.
+        The Hessian is ``2 / s2`` times the curvature by shapes and cameras, and N by
+        ``log s2``, without blocks across these three.
         """
         half = self.state.noise / 2
         shapes, steps, noise = self.split(vector)
@@ -272,10 +232,7 @@ def _inverse_hessian_product(iterate: _Iterate, memory: Memory) -> NDArray:
 def _line_search(
     iterate: _Iterate, direction: NDArray
 ) -> tuple[_Iterate | None, NDArray]:
-    """Return the first iterate that meets the Armijo condition, and the step to it.
-
-    The iterate is None if no step length above 1e-8 does.
-    """
+    """Return the first iterate that meets the Armijo condition, or None, and step."""
     slope = iterate.gradient @ direction
     # Largest step length that the parametrisation of noise and cameras allows
     length = min(

@@ -1,10 +1,9 @@
 """Number of basis shapes that a table determines.
 
-Each basis shape has a prior of its own: its 3J numbers, as the images show them, have
-the variance v_k. That variance is estimated (automatic relevance determination: MacKay,
-"Bayesian interpolation", 1992; Bishop, "Bayesian PCA", 1999). With the posterior
-covariance ``cov B_k``, the coefficients' moments held fixed, and ``C = mean_i M_i^T
-M_i`` the iteration is
+The 3J numbers of each basis shape, as the images show them, have a prior variance v_k
+that is estimated (automatic relevance determination: MacKay, "Bayesian interpolation",
+1992; Bishop, "Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the
+coefficients' moments held fixed, and ``C = mean_i M_i^T M_i`` the iteration is
 
     g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
 

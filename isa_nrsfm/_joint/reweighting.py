@@ -29,29 +29,11 @@ def reweighted(
     fit: JointFit,
     refined: Callable[[JointProblem, JointState], JointFit],
 ) -> tuple[JointFit, float]:
-    """
-    Iterate refinement and weights until the weights agree with the residuals.
+    """Iterate refinement and weights until the weights agree with the residuals.
 
-    Parameters
-    ----------
-    problem : JointProblem
-        The problem of all frames by their points.
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), NaN where a point is missing.
-    left_out : ndarray of bool, shape (n_frames, n_points)
-        Points that have not counted so far. All others that are seen had weight one.
-    fit : JointFit
-        The refinement with these weights.
-    refined : callable
-        Refines a state of a problem.
-
-    Returns
-    -------
-    fit : JointFit
-        The refinement.
-    noise_variance : float
-        Variance of a coordinate, from the median of the residuals, corrected for the
-        degrees of freedom that camera, position and coefficients of each frame take.
+    Points `left_out` (I, J) have not counted in `fit`; the others had weight one.
+    Returns the refinement and the noise variance of a coordinate, from the median of
+    the residuals, corrected for the degrees of freedom.
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
@@ -91,13 +73,11 @@ def _residual_deviations(
     noise: float,
     cameras: CameraModel,
 ) -> NDArray:
-    """
-    Return the standard deviations (n, J) of residuals over that of the noise.
+    """Return the standard deviations (n, J) of residuals over that of the noise.
 
-    Camera, position and coefficients of a frame follow its noise. With the derivatives
-    A of the image by these and weights W, residuals are ``(I - A (A^T W A + P)^-1 A^T
-    W)`` times the noise, where the prior P is the noise variance for each coefficient.
-    The arrays are motion (n, 2, 3), alpha (n, K), shapes (K + 1, 3, J), weights (n, J).
+    With the derivatives A of the image by camera, position and coefficients and weights
+    W, residuals are ``(I - A (A^T W A + P)^-1 A^T W)`` times the noise; the prior P is
+    the noise variance for each coefficient.
     """
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
@@ -148,10 +128,7 @@ def _weighted(
     loss: str,
     deviation: float,
 ) -> WeightedRows:
-    """Return frames (n, 2, J) with the weights of their residuals.
-
-    The fit has cameras, positions, coefficients and sizes of the frames.
-    """
+    """Return frames (n, 2, J) with the weights of their residuals from a fit."""
     *model, sizes = fit
     distance = distances(rows.transpose(0, 2, 1), shapes, *model)
     return WeightedRows(rows, frame_weights(loss, distance, deviation, sizes))

@@ -21,8 +21,7 @@ def posterior_blocks(
     """Return the fits of all frames of a table, before the gauge.
 
     The model is in points. The frames are those of the joint refinement, in points or
-    directions, and rows the same (n_frames, 2, n_points). The blocks are of
-    FramePosterior.
+    directions, of the rows (n_frames, 2, n_points). Returns blocks of FramePosterior.
     """
     if model.loss != "linear":
         return rows.derive(partial(_row_posterior, model=model))
@@ -49,12 +48,10 @@ def shape_uncertainty(
     share: NDArray,
     slices: Sequence[slice],
 ) -> NDArray:
-    """
-    Return the covariance of a point of the shapes for noise of variance one.
+    """Return the covariance of a point of the shapes for noise of variance one.
 
-    It is the inverse of ``sum_i share_i E_i (x) M_i^T M_i`` with the second moments
-    E_i of (1, alpha), where frame i shows a share of the points. The slices are frames
-    that are worked on at a time.
+    The inverse of ``sum_i share_i E_i (x) M_i^T M_i`` with the second moments E_i of
+    (1, alpha), where frame i shows a share of the points, in slices of frames.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
@@ -71,21 +68,12 @@ def shown_frames(
     frames: PosteriorFrames,
     uncertainty: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
-    """
-    Return fits in the gauge, and how far their noise enters their own coefficients.
+    """Return fits in the gauge, and how far their noise enters their own coefficients.
 
     The noise of frame i is in the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
     M_i``. From there it moves the coefficients of the frame by ``n_i s2_i Sigma_i / s2
-    tr(M_i (N^-1 X_i^T)_k)`` on average.
-
-    Returns
-    -------
-    shown : Decomposition
-        Cameras and coefficients in the gauge.
-    moments : ndarray of shape (n_components, n_components)
-        Sum over the frames of ``alpha_i`` times that shift times s2.
-    noise : float
-        Sum of the noise variances s2_i of the frames, from their residuals.
+    tr(M_i (N^-1 X_i^T)_k)`` on average. The second result (K, K) is the sum over the
+    frames of ``alpha_i`` times that shift times s2, the third the sum of s2_i.
     """
     motion, alpha = posterior.motion, posterior.alpha
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)

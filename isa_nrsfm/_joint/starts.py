@@ -1,9 +1,9 @@
 """Starts of the joint fit: calibrated cameras, and shapes that fit them.
 
 The cameras of a deforming object are linear combinations of few columns of the motion
-factor of its table (Xiao, Chai, Kanade 2006). The cost of such a mixture always falls
-with more columns, so it does not determine their number. The rigid cameras are tried
-first, then mixtures of more and more columns, until the objective of the fit rises.
+factor of its table (Xiao, Chai, Kanade 2006). Their cost always falls with more
+columns. The rigid cameras are tried first, then mixtures of more and more columns,
+until the objective of the fit rises.
 """
 
 from collections.abc import Iterator
@@ -40,12 +40,10 @@ HELD_STEPS = 6
 def rigid_start(
     factors: Factorisation, paper_shapes: NDArray, scaled: bool
 ) -> tuple[NDArray, NDArray]:
-    """
-    Return the paper's result with calibrated cameras.
+    """Return the paper's result with calibrated cameras (I, 2, 3) and its shapes.
 
-    The cameras (n_frames, 2, 3) are the nearest to the rigid ones, in the metric of
-    space in which the rigid cameras are most nearly calibrated; without `scaled` all
-    have the scale one. The shapes (n_components + 1, 3, n_points) are in that metric.
+    The cameras are the nearest to the rigid ones, in the metric of space in which those
+    are most nearly calibrated; without `scaled` all have the scale one.
     """
     rigid = factors.rigid_motion.reshape(-1, 2, 3)
     Q = best_metric(rigid)
@@ -62,20 +60,10 @@ def mixed_cameras(
     chosen: NDArray,
     widths: tuple[int, ...] = JOINT_OPTIONS.widths,
 ) -> Iterator[NDArray]:
-    """
-    Yield calibrated cameras (n_frames, 2, 3), mixtures of more and more columns.
+    """Yield calibrated cameras (I, 2, 3), mixtures of more and more columns.
 
-    Parameters
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_points)
-        Complete frames, centred.
-    scales : ndarray of shape (n_frames,) or None
-        Rough scales of the cameras: each frame is divided by its own before the
-        mixture. None for cameras of scale one.
-    chosen : ndarray of int, shape (n_chosen,)
-        Frames from which the mixtures are found.
-    widths : tuple of int
-        Numbers of columns.
+    Rows (I, 2, J) are complete and centred. `scales` (I,) divide the frames before the
+    mixture; None for cameras of scale one. The mixtures come from `chosen` frames.
     """
     unit = rows
     if scales is not None:  # zero for frames without points that count
@@ -94,11 +82,10 @@ def mixed_cameras(
 
 
 def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
-    """Return shapes (n_components + 1, 3, n_points) that fit calibrated cameras.
+    """Return shapes (K + 1, 3, J) that fit calibrated cameras and rows (I, 2, J).
 
     The mean shape is that of least squares, ``(sum_i M_i^T M_i) B_0 = sum_i M_i^T
-    W_i``, the others those of `extended_shapes`. Rows (n_frames, 2, n_points) are
-    complete and centred.
+    W_i``, the others those of `extended_shapes`.
     """
     gram = np.einsum("ira,irb->ab", motion, motion)
     right = np.einsum("ira,irj->aj", motion, rows)
@@ -110,28 +97,11 @@ def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
 def extended_shapes(
     rows: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray, n_more: int
 ) -> NDArray:
-    """
-    Return fitted shapes, and further basis shapes along the residuals.
+    """Return fitted shapes (n, 3, J) and n_more basis shapes along the residuals.
 
-    Parameters
-    ----------
-    rows : ndarray of shape (n_frames, 2, n_points)
-        Frames without their positions, NaN where a point is missing.
-    shapes : ndarray of shape (n_shapes, 3, n_points)
-        Mean shape and basis shapes.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Fitted cameras.
-    alpha : ndarray of shape (n_frames, n_shapes - 1)
-        Fitted coefficients.
-    n_more : int
-        Number of further basis shapes.
-
-    Returns
-    -------
-    ndarray of shape (n_shapes + n_more, 3, n_points)
-        The shapes, and the first principal components of the residuals ``M_i^+ (W_i -
-        M_i S_i)``, lifted to space parallel to the image plane. Each is as long as the
-        standard deviation of its coefficient. Zeros if there are fewer.
+    The first principal components of the residuals ``M_i^+ (W_i - M_i S_i)`` of rows
+    (I, 2, J), lifted to space parallel to the image plane, as long as the standard
+    deviation of their coefficients. Zeros if there are fewer.
     """
     rest = rows - motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
     lifted = np.linalg.pinv(motion) @ np.nan_to_num(rest)
@@ -152,8 +122,7 @@ def affine_start(
 ) -> JointState:
     """Return the paper's result, rigid cameras and scaled basis shapes, as a start.
 
-    W (2 * n_frames, n_points) is the completed measurement matrix of the problem, the
-    shapes are (n_components + 1, 3, n_points).
+    W (2 * n_frames, n_points) is the completed measurement matrix of the problem.
     """
     shapes = problem.frames.coordinates(paper_shapes)
     W = problem.frames.coordinates(W)
@@ -179,26 +148,7 @@ def best_starts(
     paper_shapes: NDArray,
     cameras: CameraModel,
 ) -> list[JointState]:
-    """
-    Return the starts of greatest likelihood, the best one first.
-
-    Parameters
-    ----------
-    problem : JointProblem
-        The frames to be fitted.
-    table : FactorisedTable
-        The table whose sample they are.
-    paper_shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes of the paper's pipeline.
-    cameras : CameraModel
-        Calibrated cameras.
-
-    Returns
-    -------
-    list of JointState
-        Shapes, cameras of all frames, and noise: three starts of small tables, one of
-        others.
-    """
+    """Return the likeliest starts, best first: three of small tables, one of others."""
     frames, options = problem.frames, problem.settings.options
     factors, thorough = table.factors, problem.thorough
     # Frames that are compared: evenly from the most to the least rigid one
@@ -252,11 +202,7 @@ def best_starts(
 def _first_state(
     problem: JointProblem, rows: NDArray, motion: NDArray, shapes: NDArray
 ) -> JointState:
-    """Return a state whose noise is a tenth of the residual of the mean shape.
-
-    The arrays are rows (n_frames, 2, n_points), motion (n_frames, 2, 3) and shapes
-    (n_shapes, 3, n_points).
-    """
+    """Return a state whose noise is a tenth of the residual of the mean shape."""
     noise = 0.1 * np.mean((rows - motion @ shapes[0]) ** 2)
     least_noise = problem.settings.options.least_noise * problem.mean_square
     return JointState(shapes, motion, max(noise, least_noise))
@@ -273,8 +219,7 @@ def with_prior(problem: JointProblem, state: JointState) -> JointState:
 def likely_basis(
     shapes: NDArray, motion: NDArray, alpha: NDArray, penalty: NDArray | float
 ) -> NDArray:
-    """
-    Return the same shapes in the basis of greatest marginal likelihood.
+    """Return the same shapes (K + 1, 3, J) in the basis of greatest likelihood.
 
     Without noise neither a shift of the mean shape along the basis shapes nor a mixing
     A of these changes the residual: alpha becomes ``A^-1 (alpha - mean)``. Of the
@@ -282,13 +227,10 @@ def likely_basis(
 
         n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A).
 
-    First a basis is taken in which the covariance of the coefficients is the identity
-    and H is diagonal. There the minimum is the diagonal A with
+    In a basis where the covariance of the coefficients is the identity and H is
+    diagonal, the minimum is the diagonal A with
 
         a_k^2 = 2 / (1 + sqrt(1 + 4 penalty H_kk / n)).
-
-    The arrays are shapes (n_shapes, 3, n_points), motion (n_frames, 2, 3) and alpha
-    (n_frames, n_components).
     """
     M, n_frames = frames_last(motion), len(motion)
     # Coefficients of mean zero
@@ -310,12 +252,10 @@ def likely_basis(
 
 
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
-    """
-    Return shapes scaled by the standard deviation of their coefficients.
+    """Return shapes (n, 3, J) scaled by the standard deviation of their coefficients.
 
-    The coefficients are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``: each by
-    itself, as the shapes are orthogonal. rows (n_frames, 2, n_points), motion
-    (n_frames, 2, 3), shapes (n_shapes, 3, n_points).
+    These are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``, as shapes are
+    orthogonal.
     """
     images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
     along = np.einsum("ikrj,irj->ik", images, rows)

@@ -248,8 +248,7 @@ def euclidean_frames(
 def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
     """Return the metric with strains, with the ridge of maximal evidence.
 
-    Usable cameras are (n_frames, 2, 3), coefficients (n_frames, n_components). The fit
-    starts from that without strains.
+    Starts without strains. Usable cameras are (I, 2, 3), coefficients (I, K).
     """
     camera: CameraModel = "weak_perspective"
     size = len(strain_basis(camera))
@@ -281,10 +280,7 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
 
 
 def _rotations_to_mean(shapes: NDArray, mean_shape: NDArray) -> NDArray:
-    """Return rotations O (I, 3, 3) that take ``shape @ O`` nearest to the mean shape.
-
-    Shapes are (I, n_points, 3), the mean shape is (n_points, 3).
-    """
+    """Return rotations O (I, 3, 3), ``shape @ O`` nearest to the mean shape (J, 3)."""
     centred = mean_shape - mean_shape.mean(axis=0)
     left, _, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ centred)
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]

@@ -139,28 +139,12 @@ def orthonormal_mixture(
     penalty: NDArray | None = None,
     max_iter: int = 200,
 ) -> tuple[NDArray, float]:
-    """
-    Return a mixture of columns whose rows are most nearly orthonormal, and its cost.
+    """Mix columns such that rows are most nearly orthonormal; return Q (n, 3) and cost.
 
-    Parameters
-    ----------
-    basis : ndarray of shape (2 * n_frames, n_columns)
-        Columns of a motion factor, about as long as columns of cameras.
-    mixing : ndarray of shape (n_before, 3)
-        The best mixture of the first columns, to start from. If these are three, each
-        triple of the columns is a start as well.
-    penalty : ndarray of shape (n_rows, n_columns), optional
-        L, for a penalty of ``||L Q||_F^2``.
-    max_iter : int, default=200
-        The most Levenberg-Marquardt steps.
-
-    Returns
-    -------
-    mixing : ndarray of shape (n_columns, 3)
-        Q.
-    cost : float
-        Mean over the frames of the squared norm of `orthonormality_residuals`, plus the
-        penalty.
+    The columns (2 I, n) are about as long as columns of cameras. `mixing` (n_before, 3)
+    is the start, the best mixture of the first columns. If these are three, each triple
+    of columns is a start as well. The cost is the mean over the frames of the squared
+    norm of `orthonormality_residuals`, plus a penalty ``||L Q||_F^2``.
     """
     n = basis.shape[1]
     L = np.zeros((0, n)) if penalty is None else penalty
@@ -189,10 +173,9 @@ def orthonormal_mixture(
 
 
 def orthonormality_residuals(cameras: NDArray) -> NDArray:
-    """Return how far the rows of cameras (n, 2, 3) are from orthonormal: (3, n).
+    """Return ``|r1|^2 - 1``, ``|r2|^2 - 1``, ``sqrt(2) r1 . r2`` of cameras (n, 2, 3).
 
-    These are ``|r1|^2 - 1``, ``|r2|^2 - 1`` and ``sqrt(2) r1 . r2``: the sum of their
-    squares is ``||R_i R_i^T - I||_F^2``.
+    The sum of their squares is ``||R_i R_i^T - I||_F^2``. The result is (3, n).
     """
     r1, r2 = cameras[:, 0], cameras[:, 1]
     across = np.sqrt(2.0) * np.vecdot(r1, r2)
@@ -200,10 +183,7 @@ def orthonormality_residuals(cameras: NDArray) -> NDArray:
 
 
 def _linearised(Q: NDArray, basis: NDArray, L: NDArray) -> tuple[NDArray, NDArray]:
-    """Return residuals (n,) whose squares add up to the cost, and their derivatives.
-
-    The derivatives (n, 3 * n_columns) are those in the entries of Q.
-    """
+    """Return residuals (n,) of Q and their Jacobian (n, 3 * n_columns)."""
     n_frames = len(basis) // 2
     P, R = basis.reshape(n_frames, 2, -1, 1), (basis @ Q).reshape(n_frames, 2, 1, 3)
     p1, p2, r1, r2 = P[:, 0], P[:, 1], R[:, 0], R[:, 1]
@@ -220,9 +200,8 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return indices of independent columns, an orthogonal basis of them, and its mixing.
 
-    ``basis = motion[:, kept] @ inverse`` with a triangular `inverse`. So the first n
-    columns of the basis span the first n columns that are kept. Columns of the basis
-    have the mean length of columns of cameras, so that the cost is well scaled.
+    ``basis = motion[:, kept] @ inverse`` with a triangular `inverse`: the first n
+    columns span the same space. They have the mean length of columns of cameras.
     """
     lengths = np.linalg.norm(motion, axis=0)
     kept = np.flatnonzero(lengths > 0)
@@ -240,11 +219,7 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def principal_columns(W: NDArray) -> NDArray:
-    """Return the motion factor (2 * n_frames, rank) of W (2 * n_frames, n_points).
-
-    These are the left singular vectors, those of the largest singular values first, as
-    long as columns of cameras are on average.
-    """
+    """Return left singular vectors (2 I, rank) of W, as long as columns of cameras."""
     square, V = np.linalg.eigh(W.T @ W)
     kept = np.flatnonzero(square > OF_STEPS * square[-1])[::-1]
     return W @ (V[:, kept] * np.sqrt(len(W) / 3 / square[kept]))

@@ -2,12 +2,10 @@
 
 A factorisation into affine cameras and shapes is known up to one 3x3 affinity of
 space. Cameras are scaled orthographic (weak perspective) in some metric of space if
-objects are small and pixels square. This condition determines the metric (Tomasi,
-Kanade 1992; Poelman, Kanade, "A paraperspective factorization method for shape and
-motion recovery", 1997).
-
-The metric is the symmetric matrix G: a root of it, ``G = Q Q^T``, takes cameras M to M
-Q, which are nearly scaled rotations. Q is known up to a rotation.
+objects are small and pixels square. This determines the metric (Tomasi, Kanade 1992;
+Poelman, Kanade, "A paraperspective factorization method for shape and motion recovery",
+1997): a symmetric matrix ``G = Q Q^T`` such that ``M Q`` are nearly scaled rotations.
+Q is known up to a rotation.
 """
 
 import numpy as np
@@ -49,13 +47,11 @@ def symmetric_power(matrix: NDArray, power: float) -> NDArray:
 
 
 def conformal_equations(cameras: NDArray) -> NDArray:
-    """
-    Return the linear equations of weak-perspective cameras for the metric of space.
+    """Return the linear equations of weak-perspective cameras for the metric of space.
 
-    For cameras (n_frames, 2, 3) with rows m1 and m2 these are the coefficients (2 *
-    n_frames, 6) of ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the six unknowns
-    of G, see `symmetric_matrix`. Turning a frame in its image plane turns the two into
-    each other.
+    For cameras (I, 2, 3) with rows m1 and m2 these are the coefficients (2 I, 6) of
+    ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the unknowns of G, see
+    `symmetric_matrix`. Roll of a frame turns the two into each other.
     """
     m1, m2 = np.moveaxis(cameras, 1, 0)
     alike = _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2)
@@ -76,15 +72,12 @@ def symmetric_matrix(unknowns: NDArray) -> NDArray:
 
 
 def metric_quadric(motion: NDArray) -> NDArray | None:
-    """
-    Find the symmetric G under which the cameras are weak-perspective ones.
+    """Find the symmetric G under which cameras (I, 2, 3) are weak-perspective ones.
 
-    The rows m1 and m2 of each camera (n_frames, 2, 3), divided by its norm, should
-    satisfy ``m1 G m1^T = m2 G m2^T`` and ``m1 G m2^T = 0``: homogeneous linear
-    equations in six unknowns, solved by least squares. To exclude G = 0 the mean of
-    ``m1 G m1^T + m2 G m2^T`` is fixed to one. With a fixed norm of G instead, a G along
-    a direction that the cameras hardly see would nearly solve the equations. None is
-    returned if they do not determine G, or if it is not safely positive definite.
+    The equations of `conformal_equations` are solved by least squares, with the mean of
+    ``m1 G m1^T + m2 G m2^T`` fixed to one. With a fixed norm of G instead, a G along a
+    direction that the cameras hardly see would nearly solve them. None if they do not
+    determine G, or if it is not safely positive definite.
     """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)

@@ -6,16 +6,14 @@ two rows of a scaled rotation. It may change with the deformation of the object,
 ``G_i = Q exp(sum_k alpha_ik E_k) Q^T`` with symmetric strains E_k.
 
 The sum of squares of the residuals (`orthonormality`) is minimised by damped
-Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``, and in the strains. After
-any step ``Q Q^T`` is positive definite. So a minimum is found even where the linear
-equations for the entries of G (`metric_quadric`) have an indefinite solution. The
-derivative of the exponential is that of Daleckii and Krein (Higham, "Functions of
-matrices", 2008, theorem 3.11).
+Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``, and in the strains, so that
+``Q Q^T`` stays positive definite even where the linear equations (`metric_quadric`)
+have an indefinite solution. The derivative of the exponential is that of Daleckii and
+Krein (Higham, "Functions of matrices", 2008, theorem 3.11).
 
-The strain of a frame, ``sum_k alpha_ik E_k``, has five or six unknowns, its coordinates
-in `strain_basis`. Derivatives in those of E_k are alpha_ik times the derivatives in
-these. So the Jacobian in all unknowns is never formed, only sums of products over the
-frames: ``J^T J`` and ``J^T r``.
+The strain of a frame, ``sum_k alpha_ik E_k``, has five or six coordinates in
+`strain_basis`. Derivatives in those of E_k are alpha_ik times the derivatives in these:
+only the sums ``J^T J`` and ``J^T r`` over the frames are formed.
 """
 
 from collections.abc import Callable
@@ -41,8 +39,7 @@ State = TypeVar("State")
 
 
 class MetricFit(NamedTuple):
-    """
-    A metric, with its cost and derivatives.
+    """A metric, with its cost and derivatives.
 
     Attributes
     ----------
@@ -51,13 +48,11 @@ class MetricFit(NamedTuple):
     strain : ndarray of shape (n_components, 3, 3)
         E_k, symmetric and without trace.
     n_frames : int
-        Number of cameras.
     cost : float
         Sum of the squared residuals of `orthonormality`.
     curvature : ndarray of shape (n_unknowns, n_unknowns)
-        ``J^T J``, the Gauss-Newton approximation of half the Hessian. J are the
-        derivatives of the residuals in the unknowns: the coordinates of E_0, E_1, ...
-        in `strain_basis`, in this order.
+        ``J^T J`` of the residuals by the coordinates of E_0, E_1, ... in
+        `strain_basis`.
     gradient : ndarray of shape (n_unknowns,)
         ``J^T r`` with r the residuals.
     """
@@ -85,11 +80,10 @@ class MetricFit(NamedTuple):
 
 
 def strain_basis(camera: CameraModel) -> NDArray:
-    """
-    Return an orthonormal basis of the strains that change the residuals.
+    """Return an orthonormal basis of the strains that change the residuals.
 
-    Six symmetric matrices for orthographic cameras. For weak-perspective ones five
-    without trace: a strain with a trace only changes the scales of the frames.
+    Six symmetric matrices for orthographic cameras, five without trace for
+    weak-perspective ones: the trace only changes the scales of the frames.
     """
     basis = np.zeros((6, 3, 3))
     diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
@@ -100,14 +94,12 @@ def strain_basis(camera: CameraModel) -> NDArray:
 
 
 def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
-    """
-    Return the deviations (n, n_frames) of rows of cameras from rows of rotations.
+    """Return residuals (n, n_frames) of the products ``M_i G M_i^T`` (2, 2, n_frames).
 
-    With the products ``M_i G M_i^T`` (2, 2, n_frames) of the rows in the metric these
-    are for orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i
-    G M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``,
-    with the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular
-    values of ``M_i Q``. Roll and scale of a frame do not change that norm.
+    For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i G
+    M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``, with
+    the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular values of
+    ``M_i Q``: it does not depend on roll and scale.
     """
     entries = np.tensordot(_patterns(camera), gram, 2)
     if camera == "orthographic":
@@ -116,10 +108,9 @@ def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
 
 
 def _patterns(camera: CameraModel) -> NDArray:
-    """Return symmetric matrices F_c (n, 2, 2) with the entries of residuals.
+    """Return symmetric F_c (n, 2, 2): residual c is ``<F_c, M_i G M_i^T>``.
 
-    Residual c is ``<F_c, M_i G M_i^T>``, before it is shifted (orthographic) or divided
-    by the trace (weak-perspective).
+    That is before it is shifted (orthographic) or divided by the trace.
     """
     if camera == "orthographic":
         across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
@@ -130,27 +121,7 @@ def _patterns(camera: CameraModel) -> NDArray:
 def fit_at(
     motion: NDArray, alpha: NDArray, Q: NDArray, strain: NDArray, camera: CameraModel
 ) -> MetricFit:
-    """
-    Return how well a metric fits cameras.
-
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, finite and not zero.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients of the strains.
-    Q : ndarray of shape (3, 3)
-        ``G = Q Q^T`` is the metric of frames without deformation.
-    strain : ndarray of shape (n_components, 3, 3)
-        E_k.
-    camera : {"orthographic", "weak_perspective"}
-        Model of the cameras.
-
-    Returns
-    -------
-    MetricFit
-        The metric, with its cost, curvature and gradient.
-    """
+    """Evaluate a metric for cameras (I, 2, 3) and strain coefficients (I, K)."""
     parts = []
     for start in range(0, len(motion), BLOCK_FRAMES):
         part = slice(start, start + BLOCK_FRAMES)
@@ -165,21 +136,10 @@ def fit_at(
 def _linearised(
     MQ: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return residuals of cameras and their derivatives.
+    """Return residuals (n, I) of cameras ``M_i Q`` (2, 3, I), and two derivatives.
 
-    Cameras in the axes of the metric, ``M_i Q``, are (2, 3, n_frames), coefficients
-    (n_components, n_frames).
-
-    Returns
-    -------
-    residuals : ndarray of shape (n, n_frames)
-        See `orthonormality`.
-    slopes : ndarray of shape (n_numbers, n, n_frames)
-        Derivatives in the coordinates of E_0 in `strain_basis`.
-    own_slopes : ndarray of shape (n_numbers, n, n_frames)
-        Derivatives in the coordinates of ``E = sum_k alpha_ik E_k``, the strain of the
-        frame. Those in the coordinates of E_k are alpha_ik times as large.
+    The derivatives (n_numbers, n, I) are those in the coordinates of E_0 in
+    `strain_basis`, and of ``E = sum_k alpha_ik E_k``, with alpha (K, I).
     """
     numbers = strain_basis(camera)
     # M_i Q exp(E) is `grown`, and M_i G_i M_i^T the product of that with M_i Q. The
@@ -257,30 +217,11 @@ def levenberg_marquardt(
     shortest_step: float = 0.0,
     least_gain: float = -np.inf,
 ) -> tuple[State, float]:
-    """
-    Minimise a sum of squares.
+    """Minimise a sum of squares; return the last state and its cost.
 
-    Parameters
-    ----------
-    evaluated : callable
-        Returns the cost of a state, ``J^T J`` and ``J^T r`` with the residuals r and
-        their derivatives J.
-    state : object
-        The first iterate.
-    moved : callable
-        Returns the state after a step (n_unknowns,).
-    max_steps : int
-        Largest number of steps.
-    shortest_step, least_gain : float
-        The iteration ends when no entry of a step is larger, or when a step gains less
-        than this share of the cost.
-
-    Returns
-    -------
-    state : object
-        The last iterate.
-    cost : float
-        Its cost.
+    `evaluated` returns the cost of a state, ``J^T J`` and ``J^T r``; `moved` the state
+    after a step (n_unknowns,). The iteration ends when no entry of a step is larger
+    than `shortest_step`, or a step gains less than a share `least_gain` of the cost.
     """
     cost, curvature, gradient = evaluated(state)
     identity = np.eye(len(gradient))
@@ -304,12 +245,10 @@ def levenberg_marquardt(
 
 
 def safe_start(motion: NDArray, G: NDArray, camera: CameraModel) -> NDArray:
-    """
-    Return Q of a positive definite metric near to a symmetric G, to start from.
+    """Return Q of a positive definite metric near to a symmetric G, to start from.
 
-    In the space in which the mean of ``M_i^T M_i`` is the identity, it has the axes of
-    G, and its stretches differ by at most the factor `STRETCH_OF_START`. Only
-    orthographic cameras determine the scale of G.
+    Where the mean of ``M_i^T M_i`` is the identity, it has the axes of G, and stretches
+    that differ by at most `STRETCH_OF_START`. Only orthographic cameras fix its scale.
     """
     counted = motion if camera == "orthographic" else unit_cameras(motion)
     root = symmetric_power(mean_gram(counted), 0.5)
@@ -328,28 +267,9 @@ def refine_metric(
     ridge: float = 0.0,
     shortest_step: float = 1e-9,
 ) -> MetricFit:
-    """
-    Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2``.
+    """Minimise ``sum_i |residuals_i|^2 + ridge * sum_k ||E_k||_F^2`` from a start.
 
-    Parameters
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, finite and not zero.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients of the strains.
-    start : MetricFit
-        The first iterate, of `fit_at` for these frames.
-    camera : {"orthographic", "weak_perspective"}
-        Model of the cameras.
-    ridge : float, default=0.0
-        Regularisation weight of the squared norm of the strains.
-    shortest_step : float
-        Convergence tolerance: the largest entry of a step.
-
-    Returns
-    -------
-    MetricFit
-        A minimum.
+    Cameras (I, 2, 3) are finite and not zero, alpha is (I, K).
     """
     # The unknowns of a step are coordinates in this basis: those of E_0, which is zero
     # at each iterate, and those of the strains E_k.

@@ -217,10 +217,7 @@ def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
 
 
 def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
-    """Return cameras (n_frames, 2, 3), and which of them are neither NaN nor zero.
-
-    `least` is the least number of cameras that is accepted.
-    """
+    """Return cameras (I, 2, 3), and a mask of the at least `least` not NaN or zero."""
     cameras = np.asarray(motion, dtype=np.float64)
     if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
         raise ValueError(
@@ -259,7 +256,7 @@ def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
 def best_metric(motion: NDArray) -> NDArray:
     """Return Q (3, 3) with which cameras (n, 2, 3) are most nearly scaled rotations.
 
-    It is the identity where they do not see three directions of space.
+    The identity if they do not see three directions of space.
     """
     cameras, usable = usable_cameras(motion)
     try:
@@ -270,10 +267,7 @@ def best_metric(motion: NDArray) -> NDArray:
 
 
 def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
-    """Return Q (3, 3), scaled so that the scales of the cameras have mean square one.
-
-    Cameras are (n_frames, 2, 3).
-    """
+    """Scale Q (3, 3) such that the scales of cameras (I, 2, 3) have mean square one."""
     # A scale is s = (s1 + s2) / 2 with the singular values of a camera. Then
     # s^2 = (s1^2 + s2^2) / 4 + s1 s2 / 2, and s1 s2 is the area that the rows span.
     rows = cameras @ Q

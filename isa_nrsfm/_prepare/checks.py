@@ -10,23 +10,7 @@ from isa_nrsfm._tables.visibility import seen_points
 
 
 def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return tracks in which the two coordinates of a point are missing together.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a coordinate is missing.
-
-    Returns
-    -------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks themselves, or a copy without points that have one coordinate.
-    n_half : ndarray of int, shape (n_frames,)
-        Number of such points in each frame.
-    first : ndarray of int, shape (n_frames,)
-        The first of them.
-    """
+    """Hide points with one coordinate. Return tracks (I, J, 2), counts, first ones."""
     none = np.zeros(len(tracks), dtype=int)
     if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
         return tracks, none, none
@@ -148,32 +132,11 @@ def check_points(
     layout: Layout = "interleaved",
     names: NDArray | None = None,
 ) -> None:
-    """
-    Refuse tables whose seen points do not determine the shapes.
+    """Refuse tables whose visible points do not determine the shapes.
 
-    Equations and unknowns are counted. A point has 3 (K + 1) unknowns, and two
-    equations in each frame that shows it. A frame that shows n points has 2 n
-    equations, and 8 + K unknowns of its own: camera, translation and coefficients. The
-    counts are necessary conditions. The shapes may still be poorly determined.
-
-    Parameters
-    ----------
-    visible : ndarray of uint8, shape (n_frames, n_bytes)
-        The seen points of each frame, packed by `visible_points`.
-    n_points : int
-        Number of points.
-    n_components : int
-        K, the number of basis shapes.
-    layout : {"interleaved", "planar"}
-        Order of the columns of the table.
-    names : ndarray of shape (2 * n_points,), optional
-        Names of the columns.
-
-    Raises
-    ------
-    ValueError
-        If a point is seen in too few frames, if too few points are seen in all, or if
-        the points fall into groups that no frame shows together.
+    `visible` is packed by `visible_points`. Equations and unknowns are counted, a
+    necessary condition. A point has 3 (K + 1) unknowns, and two equations in each frame
+    that shows it. A frame of n points has 2 n equations, and 8 + K unknowns of its own.
     """
     patterns, counts = np.unique(visible, axis=0, return_counts=True)
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)

@@ -65,29 +65,10 @@ class _Posterior(NamedTuple):
 def complete_rows(
     rows: FrameBlocks, n_points: int, n_components: int, model_frames: int
 ) -> FrameBlocks:
-    """
-    Return the frames of a table with their missing points filled in.
+    """Fill in the missing points of centred rows (I, 2, J) by their posterior means.
 
-    Missing points get their posterior means, given the seen points of their frame. They
-    are exact where the table has the rank 3K + 3 and no noise, and each frame shows at
-    least 3K + 4 points. With fewer points the prior fills what they leave open.
-
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points) of size one, centred over the points
-        that are seen; NaN where a point is not seen.
-    n_points : int
-        Number of points.
-    n_components : int
-        K, the number of basis shapes.
-    model_frames : int
-        The most frames from which the model is found.
-
-    Returns
-    -------
-    FrameBlocks
-        The frames, centred over all points.
+    These are exact for tables of rank 3K + 3 without noise if each frame shows at least
+    3K + 4 points. With fewer points the prior fills the gap.
     """
     # Of many points fewer frames are enough.
     most = int(np.clip(300 * model_frames // n_points, 200, model_frames))
@@ -99,11 +80,10 @@ def complete_rows(
 def completion_model(
     rows: NDArray, rank: int, tol: float = 0.02, max_iter: int = 200
 ) -> CompletionModel:
-    """
-    Fit the low-rank model to frames (n_frames, 2, n_points), NaN where not seen.
+    """Fit the low-rank model to frames (n_frames, 2, n_points), NaN where not seen.
 
-    EM ends when a step lowers the noise variance by less than a share `tol`. Further
-    steps fit the noise more than they improve the missing points.
+    EM ends when a step lowers the noise variance by less than a share `tol`: later
+    steps mostly fit the noise.
     """
     frames = _Frames.of_rows(rows)
     # Centred points have n_points - 1 directions, of which the noise needs one.

@@ -17,28 +17,10 @@ FEWEST_COMPARED = 10
 def warn_if_other_layout(
     rows: FrameBlocks, n_columns: int, layout: Layout, scale_frames: bool
 ) -> None:
-    """
-    Warn where a rigid object fits the other layout much better.
+    """Warn if a rigid object fits the other column layout much better.
 
-    The mean squares that a rigid fit leaves are compared, not their shares of the
-    total. The wrong layout mixes x and y, whose offset adds energy that a rigid object
-    explains.
-
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of rows (n_frames, n_columns) of the table.
-    n_columns : int
-        Number of columns.
-    layout : {"interleaved", "planar"}
-        The given order of the columns.
-    scale_frames : bool
-        Whether each frame is divided by its own size, or all by a common one.
-
-    Warns
-    -----
-    UserWarning
-        If the other layout explains much more.
+    Compares mean squares, not shares of the total: the wrong layout mixes x and y,
+    whose offset adds energy that a rigid object explains.
     """
     if min(rows.n_frames, n_columns // 2) < FEWEST_COMPARED:
         return

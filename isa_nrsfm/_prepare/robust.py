@@ -1,9 +1,8 @@
 """Robust losses: points far from the model count less.
 
-They are minimised by iteratively reweighted least squares (Holland, Welsch, "Robust
-regression using iteratively reweighted least-squares", 1977). The weight of a point
-falls with its distance from the model in units of the noise. Fit and weights alternate
-until they agree.
+Minimised by iteratively reweighted least squares (Holland, Welsch, "Robust regression
+using iteratively reweighted least-squares", 1977). Fit and weights alternate until they
+agree.
 """
 
 from collections.abc import Callable
@@ -37,25 +36,10 @@ DISTANT = 6.0
 def frame_weights(
     loss: str, distance: NDArray, deviation: float, sizes: NDArray
 ) -> NDArray:
-    """
-    Return the weights of the points of frames for a loss.
+    """Return weights (I, J) in [0, 1] of points at a distance (I, J) from the model.
 
-    Parameters
-    ----------
-    loss : {"linear", "huber", "cauchy"}
-        The loss.
-    distance : ndarray of shape (n_frames, n_points)
-        Distances of points from the model; infinite for those that are missing.
-    deviation : float
-        Standard deviation of a coordinate.
-    sizes : ndarray of shape (n_frames,)
-        Sizes of the frames, those of `robust_sizes`.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, n_points)
-        Weights between 0 and 1. Zero for points that do not belong to their frame: a
-        loss that grows without limit would bend the shapes towards them.
+    Zero beyond `DISTANT` sizes (I,): a loss that grows without limit would bend the
+    shapes towards such points.
     """
     belongs = distance <= DISTANT * sizes[:, None]
     return np.where(belongs, WEIGHTS[loss](distance / deviation), 0.0)
@@ -73,11 +57,10 @@ def distant_points(tracks: NDArray) -> NDArray:
 
 
 def robust_sizes(centred: NDArray) -> NDArray:
-    """
-    Return sizes (I,) of frames (I, J, 2) that single points hardly change.
+    """Return sizes (I,) of frames (I, J, 2) that single points hardly change.
 
-    They are the root of half the median squared distance of the seen points from their
-    `spatial_median`, or the root mean square where half of them are in one place.
+    The root of half the median squared distance of the visible points from their
+    `spatial_median`, or the RMS where half of them coincide.
     """
     return _sizes(_squares(centred))
 
@@ -105,21 +88,10 @@ def _sizes(square: NDArray) -> NDArray:
 
 
 def spatial_median(tracks: NDArray) -> NDArray:
-    """
-    Return the spatial median of each frame, the point with the least sum of distances.
+    """Return spatial medians (I, 2) of tracks (I, J, 2): least sums of distances.
 
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        Tracks, NaN where a point is not seen.
-
-    Returns
-    -------
-    ndarray of shape (n_frames, 2)
-        The iterate after a fixed number of steps of Weiszfeld (1937). It starts at the
-        mean of the half of the points that is nearest to it: a point at any distance
-        costs no digits of the others. Unlike medians of x and y it rotates with the
-        image.
+    A fixed number of steps of Weiszfeld (1937), from the mean of the `_nearest_half`.
+    Unlike medians of x and y it rotates with the image.
     """
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
@@ -143,11 +115,9 @@ def spatial_median(tracks: NDArray) -> NDArray:
 def _nearest_half(
     points: NDArray, weights: NDArray, seen: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return weights (I, J) of the half of points (I, J, 2) nearest to their mean.
+    """Return weights (I, J) of the half of points (I, J, 2) nearest to their mean.
 
-    Distances from that weighted mean (I, J), infinite for points not seen, and the
-    largest one of the half (I, 1) come with it.
+    Also returns distances (I, J) from that mean, and the largest of the half (I, 1).
     """
     _, distance = _weighted_middle(points, weights)
     distance = np.where(seen, distance, np.inf)
@@ -164,23 +134,10 @@ def _weighted_middle(points: NDArray, weights: NDArray) -> tuple[NDArray, NDArra
 
 
 def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
-    """
-    Return which points of a table are far from any rigid object.
+    """Return a mask (I, J) of the points of rows (I, 2, J) far from any rigid object.
 
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), each divided by its size; NaN where a
-        point is not seen.
-    model_frames : int
-        The most frames from which the rigid object is found.
-
-    Returns
-    -------
-    ndarray of bool, shape (n_frames, n_points)
-        Points whose distance from a rigid factorisation of the others is many times the
-        typical distance, the larger one of the table and of this point. None in frames
-        with many such points.
+    Their distance from a rigid factorisation of the others is many times the typical
+    one of the table and of the point. None in frames with many such points.
     """
     some = representative_frames(rows, model_frames)
     hidden, axes, limit = _rigid_object(rows.take(some))
@@ -190,11 +147,10 @@ def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
 
 
 def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return a rigid factorisation of frames (I, 2, J) without points that are far off.
+    """Factorise frames (I, 2, J) into a rigid object without points that are far off.
 
-    These are a mask of hidden points (I, J), orthonormal axes (J, 3), and for each
-    point its largest distance (J,) from the object. Factorisation and hiding alternate.
+    Returns a mask of hidden points (I, J), orthonormal axes (J, 3), and for each point
+    its largest distance (J,). Factorisation and hiding alternate.
     """
     target, hidden = _start_of_hiding(rows)
     seen = seen_points(target)
@@ -247,10 +203,7 @@ def _start_of_hiding(rows: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _rigid_part(target: NDArray, kept: NDArray, axes: NDArray) -> NDArray:
-    """Return the rigid parts of tracks (n, J, 2), fitted to the points that are kept.
-
-    The rigid object has the axes (J, 3) and any translation.
-    """
+    """Return the rigid parts of tracks (n, J, 2): axes (J, 3) fitted to kept points."""
     design = np.column_stack([axes, np.full(len(axes), len(axes) ** -0.5)])
     pairs = (design[:, :, None] * design[:, None]).reshape(len(axes), -1)
     moments = (kept.astype(float) @ pairs).reshape(-1, 4, 4)

@@ -23,32 +23,25 @@ from isa_nrsfm._tables.visibility import FrameReport, centred_frames, check_fram
 
 
 class ScaledTable(NamedTuple):
-    """
-    A table made ready for the fit.
+    """A table made ready for the fit.
 
     Attributes
     ----------
     shown : ndarray of bool, shape (n_rows,)
-        Which rows of the table show any point. These rows are the frames.
+        Rows of the table that show any point: the frames.
     source : Table
         These rows before centring and scaling.
     rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), x above y, without their translation
-        and divided by their sizes; NaN where a point is not seen. Single precision
-        where the table is large, complete and in single precision.
-    sizes : ndarray of shape (n_frames,)
-        What the frames were divided by.
+        Blocks (n_frames, 2, n_points) of centred frames of size one, NaN where not
+        seen.
+    sizes, n_seen : ndarray of shape (n_frames,)
+        Divisors of the frames, and their numbers of visible points.
     translation : ndarray of shape (n_frames, 2)
-        What was subtracted: the centroids of the seen points, or their spatial medians
-        with a robust loss.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of points that are seen.
-    n_points : int
-        Number of points.
+        Centroids of the visible points, or spatial medians with a robust loss.
     precision : float
         Rounding error of the coordinates of the table, relative to its frames.
     dtype : dtype
-        Type of the numbers of the given table.
+        Number type of the given table.
     """
 
     shown: NDArray
@@ -75,11 +68,7 @@ class ScaledTable(NamedTuple):
         return all_rows
 
     def part(self, rows: NDArray) -> "ScaledTable":
-        """
-        Return the table of some rows, by a mask (n_rows,), scaled as they are.
-
-        Whether they are enough for a fit is not checked.
-        """
+        """Return the table of some rows, by a mask (n_rows,), with the same scaling."""
         kept = rows[self.shown]
         return self._replace(
             shown=self.shown[rows],
@@ -100,40 +89,9 @@ def scaled_table(
     scale_frames: bool,
     robust: bool,
 ) -> ScaledTable:
-    """
-    Check a table and make it ready for the fit.
+    """Check a table, then centre and scale its frames.
 
-    Parameters
-    ----------
-    table : Table
-        The table.
-    n_components : int
-        K, the number of basis shapes.
-    layout : {"interleaved", "planar"}
-        Order of the columns.
-    names : ndarray of shape (2 * n_points,) or None
-        Names of the columns.
-    scale_frames : bool
-        Whether each frame is divided by its own size, or all by a common one.
-    robust : bool
-        Whether frames are centred at their `spatial_median` and their sizes are those
-        of `robust_sizes`, or at their means and sizes are root mean squares.
-
-    Returns
-    -------
-    ScaledTable
-        The table.
-
-    Raises
-    ------
-    ValueError
-        If the table is too small, or frames or points of it show too little.
-
-    Warns
-    -----
-    UserWarning
-        If points have only one coordinate, if rows without any point are left out, or
-        if the columns seem to be in another order.
+    `robust` takes `spatial_median` and `robust_sizes`, otherwise means and RMS.
     """
     blocks, n_columns, dtype = table
     n_points = n_columns // 2
@@ -187,11 +145,10 @@ def scaled_table(
 
 
 def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]:
-    """
-    Return arrays for all checks of some rows (n_rows, 2 * n_points) of a table.
+    """Return arrays for all checks of some rows (n_rows, 2 * n_points) of a table.
 
-    They are numbers and first ones of half points, the points seen, the largest
-    magnitudes of coordinates, and the fields of a `FrameReport`.
+    Numbers and first of half points, visible points, largest magnitudes of coordinates,
+    and the fields of a `FrameReport`.
     """
     tracks, n_half, first = without_half_points(table_to_tracks(rows, layout))
     _, report = centred_frames(tracks)

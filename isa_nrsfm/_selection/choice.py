@@ -44,13 +44,12 @@ def results_of(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def selected(scores: NDArray, select: str) -> int:
-    """
-    Return the index of the chosen number of basis shapes.
+    """Return the index of the chosen number of basis shapes.
 
-    Scores are (n_candidates, n_splits), by ascending number of basis shapes. `select`
-    is "best", the best mean, or "one_standard_error", the fewest basis shapes whose
-    mean is at most one standard error of the best mean below it (Hastie, Tibshirani,
-    Friedman, "The elements of statistical learning", 2009, section 7.10).
+    Scores are (n_candidates, n_splits), by ascending number of basis shapes. "best"
+    takes the best mean, "one_standard_error" the fewest basis shapes with a mean at
+    most one standard error below it (Hastie, Tibshirani, Friedman, "The elements of
+    statistical learning", 2009, section 7.10).
     """
     mean = scores.mean(axis=1)
     if np.isnan(mean).all():
@@ -92,10 +91,7 @@ def line(row: Row, held_out: bool) -> str:
 
 
 def warn_of_no_shape(scores: NDArray) -> None:
-    """Warn if no held-out error, minus a mean score (n_candidates, n_splits), is small.
-
-    The limit is the error of the centroid of each frame, one.
-    """
+    """Warn if no mean score (n_candidates, n_splits) beats the centroids of frames."""
     if np.nanmax(scores.mean(axis=1)) <= -1:
         warn_caller(NO_SHAPE)
 

@@ -520,11 +520,9 @@ def refuse_blocks(X: Any) -> None:
 def held_out_score(
     model: AffineNRSfM, held_out: NDArray, scorer: Any, X: Any, y: Any, params: Any
 ) -> float:
-    """
-    Return the score of a fitted estimator on rows that are held out.
+    """Return the score of a fitted estimator on held-out rows of X and y.
 
-    X and y are those of the whole table. Metadata `params` with an entry for each row
-    are split as well.
+    Metadata `params` with an entry for each row are split in the same way.
     """
     n_rows = number_of_rows(X)
     own = {

@@ -1,12 +1,10 @@
 """Fits of one table, and of parts of it, with more and more basis shapes.
 
 The table is checked, centred and scaled once. The fit of all frames starts from the one
-with fewer basis shapes: from its shapes, and the leading directions of the residuals.
-The fit of a fold, the frames that are not held out, starts from the fit of all frames
-and from that of the fold itself with fewer basis shapes. The one with the lower
-objective on the fold goes on: frames that are held out may offer a start, but only
-those that are fitted choose. The first fits, with the fewest basis shapes, search for
-their starts as `AffineNRSfM.fit` does.
+with fewer basis shapes and the leading directions of its residuals. The fit of a fold
+starts from the fit of all frames and from that of the fold itself with fewer basis
+shapes; the lower objective on the fold goes on. So held-out frames may offer a start,
+but never choose. The first fits search for their starts as `AffineNRSfM.fit` does.
 """
 
 import copy
@@ -39,17 +37,14 @@ Scorer = Callable[[AffineNRSfM, NDArray], float]
 
 
 class Row(NamedTuple):
-    """
-    Scores and times of one number of basis shapes.
+    """Scores and times of one number of basis shapes.
 
     Attributes
     ----------
     n_components : int
-        K.
     scores : ndarray of shape (n_splits,)
-        Scores of the rows that are held out.
+        Scores of held-out rows.
     fit_seconds, score_seconds : ndarray of shape (n_splits,)
-        Seconds of the fits of the other rows, and of the scores.
     path_seconds : float
         Seconds of the fit of all rows; zero where no fit starts from it.
     n_unconverged : int
@@ -65,20 +60,7 @@ class Row(NamedTuple):
 
 
 class Part(NamedTuple):
-    """
-    All of a table, or the rows of it that a split fits, ready for fits.
-
-    Attributes
-    ----------
-    estimator : AffineNRSfM
-        The estimator, whose parameters are checked for the table.
-    X : array-like of shape (n_rows, 2 * n_points)
-        All of the table, as it was given.
-    table : ScaledTable
-        The part.
-    split : tuple of ndarray, or None
-        None for all of the table.
-    """
+    """A table X, or its rows that a split fits, with parameters checked for it."""
 
     estimator: AffineNRSfM
     X: Any
@@ -112,13 +94,12 @@ def walk(
     any_basis: bool = False,
     n_jobs: int | None = None,
 ) -> Iterator[Row]:
-    """
-    Yield scores of rows that are held out, for more and more basis shapes.
+    """Yield scores of held-out rows, for ascending numbers of basis shapes.
 
-    Candidates are numbers of basis shapes, ascending. Each split has the rows that are
-    fitted and those that are held out. With `any_basis` the score is the same for any
-    basis of the deformations, and none is looked for. `n_jobs` splits are fitted at the
-    same time. Without the joint refinement no fit starts from another one.
+    Each split has the rows that are fitted and those that are held out. With
+    `any_basis` the score does not depend on the basis, and none is looked for. `n_jobs`
+    splits are fitted at a time. Without the joint refinement no fit starts from another
+    one.
     """
     estimator, _, table, _ = whole
     joint = estimator.refinement == "joint"
@@ -155,10 +136,9 @@ def walk(
 
 
 def extended(frames: PosteriorFrames, table: ScaledTable, n_components: int) -> Start:
-    """Return the shapes of a fit, extended to K basis shapes.
+    """Extend the shapes of a fit to K basis shapes by directions of its residuals.
 
-    The further ones are the leading directions of the residuals of the fit, in at most
-    200 frames of the table: they are only a start.
+    At most 200 frames of the table are used: the result is only a start.
     """
     n_frames = table.rows.n_frames
     few = spread(np.arange(n_frames), min(n_frames, 200))
@@ -205,11 +185,10 @@ def _fitted(
     before: Fitted | None,
     every: Fitted | None = None,
 ) -> Fitted:
-    """
-    Return the fit of a part with K basis shapes, and its score if it is a split.
+    """Return the fit of a part with K basis shapes, and its score if it is a split.
 
-    It starts from the fit of the same part with fewer basis shapes, `before`, and from
-    that of all of the table, `every`; without them it searches for its starts.
+    It starts from the fits with fewer basis shapes of the same part, `before`, and of
+    all of the table, `every`. Without them it searches for its starts.
     """
     since = time.perf_counter()
     estimator, X, table, split = part
