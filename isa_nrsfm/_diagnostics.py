@@ -101,11 +101,10 @@ class Diagnostics(NamedTuple):
 
 
 def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
-    """
-    Return how far the fitted table determines a joint fit, with its frames kept.
+    """Return how far the fitted table determines a joint fit, with its frames kept.
 
-    `distance` (n_rows, n_points) are lengths of the residuals of frames of size one,
-    NaN where a point is missing, and `rows` are the names of the rows.
+    `distance` (n_rows, n_points) are residuals of frames of size one, NaN where a point
+    is missing, and `rows` the names of the rows.
     """
     frames, sizes = estimator._model.frames, estimator._frame_sizes
     fitted = np.isfinite(sizes)
@@ -158,13 +157,11 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
-    """
-    Return the share of the variance of coefficients (n_components,) that is pose.
+    """Return the share of the variance of coefficients (n_components,) that is pose.
 
-    Leave-one-out R^2 of a linear regression on the nine entries of the rotations, those
+    Leave-one-out R^2 of a linear regression on the nine entries of the rotations
     nearest to affine cameras. These span yaw, pitch, roll, their squares and products,
-    to second order, and do not depend on a reference pose. NaN for coefficients that
-    are zero, or with fewer than 20 frames.
+    to second order. NaN for coefficients that are zero, or with fewer than 20 frames.
     """
     if len(alpha) < 20:
         return np.full(alpha.shape[1], np.nan)
@@ -184,13 +181,11 @@ def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
 
 
 def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
-    """
-    Return the share of points with gross residuals, and their rows and points.
+    """Return the share of points with gross residuals, and their rows and points.
 
-    `distance` (n_rows, n_points) are lengths of residuals, NaN where a point is
-    missing. The outliers (n_outliers, 2) are sorted, the largest first. The scale of a
-    residual is the median of all of them. It is larger for points and frames whose own
-    median is larger: such points and frames are badly explained as a whole.
+    The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
+    of all residuals, larger for points and frames whose own median is larger: these are
+    badly explained as a whole.
     """
     none = np.empty((0, 2), dtype=np.intp)
     if distance is None or not (shown := np.isfinite(distance)).any():
@@ -208,10 +203,7 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
 
 
 def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
-    """Return the message on outliers; empty if there are too few to matter.
-
-    `rows` are the names of the rows of the table, `names` those of its points.
-    """
+    """Return the message on outliers; empty if there are too few to matter."""
     if not found.outlier_share > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
@@ -258,11 +250,9 @@ def _of_support(found: Diagnostics, loss: str) -> str:
 def _of_coefficients(
     found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
 ) -> list[str]:
-    """
-    Return messages on coefficients that a handful of frames decide, or the pose.
+    """Return messages on coefficients that a handful of frames decide, or the pose.
 
-    `alpha` is (n_rows, n_components), NaN for rows that were not fitted; `rows` are
-    their names. The pose is only named if the layout of the points has a contour.
+    The pose is only named if the layout of the points has a contour.
     """
     messages = []
     n_frames, effective = (
@@ -326,12 +316,7 @@ def camera_meaning(ratio: float) -> str:
 
 
 def camera_advice(camera: str, ratio: float, determined: bool) -> str:
-    """
-    Return the camera model to try next, in a sentence; empty if not measured.
-
-    `ratio` is `camera_noise_ratio_`, and `determined` whether calibrated cameras
-    determine the depth.
-    """
+    """Return the camera model to try next, in a sentence; empty if not measured."""
     if np.isnan(ratio):
         return ""
     if camera != "affine" and not determined:
@@ -357,24 +342,10 @@ def reliabilities(
     """
     Return the shares of the variance of coefficients that are neither noise nor chance.
 
-    Parameters
-    ----------
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    covariance : ndarray of shape (n_components, n_components)
-        Mean over the frames of their posterior covariances.
-    moments, noise : ndarray of shape (n_components, n_components), and float
-        Sums over the blocks of frames, as in `shown_frames`.
+    These are squared correlations (K,) of the coefficients alpha (I, K) with the true
+    ones, along uncorrelated directions, decreasing. The covariance is the mean
+    posterior one; moments and noise are sums over the blocks of `shown_frames`.
 
-    Returns
-    -------
-    ndarray of shape (n_components,)
-        Squared correlations of the coefficients with the true ones, along uncorrelated
-        directions, decreasing. Zero for directions that noise alone explains, and for
-        those without any variance.
-
-    Notes
-    -----
     With known shapes they are the eigenvalues of ``(S + C)^-1 S``, with S the second
     moment of the coefficients and C the mean covariance: ``S + C`` is the whole
     variance. Estimated shapes follow the noise. A shape of ``gamma`` numbers a frame
@@ -412,13 +383,10 @@ def reliabilities(
 def weak_information(
     mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray
 ) -> NDArray:
-    """
-    Return the information matrix of V_1, ..., V_K in basis shapes ``B_k + V_k B_0``.
+    """Return the information matrix (9K, 9K) of V_1, ..., V_K in ``B_k + V_k B_0``.
 
-    The result is (9 * n_components, 9 * n_components), for noise of variance one.
-    Cameras and coefficients of the frames are unknown, the rest of the shapes is known.
-    Shapes are (n_points, 3), `motion` are cameras (n_frames, 2, 3) of frames of size
-    one.
+    For noise of variance one, unknown cameras (I, 2, 3) and coefficients of frames of
+    size one, and otherwise known shapes.
     """
     n_frames, n_components = alpha.shape
     chosen = np.unique(np.linspace(0, n_frames - 1, 400).astype(int))

@@ -9,11 +9,10 @@ intercept of the sequence, drawn from N(0, B). The state of the filter is (x_t, 
 and ``x_1 - u`` has the covariance of all ``x_t - u``. So differences between people are
 no dynamics.
 
-A frame is observed through its likelihood as a function of x, a normal density with
-the precision L_t and the information vector h_t. The posterior of a frame by itself,
-mean m_t and covariance C_t, contains the prior N(0, I). Without it there remain ``L_t =
-C_t^-1 - I`` and ``h_t = C_t^-1 m_t``: where a prediction takes the place of the prior,
-nothing counts twice. A frame that nobody saw has ``L_t = 0, h_t = 0``.
+A frame is observed through its likelihood as a function of x, a normal density with the
+precision L_t and the information vector h_t. The posterior of a frame by itself, mean
+m_t and covariance C_t, contains the prior N(0, I). Without it there remain ``L_t =
+C_t^-1 - I`` and ``h_t = C_t^-1 m_t``, and zeros for an unseen frame.
 
 References: Rauch, Tung, Striebel, "Maximum likelihood estimates of linear dynamic
 systems", 1965; Shumway, Stoffer, "An approach to time series smoothing and forecasting
@@ -52,19 +51,10 @@ class Dynamics(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """
-    Posterior of the coefficients of a sequence, given all of its frames.
+    """Posterior of the coefficients of a sequence, given all of its frames.
 
-    Attributes
-    ----------
-    mean : ndarray of shape (n_steps, K)
-        Posterior means.
-    covariance : ndarray of shape (n_steps, K, K)
-        Posterior covariances.
-    lagged : ndarray of shape (n_steps - 1, K, K)
-        Posterior covariances of x_t+1 and x_t.
-    log_likelihood : float
-        Logarithm of the likelihood of the frames, up to a constant of each frame.
+    Means (n_steps, K), covariances (n_steps, K, K), those of x_t+1 and x_t (n_steps -
+    1, K, K), and the log-likelihood of the frames, up to a constant of each frame.
     """
 
     mean: NDArray
@@ -83,14 +73,12 @@ def smoothed_posterior(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return posterior means and covariances, given all frames of their sequences.
+    """Return posterior means and covariances, given all frames of their sequences.
 
-    Means (n_frames, K), NaN for frames without a fit, and covariances (n_frames, K, K)
-    are those of the frames by themselves, with the prior N(0, I). They are returned as
-    they came if the frames show no dynamics. The time scales (K,) or (0,) are ``-1 /
-    log |l|`` of the eigenvalues l of the transition, the longest first, infinite where
-    |l| >= 1.
+    Means (I, K), NaN for frames without a fit, and covariances (I, K, K) of the frames
+    by themselves have the prior N(0, I). They are returned as they came if there are no
+    dynamics. The time scales (K,) or (0,) are ``-1 / log |l|`` of the eigenvalues l of
+    the transition, the longest first, infinite where |l| >= 1.
     """
     times, numbers = checked_times(time, len(mean)), group_numbers(groups, len(mean))
     sequences, unit = sequences_of(times, numbers, max_gap)
@@ -121,12 +109,11 @@ def smoothed_posterior(
 def sequences_of(
     time: NDArray, groups: NDArray | None, max_gap: int
 ) -> tuple[list[tuple[NDArray, NDArray]], float]:
-    """
-    Return the rows and steps of each sequence, and the time of a step (the median).
+    """Return the rows and steps of each sequence, and the time of a step (the median).
 
-    Times (n_rows,) rise within each of the groups (n_rows,), which are numbered, or
-    None for one. A gap of more than max_gap steps begins a new sequence. Steps count
-    from zero. Raises ValueError if times do not rise, or if no group has two rows.
+    Times rise within each of the numbered groups. A gap of more than max_gap steps
+    begins a new sequence. Raises ValueError if times do not rise, or if no group has
+    two rows.
     """
     if groups is None:
         groups = np.zeros(len(time), dtype=int)
@@ -155,11 +142,7 @@ def sequences_of(
 
 
 def observations(mean: NDArray, covariance: NDArray) -> Observations:
-    """
-    Return what frames show of their coefficients without the prior N(0, I).
-
-    Means are (n_frames, K), covariances (n_frames, K, K). Frames of NaN show nothing.
-    """
+    """Return the likelihood of coefficients without the prior N(0, I), zero for NaN."""
     n_frames, K = mean.shape
     precision, information = np.zeros((n_frames, K, K)), np.zeros((n_frames, K))
     known = np.isfinite(mean).all(axis=1)
@@ -205,11 +188,9 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
 def estimated_dynamics(
     sequences: Sequence[Observations], max_iter: int, tol: float, intercepts: bool
 ) -> Dynamics | None:
-    """
-    Estimate the autoregression of sequences by expectation maximisation.
+    """Estimate the autoregression by expectation maximisation; None without dynamics.
 
-    With intercepts the states of the sequences are (x_t, u). The iteration ends when no
-    posterior mean changes by more than tol. Returns None if there are no dynamics.
+    With intercepts the states of the sequences are (x_t, u).
     """
     K = sequences[0].information.shape[1] // (1 + intercepts)
     options = sequences, max_iter, tol, intercepts
@@ -293,9 +274,8 @@ def _shrunk_regression(across: NDArray, early: NDArray, Q: NDArray) -> NDArray:
     Return the transition of greatest posterior density, with a ridge from the evidence.
 
     The rows of ``Q^-1/2 F`` have the prior ``N(0, I / ridge)``. The ridge maximises the
-    evidence, a sum over the eigenvectors of the moments. Where that is hardly greater
-    than the evidence for zero the transition is zero: there are no dynamics. The
-    moments are ``sum_t E x_t+1 x_t^T`` and ``sum_t E x_t x_t^T``.
+    evidence; if that is hardly greater than for a transition of zero, this is returned.
+    The moments are ``sum_t E x_t+1 x_t^T`` and ``sum_t E x_t x_t^T``.
     """
     K = len(Q)
     values, axes = np.linalg.eigh(early)

@@ -85,22 +85,19 @@ JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 
 
 class Limits(NamedTuple):
-    """
-    Numbers that tests and benchmarks vary.
+    """Numbers that tests and benchmarks vary.
 
     Attributes
     ----------
     dense : int
-        A table with more points and more rows of images than this is not factorised as
-        a whole.
+        A table with more points and more rows of images is not factorised as a whole.
     sample : int
         Number of frames of the first sample of a large table.
     small_table : int
-        Tables with fewer coordinates than this are fitted without a sample.
+        Tables with fewer coordinates are fitted without a sample.
     model_frames : int
         Largest number of frames from which outliers and missing points are modelled.
     joint : JointOptions
-        Of the joint refinement.
     """
 
     dense: int = 1500
@@ -113,12 +110,10 @@ class Limits(NamedTuple):
 def fit_table(
     estimator: TableTransformer, source: Table, progress: FitProgress
 ) -> Decomposition:
-    """
-    Fit a table, and set the attributes of an estimator whose parameters are checked.
+    """Fit a table, and set the attributes of an estimator whose parameters are checked.
 
-    Its `isa_` is the unfitted strategy. `progress` is called after each stage, and
-    before each step of the joint refinement. Returns the fit of the rows of the table;
-    NaN for rows without points.
+    Its `isa_` is the unfitted strategy. Returns the fit of all rows, NaN where a row
+    shows no point.
     """
     n_components = estimator.n_components
     if n_components == "auto":
@@ -135,11 +130,9 @@ def fit_ready_table(
     progress: FitProgress | NoProgress,
     starts: Sequence[Start] = (),
 ) -> Decomposition:
-    """
-    Fit a table that is checked, centred and scaled, as in `fit_table`.
+    """Fit a table that is checked, centred and scaled, as in `fit_table`.
 
-    `starts` are those of the joint refinement. By default it searches for them, from
-    the result of the paper's pipeline among others.
+    Without `starts` the joint refinement searches for them.
     """
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(estimator, table, n_components, progress)
@@ -269,10 +262,7 @@ def _factorised(
     n_components: int,
     report: Callable[[str], None],
 ) -> FactorisedTable:
-    """Return a table with outliers, completed frames, sample and factors.
-
-    Outliers are looked for with a robust loss only. They count as missing points.
-    """
+    """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = estimator._limits, table.n_points
     outliers, completed, complete = None, table.rows, table.complete
     if estimator.loss != "linear":
@@ -362,8 +352,7 @@ def _joint_frames(
     tracks: JointFrames,
     alpha: NDArray,
 ) -> Decomposition:
-    """
-    Return the frames of a joint fit in the independent gauge, and set the model.
+    """Return the frames of a joint fit in the independent gauge, and set the model.
 
     `tracks` are the frames as they were fitted, `alpha` coefficients of some frames.
     """

@@ -19,8 +19,7 @@ from isa_nrsfm._tables.visibility import centred_frames, seen_points
 
 
 class TableModel(NamedTuple):
-    """
-    All that the fit of a new table depends on: model of a frame, shapes and layout.
+    """Model of a frame, shapes and layout: all that the fit of a new table depends on.
 
     Methods whose names begin with an underscore take some rows (n, 2 * n_points) of a
     table. Results are NaN for rows with too few points.
@@ -30,11 +29,9 @@ class TableModel(NamedTuple):
     frames : RigidFrames or PosteriorFrames
         The model of a frame of size one.
     mean_shape : ndarray of shape (n_points, 3)
-        Mean shape in the gauge.
+        In the gauge, as the basis.
     basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes in the gauge.
     layout : {"interleaved", "planar"}
-        Order of the columns.
     names : ndarray of shape (2 * n_points,) or None
         Names of the columns.
     unit : float or None
@@ -50,10 +47,7 @@ class TableModel(NamedTuple):
 
     @one_blas_thread
     def decompose(self, table: Table, deviations: bool = True) -> Decomposition:
-        """Return cameras, positions and coefficients of the frames of a table.
-
-        Without deviations the standard deviations of the coefficients are NaN.
-        """
+        """Return cameras, positions and coefficients of the frames of a table."""
         K = len(self.basis)
         fit = partial(self._fit_rows, dtype=table.dtype, deviations=deviations)
         found = table.blocks.collect(fit, ((2, 3), (2,), (K,), (K,)), table.dtype)
@@ -61,10 +55,7 @@ class TableModel(NamedTuple):
 
     @one_blas_thread
     def posterior(self, table: Table) -> FramePosterior:
-        """Return the fit of each frame by itself, of size one and before the gauge.
-
-        There coefficients have the prior N(0, I). Only for `PosteriorFrames`.
-        """
+        """Return the fit of each frame, of size one, before the gauge."""
         found = table.blocks.map(self._posterior)
         return FramePosterior(*map(np.concatenate, zip(*found, strict=True)))
 
@@ -74,8 +65,8 @@ class TableModel(NamedTuple):
     ) -> NDArray:
         """Return the shapes (n_frames, n_points, 3) of the frames of a table.
 
-        They are Euclidean in a metric of space; with `scaled` they have the sizes that
-        an orthographic camera shows.
+        A metric of space makes them Euclidean; `scaled` gives them the sizes that an
+        orthographic camera shows.
         """
         shapes = partial(self._shapes, metric=metric, scaled=scaled, dtype=table.dtype)
         return table.blocks.collect(shapes, (self.mean_shape.shape,), table.dtype)[0]
@@ -198,21 +189,17 @@ def held_out_energies(
     tracks: NDArray,
     sizes: NDArray,
 ) -> tuple[float, float]:
-    """
-    Return the energy of the error, and of the signal, of points that are held out.
+    """Return the energy of the error, and of the signal, of points that are held out.
 
-    The points are divided into five parts, the same for all frames and tables. Each
-    part is predicted from the others, frame by frame: camera, position and coefficients
-    are fitted without it. Shapes are (n_points, 3), tracks (n_frames, n_points, 2) with
-    NaN where a point is missing.
+    Each of five parts of the points, the same for all tables, is predicted from the
+    others: camera, position and coefficients of each frame are fitted without it. The
+    energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the
+    points, divided by the squared sizes (I,) of frames.
 
-    The energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the
-    points, each divided by the squared size of its frame. Points are left out if the
-    others of the frame do not determine its fit, or if in a frame with missing points
-    the camera, an affine one of the mean shape, adds more than twice the noise variance
-    to their prediction. Otherwise a few frames with hardly enough points would decide.
-    The limit does not depend on the basis shapes, so that scores of different K are of
-    the same points.
+    Points are left out if the others of the frame do not determine its fit, or if in a
+    frame with missing points the affine camera of the mean shape adds more than twice
+    the noise variance to their prediction: a few such frames would decide. This does
+    not depend on the basis, so that scores of different K are of the same points.
     """
     folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
     seen = seen_points(tracks)
@@ -258,10 +245,7 @@ def held_out_energies(
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:
-    """Return the variance of points (n, n_points) in cameras fitted to seen ones.
-
-    It is relative to the noise variance, for affine cameras of the mean shape.
-    """
+    """Return variances of points (n, J) from cameras, in noise variances."""
     points = np.linalg.qr(np.column_stack([mean_shape, np.ones(len(mean_shape))]))[0]
     normal = np.einsum("ij,ja,jb->iab", seen, points, points, optimize=True)
     # A little more: where the seen points are coplanar, the variance is huge.

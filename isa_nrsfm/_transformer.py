@@ -79,11 +79,7 @@ class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
 
 
 class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
-    """
-    The methods of `AffineNRSfM` that need a fit.
-
-    They use attributes that `fit` sets. The fitted model itself is `_model`.
-    """
+    """The methods of `AffineNRSfM` that need a fit: its attributes and `_model`."""
 
     n_components: Any
     isa: Any
@@ -546,11 +542,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         return frames
 
     def _opened(self, X: Any, reset: bool = False) -> Table:
-        """
-        Return a table in blocks, checked.
-
-        With reset it is the table of a fit. Without it has to match the fitted one.
-        """
+        """Return a table in checked blocks; unless `reset`, it must match the fit."""
         if not reset:
             check_is_fitted(self)
         if is_read_later(X):

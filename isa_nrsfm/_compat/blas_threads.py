@@ -16,11 +16,10 @@ def _thread_pools() -> ThreadpoolController:
 
 
 def one_blas_thread(function: Function) -> Function:
-    """
-    Decorate a function to run with one BLAS thread.
+    """Decorate a function to run with one BLAS thread.
 
-    Products of small matrices are not faster with threads. Beside another program, two
-    threads take 2 to 12 times as long. Blocks of frames run in parallel instead.
+    Small products gain nothing from threads; beside another program they take 2 to 12
+    times as long. Blocks of frames run in parallel instead.
     """
 
     @wraps(function)

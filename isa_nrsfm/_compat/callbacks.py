@@ -1,7 +1,6 @@
 """Progress of a fit: lines on the terminal, and scikit-learn's callbacks.
 
-Callbacks are new in scikit-learn 1.9, and experimental there. No other module uses
-their interface. With older versions there are only the lines on the terminal.
+Callbacks are new and experimental in scikit-learn 1.9. Only this module uses them.
 """
 
 import copy
@@ -39,23 +38,11 @@ def without_callbacks(estimator: Any) -> Any:
 
 
 class FitProgress:
-    """
-    Reports the stages of a fit, and the steps of one of them.
+    """Reports the stages of a fit, and the steps of the stage `stepwise`.
 
-    For callbacks the fit is a task with its stages as subtasks, and the steps of a
-    stage are subtasks of that. With `verbose`, a line is printed at the end of each
-    stage. Above one, the current stage and step are printed and overwritten.
-
-    Parameters
-    ----------
-    estimator : object
-        The estimator, with `CallbackSupportMixin` and `verbose`.
-    stages : sequence of str
-        The names of the stages, in order.
-    stepwise : str
-        The stage whose number of steps is unknown.
-    **data : object
-        X and y of the fit, for the callbacks.
+    For callbacks the fit is a task with its stages as subtasks, and steps as subtasks
+    of that. With `verbose`, a line is printed at the end of each stage; above one, the
+    current stage and step are printed and overwritten. Callbacks get X and y as `data`.
     """
 
     def __init__(

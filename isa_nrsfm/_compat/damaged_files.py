@@ -9,12 +9,10 @@ from collections.abc import Iterator
 def reading(
     path: str | os.PathLike[str], what: str, expected: str | None = None
 ) -> Iterator[None]:
-    """
-    Name the file in any error of reading it; errors of content become ValueErrors.
+    """Name the file in any error of reading it; errors of content become ValueErrors.
 
-    Which errors damaged content makes h5py, pyarrow, zipfile, json and others raise is
-    not documented, and there are many kinds. A reader raises its own without the path.
-    `what` is the kind of file, `expected` its required content.
+    Damaged content makes h5py, pyarrow, zipfile, json and others raise errors of many
+    undocumented kinds. `what` is the kind of file, `expected` its required content.
     """
     try:
         yield

@@ -1,9 +1,8 @@
 """Public names that are imported when they are first used (SPEC 1).
 
 An ``__init__.py`` lists its public names twice: under `TYPE_CHECKING`, for type
-checkers and editors, and for `lazy_names`. `tests/test_conventions.py` compares them.
-
-See https://scientific-python.org/specs/spec-0001/.
+checkers and editors, and for `lazy_names`. See
+https://scientific-python.org/specs/spec-0001/.
 """
 
 import os
@@ -21,11 +20,9 @@ def lazy_names(
     names: Mapping[str, Sequence[str]],
     subpackages: Sequence[str] = (),
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """
-    Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
-    `names` maps modules to the public names that they define; `subpackages` are folders
-    that are imported when they are first used. A name is imported once. Errors of
+    `names` maps modules to their public names; `subpackages` are folders. Errors of
     imports are raised unchanged, and at once if `EAGER_IMPORT` is set.
     """
     namespace = vars(sys.modules[package])

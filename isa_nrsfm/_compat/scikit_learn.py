@@ -38,11 +38,7 @@ class Interval(_Interval):
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
-    """
-    Return a decorator of `fit` that checks the estimator's parameters.
-
-    With `nested`, estimators that this one fits check theirs.
-    """
+    """Return a decorator of `fit` that checks parameters (nested: of estimators)."""
     decorate: Callable[[Function], Function] = _fit_context(
         prefer_skip_nested_validation=not nested
     )

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 
 def array_in(content: bytes) -> NDArray:
-    """
-    Return the array of numbers in bytes of NumPy's format.
+    """Return the array of numbers in bytes of NumPy's format.
 
-    NumPy itself makes room for any shape that the header names. Raise if the bytes hold
-    objects, or more or fewer numbers than the header has.
+    NumPy makes room for any shape in the header. Raise if the bytes hold objects, or
+    more or fewer numbers than the header has.
     """
     stored = io.BytesIO(content)
     version = np.lib.format.read_magic(stored)

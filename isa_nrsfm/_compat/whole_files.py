@@ -28,12 +28,11 @@ def write_whole(path: StrPath, contents: bytes) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
-    """
-    Open a file that has all of its new contents after the block, or stays as it was.
+    """Open a file that has all of its new contents after the block, or stays as it was.
 
-    The new file gets the permissions of the old one. A link stays a link. A path that
-    is no regular file, such as a pipe, is written to directly. OSErrors name the path,
-    also where a library that writes hides them behind one of its own.
+    Permissions and links stay. A path that is no regular file, such as a pipe, is
+    written to directly. OSErrors name the path, even if a library hides them behind its
+    own.
     """
     target = Path(os.path.realpath(path))
     with _naming(path):
@@ -59,8 +58,7 @@ def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def files_together(folder: StrPath, *, removed: Iterable[str] = ()) -> Iterator[Path]:
-    """
-    Write files to a new folder, which move to a folder after the block.
+    """Write files to a new folder, which move to a folder after the block.
 
     If the block fails all old files stay. Otherwise files in `removed` are deleted, and
     the new ones move. A process that is stopped meanwhile leaves old and new files.
@@ -91,11 +89,7 @@ def files_together(folder: StrPath, *, removed: Iterable[str] = ()) -> Iterator[
 
 @contextlib.contextmanager
 def folder_for_writing(path: StrPath) -> Iterator[None]:
-    """
-    Make a folder and check that it can be written to. OSErrors name it.
-
-    If the block fails, new folders without files are removed.
-    """
+    """Make a folder and check that it can be written to; remove new ones on failure."""
     folder = Path(path)
     made = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
@@ -111,10 +105,7 @@ def folder_for_writing(path: StrPath) -> Iterator[None]:
 
 
 def check_replaceable(path: Path) -> int | None:
-    """Raise if a path is no plain file or is protected; return its permissions.
-
-    None if there is no file.
-    """
+    """Return the permissions of a path, None if absent; raise if it is protected."""
     if path.is_symlink() or (path.exists() and not path.is_file()):
         raise OSError(errno.EINVAL, "is no plain file", os.fspath(path))
     if not path.exists():

@@ -1,8 +1,8 @@
 """The canonical choice among shapes and cameras that fit a table equally well.
 
 An affinity of space (with calibrated cameras a rotation) and the order, scale and sign
-of the basis shapes are free. Here they are fixed. The sign of depth is fixed by a
-convention only: a table does not tell an object from its mirror image.
+of the basis shapes are free. Here they are fixed. The sign of depth is a convention: a
+table does not distinguish an object from its mirror image.
 """
 
 from collections.abc import Callable
@@ -27,23 +27,11 @@ class Gauge(NamedTuple):
 
 
 def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
-    """
-    Return the rotation or reflection of space that shows the mean shape from front.
+    """Return the orthogonal A (3, 3) with which ``S A^T`` and ``M A^T`` are frontal.
 
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        Mean shape, centred.
-    cameras : ndarray of shape (n_frames, 2, 3)
-        Cameras.
-
-    Returns
-    -------
-    ndarray of shape (3, 3)
-        Orthogonal matrix A such that shapes ``S A^T`` and cameras ``M A^T`` are
-        canonical. The x and y axes are the orthonormal pair nearest to the rows of the
-        mean camera. Where the cameras have no common view, x, y and z are the principal
-        axes of ``sum_i M_i^T M_i``. The third moment of depth is non-negative.
+    The x and y axes are the orthonormal pair nearest to the rows of the mean camera. If
+    cameras (I, 2, 3) have no common view, the axes are the principal ones of ``sum_i
+    M_i^T M_i``. The third moment of depth of the mean shape (J, 3) is non-negative.
     """
     view = mean_view(cameras)
     if view is None:
@@ -58,13 +46,11 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
 
 
 def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
-    """
-    Return the affinity A (3, 3) of space that makes the mean shape white.
+    """Return the affinity A (3, 3) of space that makes the mean shape (J, 3) white.
 
-    Shapes become ``B A^T`` and cameras (n_frames, 2, 3), each divided by the size of
-    its frame, ``M A^-1``. The mean of ``b b^T`` over the points of the mean shape (J,
-    3) is the identity, with zeros along directions in which it is flat. In that space A
-    is the rotation or reflection of `canonical_rotation`.
+    Shapes become ``B A^T`` and cameras (I, 2, 3) of frames of size one ``M A^-1``. The
+    mean of ``b b^T`` over the points is the identity, with zeros along directions in
+    which the shape is flat. The rotation is `canonical_rotation`.
     """
     variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
     inside = variance > 1e-18 * variance[-1]
@@ -78,11 +64,9 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
 def euclidean_space(
     mean_shape: NDArray, motion: NDArray, size: float | None
 ) -> NDArray:
-    """
-    Return the scaled rotation or reflection (3, 3) of `canonical_rotation`.
+    """Return `canonical_rotation` times a size, for calibrated cameras (I, 2, 3).
 
-    Shapes are multiplied by `size`. None makes the mean square of the coordinates of
-    the mean shape (J, 3) one. Cameras (n_frames, 2, 3) are calibrated.
+    None gives the coordinates of the mean shape (J, 3) the mean square one.
     """
     if size is None:
         size = 1.0 / (np.sqrt(np.mean(mean_shape**2)) or 1.0)
@@ -96,29 +80,12 @@ def canonical_gauge(
     alpha: NDArray,
     space: NDArray,
 ) -> Gauge:
-    """
-    Return the canonical shapes among those that fit equally well.
+    """Return the canonical shapes among those that fit equally well, in a space (3, 3).
 
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0, centred.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, each divided by the size of its frame.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    space : ndarray of shape (3, 3)
-        The affinity of space, of `canonical_space` or `euclidean_space`.
-
-    Returns
-    -------
-    Gauge
-        The shapes in that space. The basis is sorted by decreasing energy in the
-        images, ``sum_i ||alpha_ik M_i B_k||_F^2``. It is scaled such that coefficients
-        have unit variance over the frames (unit mean square where they do not vary) and
-        a non-negative third moment. A basis shape without motion becomes zero.
+    The basis is sorted by decreasing energy in the images, ``sum_i ||alpha_ik M_i
+    B_k||_F^2``, with cameras (I, 2, 3) of frames of size one. Coefficients (I, K) get
+    unit variance (mean square where they do not vary) and non-negative skewness. A
+    basis shape without motion becomes zero.
     """
     energy = image_energies(motion, basis, alpha)
     order = np.argsort(-energy, kind="stable")
@@ -139,26 +106,11 @@ def rigid_gauge(
     camera: str,
     dtype: Any,
 ) -> tuple[Gauge, Decomposition]:
-    """
-    Return the gauge of the paper's pipeline, and the fit of the frames in it.
+    """Return the gauge of the paper's pipeline, and the fit of the frames in it.
 
-    It is the gauge of the fit of the frames by the points that they show. With missing
-    points that is not the one of completed frames.
-
-    Parameters
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        B_0, centred.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Basis shapes.
-    sizes : ndarray of shape (n_frames,)
-        Sizes of the frames.
-    fitted : callable
-        Returns the fit of the frames for a mean shape and a basis.
-    camera : {"affine", "weak_perspective", "orthographic"}
-        The camera model.
-    dtype : dtype
-        Type of the numbers that the shapes are rounded to.
+    It is the gauge of the fit of the frames by their visible points, not of completed
+    frames. `fitted` returns the fit for a mean shape (J, 3) and a basis (K, J, 3),
+    rounded to a dtype.
     """
     order, frames = np.arange(len(basis)), fitted(mean_shape, basis)
     # One scaling is enough, unless frames have fewer points than coefficients need.
@@ -189,24 +141,17 @@ def coefficient_sizes(alpha: NDArray) -> NDArray:
 
 
 def image_energies(motion: NDArray, basis: NDArray, alpha: NDArray) -> NDArray:
-    """
-    Return the energies of basis shapes in the images, ``sum_i ||alpha_ik M_i B_k||^2``.
-
-    Cameras are (n_frames, 2, 3), basis shapes (n_components, n_points, 3), coefficients
-    (n_frames, n_components), energies (n_components,).
-    """
+    """Return ``sum_i ||alpha_ik M_i B_k||^2`` (K,) of basis shapes (K, J, 3)."""
     cameras = motion.transpose(0, 2, 1) @ motion
     weighted = np.tensordot(alpha**2, cameras, axes=(0, 0))
     return np.einsum("kab,kab->k", weighted, basis.transpose(0, 2, 1) @ basis)
 
 
 def mode_covariance(motion: NDArray, alpha: NDArray) -> NDArray:
-    """
-    Return the mode covariance matrix of cameras (I, 2, 3) and coefficients (I, K).
+    """Return the mode covariance matrix of cameras (I, 2, 3) and coefficients (I, K).
 
     ``(1 / 2I) sum_i (alpha_i alpha_i^T) (x) (M_i^T M_i)``, of shape (3K, 3K), is the
-    covariance over the images of Brandt et al. (2018), section 3.3, if the motion has
-    block structure.
+    covariance over the images of Brandt et al. (2018), section 3.3.
     """
     total = np.zeros((3 * alpha.shape[1],) * 2)
     for start in range(0, len(alpha), 4096):  # blocks limit memory

@@ -33,32 +33,12 @@ def independent_gauge(
     camera: str = "affine",
     unit: float | None = None,
 ) -> tuple[Gauge, FrameMap]:
-    """
-    Return the independent basis of a fit.
+    """Return the independent basis of a fit as a gauge, and the map of frames to it.
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes, centred.
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, each divided by the size of its frame.
-    alpha : ndarray of shape (n_frames, n_components)
-        Coefficients.
-    independence : {"shapes", "coefficients", None}
-        Whether the basis shapes are to be independent over the points or their
-        coefficients over the frames; None takes the principal axes of the deformation.
-    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        The camera model: affinities of space, or with calibrated cameras only
-        rotations, fit equally well. Scales of orthographic cameras absorb nothing.
-    unit : float, optional
-        The `size` of `euclidean_space`, with calibrated cameras.
-
-    Returns
-    -------
-    gauge : Gauge
-        The canonical shapes, with factors relative to the mixed basis.
-    frames : FrameMap
-        Map of cameras and coefficients of frames to these shapes.
+    Shapes (K + 1, 3, J) are centred, cameras (I, 2, 3) those of frames of size one.
+    "shapes" are to be independent over the points, "coefficients" over the frames; None
+    takes the principal axes of the deformation. `unit` is the size in
+    `euclidean_space`.
     """
     # The shifts u and v, then the affinity of space.
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
@@ -92,20 +72,16 @@ def _centred(
     alpha: NDArray,
     camera: str,
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
+    """Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
 
     ``B_0 + sum_k u_k B_k`` gives the coefficients mean zero. ``B_k + v_k B_0`` makes
     the basis shapes orthogonal to the mean shape: ``<T B_k, T B_0> = 0`` where T
     whitens B_0, that is ``tr(B_k B_0^+) = 0``. With weak-perspective cameras it is
-    ``<B_k, B_0> = 0``. Each shift slightly undoes the other, so they alternate until
-    both vanish.
+    ``<B_k, B_0> = 0``. Each shift slightly undoes the other, so they alternate.
 
-    Then ``1 - sum_k v_k alpha_ik`` is the factor of the scale of frame i. Only u is
-    used, with v = 0, where such a factor is not positive or too small, where the
-    alternation does not converge, and for orthographic cameras, whose scale is fixed.
-
-    Shapes are (n, 3, n_points), cameras (n_frames, 2, 3), alpha (n_frames, n - 1).
+    Then ``1 - sum_k v_k alpha_ik`` is the factor of the scale of frame i. v is zero
+    where such a factor is not positive or too small, where the alternation does not
+    converge, and for orthographic cameras, whose scale is fixed.
     """
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=OF_RANKS), 1)
     first = total = _mean_shift(alpha)
@@ -146,10 +122,7 @@ def _mean_shift(alpha: NDArray) -> NDArray:
 
 
 def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
-    """Return the mixing (K, K) to uncorrelated coefficients, orthogonal basis shapes.
-
-    The basis is (K, n_points, 3) in the white space, alpha is (n_frames, K).
-    """
+    """Return the mixing (K, K) to uncorrelated coefficients, orthogonal shapes."""
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
     variance[variance <= OF_RANKS**2 * max(variance[-1], 1e-300)] = 1.0
     root = (axes * np.sqrt(variance)) @ axes.T

@@ -1,13 +1,11 @@
 """Algebra of many small symmetric matrices, the index of the matrix last.
 
-With the index last each operation is one pass over long rows of numbers. For matrices
-of one to fifteen rows that is faster than a call of LAPACK for each.
+Each operation is one pass over long rows of numbers, faster than a call of LAPACK for
+each matrix of up to fifteen rows. The k (k + 1) / 2 entries of a matrix are packed by
+rows from the diagonal on; those of 3x3 matrices of space are xx, xy, xz, yy, yz, zz.
 
-The k (k + 1) / 2 entries of a matrix are packed by rows, each row from the diagonal on.
-Those of 3x3 matrices of space are xx, xy, xz, yy, yz, zz.
-
-No function divides by zero. A pivot that is not positive is left out: its row and its
-column count as zero, so that results are finite for any matrix.
+A pivot that is not positive is left out: its row and its column count as zero, so that
+results are finite for any matrix.
 """
 
 import math
@@ -29,11 +27,9 @@ def unpack3(packed: NDArray) -> NDArray:
 
 
 def inverse3(packed: NDArray) -> NDArray:
-    """
-    Return the inverses (3, 3, n) of positive semidefinite matrices (6, n).
+    """Return the inverses (3, 3, n) of positive semidefinite matrices (6, n).
 
-    Those of singular ones are generalised inverses, with a row and a column of zeros
-    for each coordinate that the ones before it determine.
+    Generalised inverses of singular ones have zeros for dependent coordinates.
     """
     a, d, e, b, f, c = packed
     # R = L^-1 of the Cholesky factor L
@@ -100,10 +96,10 @@ def packed_products(A: NDArray, B: NDArray) -> NDArray:
 
 def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     """
-    Solve ``A x = b`` for packed positive definite A (n_pairs, n) and b (k, n).
+    Solve ``A x = b`` for packed A (n_pairs, n) and b (k, n); return x and definiteness.
 
-    Returned are x (k, n), zero for unknowns that are left out, and whether all pivots
-    are positive (n,), that is, A is positive definite.
+    x is zero for unknowns that are left out; A is definite (n,) if all pivots are
+    positive.
     """
     k, n = b.shape
     diagonal, positive = A[diagonal_of(A)], np.ones(n, dtype=bool)
@@ -132,14 +128,12 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
-    """
-    Sweep rows of packed symmetric matrices (n_pairs, n), in place.
+    """Sweep rows of packed symmetric matrices (n_pairs, n), in place.
 
     For ``[[C, G^T], [G, A]]``, with A the rows from the first to sweep on, that leaves
     ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
-    SWEEP operator", The American Statistician 33, 1979). Returned are the sums of the
-    logarithms of the positive pivots, ``log det A`` (n,), and whether all pivots are
-    positive (n,).
+    SWEEP operator", The American Statistician 33, 1979). Returns ``log det A`` (n,) of
+    the positive pivots, and whether all pivots are positive (n,).
     """
     rows = packed_rows(packed)
     k, n = len(rows), packed.shape[1]
@@ -167,10 +161,7 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
 
 
 def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
-    """Return the inverse pivots (n,), zero for those left out.
-
-    Matrices with a pivot left out become False in `positive` (n,), in place.
-    """
+    """Return inverse pivots (n,), zero where left out; clear `positive` there."""
     # Less, as a share of the entry before elimination, is rounding error.
     kept = pivot > OF_STEPS * diagonal
     if kept.all():

@@ -1,9 +1,8 @@
-"""What counts as rounding errors, in double precision.
+"""Limits of rounding errors, in double precision.
 
-Each limit is a share of the numbers that a result was computed from. The unit roundoff
-is 1.1e-16; a limit stands above it by what operations of its kind were seen to lose. A
-module takes the limit of the operations that it does. None is critical: with all of
-them halved, or all doubled, ``python -m benchmarks.accuracy tables`` prints the same
+Each is a share of the numbers that a result was computed from, above the unit roundoff
+1.1e-16 by the observed loss of its kind of operations. None is critical: with all of
+them halved, or doubled, ``python -m benchmarks.accuracy tables`` prints the same
 digits.
 """
 

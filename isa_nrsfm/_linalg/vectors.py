@@ -16,22 +16,18 @@ LANES = 16
 
 
 def in_lanes(frames: NDArray) -> NDArray:
-    """
-    Return numbers of frames (n,), the last one repeated up to a multiple of `LANES`.
+    """Return numbers of frames (n,), the last one repeated up to a multiple of `LANES`.
 
-    In arrays with the frame as the last index, the numbers that are found for a frame
-    then do not depend on how many frames there are, to the last bit. Frames that come
-    several times stay equal, and may be written to the same place.
+    With the frame as the last index, results of a frame then do not depend on the
+    number of frames, to the last bit. Repeated frames may be written to the same place.
     """
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 
 
 def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
-    """
-    Return the values (..., n_taken) of some frames, of values (..., n_frames).
+    """Return the values (..., n_taken) of some frames, of values (..., n_frames).
 
-    The frame stays the last axis in memory: sums are rounded by that order. Indexing
-    with an array would put the frame first.
+    The frame stays the last axis in memory, which determines the rounding of sums.
     """
     if isinstance(frames, slice):
         return values[..., frames]
@@ -39,11 +35,7 @@ def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
 
 
 def frames_last(motion: NDArray) -> NDArray:
-    """
-    Return matrices (n, a, b) as (a, b, n), with long rows over the frames in memory.
-
-    What comes from `frames_first` is not copied.
-    """
+    """Return matrices (n, a, b) as (a, b, n), with long rows over the frames."""
     return np.ascontiguousarray(motion.transpose(1, 2, 0))
 
 
@@ -53,11 +45,7 @@ def frames_first(M: NDArray) -> NDArray:
 
 
 def orientations(rows: NDArray) -> NDArray:
-    """
-    Return a sign for each row (n_rows, n_entries): that of its third moment.
-
-    Where the third moment vanishes the entry of largest magnitude decides.
-    """
+    """Return the sign of the third moment, or largest entry, of rows (n, m)."""
     largest = np.abs(rows).max(axis=1, keepdims=True)
     scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
     moment = np.sum(scaled**3, axis=1)
@@ -67,11 +55,10 @@ def orientations(rows: NDArray) -> NDArray:
 
 
 def polar(matrices: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return polar decompositions ``A = P O`` of matrices (..., m, d), ``m <= d``.
+    """Return polar decompositions ``A = P O`` of matrices (..., m, d), ``m <= d``.
 
-    O (..., m, d) are the nearest orthonormal rows. The singular values (..., m) of A
-    are the eigenvalues of P, whose eigenvectors (..., m, m) are in columns.
+    O (..., m, d) are the nearest orthonormal rows. Also returns the eigenvalues (...,
+    m) of P, the singular values of A, and its eigenvectors (..., m, m) in columns.
     """
     U, values, Vt = np.linalg.svd(matrices, full_matrices=False)
     return U @ Vt, values, U

@@ -22,17 +22,15 @@ from isa_nrsfm._paper.block_structure import MotionProducts
 def refine_alternating(
     products: MotionProducts, starts: NDArray, *, max_iter: int, tol: float
 ) -> tuple[NDArray, NDArray, int, bool]:
-    """
-    Return the blocks that explain most of the motion, each from several starts.
+    """Return the blocks that explain most of the motion, each from several starts.
 
-    Consecutive signals of the products form a subspace. Of the starts (n_blocks,
-    n_starts, 3, 3) the best one after six steps is used. A block has converged when a
-    step gains less than `tol` of its energy.
+    Of the starts (n_blocks, n_starts, 3, 3) the best one after six steps is used. A
+    block has converged when a step gains less than `tol` of its energy.
 
     Returns the blocks E (n_blocks, 3, 3) of unit norm and arbitrary sign, ``M_ik ~
     alpha_ik M_0^i E_k``, zero for a subspace without motion; their energies ``sum_i
-    ||alpha_ik M_0^i E_k||^2`` (n_blocks,); the largest number of steps of a block; and
-    whether all blocks have converged.
+    ||alpha_ik M_0^i E_k||^2`` (n_blocks,); the largest number of steps; and
+    convergence.
     """
     E, energy = np.zeros((len(starts), 3, 3)), np.zeros(len(starts))
     n_iter, converged = 1, True
@@ -57,11 +55,7 @@ def refine_alternating(
 
 
 def _step(P: NDArray, rigid: NDArray, E: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return the energies (n,) of matrices E (n, 3, 3), and E after a step, of unit norm.
-
-    P and `rigid` (n_frames, 9) are as in `MotionProducts`.
-    """
+    """Return energies (n,) of E (n, 3, 3), and E after a step, of unit norm."""
     inner = P @ E.reshape(-1, 9).T  # <M_ik, M_0^i E>
     square = rigid @ (E @ E.swapaxes(1, 2)).reshape(-1, 9).T  # ||M_0^i E||^2
     alpha = np.divide(inner, square, where=square > 0, out=np.zeros_like(inner))

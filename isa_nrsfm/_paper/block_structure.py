@@ -1,8 +1,8 @@
-"""Block structure of the motion: 3x3 matrices that take subspaces to the rigid motion.
+"""Block structure of the motion: 3x3 matrices that map subspaces to the rigid motion.
 
 The motion of subspace k is known up to a 3x3 matrix. With the right D_k it is the rigid
 motion times a coefficient, ``M_ik D_k ~ alpha_ik M_0^i`` (Brandt et al. 2018, appendix
-A). All functions here need of each frame only the products in `MotionProducts`.
+A). Only the products in `MotionProducts` are needed.
 """
 
 from typing import NamedTuple
@@ -60,12 +60,12 @@ def motion_products(rigid_motion: NDArray, motion: NDArray) -> MotionProducts:
 
 def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     """
-    Return for each subspace the matrix D_k that takes its motion to the rigid motion.
+    Return D_k (n_blocks, 3, 3) that maps the motion of subspaces to the rigid motion.
 
     D_k and alpha_k make ``sum_i ||M_ik D_k - alpha_ik M_0^i||_F^2`` small. With the
-    best alpha_k put in, this cost is a quadratic form in vec(D_k). The methods, one of
-    `BLOCK_RECOVERIES`, differ in how they exclude ``D_k = 0``. The result (n_blocks, 3,
-    3) has norm one and arbitrary sign; it is zero for a subspace without motion.
+    best alpha_k put in, this is a quadratic form in vec(D_k). The methods
+    `BLOCK_RECOVERIES` differ in how they exclude ``D_k = 0``. Norm one, arbitrary sign;
+    zero without motion.
     """
     energy = products.rigid_energies()
     blocks = products.blocks()
@@ -104,14 +104,12 @@ def _explained(m: NDArray, energy: NDArray) -> NDArray:
 
 
 def lifted_moments(products: MotionProducts) -> NDArray:
-    """
-    Return the second moments ``sum_i L_i[a, m] L_i[b, n]`` of the lifted motions.
+    """Return second moments ``sum_i L_i[a, m] L_i[b, n]`` (3, 3, n_signals, n_signals).
 
-    The motion of a frame is lifted from the image to space by a regularised inverse of
-    its rigid camera, ``L_i = (M_0^iT M_0^i + ridge I)^-1 M_0^iT M^i``, a 3 x n_signals
-    matrix. If the motion of subspace k is ``alpha_ik M_0^i E_k``, the columns of L_i
-    that belong to it are nearly ``alpha_ik E_k``, and the leading eigenvector of their
-    second moments is nearly E_k. The result is (3, 3, n_signals, n_signals).
+    ``L_i = (M_0^iT M_0^i + ridge I)^-1 M_0^iT M^i`` lifts the motion of a frame from
+    the image to space. If the motion of subspace k is ``alpha_ik M_0^i E_k``, its
+    columns of L_i are nearly ``alpha_ik E_k``, and the leading eigenvector of their
+    moments E_k.
     """
     n_frames, _, n_signals = products.cross.shape
     energy = products.rigid_energies()
@@ -122,11 +120,10 @@ def lifted_moments(products: MotionProducts) -> NDArray:
 
 
 def lifted_blocks(moments: NDArray, subspaces: NDArray) -> NDArray:
-    """
-    Return the lifted moments (n_subspaces, 9, 9) of subspaces.
+    """Return the lifted moments (n, 9, 9) of subspaces (n, 3, n_signals).
 
     These are the second moments of the 3x3 matrices ``L_i A_k``, row by row, where the
-    columns of A_k are the rows of subspace k (n_subspaces, 3, n_signals).
+    columns of A_k are the rows of subspace k.
     """
     rows = subspaces[:, None, None]
     blocks = rows @ moments @ rows.swapaxes(-1, -2)  # (k, a, b, m, n)
@@ -134,19 +131,17 @@ def lifted_blocks(moments: NDArray, subspaces: NDArray) -> NDArray:
 
 
 def structure_energies(moments: NDArray, subspaces: NDArray) -> NDArray:
-    """
-    Return the energy (n_subspaces,) of the lifted motion that has block structure.
+    """Return the energies (n_subspaces,) of lifted motion with block structure.
 
-    This is the largest eigenvalue of the moments of `lifted_blocks`: the energy that is
-    a coefficient times one matrix E_k.
+    The largest eigenvalue of `lifted_blocks`: energy of a coefficient times one E_k.
     """
     return np.linalg.eigvalsh(lifted_blocks(moments, subspaces))[:, -1]
 
 
 def leading_blocks(moments: NDArray, subspaces: NDArray, n_leading: int = 2) -> NDArray:
-    """Return candidates for E_k (n_subspaces, n_leading, 3, 3), the likeliest first.
+    """Return leading eigenvectors of `lifted_blocks` (n_subspaces, n_leading, 3, 3).
 
-    These are the leading eigenvectors of the moments of `lifted_blocks`.
+    They are candidates for E_k, the likeliest first.
     """
     vectors = np.linalg.eigh(lifted_blocks(moments, subspaces))[1]
     leading = vectors[:, :, : -n_leading - 1 : -1].swapaxes(1, 2)

@@ -16,10 +16,7 @@ from isa_nrsfm._paper.svd import Triplets, leading_triplets
 
 
 class Factorisation(NamedTuple):
-    """
-    Rigid and non-rigid part of a measurement matrix W.
-
-    ``W ~ M_0 B_0 + M' B'``, the best approximation of rank 3K + 3.
+    """Rigid and non-rigid part of W, ``W ~ M_0 B_0 + M' B'`` of rank 3K + 3.
 
     Attributes
     ----------
@@ -32,8 +29,7 @@ class Factorisation(NamedTuple):
         M', by decreasing column norm.
     signals : ndarray of shape (n_signals, n_points)
         B', centred and white, orthogonal to B_0. `n_signals` is 3K, or less where W has
-        a lower rank: the least multiple of three with room for all singular values
-        above rounding errors.
+        a lower rank: the least multiple of three above the rank.
     """
 
     rigid_motion: NDArray
@@ -48,12 +44,10 @@ def factorise(
     precision: float = 0.0,
     triplets: Triplets | None = None,
 ) -> Factorisation:
-    """
-    Return the rigid and the non-rigid factors of a measurement matrix.
+    """Return the rigid and the non-rigid factors of centred W (2 * n_frames, n_points).
 
-    W is (2 * n_frames, n_points) with centred rows. `precision` is the rounding error
-    of its entries, relative to their root mean square. `triplets` are the 3K + 3
-    leading ones of a larger matrix that contains the frames of W, by default of W.
+    `precision` is the rounding error of its entries, relative to their RMS. `triplets`
+    are the 3K + 3 leading ones of a larger matrix, by default of W.
     """
     n_points = W.shape[1]
     S, Vt, _ = triplets or leading_triplets(W, 3 * n_components + 3)

@@ -1,8 +1,7 @@
-"""The paper's pipeline: from a factorisation to basis shapes.
+"""The paper's pipeline: independent subspaces, block structure, refinement.
 
 Brandt, Ackermann, Grasshof, "Uncalibrated Non-Rigid Factorisation by Independent
-Subspace Analysis" (2018): independent subspaces, block structure, refinement, each in
-a module of its own.
+Subspace Analysis" (2018).
 """
 
 from collections.abc import Callable
@@ -26,8 +25,7 @@ from isa_nrsfm._paper.factors import Factorisation
 
 
 class PaperResult(NamedTuple):
-    """
-    Result of the paper's pipeline, before a gauge is chosen.
+    """Result of the paper's pipeline, before a gauge is chosen.
 
     Attributes
     ----------
@@ -39,7 +37,6 @@ class PaperResult(NamedTuple):
     n_iter : int
         Steps of the refinement, 1 without a refinement.
     converged : bool
-        Whether it has converged.
     """
 
     shapes: NDArray
@@ -58,13 +55,7 @@ def run_paper_pipeline(
     tol: float,
     report: Callable[[str], None],
 ) -> PaperResult:
-    """
-    Run the stages of the paper after the factorisation.
-
-    The strategy `isa` is fitted here. `block_recovery` is a method of `recover_blocks`.
-    `max_iter` and `tol` are those of `refine_alternating`; zero steps leave it out.
-    `report` is called with the name of each finished stage.
-    """
+    """Fit the strategy `isa`, recover blocks and refine them unless max_iter is 0."""
     n_rows, n_points = len(factors.motion), factors.signals.shape[1]
     products = motion_products(factors.rigid_motion, factors.motion)
     moments = lifted_moments(products)
@@ -97,14 +88,12 @@ def run_paper_pipeline(
 def _independent_subspaces(
     isa: Any, signals: NDArray, covariance: NDArray, moments: NDArray
 ) -> NDArray:
-    """
-    Fit a strategy to signals (n_signals, n_points) and return its unmixing matrix.
+    """Fit a strategy to signals (n_signals, n_points) and return its unmixing matrix.
 
-    If `fit` of the strategy has a parameter `covariance`, it gets the covariance over
-    the images, ``C = (J / 2I) M'^T M'`` (Brandt et al. 2018, section 3.3). Their mean
-    term is left out: it would depend on the rotation of single images. If it has a
-    parameter `criterion`, it gets the function `structure_energies` of `lifted_moments`
-    to rate candidates for subspaces by their block structure.
+    A parameter `covariance` of its `fit` gets the covariance over the images, ``C = (J
+    / 2I) M'^T M'`` (Brandt et al. 2018, section 3.3), without their mean, which would
+    depend on the rotation of single images. A parameter `criterion` gets
+    `structure_energies`.
     """
     fit_params: dict[str, Any] = {}
     if has_fit_parameter(isa, "covariance"):

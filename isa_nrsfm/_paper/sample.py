@@ -1,8 +1,7 @@
-"""Frames of a large table for the first stages.
+"""Frames of a large table for the first stages, which only make a start.
 
-The stages of the paper and the first steps of the joint refinement only make a start
-for the steps that follow. A sample of the frames makes one as good. It is spread evenly
-from the most to the least rigid frame, so that the order of the frames does not matter.
+A sample is spread evenly from the most to the least rigid frame, so that the order of
+the frames does not matter.
 """
 
 from functools import partial
@@ -18,17 +17,9 @@ from isa_nrsfm._tables.ordering import spread
 
 
 class Sample(NamedTuple):
-    """
-    Frames for the first stages.
+    """Completed measurement matrix W of a first sample, and indices of growing ones.
 
-    Attributes
-    ----------
-    W : ndarray of shape (2 * n_chosen, n_points)
-        Their measurement matrix, completed where points are missing.
-    parts : list of ndarray of int
-        Indices of frames, increasing. The first array has the frames of W, the others
-        the larger and larger samples of the steps that follow. Empty where W has all
-        frames.
+    The first of `parts` has the frames of W. It is empty if W has all frames.
     """
 
     W: NDArray
@@ -45,8 +36,7 @@ def sample_frames(
     """
     Return frames for the first stages, from blocks of complete ones (n, 2, n_points).
 
-    `rigid_shape` is (3, n_points), `first` the size of the first sample. Tables with
-    fewer coordinates than `small_table` are taken whole.
+    Tables with fewer coordinates than `small_table` are taken whole.
     """
     n_frames = rows.n_frames
     parts: list[NDArray] = []
@@ -62,12 +52,7 @@ def sample_frames(
 
 
 def rigid_energy(rows: NDArray, shape: NDArray) -> NDArray:
-    """
-    Return the residual energy (n_frames,) of frames after the fit of a rigid shape.
-
-    Rows are (n_frames, 2, n_points), the shape (3, n_points). The energies ``min_M
-    ||W_i - M shape||_F^2`` have the rounding errors of ``||W_i||_F^2``.
-    """
+    """Return ``min_M ||W_i - M shape||_F^2`` (I,) of rows (I, 2, J)."""
     axes, size, _ = np.linalg.svd(shape.T, full_matrices=False)
     axes = axes[:, size > OF_RANKS * size[0]]
     seen = (rows.reshape(-1, rows.shape[-1]) @ axes).reshape(len(rows), -1)

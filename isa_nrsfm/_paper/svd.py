@@ -16,8 +16,7 @@ DENSE = 1500
 
 
 class Triplets(NamedTuple):
-    """
-    Leading singular values of a matrix, and their right vectors.
+    """Leading singular values of a matrix, and their right vectors.
 
     Attributes
     ----------
@@ -51,15 +50,12 @@ def block_triplets(
     """
     Return the k leading triplets of a matrix in blocks of frames (n, ..., n_columns).
 
-    `shape` has the numbers of rows and columns. The right singular vectors of a tall
-    matrix are those of its triangular factor, which is put together from those of the
-    blocks (Demmel, Grigori, Hoemmen, Langou, "Communication-optimal parallel and
-    sequential QR and LU factorizations", 2012).
-
-    Of a matrix with many rows and many columns, the subspace of the leading right
-    vectors comes from a block Krylov method (Golub, Van Loan, "Matrix computations",
-    2013, section 10.3.6). The triplets are those of the matrix projected to it. They
-    do not come from ``W^T W``, so small singular values keep their precision.
+    The right singular vectors of a tall matrix are those of its triangular factor,
+    joined from those of the blocks (Demmel, Grigori, Hoemmen, Langou,
+    "Communication-optimal parallel and sequential QR and LU factorizations", 2012). Of
+    a matrix with many rows and columns, a block Krylov method finds the leading right
+    subspace (Golub, Van Loan, "Matrix computations", 2013, section 10.3.6). Without
+    ``W^T W`` small singular values keep their precision.
     """
     n_rows, n_columns = shape
     if min(shape) > max(dense, 4 * k):
@@ -106,13 +102,11 @@ def _block_triangle(block: NDArray, V: NDArray | None) -> NDArray:
 def _leading_subspace(
     blocks: FrameBlocks, n_columns: int, k: int, energy: float
 ) -> NDArray:
-    """
-    Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
+    """Return an orthonormal basis (n_columns, k) of the leading right singular vectors.
 
-    A block Krylov method: each pass adds the block ``W^T W V`` to the basis, V being
-    the last block. The energy in the subspace grows with each pass. The gains shrink by
-    larger and larger factors, so the last two bound the next one. The method ends when
-    that bound is below 1e-6 of the energy that is left.
+    Each pass of the block Krylov method adds ``W^T W V``, V being the last block. The
+    gains of energy shrink by larger and larger factors, so the last two bound the next
+    one. The method ends when that bound is below 1e-6 of the energy that is left.
     """
     # First block: the leading subspace of a sample of frames.
     width = k + 10

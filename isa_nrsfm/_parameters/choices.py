@@ -1,7 +1,6 @@
-"""The texts that parameters of `AffineNRSfM` may be, each default first.
+"""The values of text parameters of `AffineNRSfM`, each default first.
 
-The command line offers them in its help, which must not wait for NumPy or scikit-learn:
-this module imports nothing.
+No imports: the help of the command line must not wait for NumPy or scikit-learn.
 """
 
 BLOCK_RECOVERIES = ("generalized_eigen", "eigen", "irls")

@@ -1,8 +1,7 @@
-"""Frames in blocks: the one place that knows who computes a block, and where.
+"""Block-wise execution: in memory, in threads, from disk or on dask.
 
 All stages of the fit are sums over frames, or go frame by frame. They are written as
-functions of a block of frames, and run here: on arrays in memory, in threads, on tables
-that are read from disk block by block, or on a dask cluster.
+functions of a block of frames.
 """
 
 import mmap
@@ -16,11 +15,10 @@ from numpy.typing import NDArray
 
 
 class FrameBlocks:
-    """
-    Consecutive blocks of the frames of a table, in memory or read when they are needed.
+    """Consecutive blocks of the frames of a table, in memory or read when needed.
 
-    A block holds some consecutive frames: an array with a row for each of them, or any
-    object that a function given to `derive` has returned.
+    A block is an array with a row for each of some consecutive frames, or any object
+    that a function given to `derive` has returned.
 
     Parameters
     ----------
@@ -29,8 +27,7 @@ class FrameBlocks:
     lengths : sequence of int
         Number of frames of each block.
     cached : bool
-        Whether derived blocks are computed at once and kept. Otherwise they are
-        computed anew each time they are read.
+        Whether derived blocks are computed at once and kept, or anew at each reading.
     n_threads : int, default=1
         Threads that work on blocks at the same time.
     """
@@ -82,12 +79,7 @@ class FrameBlocks:
         return sum(self.lengths)
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
-        """
-        Yield the results of a function of each block, in order.
-
-        The function is called with a block and the rows of the arrays (n_frames, ...)
-        that belong to its frames.
-        """
+        """Yield results of a function of each block and its rows of arrays."""
         run = self._reader(function, by_frame)
         numbers = range(len(self.lengths))
         if min(self.n_threads, len(numbers)) < 2:
@@ -144,11 +136,9 @@ class FrameBlocks:
         shapes: tuple[tuple[int, ...], ...],
         dtype: Any,
     ) -> tuple[Any, ...]:
-        """
-        Return several arrays that a function makes of the blocks, each for all frames.
+        """Return arrays of all frames that a function makes of the blocks.
 
-        The shapes of their rows and the type of their numbers are needed where there
-        are no blocks, or where they are not computed yet.
+        Shapes of rows and dtype serve if there are no blocks, or none is computed yet.
         """
         parts = list(self.map(function))
         if len(parts) == 1:
@@ -162,11 +152,7 @@ class FrameBlocks:
         return values
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
-        """
-        Return fewer blocks of at most n_frames frames, joined from consecutive ones.
-
-        Blocks that are not in memory stay as they are.
-        """
+        """Join consecutive blocks in memory into blocks of at most n_frames frames."""
         if not self.cached:
             return self
         groups: list[list[int]] = [[]]

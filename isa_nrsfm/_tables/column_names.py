@@ -1,9 +1,8 @@
 """Names of the columns of landmarks.
 
-A landmark coordinate is named by an axis letter (``x``, ``y``, ``z``) and a point,
-which is a number or a word: ``x00``, ``x_0``, ``x-0``, ``0_x``, ``0x``, ``nose_x``,
-``nose.x``, ``x_nose``, ``eye_lmk_x_3``. Lower and upper case are different columns.
-Blanks around a name do not count.
+A landmark coordinate is named by an axis letter (``x``, ``y``, ``z``) and a point, a
+number or a word: ``x00``, ``x_0``, ``x-0``, ``0_x``, ``0x``, ``nose_x``, ``nose.x``,
+``x_nose``, ``eye_lmk_x_3``. Case matters, blanks around a name do not.
 
 Names of the same form are a *set* of landmarks, written as a pattern in which ``#``
 stands for a number and ``*`` for any text: ``x_#,y_#``, ``eye_lmk_x_#,eye_lmk_y_#``,
@@ -30,13 +29,12 @@ _TRAILING_NUMBER = re.compile(r"(.*?)(\d+)", re.DOTALL)
 
 
 class Coordinate(NamedTuple):
-    """
-    The parts of the name of a landmark column.
+    """The parts of the name of a landmark column.
 
     ``axis`` is 0, 1 or 2 for x, y or z; ``point`` is the name without its axis letter
-    (``"3"``, ``"nose"``, ``"eye_lmk_3"``). ``memberships`` are the sets of the column,
-    the narrowest first, each with the key of the point in the set. A set is the text
-    before the axis letter, the three letters, and the text after it.
+    (``"3"``, ``"nose"``, ``"eye_lmk_3"``). ``memberships`` are its sets, the narrowest
+    first: the text before the axis letter, the three letters and the text after it;
+    each with the key of the point.
     """
 
     axis: int
@@ -76,13 +74,11 @@ def parse_coordinate(name: Hashable) -> Coordinate | None:
 def names_layout(
     names: Iterable[Hashable],
 ) -> Literal["interleaved", "planar", "other"] | None:
-    """
-    Return the arrangement of a table's landmark columns.
+    """Return the arrangement of a table's landmark columns.
 
-    "interleaved" is x0, y0, x1, y1, ..., "planar" x0, x1, ..., y0, y1, .... "other" is
-    another order, incomplete points, a third coordinate or other columns beside them.
-    None if there are not both x and y, or if the other columns are pairs that differ in
-    the letters x and y alone, such as lx1, ly1.
+    "interleaved" is x0, y0, x1, y1, ..., "planar" x0, x1, ..., y0, y1, ..., "other" any
+    other order, incomplete points, or further columns. None without both x and y, or if
+    the other columns are pairs that differ in these letters alone, such as lx1, ly1.
     """
     axes, points, rest = [], [], []
     for name in names:

@@ -12,18 +12,10 @@ from isa_nrsfm._tables.blocks import FrameBlocks, chosen_rows
 
 
 class DaskBlocks(FrameBlocks):
-    """
-    Blocks on the workers of the active dask scheduler.
+    """Blocks, a sequence of Delayed, on the workers of the active dask scheduler.
 
     Derived blocks stay on the workers. Only `map` brings results back. If a worker is
-    lost, the scheduler computes its blocks again, beginning with the table.
-
-    Parameters
-    ----------
-    blocks : sequence of Delayed
-        The blocks.
-    lengths : sequence of int
-        Number of frames of each. Blocks without frames are left out.
+    lost, the scheduler computes its blocks again. Blocks without frames are left out.
     """
 
     def __init__(self, blocks: Sequence[Any], lengths: Sequence[int]):

@@ -8,11 +8,7 @@ from sklearn.utils import check_array, column_or_1d
 
 
 def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
-    """
-    Return a column with one entry for each frame: numbers, or names as str.
-
-    Another length and missing entries (None, NaN or NA) are refused by `name`.
-    """
+    """Return a column (n_frames,) of numbers, or names as str, without gaps."""
     column = np.asarray(column_or_1d(values))
     if len(column) != n_frames:
         raise ValueError(
@@ -49,11 +45,7 @@ def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
 
 
 def checked_times(time: Any, n_rows: int) -> NDArray:
-    """
-    Return finite times of rows (n_rows,), dates and durations in seconds.
-
-    None stands for rows in order, one step apart.
-    """
+    """Return finite times of rows (n_rows,) in seconds; None means single steps."""
     if time is None:
         return np.arange(n_rows, dtype=float)
     time = checked_column("time", time, n_rows)

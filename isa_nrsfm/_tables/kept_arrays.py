@@ -18,30 +18,11 @@ Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 
 @contextlib.contextmanager
 def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
-    """
-    Make ready to keep arrays in files, and remove the files if the block fails.
+    """Keep arrays in files of a folder, and remove the files if the block fails.
 
-    Each block writes to a new folder within the given one, named by the time and at
-    random, so that no other fit, process or clone writes to files that are mapped.
-
-    Parameters
-    ----------
-    path : str, path-like or None
-        The path of the folder. It is made if it does not exist. None keeps arrays where
-        they are.
-
-    Yields
-    ------
-    callable
-        Takes arrays by name, and returns them by name: memory maps of files that are
-        named like them.
-
-    Raises
-    ------
-    ValueError
-        If the path is empty.
-    OSError
-        If the folder cannot be made or written to, or a file cannot be written.
+    Yields a function that maps arrays by name to memory maps by name, or to themselves
+    if the path is None. Each block writes to a new folder in the given one, which is
+    made if necessary: no other fit or process writes to files that are mapped.
     """
     if path is None:
         yield dict

@@ -1,4 +1,4 @@
-"""Tables of landmarks and the tracks in them: the one place that knows a layout.
+"""Tables of landmarks and the tracks in them, in either layout of the columns.
 
 A *table* has one row a frame and two columns a point, shape ``(n_frames,
 2 * n_points)``. *Tracks* are the same numbers as ``(n_frames, n_points, 2)``. A point
@@ -43,10 +43,9 @@ def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
 
 
 def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return tracks (I, J, 2) centred over the points that they show, and centroids.
+    """Return tracks (I, J, 2) centred over their visible points, and centroids.
 
-    Frames whose seen points are all equal are refused.
+    Frames whose visible points are all equal are refused.
     """
     centred, report = centred_frames(tracks)
     refuse_one_place(report, tracks.shape[1])
@@ -54,21 +53,9 @@ def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
-    """
-    Return the sizes by which frames are divided before they are compared.
+    """Return the sizes (I,) by which centred tracks (I, J, 2) are divided.
 
-    Parameters
-    ----------
-    centred : ndarray of shape (n_frames, n_points, 2)
-        Centred tracks, NaN where a point is not seen. Each frame shows some.
-    scale_frames : bool
-        True for a size of its own for each frame, False for one size for all.
-
-    Returns
-    -------
-    ndarray of shape (n_frames,)
-        The root mean square of the seen coordinates of each frame. With one size for
-        all it is the root of the mean of these mean squares.
+    The RMS of the visible coordinates of each frame, or of all if not `scale_frames`.
     """
     known = ~np.isnan(centred)
     seen = np.where(known, centred, 0.0)

@@ -10,12 +10,10 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 
 def order_by_halves(rows: FrameBlocks) -> NDArray:
-    """
-    Return an order of frames (n_frames,) that stays the same when they are permuted.
+    """Return an order of frames (n_frames,) that stays the same when they are permuted.
 
-    Blocks of frames (n_frames, ...) are sorted by the share of their energy that is in
-    the first half of their entries. For rows (2, n_points) that is the share of x. NaN
-    counts as zero.
+    Frames (n_frames, ...) are sorted by the share of their energy in the first half of
+    their entries: for rows (2, n_points) the share of x. NaN counts as zero.
     """
     return np.argsort(rows.joined(_first_half), kind="stable")
 
@@ -37,24 +35,10 @@ def spread(order: NDArray, n: int) -> NDArray:
 
 def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     """
-    Return frames from which the model of a large table is found.
+    Return indices of about `most` frames of rows (I, 2, J), for the model of a table.
 
-    They are spread evenly over the order of `order_by_halves`, so that they do not
-    depend on the order of the table. For each point that few of them show, frames that
-    show it are added, spread in the same way.
-
-    Parameters
-    ----------
-    rows : FrameBlocks
-        Blocks of frames (n_frames, 2, n_points), NaN where a point is not seen.
-    most : int
-        Number of frames, before those that are added. A table with no more frames is
-        taken whole.
-
-    Returns
-    -------
-    ndarray of int, shape (n_chosen,)
-        The frames, in the order of the table.
+    They are spread evenly over `order_by_halves`, independent of the order of the
+    table. For each point that few of them show, frames that show it are added.
     """
     if rows.n_frames <= most:
         return np.arange(rows.n_frames)

@@ -24,18 +24,7 @@ CHECKS: dict[str, Any] = {
 
 
 class Table(NamedTuple):
-    """
-    A table in blocks of its rows.
-
-    Attributes
-    ----------
-    blocks : FrameBlocks
-        Blocks (n_frames, 2 * n_points) of float32 or float64.
-    n_columns : int
-        Number of columns.
-    dtype : dtype
-        Type of the numbers.
-    """
+    """A table in blocks (n_frames, 2 * n_points) of float32 or float64 rows."""
 
     blocks: FrameBlocks
     n_columns: int
@@ -51,8 +40,7 @@ class Table(NamedTuple):
 
     @classmethod
     def read_later(cls, X: Any, working_memory: float | None) -> "Table":
-        """
-        Return the table of a dask array, or one that is read in blocks.
+        """Return the table of a dask array, or one that is read in blocks.
 
         Chunks of dask stay on its workers; blocks use `working_memory` megabytes.
         """
@@ -124,12 +112,10 @@ def column_sample(X: Any) -> Any:
 
 
 class StoredTable:
-    """
-    A table whose rows are read from files when they are needed.
+    """A table whose rows are read from files when they are needed.
 
-    `isa_nrsfm.io.open_table` makes one. It can be given to `AffineNRSfM.fit`,
-    `transform`, `score` and the other methods that take a table, and is then read block
-    by block.
+    `isa_nrsfm.io.open_table` makes one. `AffineNRSfM.fit`, `transform`, `score` and the
+    other methods that take a table read it block by block.
 
     Parameters
     ----------
@@ -147,12 +133,6 @@ class StoredTable:
     ----------
     shape : tuple of int
         Numbers of rows and columns.
-    ndim : int
-        2.
-    dtype : dtype
-        Type of the numbers.
-    columns : ndarray of shape (n_columns,) or None
-        Names of the columns.
     """
 
     ndim = 2

@@ -14,19 +14,18 @@ EQUAL = 4
 
 
 class FrameReport(NamedTuple):
-    """
-    Place, size and visible points of frames.
+    """Place, size and visible points of frames.
 
     Attributes
     ----------
     translation : ndarray of shape (n_frames, 2)
-        Centroids of the seen points, NaN for frames without any.
+        Centroids of the visible points, NaN for frames without any.
     size : ndarray of shape (n_frames,)
-        Root mean squares of the centred coordinates, zero for frames without any.
+        RMS of the centred coordinates, zero for frames without any.
     n_seen : ndarray of int, shape (n_frames,)
-        Number of points that are seen.
+        Number of visible points.
     in_one_place : ndarray of bool, shape (n_frames,)
-        Whether all seen points are equal, up to rounding.
+        Whether all visible points are equal, up to rounding.
     on_line : ndarray of bool, shape (n_frames,)
         Whether points are missing and the others on one line, up to rounding.
     """
@@ -39,13 +38,11 @@ class FrameReport(NamedTuple):
 
     @property
     def usable(self) -> NDArray:
-        """
-        Whether frames (n_frames,) show enough to determine their camera.
+        """Return a mask of frames (n_frames,) with enough points for a camera.
 
-        They show at least four points that are not all in one place and, if some are
-        missing, not all on one line. A complete frame may show its points on a line:
-        that is a flat object seen edge on. Where only some points are seen, they rather
-        lie on a line of the object, which leaves the camera free to turn around it.
+        Four points or more, not all in one place and, if some are missing, not on a
+        line. A complete frame on a line is a flat object seen edge on. With some points
+        missing the line may be one of the object, which can turn around it.
         """
         enough = self.n_seen >= FEWEST_POINTS
         return enough & ~self.in_one_place & ~self.on_line
@@ -64,21 +61,7 @@ def seen_points(tracks: NDArray) -> NDArray:
 
 
 def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
-    """
-    Centre frames over the points that they show.
-
-    Parameters
-    ----------
-    tracks : ndarray of shape (n_frames, n_points, 2)
-        The tracks, NaN where a point is not seen.
-
-    Returns
-    -------
-    centred : ndarray of shape (n_frames, n_points, 2)
-        Tracks minus centroids in double precision, NaN where a point is not seen.
-    report : FrameReport
-        What the frames show.
-    """
+    """Return frames (I, J, 2) centred over their visible points in double precision."""
     eps = EQUAL * np.finfo(tracks.dtype).eps
     # The same memory order, so that sums are the same to the last bit.
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
@@ -111,11 +94,10 @@ def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
 def _collinear(
     centred: NDArray, place: NDArray, n_seen: NDArray, eps: float
 ) -> NDArray:
-    """
-    Return in which frames (n,) the seen points are on a line, up to rounding.
+    """Return in which centred frames (n, J, 2) the visible points are on a line.
 
-    Tracks (n, J, 2) are centred and zero where a point is not seen; place (n,) is the
-    distance of their centroids from the origin.
+    Missing points are zero; `place` (n,) is the distance of the centroid from the
+    origin.
     """
     x, y = centred[..., 0], centred[..., 1]
     # The principal axis by its angle. Eigenvalues of the 2x2 second moment would square

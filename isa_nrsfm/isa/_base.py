@@ -68,11 +68,10 @@ class BaseSubspaceAnalysis(
 
     @abstractmethod
     def _unmix(self, Z: NDArray, whitening: NDArray) -> NDArray:
-        """
-        Return the orthogonal matrix that unmixes white signals.
+        """Return the orthogonal matrix that unmixes white Z (n_signals, n_samples).
 
-        Z is (n_signals, n_samples). The result and `whitening`, with ``Z = whitening @
-        (signals - mean_).T``, are (n_signals, n_signals).
+        ``Z = whitening @ (signals - mean_).T``; both matrices are (n_signals,
+        n_signals).
         """
 
     def transform(self, signals: Any) -> NDArray:
@@ -95,12 +94,10 @@ class BaseSubspaceAnalysis(
 
 
 def whiten(centred: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return white signals Z (n_signals, n_samples), and the whitening matrix.
+    """Return white signals Z (n_signals, n_samples), and the whitening matrix.
 
     ZCA whitening of the standardised signals: ``Z = whitening @ centred.T`` with ``Z
-    Z^T = n_samples I``. Signals that are white already stay as they are, up to
-    rounding. `centred` is (n_samples, n_signals), with zero mean.
+    Z^T = n_samples I``. White signals stay as they are, up to rounding.
     """
     n_samples, n_signals = centred.shape
     scale = centred.std(axis=0)

@@ -203,11 +203,7 @@ def _run(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return unmixing, likelihood, steps and convergence of a batch of starts.
-
-    Starts and unmixing are (n_batch, n_signals, n_signals), Z is (n_signals,
-    n_samples), the other results are (n_batch,).
-    """
+    """Return unmixing, likelihood, steps and convergence of starts (n_batch, n, n)."""
     # FastICA: subspaces of size one. Inside a subspace the components may not be
     # determined, so it does not need to converge further than this.
     W, n_iter_ica, _ = iterate(

@@ -7,12 +7,10 @@ from isa_nrsfm.isa._density import SubspaceDensity
 
 
 def orthogonalise(W: NDArray) -> NDArray:
-    """
-    Return the orthogonal matrices nearest to matrices (n_batch, n, n).
+    """Return the orthogonal matrices ``(W W^T)^(-1/2) W`` nearest to W (n_batch, n, n).
 
-    The symmetric orthogonalisation ``(W W^T)^(-1/2) W`` comes from the eigenvectors of
-    ``W W^T``, in two thirds of the time of an SVD of W. Squaring costs precision, which
-    one Newton step restores (Higham 2008, chapter 8).
+    Eigenvectors of ``W W^T`` take two thirds of the time of an SVD of W. One Newton
+    step restores the precision that squaring costs (Higham 2008, chapter 8).
     """
     values, axes = np.linalg.eigh(W @ W.swapaxes(-1, -2))
     poor = values[:, 0] <= 1e-8 * values[:, -1]  # nearly singular
@@ -27,9 +25,9 @@ def orthogonalise(W: NDArray) -> NDArray:
 
 
 def subspace_energies(Y: NDArray, subspace_size: int) -> NDArray:
-    """Return the energies (..., n_subspaces, n_samples) of signals by subspaces.
+    """Return energies (..., n_subspaces, n_samples) of Y (..., n_signals, n_samples).
 
-    Y is (..., n_signals, n_samples); consecutive rows form a subspace.
+    Consecutive rows form a subspace.
     """
     *batch, _, n_samples = Y.shape
     return (Y * Y).reshape(*batch, -1, subspace_size, n_samples).sum(axis=-2)
@@ -53,14 +51,12 @@ def fixed_point_step(
     density: SubspaceDensity,
     length: NDArray | float = 1.0,
 ) -> NDArray:
-    """
-    Return W after one step of FastISA (Hyvarinen and Koster 2006).
+    """Return W (n_batch, n, n) after one step of FastISA (Hyvarinen and Koster 2006).
 
     For each row w of subspace k, with y = w z, that is the orthogonalised ``E[z y
     g(u_k)] - E[g(u_k) + 2 y^2 g'(u_k)] w``. With a step length (n_batch,) below 1.0 a
     multiple of w is added, so that each row turns by about this share of the full step.
-    The fixed points are the same. W is (n_batch, n_signals, n_signals), orthogonal, Z
-    (n_signals, n_samples), white.
+    The fixed points are the same.
     """
     n_batch, n_signals, n_samples = len(W), *Z.shape
     Y = (W @ Z).reshape(n_batch, -1, subspace_size, n_samples)
@@ -80,8 +76,7 @@ def subspace_change(W: NDArray, W_new: NDArray, subspace_size: int) -> NDArray:
     Return the largest change (n_batch,) of a subspace between two orthogonal matrices.
 
     It is ``||P_k - P_new,k||_F^2 / (2 d)`` with projectors ``P_k = W_k^T W_k``, the
-    mean square sine of the d principal angles. Rows may rotate inside their subspace
-    for ever. W and W_new are (n_batch, n_signals, n_signals).
+    mean square sine of the d principal angles: rows may rotate inside their subspace.
     """
     shape = (len(W), -1, subspace_size, W.shape[-1])
     cosines = W.reshape(shape) @ W_new.reshape(shape).swapaxes(-1, -2)
@@ -97,16 +92,11 @@ def iterate(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Repeat `fixed_point_step` on each start until it converges.
+    """Repeat `fixed_point_step` on each start until `subspace_change` is below `tol`.
 
     With few samples the published iteration mostly ends in cycles. The step length of a
-    start that cycles is halved, which does not change its fixed points.
-
-    W (n_batch, n_signals, n_signals) are orthogonal starts, Z (n_signals, n_samples)
-    white signals. `tol` is the tolerance on `subspace_change` by a step of length 1.
-    Returns the last iterates, and for each start the number of steps and whether it has
-    converged.
+    start that cycles is halved. Returns the last iterates (n_batch, n, n), and for each
+    start the number of steps and whether it has converged.
     """
     W = W.copy()
     n_iter = np.zeros(len(W), dtype=int)

@@ -27,20 +27,16 @@ def swap_until_best(assignment: NDArray, gains: Gains) -> NDArray:
 
 
 def rows_by_subspace(assignment: NDArray) -> NDArray:
-    """Return an order (n_signals,) of the signals that makes subspaces consecutive.
-
-    Subspaces are in the order of their first signals.
-    """
+    """Return an order (n_signals,) of the signals that makes subspaces consecutive."""
     _, first, group = np.unique(assignment, return_index=True, return_inverse=True)
     return np.argsort(first[group], kind="stable")
 
 
 def covariance_gains(covariance: NDArray) -> Gains:
-    """
-    Return the gains for pooling by a covariance (n_signals, n_signals).
+    """Return the gains for pooling by a covariance (n_signals, n_signals).
 
-    The objective is the energy (sum of squares) of the covariance inside the diagonal
-    blocks of the subspaces (Brandt et al. 2018, section 3.3).
+    The objective is the energy of the covariance inside the diagonal blocks of the
+    subspaces (Brandt et al. 2018, section 3.3).
     """
     energy = covariance**2
     total = float(energy.sum())
@@ -60,11 +56,9 @@ def covariance_gains(covariance: NDArray) -> Gains:
 
 
 def value_gains(value: Callable[[NDArray], NDArray], n_signals: int) -> Gains:
-    """
-    Return the gains for an objective that is a sum over the subspaces.
+    """Return the gains for an objective that is a sum of the values of groups.
 
-    `value` returns the value of each of some groups of signals as a subspace. Groups
-    are ndarrays of int of shape (n_groups, subspace_size), in any order inside.
+    `value` takes groups of signals, ints (n_groups, subspace_size) in any order inside.
     """
     # with_b[a, b] is the value of the subspace of a with a replaced by b. Row a depends
     # only on the mates of a, the signals of its subspace. A swap changes the mates of
@@ -89,10 +83,7 @@ def value_gains(value: Callable[[NDArray], NDArray], n_signals: int) -> Gains:
 
 
 def likelihood_gains(signals: NDArray, density: SubspaceDensity) -> Gains:
-    """Return the gains for grouping by the likelihood of ISA, ``sum_k E F(u_k)``.
-
-    Signals are (n_signals, n_samples), uncorrelated with unit variance.
-    """
+    """Return the gains for the likelihood ``sum_k E F(u_k)`` of white signals."""
     square = signals**2
 
     def value(groups: NDArray) -> NDArray:

@@ -234,12 +234,10 @@ def _check_covariance(covariance: Any, n_signals: int) -> NDArray:
 def _objective(
     W: NDArray, Z: NDArray, covariance: NDArray | None, in_order: NDArray
 ) -> tuple[Gains, Callable[[NDArray], float]]:
-    """
-    Return the gains of swaps of rows of W, and the value of the rows in an order.
+    """Return the gains of swaps of rows of W, and the value of the rows in an order.
 
     The value is the share of the energy of the covariance inside the blocks, or without
-    one the log-likelihood. W and the covariance of the white signals Z (n_signals,
-    n_samples) are (n_signals, n_signals).
+    a covariance the log-likelihood of W and Z (n_signals, n_samples).
     """
     if covariance is None:
         density, size = SqrtDensity(), int(np.count_nonzero(in_order == 0))

@@ -1,9 +1,9 @@
 """Independent signals whose samples are vectors, all coordinates mixed alike.
 
 A sample of a signal is a vector of d coordinates. Independent subspace analysis mixes
-all dK coordinates of K signals, by a dK x dK matrix. Here the same K x K matrix mixes
-each of the coordinates. This is the freedom that a fit leaves to its basis shapes: the
-samples are points, d is 3. With d = 1 it is plain ICA, as for coefficients.
+all dK coordinates of K signals. Here the same K x K matrix mixes each coordinate: the
+freedom that a fit leaves to its basis shapes, with points as samples and d = 3. With d
+= 1 it is plain ICA, as for coefficients.
 """
 
 import numpy as np
@@ -27,33 +27,22 @@ TEMPER = 1e-3
 
 def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     """
-    Return the mixing, the same for all coordinates, that makes signals independent.
+    Return the mixing W, the same for all coordinates, that makes signals independent.
 
-    The signals are whitened. From several orthogonal starts, a few steps of FastICA for
-    vectors are taken. From the likeliest result the likelihood of independent spherical
-    signals, ``sum_k E log p_k(||y_k||) + size * log |det W|`` with ``y = W signals``,
-    is maximised over all invertible W by Newton steps. Each density p_k is the
-    likeliest of a few, with heavy or light tails.
+    The signals (n_signals, n_samples, size) are whitened, without removing means. From
+    several orthogonal starts a few steps of FastICA for vectors are taken. From the
+    likeliest result the likelihood of independent spherical signals, ``sum_k E log
+    p_k(||y_k||) + size * log |det W|`` with ``y = W signals``, is maximised over all
+    invertible W by Newton steps. Each density p_k is the likeliest of a few, with heavy
+    or light tails.
 
-    Signals are (n_signals, n_samples, size): each sample is a vector of `size`
-    coordinates, such as the points of basis shapes (3) or the frames of coefficients
-    (1). Means are not removed. The orthogonal starts are a canonical one, and rotations
-    of it.
-
-    The independent signals ``tensordot(W, signals, 1)`` have mean square 1 over their
-    ``n_samples * size`` numbers, and non-negative skewness. They are sorted by
-    likelihood, the least Gaussian one first. Where the signals have a rank r below
-    their number, only the first r rows of the invertible matrix W (n_signals,
-    n_signals) give independent signals, the others signals of zeros.
-
-    Notes
-    -----
-    The independent signals do not depend on the order of the samples, on the basis in
-    which the signals are given or on a rotation common to all samples, but for
-    rounding, order and sign. Where two or more signals are Gaussian, or there are too
-    few samples, a mixing is returned that has no further meaning.
-
-    One Newton step takes ``O(n_signals^3 n_samples size + n_signals^6)`` operations.
+    The independent signals have mean square 1 and non-negative skewness, the least
+    Gaussian one first. If the signals have a rank r below their number, only the first
+    r rows of W give independent signals, the others zeros. The result does not depend
+    on the order of the samples, the basis of the signals or a rotation common to all
+    samples. If several signals are Gaussian, or there are too few samples, it has no
+    meaning. One Newton step takes ``O(n_signals^3 n_samples size + n_signals^6)``
+    operations.
 
     References
     ----------
@@ -89,23 +78,16 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
 
 
 def independent_coefficients(alpha: NDArray) -> NDArray[np.float64]:
-    """
-    Return the mixing that makes coefficients (n_frames, n_components) independent.
+    """Return the mixing W (K, K) that makes coefficients (n_frames, K) independent.
 
-    The columns of ``alpha @ W.T`` are independent over the frames, with unit variance.
-    With the basis ``tensordot(inv(W).T, basis, 1)`` they give the same shapes. Order,
-    sign and linear dependencies are as for `shared_mixing`.
+    The columns of ``alpha @ W.T`` have unit variance. With the basis
+    ``tensordot(inv(W).T, basis, 1)`` they give the same shapes.
     """
     return shared_mixing((alpha - alpha.mean(axis=0)).T[:, :, None])
 
 
 def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
-    """
-    Return the mixings to uncorrelated rows of mean square 1, and to rows of zeros.
-
-    Of n_rows rows of a given rank, the mixings are (rank, n_rows) and (n_rows - rank,
-    n_rows), orthogonal to each other.
-    """
+    """Return mixings to white rows (rank, n), and to rows of zeros (n - rank, n)."""
     # The triangular factor keeps the precision that rows @ rows.T would lose.
     R = np.linalg.qr(rows.T, mode="r") / np.sqrt(rows.shape[1])
     U, S, _ = np.linalg.svd(R.T)
@@ -116,11 +98,9 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _few_samples(Z: NDArray) -> NDArray:
-    """
-    Return some of many samples, spread evenly from the smallest to the largest.
+    """Return some of many samples, spread evenly from the smallest to the largest.
 
-    Z is (n_signals, n_samples, size). Neither the order of the samples nor an
-    orthogonal mixing of the signals changes which samples are taken.
+    The order of samples and orthogonal mixings of the signals do not change the choice.
     """
     if Z.shape[1] <= 3000:
         return Z
@@ -129,8 +109,7 @@ def _few_samples(Z: NDArray) -> NDArray:
 
 
 def _starts(Z: NDArray, n_starts: int) -> NDArray:
-    """
-    Return orthogonal matrices (n_starts, n_signals, n_signals) to start from.
+    """Return orthogonal matrices (n_starts, n_signals, n_signals) to start from.
 
     ``W Z`` is the same for any orthogonal mixing of the white signals Z (n_signals,
     n_samples, size). The first W has the axes of a fourth-order moment (FOBI, Cardoso
@@ -153,12 +132,10 @@ def _starts(Z: NDArray, n_starts: int) -> NDArray:
 
 
 def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
-    """
-    Return the iterates after some steps of symmetric FastICA for vectors.
+    """Return W (n_starts, n, n) after some steps of symmetric FastICA for vectors.
 
     A step is ``w+ = E[sum_c z_c y_c g(u)] - E[size g(u) + 2 u g'(u)] w`` with ``u =
-    ||y||^2`` and ``g = F'``, followed by symmetric orthogonalisation. W is (n_starts,
-    n_signals, n_signals), orthogonal, and Z (n_signals, n_samples, size), white.
+    ||y||^2`` and ``g = F'``, followed by symmetric orthogonalisation.
     """
     n_signals, n_samples, size = Z.shape
     flat, tail = Z.reshape(n_signals, -1), np.array(8.0)  # mild: few local optima
@@ -173,10 +150,7 @@ def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
 
 
 def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
-    """Return F(u), the logarithm of a density of `TAILS` up to a constant.
-
-    u are squared norms (..., n_samples), `tail` is broadcast to them.
-    """
+    """Return the log density F(u) of `TAILS` at squared norms u (..., n_samples)."""
     light = tail == LIGHT
     F = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
     if light.any():
@@ -207,13 +181,10 @@ def _log_integral(tail: float, size: int) -> float:
 
 
 def _fit_densities(W: NDArray, Z: NDArray) -> tuple[float, NDArray, NDArray, NDArray]:
-    """
-    Return the likelihood of the signals ``y = W z`` with their likeliest densities.
+    """Return the likelihood of the signals ``y = W z`` with their likeliest densities.
 
-    W is (n_signals, n_signals), Z (n_signals, n_samples, size). The other results are
-    (n_signals,): the density of each signal, one of `TAILS`, its squared scale, and
-    ``E log p_k(||y_k||)``. The likelihood is the sum of these plus ``size * log |det
-    W|``.
+    Also returns for each signal its density, one of `TAILS`, its squared scale, and ``E
+    log p_k(||y_k||)``. The likelihood adds ``size * log |det W|`` to the sum of these.
     """
     size = Z.shape[2]
     Y = np.tensordot(W, Z, 1)
@@ -240,10 +211,7 @@ def _fit_densities(W: NDArray, Z: NDArray) -> tuple[float, NDArray, NDArray, NDA
 
 
 def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, NDArray]:
-    """Return a local maximum of the likelihood near W, and log densities of signals.
-
-    The mixing and the densities take turns, until the densities stay the same.
-    """
+    """Alternate mixing and densities to a local maximum; return W and log densities."""
     _, tails, variance, of_signals = _fit_densities(W, Z)
     for _ in range(10):
         before = tails
@@ -258,10 +226,7 @@ def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
     """
     Maximise the likelihood over all mixings W for fixed densities `tails` (n_signals,).
 
-    The Newton steps are relative, ``W <- exp(E) W``, so that long ones keep W
-    invertible. Where the Hessian is not negative definite, or a step is too long or
-    does not raise the likelihood enough, a multiple of the identity is subtracted from
-    the Hessian (Levenberg-Marquardt).
+    The Newton steps are relative, ``W <- exp(E) W``, and damped (Levenberg-Marquardt).
     """
     size = Z.shape[2]
     tail = tails[:, None]
@@ -299,8 +264,7 @@ def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
 def _relative_derivatives(
     Y: NDArray, g: NDArray, dg: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """
-    Return the gradient G and the Hessian H of the likelihood in a relative step E.
+    """Return the gradient G and the Hessian H of the likelihood in a relative step E.
 
     To second order ``W <- (I + E) W`` raises it by ``<G, E> + <E, H E> / 2``. With
     means over the samples written as E[],
@@ -309,8 +273,7 @@ def _relative_derivatives(
         H_ka,kb = 2 E[g_k y_a.y_b] + 4 E[g'_k (y_k.y_a) (y_k.y_b)]
 
     and ``-size`` is added to ``H_ka,ak`` (Ablin, Cardoso and Gramfort 2018, here for
-    vectors). G is (n, n), H (n, n, n, n) for n signals; Y is (n, n_samples, size), g
-    and dg are (n, n_samples).
+    vectors). Y is (n, n_samples, size), H (n, n, n, n).
     """
     n_signals, n_samples, size = Y.shape
     Y = np.ascontiguousarray(Y.transpose(0, 2, 1))  # samples last: long rows are fast
@@ -330,10 +293,7 @@ def _relative_derivatives(
 
 
 def _ascent(gradient: NDArray, hessian: NDArray, shift: float) -> NDArray | None:
-    """Return the step ``E = (shift I - H)^-1 G`` (n_signals, n_signals).
-
-    None if the matrix is not positive definite.
-    """
+    """Return the step ``E = (shift I - H)^-1 G``, None if this is not definite."""
     matrix = shift * np.eye(gradient.size) - hessian.reshape(gradient.size, -1)
     try:
         factor = cho_factor(matrix)
