@@ -87,17 +87,10 @@ JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 class Limits(NamedTuple):
     """Numbers that tests and benchmarks vary.
 
-    Attributes
-    ----------
-    dense : int
-        A table with more points and more rows of images is not factorised as a whole.
-    sample : int
-        Number of frames of the first sample of a large table.
-    small_table : int
-        Tables with fewer coordinates are fitted without a sample.
-    model_frames : int
-        Largest number of frames from which outliers and missing points are modelled.
-    joint : JointOptions
+    dense: a table with more points and rows of images is not factorised as a whole.
+    sample: number of frames of the first sample of a large table.
+    small_table: tables with fewer coordinates are fitted without a sample.
+    model_frames: most frames from which outliers and missing points are modelled.
     """
 
     dense: int = 1500

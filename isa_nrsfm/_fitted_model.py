@@ -22,20 +22,9 @@ class TableModel(NamedTuple):
     """Model of a frame, shapes and layout: all that the fit of a new table depends on.
 
     Methods whose names begin with an underscore take some rows (n, 2 * n_points) of a
-    table. Results are NaN for rows with too few points.
-
-    Attributes
-    ----------
-    frames : RigidFrames or PosteriorFrames
-        The model of a frame of size one.
-    mean_shape : ndarray of shape (n_points, 3)
-        In the gauge, as the basis.
-    basis : ndarray of shape (n_components, n_points, 3)
-    layout : {"interleaved", "planar"}
-    names : ndarray of shape (2 * n_points,) or None
-        Names of the columns.
-    unit : float or None
-        The one size of all frames of a table; None where each has its own.
+    table. Results are NaN for rows with too few points. The mean shape (J, 3) and the
+    basis (K, J, 3) are in the gauge. `names` (2J,) are those of the columns. `unit` is
+    the one size of all frames of a table; None where each has its own.
     """
 
     frames: RigidFrames | PosteriorFrames

@@ -38,16 +38,10 @@ LARGEST_TURN = 1.0
 class AffineCameras:
     """Free 2x3 matrices; the parameters are their entries, row by row.
 
-    Attributes
-    ----------
-    name : str
-        The value of the parameter `camera`, or held.
-    n_parameters : int
-        Number of parameters p of a step of one camera; zero for cameras that are held.
-    calibrated : bool
-        Whether cameras are scaled rotations.
-    scaled : bool
-        Whether each camera has a scale of its own.
+    name: the value of the parameter `camera`, or held.
+    n_parameters: length of a step of one camera; zero for cameras that are held.
+    calibrated: whether cameras are scaled rotations.
+    scaled: whether each camera has a scale of its own.
     """
 
     calibrated = False

@@ -27,18 +27,10 @@ from isa_nrsfm._linalg.packed_symmetric import (
 class CoefficientPosterior(NamedTuple):
     """Posterior of the coefficients of frames.
 
-    Attributes
-    ----------
-    c : ndarray of shape (n_shapes, n_frames)
-        One, and the posterior means of the coefficients.
-    inverse : ndarray of shape (n_pairs, n_frames)
-        Minus Q, packed, with a meaningless row and column for the mean shape.
-    objective : ndarray of shape (n_frames,)
-        ``min_a ||W - M S(a)||^2 + s2 |a|^2``.
-    log_determinant : ndarray of shape (n_frames,)
-        ``log det(I + H / s2)``.
-    image_energy : ndarray of shape (n_components, n_frames)
-        ``H_kk``, the energy of the images of the basis shapes.
+    c (n_shapes, I): one, and the posterior means of the coefficients. inverse (n_pairs,
+    I): minus Q, packed; its row and column of the mean shape are void. objective (I,):
+    ``min_a ||W - M S(a)||^2 + s2 |a|^2``. log_determinant (I,): ``log det(I + H /
+    s2)``. image_energy (K, I): ``H_kk``, the energy of the images of the basis shapes.
     """
 
     c: NDArray

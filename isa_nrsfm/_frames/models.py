@@ -55,13 +55,9 @@ class Decomposition(NamedTuple):
 class FrameMap(NamedTuple):
     """Maps cameras and coefficients of frames to other shapes that fit equally well.
 
-    Attributes
-    ----------
-    mixing : ndarray of shape (n_components + 1, n_components + 1)
-        Maps ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale, different for each
-        frame, goes to its camera.
-    space : ndarray of shape (3, 3)
-        Affinity of space, ``new shape = shape @ space.T``.
+    mixing (K + 1, K + 1): maps ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale,
+    different for each frame, goes to its camera.
+    space (3, 3): affinity of space, ``new shape = shape @ space.T``.
     """
 
     mixing: NDArray
@@ -102,15 +98,9 @@ class FrameMap(NamedTuple):
 class RigidFrames(NamedTuple):
     """The paper's model of a frame: rigid camera, coefficients by least squares.
 
-    Attributes
-    ----------
-    mean_shape : ndarray of shape (n_points, 3)
-        Centred.
-    basis : ndarray of shape (n_components, n_points, 3)
-        Centred basis shapes, ``B_k B_l^T = 0`` (3x3) for different k and l, with the
-        mean shape as B_0. The least squares then separate where no point is missing.
-    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-        Calibrated cameras are the nearest to those of the rigid fit.
+    Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
+    shape as B_0. The least squares then separate where no point is missing. Calibrated
+    cameras are the nearest to those of the rigid fit.
     """
 
     mean_shape: NDArray
@@ -134,8 +124,7 @@ class RigidFrames(NamedTuple):
         """Return the camera of the rigid fit and the coefficients of least squares.
 
         ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or zero
-        where camera i does not see basis shape k at all. Otherwise the solution of
-        least norm. The other parameters of `PosteriorFrames.fit` do not matter.
+        if unseen; otherwise the solution of least norm. Ignores the other parameters.
         """
         n_frames, n_components = len(tracks), len(self.basis)
         fit = Decomposition(
@@ -192,21 +181,11 @@ class RigidFrames(NamedTuple):
 class PosteriorFrames:
     """The joint refinement's model of a frame: its posterior, camera and coefficients.
 
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Shapes with coefficients that are drawn from N(0, I), rows centred.
-    noise_variance : float
-        Noise variance of a coordinate, for frames of size one.
-    starts : ndarray of shape (n_starts, n_components)
-        Further coefficients to start from if the fit from zero is bad.
-    loss : {"linear", "huber", "cauchy"}
-        Loss of the residuals.
-    gauge : FrameMap
-        Maps cameras and coefficients to those of the public shapes.
-    camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
-    certainty : DepthCertainty
-        Uncertainty of the fit of the shapes, with calibrated cameras.
+    shapes (K + 1, 3, J): centred, with coefficients that are drawn from N(0, I).
+    noise_variance: that of a coordinate, for frames of size one. starts (n_starts, K):
+    further coefficients to start from if the fit from zero is bad. gauge: maps cameras
+    and coefficients to those of the public shapes. certainty: uncertainty of the fit of
+    the shapes, with calibrated cameras.
     """
 
     shapes: NDArray

@@ -42,11 +42,8 @@ FLAT = 1e-10
 class Gram:
     """The Gram matrices of shapes: one for all complete frames, or one for each frame.
 
-    Parameters
-    ----------
-    pairs : ndarray of shape (n_pairs, 6) or (n_pairs, 6, n_frames)
-        ``(G_kl + G_kl^T) / 2``, packed, for the pairs of `pair_indices`. The fit
-        depends only on this symmetric part.
+    pairs (n_pairs, 6) or (n_pairs, 6, I): ``(G_kl + G_kl^T) / 2``, packed. The fit
+    depends only on this symmetric part.
     """
 
     def __init__(self, pairs: NDArray) -> None:
@@ -91,16 +88,10 @@ def _times(matrices: NDArray, vectors: NDArray) -> NDArray:
 class FrameTracks(NamedTuple):
     """Tracks with the frame index last, ready for products with any shapes.
 
-    Attributes
-    ----------
-    weighted : ndarray of shape (n_points, 2, n_frames)
-        ``w_ij (m_ij - mean_i)``; zero for points that are missing.
-    weights : ndarray of shape (n_points, n_frames) or None
-        w_ij; None where all are 1.
-    centroid : ndarray of shape (2, n_frames)
-        ``mean_i``, the weighted mean of the points. Zero for frames without points.
-    weight, energy : ndarray of shape (n_frames,)
-        ``sum_j w_ij`` and ``sum_j w_ij ||m_ij - mean_i||^2``.
+    weighted (J, 2, I): ``w_ij (m_ij - mean_i)``; zero for points that are missing.
+    weights (J, I): w_ij; None where all are 1.
+    centroid (2, I): ``mean_i``, zero for frames without points.
+    weight, energy (I,): ``sum_j w_ij`` and ``sum_j w_ij ||m_ij - mean_i||^2``.
     """
 
     weighted: NDArray
@@ -127,16 +118,9 @@ class FrameTracks(NamedTuple):
 class FrameSums(NamedTuple):
     """Sums over the points of frames, with weights w_ij.
 
-    Attributes
-    ----------
-    cross : ndarray of shape (n_shapes, 3, 2, n_frames)
-        ``P_ik``.
-    gram : Gram
-        ``G_i,kl``.
-    shape_centroid : ndarray of shape (n_shapes, 3, n_frames)
-        ``mean_ik``, weighted means of the points of the shapes.
-    centroid, weight, energy : ndarray
-        As in `FrameTracks`.
+    cross (n_shapes, 3, 2, I): ``P_ik``; gram: ``G_i,kl``. shape_centroid (n_shapes, 3,
+    I): ``mean_ik``, weighted means of points of the shapes. centroid, weight, energy:
+    as in `FrameTracks`.
     """
 
     cross: NDArray

@@ -24,23 +24,15 @@ LARGEST_DAMPING = 1e8
 class FramePosterior(NamedTuple):
     """Fits of frames; NaN for frames whose points do not determine a camera.
 
-    Attributes
-    ----------
-    motion : ndarray of shape (n_frames, 2, 3)
-        Cameras, in the units of the tracks per unit of the shapes.
-    translation : ndarray of shape (n_frames, 2)
-        Image of the origin of the shapes.
-    alpha : ndarray of shape (n_frames, n_components)
-    covariance : ndarray of shape (n_frames, n_components or 0, n_components or 0)
-        Posterior covariance of alpha in the normal approximation at the optimum
-        (Laplace), with the uncertainty of camera and position.
-    turn_covariance : ndarray of shape (n_frames, 3, 3)
-        Posterior covariance of the rotation vectors w of ``M exp(hat(w))``, in radians
-        squared, with the uncertainty of the coefficients. NaN for affine cameras.
-    objective : ndarray of shape (n_frames,)
-        ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2``, to 1e-12 of the energy.
-    converged : ndarray of bool, shape (n_frames,)
-        Whether the last Newton step was below the convergence tolerance.
+    motion (I, 2, 3): cameras, in the units of the tracks per unit of the shapes.
+    translation (I, 2): image of the origin of the shapes.
+    covariance (I, K, K) or (I, 0, 0): posterior covariance of alpha in the normal
+    approximation at the optimum (Laplace), with the uncertainty of camera and position.
+    turn_covariance (I, 3, 3): posterior covariance of the rotation vectors w of ``M
+    exp(hat(w))``, with the uncertainty of the coefficients. NaN for affine cameras.
+    objective (I,): ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2``, to 1e-12 of the
+    energy.
+    converged (I,): whether the last Newton step was below the convergence tolerance.
     """
 
     motion: NDArray
@@ -90,18 +82,11 @@ class FrameProblem(NamedTuple):
 class State(NamedTuple):
     """The objectives of frames at some positions, and their derivatives.
 
-    Attributes
-    ----------
-    position : ndarray of shape (..., n_frames)
-        Coefficients or cameras.
-    value : ndarray of shape (n_frames,)
-        The objectives, up to a constant of each frame.
-    slope : ndarray of shape (n_parameters, n_frames)
-        Minus half the gradient.
-    definite : ndarray of shape (n_pairs, n_frames)
-        A positive semidefinite part of the Hessian, packed: steps are damped by it.
-    hessian : ndarray of shape (n_pairs, n_frames)
-        Half the Hessian, packed.
+    position (..., n): coefficients or cameras.
+    value (n,): the objectives, up to a constant of each frame.
+    slope (n_parameters, n): minus half the gradient.
+    definite (n_pairs, n): a semidefinite part of the Hessian, packed, for damping.
+    hessian (n_pairs, n): half the Hessian, packed.
     """
 
     position: NDArray
@@ -133,20 +118,10 @@ class State(NamedTuple):
 class FrameSearch:
     """A search for cameras of one model that see given shapes, frame by frame.
 
-    Parameters
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Mean shape and basis shapes in the coordinates of the search, rows centred.
-    space : ndarray of shape (3, 3)
-        Maps the original shapes to these coordinates.
-
-    Attributes
-    ----------
-    first_steps : int
-        Largest number of steps of a first round, block by block. Frames that have not
-        converged then are collected from all blocks for a second round.
-    rough_steps : int
-        Largest number of steps for rough cameras.
+    Shapes (K + 1, 3, J), rows centred, are in the coordinates of the search, to which
+    `space` (3, 3) maps the original ones. A first round has at most `first_steps`
+    steps, block by block. Frames that have not converged are collected from all blocks
+    for a second round. Rough cameras take `rough_steps`.
     """
 
     first_steps = MAX_STEPS

@@ -32,14 +32,10 @@ from isa_nrsfm._linalg.rounding import OF_DISTANCES
 class Spectrum(NamedTuple):
     """Noise level and missing energy of a rank-(3K+3) model, from the singular values.
 
-    Attributes
-    ----------
-    noise : float
-        Share of the mean square: the mean of the squared singular values beyond 3K + 3
-        (Tipping, Bishop, "Probabilistic principal component analysis", 1999, eq. 8).
-    missing : float
-        Share of the energy beyond the K + 3 largest singular values. For motion capture
-        about the share of the shapes that the best K basis shapes leave.
+    noise: share of the mean square, the mean of the squared singular values beyond 3K +
+    3 (Tipping, Bishop, "Probabilistic principal component analysis", 1999, eq. 8).
+    missing: share of the energy beyond the K + 3 largest singular values. For motion
+    capture about the share of the shapes that the best K basis shapes leave.
     """
 
     noise: float
@@ -63,14 +59,9 @@ class Spectrum(NamedTuple):
 class Start(NamedTuple):
     """Shapes and noise of a similar table from which a joint fit may start.
 
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        Basis shapes are as long as the standard deviation of their coefficients.
-    noise_variance : float
-        Variance of a coordinate.
-    calibrated_first : bool
-        Whether a fit with calibrated cameras precedes that with affine ones.
+    Basis shapes (K, 3, J) are as long as the standard deviation of their coefficients.
+    With `calibrated_first` a fit with calibrated cameras precedes that with affine
+    ones.
     """
 
     shapes: NDArray

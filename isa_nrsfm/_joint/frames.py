@@ -38,12 +38,8 @@ class WeightedRows(NamedTuple):
 class JointFrames:
     """Frames of a table, ready for passes over them.
 
-    Attributes
-    ----------
-    blocks : FrameBlocks
-        Blocks of FrameTracks. All of them have weights, or none has.
-    directions : ndarray of shape (n_directions, n_points) or None
-        Orthonormal rows, or None if frames are given by their points.
+    All blocks of FrameTracks have weights, or none has. Directions (n_directions, J)
+    are orthonormal rows, None if frames are given by their points.
     """
 
     blocks: FrameBlocks

@@ -45,27 +45,16 @@ from isa_nrsfm._linalg.vectors import frames_last
 class LikelihoodTerms(NamedTuple):
     """Objective, derivatives and posterior moments, from one pass over the frames.
 
-    Attributes
-    ----------
-    value : float
-        The objective.
-    shape_gradient : ndarray of shape (n_shapes, 3, n_points)
-        Derivative by the shapes.
-    noise_gradient : float
-        Derivative by the logarithm of the noise variance.
-    shape_curvature : ndarray of shape (n_points or 1, 3 * n_shapes, 3 * n_shapes)
-        ``sum_i w_ij E_i (x) M_i^T M_i`` with the posterior second moments E_i of
-        (1, alpha). Times ``2 / s2`` it is the Hessian by point j of the shapes,
-        posterior and positions held fixed. One matrix for all points if all weights are
-        one.
-    residual : float
-        Sum of squared residuals of the tracks at the posterior means.
-    motion_gradient : ndarray of shape (2, 3, n_frames)
-        Derivative by the cameras.
-    motion_curvature : ndarray of shape (6, n_frames)
-        ``sum_kl E_kl B_k B_l^T``, packed: the same for each row of the cameras.
-    alpha : ndarray of shape (n_components, n_frames)
-        Posterior means of the coefficients.
+    shape_gradient (n_shapes, 3, J): derivative of the value by the shapes.
+    noise_gradient: derivative by the logarithm of the noise variance.
+    shape_curvature (J or 1, 3 n_shapes, 3 n_shapes): ``sum_i w_ij E_i (x) M_i^T M_i``
+    with the posterior second moments E_i of (1, alpha). Times ``2 / s2`` it is the
+    Hessian by point j of the shapes, posterior and positions held fixed. One matrix for
+    all points if all weights are one.
+    residual: sum of squared residuals of the tracks at the posterior means.
+    motion_gradient (2, 3, I): derivative by the cameras.
+    motion_curvature (6, I): ``sum_kl E_kl B_k B_l^T``, packed: the same for each row.
+    alpha (K, I): posterior means of the coefficients.
     """
 
     value: float
@@ -81,21 +70,10 @@ class LikelihoodTerms(NamedTuple):
 class MarginalLikelihood:
     """The objective and its derivatives, as a sum over blocks of frames.
 
-    Parameters
-    ----------
-    frames : JointFrames
-        The frames.
-    penalty : float or ndarray of shape (n_components,)
-        Factor of ``sum_i tr H_i``, or one for the diagonal entry of each basis shape.
-    extent_weight : float, default=0.0
-        Weight of the prior of the extents, for each coordinate.
-
-    Attributes
-    ----------
-    n_seen : float
-        Number of coordinates that were seen, N.
-    square : float
-        Weighted energy of the centred tracks.
+    penalty: factor of ``sum_i tr H_i``, or one (K,) for each diagonal entry.
+    extent_weight: weight of the prior of the extents, for each coordinate.
+    n_seen: number N of coordinates that were seen.
+    square: weighted energy of the centred tracks.
     """
 
     def __init__(

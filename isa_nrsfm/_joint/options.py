@@ -13,42 +13,26 @@ class JointOptions(NamedTuple):
     With all `widths` doubled the error of yoga rises from 10.6 to 16.8 percent, with
     all halved to 12.5. Half of `compared_tol` gains 8 percent on large tables.
 
-    Attributes
-    ----------
-    basis_std : float
-        Prior of the basis shapes: standard deviation of the coordinates of the image of
-        a basis shape with coefficient one, as a share of the size of the frame
-        (``python -m benchmarks.accuracy prior``).
-    least_noise : float
-        Floor of the noise variance while the model may be wrong, as a share of the mean
-        square of the tracks. Unmodelled deformation must be absorbed by the noise;
-        otherwise it distorts the depths.
-    right : float
-        Largest noise variance of a right model, in units of that of the spectrum. The
-        ratio is 0.8 to 1.0 for artificial tables with the true K or more, 1.3 to 1.8
-        with fewer basis shapes, and 1.9 and more for motion capture and cloth (``python
-        -m benchmarks.accuracy noise``).
-    cut_off, most_noise : float
-        Floor of the noise variance for calibrated cameras and too few basis shapes: a
-        multiple of the share of energy beyond K + 3 singular values, limited because
-        large motion adds to the spectrum.
-    few_frames : int
-        Largest number of frames of a small table, such as motion capture: it has
-        several minima. In large tables all starts find the same minimum.
-    widths : tuple of int
-        Columns of the mixtures from which cameras start, three for each shape.
-    compared_tol : float
-        Convergence tolerance of compared starts, for each frame. The objectives of
-        different minima differ by tens for each frame.
-    catching_up : int
-        Steps after which a further given start must still be able to become the best
-        (``python -m benchmarks.choice``).
-    many_points : int
-        Frames with more points are given by directions.
-    determined : float
-        Least share of its numbers that the table determines of a relevant basis shape.
-        On artificial tables with 2 % noise true shapes have 0.998 and more, others 0.83
-        and less (``python -m benchmarks.recovery components``).
+    basis_std: prior standard deviation of the coordinates of the image of a basis shape
+    with coefficient one, as a share of the size of the frame (``benchmarks.accuracy``).
+    least_noise: floor of the noise variance while the model may be wrong, as a share of
+    the mean square. Unmodelled deformation must be absorbed by the noise; otherwise it
+    distorts the depths. right: largest noise variance of a right model, in units of
+    that of the spectrum. The ratio is 0.8 to 1.0 for artificial tables with the true K
+    or more, 1.3 to 1.8 with fewer basis shapes, 1.9 and more for motion capture
+    (``benchmarks.accuracy noise``). cut_off, most_noise: floor of the noise variance
+    for calibrated cameras and too few basis shapes, a multiple of the share of energy
+    beyond K + 3 singular values; limited because large motion adds to the spectrum.
+    few_frames: largest number of frames of a small table, with several minima. In large
+    tables all starts find the same minimum. widths: columns of the mixtures from which
+    cameras start, three for each shape. compared_tol: convergence tolerance of compared
+    starts, for each frame. The objectives of different minima differ by tens for each
+    frame. catching_up: steps after which a further given start must still be able to
+    become the best (``benchmarks.choice``). many_points: frames with more points are
+    given by directions. determined: least share of its numbers that the table
+    determines of a relevant basis shape. On artificial tables with 2 % noise true
+    shapes have 0.998 and more, others 0.83 and less (``benchmarks.recovery
+    components``).
     """
 
     basis_std: float = 0.008

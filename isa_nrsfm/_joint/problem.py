@@ -27,21 +27,12 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 class FactorisedTable(NamedTuple):
     """A table that is ready for a fit.
 
-    Attributes
-    ----------
-    rows, completed : FrameBlocks
-        Centred frames (n_frames, 2, n_points) of size one, NaN where a point is
-        missing; and the same with missing points and outliers filled in.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of visible points.
-    outliers : ndarray of bool, shape (n_frames, n_points), or None
-        Points that a robust loss leaves out at first; None for other losses.
-    triplets : Triplets
-        The 3K + 3 largest singular values of the completed table, and the rest.
-    sample : Sample
-        Frames of the first steps.
-    factors : Factorisation
-        Factors of the measurement matrix of the sample.
+    rows: centred frames (I, 2, J) of size one, NaN where a point is missing.
+    completed: the same with missing points and outliers filled in.
+    n_seen (I,): number of visible points.
+    outliers (I, J): points that a robust loss leaves out at first, None for others.
+    triplets: the 3K + 3 largest singular values of the completed table, and the rest.
+    sample, factors: frames of the first steps, and factors of their matrix.
     """
 
     rows: FrameBlocks
@@ -68,14 +59,8 @@ class JointSettings(NamedTuple):
 class JointProblem:
     """The objective of the joint fit of some frames, and the steps that minimise it.
 
-    Attributes
-    ----------
-    frames : JointFrames
-    settings : JointSettings
-    thorough : bool
-        Whether many starts are compared, as for small tables.
-    penalty : float or ndarray of shape (n_components,)
-        Factor of the prior of the basis shapes, see `MarginalLikelihood`.
+    thorough: whether many starts are compared, as for small tables.
+    penalty: factor of the prior of the basis shapes, or one (K,) for each.
     """
 
     frames: JointFrames

@@ -38,22 +38,14 @@ class JointState(NamedTuple):
 class JointFit(NamedTuple):
     """Result of the joint refinement.
 
-    Attributes
-    ----------
-    state : JointState
-    history : ndarray of shape (n_iter + 1,)
-        The objective at the start and after each step; it never rises.
-    gradient_norm : float
-        ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D of the
-        approximate Hessian and the number N of coordinates. Its square is about half to
-        twice the decrease of the objective for each coordinate that is still possible.
-    converged : bool
-    left : float
-        The larger one of the noise variance and the mean square residual at the
-        posterior means of the coefficients.
-    camera_noise_ratio : float
-        Noise variance with calibrated cameras divided by that with affine ones, for the
-        sample of `fit_jointly`. NaN with given starts.
+    history (n_iter + 1,): objective at the start and after each step; it never rises.
+    gradient_norm: ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D
+    of the approximate Hessian and the number N of coordinates. Its square is about half
+    to twice the decrease of the objective for each coordinate that is still possible.
+    left: the larger one of the noise variance and the mean square residual at the
+    posterior means of the coefficients. camera_noise_ratio: noise variance with
+    calibrated cameras divided by that with affine ones, for the sample of
+    `fit_jointly`. NaN with given starts.
     """
 
     state: JointState

@@ -41,20 +41,11 @@ State = TypeVar("State")
 class MetricFit(NamedTuple):
     """A metric, with its cost and derivatives.
 
-    Attributes
-    ----------
-    Q : ndarray of shape (3, 3)
-        ``G = Q Q^T`` is the metric of frames without deformation.
-    strain : ndarray of shape (n_components, 3, 3)
-        E_k, symmetric and without trace.
-    n_frames : int
-    cost : float
-        Sum of the squared residuals of `orthonormality`.
-    curvature : ndarray of shape (n_unknowns, n_unknowns)
-        ``J^T J`` of the residuals by the coordinates of E_0, E_1, ... in
-        `strain_basis`.
-    gradient : ndarray of shape (n_unknowns,)
-        ``J^T r`` with r the residuals.
+    Q (3, 3): ``G = Q Q^T`` is the metric of frames without deformation.
+    strain (K, 3, 3): E_k, symmetric and without trace.
+    cost: sum of the squared residuals of `orthonormality`.
+    curvature: ``J^T J`` of these by the coordinates of E_0, E_1, ... in `strain_basis`.
+    gradient: ``J^T r`` with r the residuals.
     """
 
     Q: NDArray

@@ -15,17 +15,10 @@ from isa_nrsfm._linalg.rounding import OF_RANKS
 
 
 class MotionProducts(NamedTuple):
-    """
-    Products of the rigid motion M_0^i and the motion M^i of n_signals signals.
+    """Products of the rigid motion M_0^i and the motion M^i of n_signals signals.
 
-    Attributes
-    ----------
-    cross : ndarray of shape (n_frames, 3, n_signals)
-        ``M_0^iT M^i``.
-    rigid : ndarray of shape (n_frames, 9)
-        ``M_0^iT M_0^i``, row by row.
-    gram : ndarray of shape (n_signals, n_signals)
-        ``sum_i M^iT M^i``.
+    ``M_0^iT M^i`` (I, 3, n_signals), ``M_0^iT M_0^i`` (I, 9), row by row, and ``sum_i
+    M^iT M^i`` (n_signals, n_signals).
     """
 
     cross: NDArray

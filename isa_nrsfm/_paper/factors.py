@@ -18,18 +18,11 @@ from isa_nrsfm._paper.svd import Triplets, leading_triplets
 class Factorisation(NamedTuple):
     """Rigid and non-rigid part of W, ``W ~ M_0 B_0 + M' B'`` of rank 3K + 3.
 
-    Attributes
-    ----------
-    rigid_motion : ndarray of shape (2 * n_frames, 3)
-        M_0, two rows a frame; its columns are orthogonal.
-    rigid_shape : ndarray of shape (3, n_points)
-        B_0, centred and white: ``B_0 B_0^T = n_points I``. Rows are zero where W has a
-        rank below 3.
-    motion : ndarray of shape (2 * n_frames, n_signals)
-        M', by decreasing column norm.
-    signals : ndarray of shape (n_signals, n_points)
-        B', centred and white, orthogonal to B_0. `n_signals` is 3K, or less where W has
-        a lower rank: the least multiple of three above the rank.
+    rigid_motion (2I, 3): M_0, two rows a frame; its columns are orthogonal. rigid_shape
+    (3, J): B_0, centred and white: ``B_0 B_0^T = n_points I``. Rows are zero where W
+    has a rank below 3. motion (2I, n_signals): M', by decreasing column norm. signals
+    (n_signals, J): B', centred and white, orthogonal to B_0. `n_signals` is 3K, or
+    where W has a lower rank the least multiple of three above it.
     """
 
     rigid_motion: NDArray

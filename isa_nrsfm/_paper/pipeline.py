@@ -27,16 +27,10 @@ from isa_nrsfm._paper.factors import Factorisation
 class PaperResult(NamedTuple):
     """Result of the paper's pipeline, before a gauge is chosen.
 
-    Attributes
-    ----------
-    shapes : ndarray of shape (n_components + 1, 3, n_points)
-        B_0 of the rigid factorisation, and ``B_k = E_k B_ISA,k``; zero for subspaces
-        without motion.
-    mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
-        ``(J / 2I) M_ISA^T M_ISA``, in the order of the basis.
-    n_iter : int
-        Steps of the refinement, 1 without a refinement.
-    converged : bool
+    shapes (K + 1, 3, J): B_0 of the rigid factorisation, and ``B_k = E_k B_ISA,k``;
+    zero for subspaces without motion. mode_covariance (3K, 3K): ``(J / 2I) M_ISA^T
+    M_ISA``, in the order of the basis. n_iter: steps of the refinement, 1 without a
+    refinement.
     """
 
     shapes: NDArray

@@ -16,16 +16,10 @@ DENSE = 1500
 
 
 class Triplets(NamedTuple):
-    """Leading singular values of a matrix, and their right vectors.
+    """Leading singular values of a matrix, decreasing, and their right vectors.
 
-    Attributes
-    ----------
-    values : ndarray of shape (k,)
-        Singular values, decreasing; fewer if the matrix does not have as many.
-    vectors : ndarray of shape (k, n_columns)
-        Right singular vectors as rows. The left ones are ``W V / S``.
-    rest : float
-        Sum of the other squared singular values.
+    Fewer values (k,) and vectors (k, n_columns) if the rank is lower; the left ones are
+    ``W V / S``. `rest` is the sum of the other squared singular values.
     """
 
     values: NDArray

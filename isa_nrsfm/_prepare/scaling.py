@@ -25,23 +25,13 @@ from isa_nrsfm._tables.visibility import FrameReport, centred_frames, check_fram
 class ScaledTable(NamedTuple):
     """A table made ready for the fit.
 
-    Attributes
-    ----------
-    shown : ndarray of bool, shape (n_rows,)
-        Rows of the table that show any point: the frames.
-    source : Table
-        These rows before centring and scaling.
-    rows : FrameBlocks
-        Blocks (n_frames, 2, n_points) of centred frames of size one, NaN where not
-        seen.
-    sizes, n_seen : ndarray of shape (n_frames,)
-        Divisors of the frames, and their numbers of visible points.
-    translation : ndarray of shape (n_frames, 2)
-        Centroids of the visible points, or spatial medians with a robust loss.
-    precision : float
-        Rounding error of the coordinates of the table, relative to its frames.
-    dtype : dtype
-        Number type of the given table.
+    shown (n_rows,): mask of the rows that show any point, the frames.
+    source: these rows before centring and scaling.
+    rows: blocks (I, 2, J) of centred frames of size one, NaN where not seen.
+    sizes, n_seen (I,): divisors of the frames, and their numbers of visible points.
+    translation (I, 2): centroids of visible points, or medians with a robust loss.
+    precision: rounding error of the coordinates of the table, relative to its frames.
+    dtype: number type of the given table.
     """
 
     shown: NDArray

@@ -39,16 +39,9 @@ Scorer = Callable[[AffineNRSfM, NDArray], float]
 class Row(NamedTuple):
     """Scores and times of one number of basis shapes.
 
-    Attributes
-    ----------
-    n_components : int
-    scores : ndarray of shape (n_splits,)
-        Scores of held-out rows.
-    fit_seconds, score_seconds : ndarray of shape (n_splits,)
-    path_seconds : float
-        Seconds of the fit of all rows; zero where no fit starts from it.
-    n_unconverged : int
-        Number of these fits that did not converge.
+    Held-out scores and seconds of each split, (n_splits,), seconds of the fit of all
+    rows (zero where no fit starts from it), and the number of fits that did not
+    converge.
     """
 
     n_components: int

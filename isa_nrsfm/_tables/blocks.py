@@ -18,18 +18,10 @@ class FrameBlocks:
     """Consecutive blocks of the frames of a table, in memory or read when needed.
 
     A block is an array with a row for each of some consecutive frames, or any object
-    that a function given to `derive` has returned.
-
-    Parameters
-    ----------
-    read : callable
-        Returns a block, given its number.
-    lengths : sequence of int
-        Number of frames of each block.
-    cached : bool
-        Whether derived blocks are computed at once and kept, or anew at each reading.
-    n_threads : int, default=1
-        Threads that work on blocks at the same time.
+    that a function given to `derive` has returned. `read` returns a block, given its
+    number; `lengths` are their numbers of frames. Derived blocks are computed at once
+    and kept if `cached`, or anew at each reading; `n_threads` work on blocks at the
+    same time.
     """
 
     def __init__(

@@ -16,18 +16,11 @@ EQUAL = 4
 class FrameReport(NamedTuple):
     """Place, size and visible points of frames.
 
-    Attributes
-    ----------
-    translation : ndarray of shape (n_frames, 2)
-        Centroids of the visible points, NaN for frames without any.
-    size : ndarray of shape (n_frames,)
-        RMS of the centred coordinates, zero for frames without any.
-    n_seen : ndarray of int, shape (n_frames,)
-        Number of visible points.
-    in_one_place : ndarray of bool, shape (n_frames,)
-        Whether all visible points are equal, up to rounding.
-    on_line : ndarray of bool, shape (n_frames,)
-        Whether points are missing and the others on one line, up to rounding.
+    translation (I, 2): centroids of the visible points, NaN for frames without any.
+    size (I,): RMS of the centred coordinates, zero for frames without any.
+    n_seen (I,): number of visible points.
+    in_one_place (I,): whether all visible points are equal, up to rounding.
+    on_line (I,): whether points are missing and the others on one line.
     """
 
     translation: NDArray

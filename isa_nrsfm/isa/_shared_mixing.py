@@ -30,11 +30,12 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     Return the mixing W, the same for all coordinates, that makes signals independent.
 
     The signals (n_signals, n_samples, size) are whitened, without removing means. From
-    several orthogonal starts a few steps of FastICA for vectors are taken. From the
-    likeliest result the likelihood of independent spherical signals, ``sum_k E log
-    p_k(||y_k||) + size * log |det W|`` with ``y = W signals``, is maximised over all
-    invertible W by Newton steps. Each density p_k is the likeliest of a few, with heavy
-    or light tails.
+    several orthogonal starts a few steps of FastICA for vectors are taken (Hyvarinen,
+    "Fast and robust fixed-point algorithms for independent component analysis", 1999).
+    From the likeliest result the likelihood of independent spherical signals, ``sum_k E
+    log p_k(||y_k||) + size * log |det W|`` with ``y = W signals``, is maximised over
+    all invertible W by Newton steps. Each density p_k is the likeliest of a few, with
+    heavy or light tails.
 
     The independent signals have mean square 1 and non-negative skewness, the least
     Gaussian one first. If the signals have a rank r below their number, only the first
@@ -42,15 +43,9 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     on the order of the samples, the basis of the signals or a rotation common to all
     samples. If several signals are Gaussian, or there are too few samples, it has no
     meaning. One Newton step takes ``O(n_signals^3 n_samples size + n_signals^6)``
-    operations.
-
-    References
-    ----------
-    A. Hyvarinen, "Fast and robust fixed-point algorithms for independent component
-    analysis", IEEE Trans. Neural Networks 10(3), 1999.
-    P. Ablin, J.-F. Cardoso, A. Gramfort, "Faster independent component analysis by
-    preconditioning with Hessian approximations", IEEE Trans. Signal Processing 66(15),
-    2018: relative gradient and Hessian, here with vectors and without approximation.
+    operations (gradient and Hessian: Ablin, Cardoso, Gramfort, "Faster independent
+    component analysis by preconditioning with Hessian approximations", 2018, here
+    without approximation).
     """
     signals = np.ascontiguousarray(signals, dtype=np.float64)
     n_signals, _, size = signals.shape
