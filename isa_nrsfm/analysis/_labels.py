@@ -10,12 +10,10 @@ Kind = Literal["classes", "number"]
 
 
 def kind_of(y: NDArray, kind: str) -> Kind:
-    """
-    Return whether labels (n_frames,) are classes or numbers.
+    """Return whether labels (n_frames,) are classes or numbers; refuse useless ones.
 
     "auto" takes names, truth values and whole numbers for classes, as scikit-learn
-    does. Labels that are all equal, classes that are all different, and names that
-    should be numbers raise a ValueError.
+    does.
     """
     if kind not in ("auto", "classes", "number"):
         raise ValueError(f"kind must be 'auto', 'classes' or 'number'; got {kind!r}")

@@ -57,17 +57,16 @@ class FrameOrder(NamedTuple):
 def dependent_blocks(
     alpha: NDArray, labels: NDArray, order: FrameOrder
 ) -> tuple[int, NDArray]:
-    """
-    Return the length of blocks that are much longer than the autocorrelation of frames.
+    """Return the length of blocks much longer than the autocorrelation of frames.
 
-    Also return the share of the variance of a covariance (n_components,) that is lost
-    at the cuts between blocks. Coefficients and labels are ordered, and relative to the
-    mean of their group; independent frames have the length one.
+    Also returns the share of the variance of a covariance (n_components,) that is lost
+    at the cuts. Coefficients and labels are ordered, and relative to the mean of their
+    group.
 
     The covariance of two unrelated series has ``1 + 2 sum_h r_h s_h`` times the
     variance for independent frames, with the autocorrelations r and s of the series
     (Bartlett, "Some aspects of the time-correlation problem", 1935). So frames count as
-    independent if the labels or the coefficients are independent.
+    independent, with length one, if the labels or the coefficients are.
     """
     n_frames, n_components = alpha.shape
     # With 5 and with 10 autocorrelation times a block, 3 to 7 % of random labels in
@@ -104,11 +103,9 @@ def dependent_blocks(
 def permutations_within(
     order: FrameOrder, length: int, n_permutations: int, rng: np.random.RandomState
 ) -> Iterator[NDArray]:
-    """
-    Yield permutations (n_frames,) of ordered frames within their groups.
+    """Yield permutations (n_frames,) of ordered frames within their groups.
 
-    Groups are shifted circularly, cut into blocks, and these are shuffled. A group that
-    is no longer than a block is only shifted.
+    Groups are shifted circularly, cut into blocks (if longer), and these are shuffled.
     """
     block = order.blocks(length)
     starts, lengths = np.flatnonzero(np.diff(block, prepend=-1)), np.bincount(block)
@@ -133,9 +130,9 @@ def permuted_energies(
     """
     Compute squared covariances of coefficients with labels, and with permuted labels.
 
-    Return them (n_permutations + 1, n_components), first those of the labels as given,
-    and the units that are permuted. The parts between groups and within groups are
-    summed, each divided by its mean over the permutations.
+    Returns them (n_permutations + 1, n_components), the given labels first, and the
+    permuted units. The parts between and within groups are summed, each divided by its
+    mean over the permutations.
     """
     alpha, labels = alpha[order.rows], labels[order.rows]
     total = np.sum((labels - labels.mean(axis=0)) ** 2)

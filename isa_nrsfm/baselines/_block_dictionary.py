@@ -33,13 +33,11 @@ def group_sparse_factors(
     random_state: np.random.RandomState,
     most_frames: int = 1000,
 ) -> tuple[NDArray, NDArray]:
-    """
-    Solve the relaxed problem: return blocks, and atoms with ``||D_l||_F <= 1``.
+    """Solve the relaxed problem: return blocks, and atoms with ``||D_l||_F <= 1``.
 
-    They are approximately a stationary point of ``sum_i (||W_i - sum_l P_il D_l||_F^2 /
-    2 + penalty sum_l ||P_il||_F)``, for frames of mean square norm one, by the
-    alternating direction method of multipliers with copies of blocks and atoms. If
-    there are more than `most_frames` frames, a random subset is used.
+    They nearly minimise ``sum_i (||W_i - sum_l P_il D_l||_F^2 / 2 + penalty sum_l
+    ||P_il||_F)``, for frames of mean square norm one, by the alternating direction
+    method of multipliers. Of more than `most_frames` frames a random subset is used.
     """
     if len(frames) > most_frames:
         frames = frames[random_state.permutation(len(frames))[:most_frames]]
@@ -84,18 +82,16 @@ def _within_unit_norm(rows: NDArray, n_atoms: int) -> NDArray:
 def code_frames(
     frames: NDArray, atoms: NDArray, sparsity: int, ridge: float, batch: int = 1000
 ) -> tuple[NDArray, NDArray]:
-    """
-    Find at most `sparsity` blocks for each frame by reweighted ridge regression.
+    """Find at most `sparsity` blocks for each frame by reweighted ridge regression.
 
-    Return the blocks and which are active, at least one for each frame. In alternation,
-    ``||W_i - sum_l P_il D_l||_F^2 + ridge * ||W_i||_F^2 sum_l ||P_il||_F^2 / w_il^2``
-    is minimised, where w_il is the previous norm of P_il, and the largest blocks are
-    selected, ever fewer (Gorodnitsky, Rao, "Sparse signal reconstruction from limited
-    data using FOCUSS", 1997). A block that alone explains a share x of the frame ends
-    with the share ``(x + sqrt(x^2 - 4 x ridge)) / 2 - ridge``; it vanishes if x is less
-    than four times `ridge`. If all blocks of a frame vanish, it gets the block of the
-    atom that explains most of it, without a price. Atoms have orthonormal rows, frames
-    are non-zero; batches of frames limit the memory.
+    Alternately ``||W_i - sum_l P_il D_l||_F^2 + ridge * ||W_i||_F^2 sum_l ||P_il||_F^2
+    / w_il^2`` is minimised, where w_il is the previous norm of P_il, and the largest
+    blocks are selected, ever fewer (Gorodnitsky, Rao, "Sparse signal reconstruction
+    from limited data using FOCUSS", 1997). A block that alone explains a share x of the
+    frame ends with the share ``(x + sqrt(x^2 - 4 x ridge)) / 2 - ridge``, or zero if x
+    is below four times `ridge`. A frame without blocks gets that of its best atom.
+    Atoms have orthonormal rows, frames are non-zero. Returns blocks and a mask of
+    active ones.
     """
     n_frames, n_atoms = len(frames), len(atoms)
     rows = atoms.reshape(3 * n_atoms, -1)
@@ -122,12 +118,11 @@ def code_frames(
 def _reweighted_ridge(
     gram: NDArray, right: NDArray, sparsity: int, ridge: float
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return blocks of frames of norm one, their atoms, and which of them are active.
+    """Return blocks of frames of norm one, their atoms, and which of them are active.
 
-    `gram` (n_atoms, n_atoms, 3, 3) has the products ``D_l D_m^T``, `right` (n_frames,
-    n_atoms, 3, 2) the ``D_l W_i^T``. With ``P_il = w_il Z_il`` the equations ``(w G w +
-    ridge) Z = w D W^T`` stay well conditioned when weights vanish.
+    From ``D_l D_m^T`` (n_atoms, n_atoms, 3, 3) and ``D_l W_i^T`` (n_frames, n_atoms, 3,
+    2). With ``P_il = w_il Z_il`` the equations ``(w G w + ridge) Z = w D W^T`` stay
+    well conditioned when weights vanish.
     """
     n_frames, size = right.shape[:2]
     chosen = np.tile(np.arange(size), (n_frames, 1))
@@ -164,14 +159,12 @@ def update_atoms(
     active: NDArray,
     replace: bool = True,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """
-    Fit each atom and its blocks in turn to the residual of the others.
+    """Fit each atom and its blocks in turn to the residual of the others.
 
-    Return atoms, blocks, active, and residuals of the frames. An atom becomes the
-    orthonormal rows of the best approximation of rank three; the sum of squared
-    residuals never increases. With `replace`, an atom of fewer than three frames
-    becomes the three main directions of the two frames with the largest residuals, and
-    is inactive.
+    Returns atoms, blocks, active, and residuals. An atom becomes the orthonormal rows
+    of the best approximation of rank three; the sum of squared residuals never
+    increases. With `replace`, an atom of fewer than three frames becomes the three main
+    directions of the two frames with the largest residuals, and is inactive.
     """
     atoms, blocks, active = atoms.copy(), blocks.copy(), active.copy()
     residuals = frames - np.einsum("ilrc,lcp->irp", blocks, atoms, optimize=True)
@@ -210,13 +203,11 @@ def block_ksvd(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, float, int]:
-    """
-    Learn a dictionary by which each frame is a sum of at most `sparsity` blocks.
+    """Learn a dictionary by which each frame is a sum of at most `sparsity` blocks.
 
     A sweep codes the frames, then updates the atoms. Sweeps end one after the relative
-    change of the sum of squared residuals falls to `tol`; in the last one no atom is
-    replaced. Return atoms, blocks, active, the residual as a share of the energy of the
-    frames, and the number of sweeps.
+    change of the residual falls to `tol`; in the last one no atom is replaced. Returns
+    atoms, blocks, active, the residual share of the energy, and the number of sweeps.
     """
     atoms = np.linalg.svd(atoms, full_matrices=False)[2]
     energy = float(np.sum(frames**2))

@@ -28,14 +28,12 @@ def nuclear_norm_shapes(
     max_iter: int,
     tol: float,
 ) -> tuple[NDArray, int, bool]:
-    """
-    Minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` over the shapes.
+    """Minimise ``mu ||S||_* + 1/2 sum_i ||W_i - R_i S_i||_F^2`` over the shapes.
 
-    S has one row for each frame, mu is the price; the cameras (n_frames, 2, 3) have
-    orthonormal rows. Proximal gradient steps of length one have Nesterov's momentum,
-    reset when it leads up (Beck, Teboulle 2009; O'Donoghue, Candes 2015). The published
-    steps have length 0.2 and no momentum. Return shapes (n_frames, n_points, 3), the
-    number of steps, and whether the relative change in the last was at most `tol`.
+    S has one row for each frame, mu is the price. Proximal gradient steps of length one
+    have Nesterov's momentum, reset when it leads up (Beck, Teboulle 2009; O'Donoghue,
+    Candes 2015); the published ones length 0.2 and no momentum. Returns shapes (I, J,
+    3), the number of steps, and whether the last relative change was at most `tol`.
     """
     images = W.reshape(len(cameras), 2, -1).transpose(0, 2, 1)
     # The curvature of the images is one, as the cameras have orthonormal rows.

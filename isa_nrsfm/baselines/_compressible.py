@@ -33,11 +33,11 @@ def metric_correction(blocks: NDArray) -> NDArray:
     """
     Return G (3, 3) that makes blocks P_i (n_frames, 2, 3) scaled orthographic cameras.
 
-    The rows of ``P_i G`` are orthogonal and of equal length: ``Q = G G^T`` is the
-    symmetric matrix of unit norm with the least sum of squares of ``p1 Q p1^T - p2 Q
-    p2^T`` and ``2 p1 Q p2^T``, an eigenvector. Of several solutions, with fewer than
-    three frames, it is the nearest to the identity. If Q is not positive definite, its
-    axes are kept, and stretches differ by a factor of at most 20.
+    ``Q = G G^T`` is the symmetric matrix of unit norm with the least sum of squares of
+    ``p1 Q p1^T - p2 Q p2^T`` and ``2 p1 Q p2^T``, an eigenvector. Of several solutions,
+    with fewer than three frames, it is the nearest to the identity. If Q is not
+    positive definite, its axes are kept, and stretches differ by a factor of at most
+    20.
     """
     equations = conformal_equations(blocks)
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
@@ -50,12 +50,11 @@ def metric_correction(blocks: NDArray) -> NDArray:
 
 
 def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
-    """
-    Return the orthogonal O (3, 3) that, with the best c_i, aligns blocks to cameras.
+    """Return the orthogonal O (3, 3) that, with the best c_i, aligns blocks to cameras.
 
-    It minimises ``sum_i ||P_i O - c_i R_i||^2`` for P_i and R_i (n_frames, 2, 3), by
-    alternation of coefficients and orthogonal Procrustes problems. The start is the
-    unconstrained matrix with the largest ``sum_i <P_i O, R_i>^2``.
+    It minimises ``sum_i ||P_i O - c_i R_i||^2`` by alternation of coefficients and
+    orthogonal Procrustes problems, from the unconstrained matrix with the largest
+    ``sum_i <P_i O, R_i>^2``.
     """
     products = np.einsum("irc,ird->icd", blocks, cameras).reshape(-1, 9)
     start = np.linalg.eigh(products.T @ products)[1][:, -1]
@@ -71,16 +70,15 @@ def align_blocks(blocks: NDArray, cameras: NDArray) -> NDArray:
 def chain_atoms(
     atoms: NDArray, blocks: NDArray, active: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Make cameras of the blocks of all atoms, in one orientation of space.
+    """Make cameras of the blocks of all atoms, in one orientation of space.
 
-    Return cameras R_i (n_frames, 2, 3), coefficients c_il (n_frames, n_atoms) and
-    corrected atoms X_l (n_atoms, 3, n_points), zero if unused. The most used atom comes
-    first, then always the one that shares most frames with those before it. Blocks
-    become ``P_il G_l``: G_l is the `metric_correction` times the orthogonal matrix that
-    aligns them with the cameras of shared frames, or, with fewer than ten of these, the
-    shape with the first. R_i is the camera nearest to the block of the frame's first
-    atom, ``c_il = <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
+    Returns cameras R_i (I, 2, 3), coefficients c_il (I, n_atoms) and corrected atoms
+    X_l (n_atoms, 3, J), zero if unused. The most used atom comes first, then always the
+    one that shares most frames with those before it. Blocks become ``P_il G_l``: G_l is
+    the `metric_correction` times the orthogonal matrix that aligns them with the
+    cameras of shared frames, or, with fewer than ten of these, the shape with the
+    first. R_i is the camera nearest to the block of the frame's first atom, ``c_il =
+    <P_il G_l, R_i> / 2`` and ``X_l = G_l^-1 D_l``.
     """
     n_frames, n_atoms = active.shape
     cameras, seen = np.zeros((n_frames, 2, 3)), np.zeros(n_frames, dtype=bool)

@@ -13,11 +13,9 @@ from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 
 
 def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
-    """
-    Return the orthographic camera (n_frames, 2, 3) of each frame of W.
+    """Return cameras (I, 2, 3) of W, the nearest to those of `orthonormal_cameras`.
 
-    Cameras are the nearest to those that `orthonormal_cameras` finds in the span of
-    the first ``3 * rank`` left singular vectors; the rest of W counts as noise.
+    These are in the span of the first ``3 * rank`` left singular vectors.
     """
     S, Vt, rest = leading_triplets(W, 3 * rank)
     n_columns = int(np.sum(S > OF_RANKS * S[0]))

@@ -11,11 +11,10 @@ from isa_nrsfm._linalg.vectors import orientations
 
 
 def shape_signs(shapes: NDArray) -> NDArray:
-    """
-    Return signs of shapes (n_frames, n_points, 3) that make them similar.
+    """Return signs z_i of shapes (n_frames, n_points, 3) that make them similar.
 
-    Each z_i S_i has a non-negative inner product with ``sum_i z_i S_i``. The iteration
-    starts at the first left singular vector; the order of the frames does not matter.
+    Each z_i S_i has a non-negative inner product with ``sum_i z_i S_i``, from the first
+    left singular vector.
     """
     rows = shapes.reshape(len(shapes), -1)
     tall = len(rows) > rows.shape[1]
@@ -43,12 +42,11 @@ def _sign(values: NDArray) -> NDArray:
 def principal_shapes(
     shapes: NDArray, n_components: int
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """
-    Return mean, principal components and coefficients of shapes.
+    """Return mean, principal components and coefficients of shapes.
 
-    The components (n_components, n_points, 3) are orthogonal, in decreasing order, one
-    standard deviation each. The coefficients (n_frames, n_components) have mean zero,
-    unit variance and non-negative skewness. Both are zero without any variation.
+    The components (K, J, 3) are orthogonal, decreasing, one standard deviation each.
+    The coefficients (I, K) are white, with non-negative skewness. Zero without
+    variation.
     """
     mean_shape = shapes.mean(axis=0)
     rest = (shapes - mean_shape).reshape(len(shapes), -1)

@@ -29,8 +29,7 @@ def choose_n_components(
 ) -> AffineNRSfMCV:
     """Return the fitted search for the number that best predicts held-out frames.
 
-    Frames of one group (n_frames,) are held out together. The result of each number is
-    written to the terminal at once.
+    Frames of one group are held out together. Results are printed at once.
     """
     splitter: Any = N_PARTS
     if groups is not None:
@@ -49,7 +48,7 @@ def choose_n_components(
 def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
     """Return the numbers tried, their held-out errors, seconds, and the one chosen.
 
-    If that is the largest, also the next numbers, and about how long they would take.
+    If that is the largest, also the next numbers with their expected seconds.
     """
     results, n_parts = search.cv_results_, search.n_splits_
     seconds = results["path_fit_time"] + n_parts * (
@@ -78,10 +77,10 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
 
 
 def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArray:
-    """Return about how many seconds further numbers of basis shapes take.
+    """Return the expected seconds of further numbers of basis shapes.
 
-    The line of least squares, and at least the seconds of the largest number. The first
-    number is left out if there are two others: it includes the search for starts.
+    The least squares line, and at least the seconds of the largest number. The first of
+    three or more numbers is left out: it includes the search for starts.
     """
     if len(tried) > 2:
         tried, seconds = tried[1:], seconds[1:]

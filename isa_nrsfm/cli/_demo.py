@@ -24,10 +24,7 @@ _CAMERA: Final = "weak_perspective"
 
 
 def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
-    """Fit artificial faces with the numbers of basis shapes to try; return the report.
-
-    The report ends with the truth.
-    """
+    """Fit artificial faces with the numbers of basis shapes to try; report truths."""
     pd = import_optional("pandas", extra="io")
     faces = make_face_tracks(400, n_components=3, camera=_CAMERA, random_state=0)
     table = pd.DataFrame(faces.data.round(2), columns=faces.feature_names)

@@ -40,10 +40,9 @@ def chosen_edges(
     *,
     surfaces: bool = False,
 ) -> Any:
-    """Return the lines to draw, as figures and exporters take them.
+    """Return the lines to draw: an option, or the skeleton stored in the table.
 
-    The skeleton stored in the table serves if no option is given. Triangles become
-    lines unless surfaces are drawn.
+    Triangles become lines unless surfaces are drawn.
     """
     if args.edges == NONE:
         return None

@@ -56,9 +56,9 @@ def fit_table(
 ) -> dict[str, Any]:
     """Fit a table, write everything, and return the report.
 
-    A table that is given is written to the path in the options. `warned` has the
-    warnings so far, and grows. Functions of the model and its table make `extra`
-    entries of the report.
+    A given table is written to the path in the options. `warned` has the warnings so
+    far, and grows. Functions of the model and its table make `extra` entries of the
+    report.
     """
     _check_options(args)
     folder = Path(args.output)

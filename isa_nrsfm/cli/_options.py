@@ -1,8 +1,7 @@
 """The options of all commands, each written once.
 
-Neither the estimator nor a reader of tables is imported here: ``--help`` does not wait
-for them. Defaults of `AffineNRSfM` and its strategies are written once more;
-`tests/test_cli.py` compares them.
+``--help`` must not wait for imports of the estimator or a reader. `tests/test_cli.py`
+compares the defaults with those of `AffineNRSfM` and its strategies.
 """
 
 import re

@@ -149,10 +149,7 @@ def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
-    """Write the report as JSON, in which NaN and infinities become null; return it.
-
-    It gets the digests of those of its files that are in the folder.
-    """
+    """Write the report and digests of its files as JSON, NaN as null; return it."""
     digests = report.get(DIGESTS, {}) | digests_of(folder, report["files"])
     report = report | {DIGESTS: digests}
     text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)

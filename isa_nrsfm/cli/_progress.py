@@ -22,20 +22,11 @@ def show_stage(text: str) -> None:
 def shown_progress(
     program: str, since: float, shortest: float = SHORTEST
 ) -> Iterator[None]:
-    """
-    Repeat the last printed line every few seconds on the standard error.
+    """Repeat the last printed line every few seconds on the standard error.
 
     Nothing of the block reaches the standard output. On a terminal whole lines are
-    shown at once; those that end with a carriage return are shown only in turn.
-
-    Parameters
-    ----------
-    program : str
-        The name that lines begin with.
-    since : float
-        When the program was started, of `time.perf_counter`.
-    shortest : float
-        The least seconds between two lines.
+    shown at once; those that end with a carriage return only in turn. Lines begin with
+    the program's name and its time since `time.perf_counter` was `since`.
     """
     shown = sys.stderr
     latest = _LatestLine(shown if shown.isatty() else None)

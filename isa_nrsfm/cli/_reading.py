@@ -41,14 +41,13 @@ INNER, WITHOUT = "inner", "without:"
 
 
 class Frames(NamedTuple):
-    """
-    The rows of a table as frames.
+    """The rows of a table as frames.
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
-    are not skipped; their index is the number of the row in the table. ``usable`` marks
-    the rows that can be fitted, ``seen`` their visible points. ``left_out`` has reason,
-    rows, and whether they were skipped on request. ``not_used`` has the number of
-    points of each set of coordinates that is not used.
+    are not skipped, by the number of the row in the table. ``usable`` marks the rows
+    that can be fitted, ``seen`` their visible points. ``left_out`` has reason, rows,
+    and whether they were skipped on request, ``not_used`` the sizes of unused sets of
+    coordinates.
     """
 
     points: "pd.DataFrame"
@@ -218,10 +217,7 @@ def _tracks(
     columns: LandmarkColumns,
     kept: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Return the points of all rows, so that messages name rows of the table.
-
-    NaN where a coordinate is missing, and in rows that are not kept.
-    """
+    """Return the points of all rows of the table, NaN where missing or not kept."""
     cells = table.loc[kept, columns.interleaved]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
     values = np.stack([as_numbers(cells[name]) for name in cells], axis=1)

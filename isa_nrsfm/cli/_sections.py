@@ -167,10 +167,7 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
 
 
 def write_page(folder: Path, report: dict[str, Any]) -> None:
-    """Write the report of a fit as a page, with the figures of the folder in it.
-
-    All texts of the table, such as names of columns, stay text.
-    """
+    """Write the report of a fit as a page, with the figures of the folder in it."""
     title = escape(fit_title(report))
     about = f"{report['table']['path']}, {report['finished']}"
     parts = [f"<h1>{title}</h1>", f'<p class="quiet">{escape(about)}</p>']

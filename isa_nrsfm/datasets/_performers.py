@@ -30,13 +30,12 @@ def perform(
     rng: RandomState,
     **options: Any,
 ) -> Bunch:
-    """
-    Return the table of people who take poses in turn, with all truths.
+    """Return the table of people who take poses in turn, with all truths.
 
     ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new person, x
-    to the right, y down, z away, at times (n,) and with weights (n, n_poses) of the
-    poses that add up to one. `largest_angles` are yaw, pitch and roll in degrees,
-    `scales` the least and most pixels a millimetre, `options` those of `observe`.
+    to the right, y down, z away, for weights (n, n_poses) that add up to one.
+    `largest_angles` are yaw, pitch and roll in degrees, `scales` the least and most
+    pixels a millimetre.
     """
     if n_frames < 2 * n_people:
         raise ValueError(

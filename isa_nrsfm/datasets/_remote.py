@@ -23,12 +23,10 @@ class RemoteFile(NamedTuple):
 def fetch_file(
     remote: RemoteFile, data_home: DataHome = None, download_if_missing: bool = True
 ) -> Path:
-    """
-    Return the path of a file of a public data set; download it if it is missing.
+    """Return the path of a file of a public data set; download it if it is missing.
 
-    An existing file with the right checksum is used, without network and pooch; it is
-    never overwritten. A failed download leaves nothing in the folder, by default the
-    subfolder ``isa_nrsfm`` of scikit-learn's data home.
+    An existing file with the right checksum is used, and never overwritten. A failed
+    download leaves nothing in the folder.
     """
     if data_home is None:
         folder = Path(get_data_home(), "isa_nrsfm")

@@ -32,9 +32,8 @@ def draw_motion(
 ) -> NDArray[np.float64]:
     """Return cameras (n_frames, 2, 3) that look along the z axis of the rotations.
 
-    Scales are log-uniform between the two given; orthographic cameras have their
-    geometric mean. Affine cameras stretch the image along a random axis, by a ratio of
-    singular values between 0.5 and 1 at constant area.
+    Scales are log-uniform, orthographic ones the geometric mean. Affine cameras stretch
+    the image along a random axis, by 0.5 to 1 at constant area.
     """
     n_frames = len(rotations)
     shortest, longest = np.log(scales)

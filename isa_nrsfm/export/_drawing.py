@@ -52,7 +52,7 @@ def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawin
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:
     """Return the Delaunay triangles (n, 3) of the front view of a shape (n_points, 3).
 
-    They are counter-clockwise for the viewer: x points right, y up and z to the viewer.
+    Counter-clockwise for the viewer: x points right, y up and z to the viewer.
     """
     try:
         corners = Delaunay(shape[:, :2]).simplices.astype(np.intp)

@@ -1,9 +1,8 @@
 """The upright space in which shapes are exported, and the shapes of a model in it.
 
 In that space x points right, y down and z away from the viewer, who sees the object
-from the front. Its lengths and angles are those of the object as far as the cameras of
-the fitted table determine them. Calibrated cameras have Euclidean shapes as they
-are, which are only turned.
+from the front. Its lengths and angles are Euclidean as far as the cameras of the fitted
+table determine them. Shapes of calibrated cameras are only turned.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -46,9 +45,9 @@ class UprightSpace(NamedTuple):
     """The transform from the space of a model to the upright space.
 
     ``shape @ transform.T`` is upright; the transform of Euclidean shapes is orthogonal.
-    `camera` is None for affine shapes. `metric` makes shapes of affine cameras
-    Euclidean, otherwise it is None. `image_axes` is diagonal and takes the axes of an
-    image and its depth to those of the upright space.
+    `camera` is None for affine shapes; `metric`, or None, makes shapes of affine
+    cameras Euclidean. The diagonal `image_axes` maps the axes of an image to the
+    upright ones.
     """
 
     camera: str | None

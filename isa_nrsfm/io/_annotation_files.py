@@ -35,13 +35,11 @@ def is_pts(path: Path) -> bool:
 
 
 def read_pts(path: Path) -> Landmarks:
-    """
-    Read a .pts file, or all of a folder in the order of their names.
+    """Read a .pts file, or all of a folder in the order of their names.
 
     A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
-    braces, a line ``x y`` for each point. Other files of the folder, such as the
-    images, and folders in it do not count. Coordinates are as they are written; iBUG
-    counts pixels from 1.
+    braces, a line ``x y`` for each point. Other files of the folder are ignored.
+    Coordinates are as they are written; iBUG counts pixels from 1.
     """
     files = [path]
     if path.is_dir():
@@ -76,13 +74,11 @@ def is_wflw(path: Path) -> bool:
 
 
 def read_wflw(path: Path) -> Landmarks:
-    """
-    Read a list of WFLW, with a line for each face.
+    """Read a list of WFLW, with a line for each face.
 
     A line has 196 coordinates, x and y in turn, the box of the face (``x_min y_min
-    x_max y_max``), six attributes that are 0 or 1 (pose, expression, illumination,
-    make-up, occlusion, blur) and the name of the image. Box and attributes
-    may be missing.
+    x_max y_max``), six attributes 0 or 1 (pose, expression, illumination, make-up,
+    occlusion, blur) and the name of the image. Box and attributes may be missing.
     """
     rows: list[NDArray[np.float64]] = []
     images: list[str] = []

@@ -22,15 +22,14 @@ def is_coco(path: Path) -> bool:
 
 
 def read_coco(path: Path, category: str | None = None) -> Landmarks:
-    """
-    Read keypoints of COCO, annotations or results of a detector.
+    """Read keypoints of COCO, annotations or results of a detector.
 
     Annotations are an object with ``images``, ``annotations`` and ``categories``; the
-    third number of a keypoint is 0 where it is not labelled, 1 where it is hidden and 2
-    where it is visible. Results are a list of objects with ``image_id``,
-    ``category_id``, ``keypoints`` and ``score``; the third number is a confidence. Each
-    instance has a row, and each image without any has one without points. Of several
-    categories with different keypoints, ``category`` names the one to read.
+    third number of a keypoint is 0 if not labelled, 1 if hidden and 2 if visible.
+    Results are a list of objects with ``image_id``, ``category_id``, ``keypoints`` and
+    ``score``; the third number is a confidence. Each instance has a row, and each image
+    without any has one without points. ``category`` chooses one of several with
+    different keypoints.
     """
     try:
         with path.open(encoding="utf-8-sig") as file:

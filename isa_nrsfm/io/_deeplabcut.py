@@ -29,14 +29,12 @@ def is_deeplabcut(path: Path) -> bool:
 
 
 def read_deeplabcut(path: Path) -> Landmarks:
-    """
-    Read a csv or h5 file of DeepLabCut or Lightning Pose.
+    """Read a csv or h5 file of DeepLabCut or Lightning Pose.
 
     The columns have the levels ``scorer``, ``individuals`` (only with several animals),
-    ``bodyparts`` and ``coords``, which are ``x``, ``y`` and, but for labels made by
-    hand, ``likelihood``. The index has the number of the frame or the path of the
-    image. The individual "single", to which DeepLabCut gives points that belong to no
-    animal, is left out with a warning where there are others.
+    ``bodyparts`` and ``coords``: ``x``, ``y`` and, but for labels made by hand,
+    ``likelihood``. The index has the number of the frame or the path of the image. The
+    individual "single", for points of no animal, is left out where there are others.
     """
     table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
     scorers = {column[0] for column in table.columns}
@@ -119,10 +117,7 @@ def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
 def _places(
     columns: Sequence[tuple[str, ...]],
 ) -> dict[tuple[str, str], tuple[int, int, int]]:
-    """Return the places of x, y and likelihood by individual and bodypart.
-
-    The place is -1 if there is no likelihood.
-    """
+    """Return the places of x, y, likelihood (or -1) by individual and bodypart."""
     places: dict[tuple[str, str], dict[str, int]] = {}
     for number, column in enumerate(columns):
         *individual, bodypart, coord = column[1:]

@@ -37,14 +37,13 @@ def is_openface(path: Path) -> bool:
 
 
 def read_openface(path: Path) -> Landmarks:
-    """
-    Read a csv file of OpenFace 1 or 2, of a video or an image.
+    """Read a csv file of OpenFace 1 or 2, of a video or an image.
 
     The columns are those of ``RecorderCSV.cpp``: ``frame, face_id, timestamp,
-    confidence, success`` (``face, confidence`` for images) and, as far as they were
-    asked for, gaze, eyes, pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has
-    no ``face_id``, and blanks before the names. Rows in which ``success`` is 0 hold
-    numbers that are not of a face.
+    confidence, success`` (``face, confidence`` for images) and optional gaze, eyes,
+    pose, ``x_0 ... x_67, y_0 ... y_67`` and more. OpenFace 1 has no ``face_id``, and
+    blanks before the names. Rows in which ``success`` is 0 hold numbers that are not of
+    a face.
     """
     names = header_names(path)
     if "x_0" not in names:
@@ -103,13 +102,10 @@ def is_mediapipe(path: Path) -> bool:
 def read_mediapipe(
     path: Path, image_size: tuple[float, float] | None = None
 ) -> Landmarks:
-    """
-    Read a csv file with the points of MediaPipe.
+    """Read a csv file with the points of MediaPipe.
 
-    MediaPipe divides x by the width of the image and y by its height. Coordinates of
-    this kind are multiplied with ``image_size`` (width, height), or else with the
-    columns ``image_width`` and ``image_height``. Coordinates in pixels are taken as
-    they are.
+    Coordinates divided by the width and height of the image are multiplied by
+    ``image_size``, or the columns ``image_width`` and ``image_height``.
     """
     if image_size is not None:
         image_size = _checked_size(image_size)

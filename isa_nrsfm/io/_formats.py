@@ -1,7 +1,6 @@
 """The formats of landmark files, and reading them.
 
-This module imports no reader before a file is read: the command line has the names of
-the formats in its help, which must not wait.
+Readers are imported when a file is read: the help of the command line must not wait.
 """
 
 from collections.abc import Callable, Mapping

@@ -30,11 +30,10 @@ def root_groups(path: Path) -> set[str]:
 
 
 def content_of(group: Any, name: str) -> Any:
-    """
-    Return the content of a dataset: an array, a number or a text.
+    """Return the content of a dataset: an array, a number or a text.
 
-    Raise if there is no such dataset, or if it claims to hold more than the file can:
-    HDF5 has no data of the parts of an array that nobody wrote.
+    Raise if there is none, or if it claims to hold more than the file can: HDF5 has no
+    data of the parts of an array that nobody wrote.
     """
     dataset = group.get(name)
     if dataset is None or not hasattr(dataset, "nbytes"):

@@ -16,21 +16,12 @@ MIN_POINTS = 7
 
 
 class LandmarkColumns(NamedTuple):
-    """
-    The columns of one set of landmarks.
+    """The columns of one set of landmarks, each (n_points,), named as in the table.
 
-    Attributes
-    ----------
-    pattern : str
-        The set, such as ``"x_#,y_#"``.
-    points : tuple of str, length n_points
-        Names of the points, without the axis letter if that is unambiguous.
-    x, y : tuple of str, length n_points
-        The column of each point's coordinate, named as in the table (with blanks).
-    z : tuple of str
-        Columns with a third coordinate of these points. They are not used.
-    gaps : tuple of int
-        Numbers that are absent between the first and the last numbered point.
+    pattern: the set, such as ``"x_#,y_#"``.
+    points: names of the points, without the axis letter if that is unambiguous.
+    z: columns with a third coordinate of these points. They are not used.
+    gaps: numbers that are absent between the first and the last numbered point.
     """
 
     pattern: str
@@ -95,11 +86,9 @@ def find_landmark_columns(
 
 
 def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
-    """
-    Count the points of every set of landmarks by pattern, in table order.
+    """Count the points of every set of landmarks by pattern, in table order.
 
-    A set needs at least one x and one y column (names such as ``x0, x1, x2`` alone are
-    those of any table). Sets too small for a basis shape are counted.
+    Sets have an x and a y column or more (``x0, x1, x2`` are those of any table).
     """
     members: dict[tuple[str, str, str], list[set[int | str]]] = {}
     coordinates = [found for name in names if (found := parse_coordinate(name))]

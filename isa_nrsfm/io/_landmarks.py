@@ -98,15 +98,13 @@ def assemble(
     failed: NDArray[np.bool_] | None = None,
     skeleton: Skeleton | None = None,
 ) -> Landmarks:
-    """
-    Put landmarks together in the one form that all readers return, and check them.
+    """Put landmarks together in the one form that all readers return, and check them.
 
     `tracks` (n_frames, n_points, 2) are NaN where points are missing. Points whose
-    names are None have numbers from 0 and columns ``x_0, y_0``, ...; the columns of
-    others are by default their names with ``_x`` and ``_y``. `frames` has further
-    columns of each frame, `confidence` is (n_frames, n_points). Frames without points
-    are added to those that `failed`. The skeleton is by default that of the layout that
-    the format or the names of the points determine.
+    names are None have numbers from 0 and columns ``x_0, y_0``, ...; other columns are
+    by default the names with ``_x`` and ``_y``. `frames` has further columns of each
+    frame. Frames without points are added to those that `failed`. The skeleton is by
+    default that of the layout that the format or the names of the points determine.
     """
     pd = import_optional("pandas", extra="io")
     n_frames, n_points, _ = tracks.shape
@@ -157,13 +155,12 @@ def assemble_individuals(
     of_instances: dict[str, NDArray[np.float64]] | None = None,
     **known: Any,
 ) -> Landmarks:
-    """
-    Give each individual that a frame shows a row of its own.
+    """Give each individual that a frame shows a row of its own.
 
     A single individual has a row in every frame. Of several, those without a visible
     point have none. A frame in which nobody is seen has one row without points.
-    `tracks` are (n_frames, n_individuals, n_points, 2), `confidence` and the arrays in
-    `of_instances` have its first axes. Without names there is no column ``individual``.
+    `tracks` are (n_frames, n_individuals, n_points, 2). Without names no column
+    ``individual``.
     """
     if tracks.shape[1] == 0:
         raise ValueError("expected points of one individual or more; got none")

@@ -20,14 +20,7 @@ IMPLIED = ("camera_", "frames_scaled_")
 
 
 class NamedStrategy(BaseEstimator):
-    """
-    Placeholder for an ISA strategy or a density that a model file only names.
-
-    Parameters
-    ----------
-    name : str, default=""
-        Full name of its class.
-    """
+    """Placeholder for an ISA strategy or density that a model file only names."""
 
     def __init__(self, name: str = ""):
         self.name = name

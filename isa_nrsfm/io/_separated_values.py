@@ -46,12 +46,11 @@ def header_names(path: Path) -> list[str]:
 
 
 def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
-    """
-    Yield the rows of a text file that are not empty.
+    """Yield the non-empty rows of a text file.
 
     Raise if one has not as many cells as the first, if none follows it, or at a null
-    character. pandas fills short lines up and cuts long ones, and some readers end a
-    cell at a null character. Files in UTF-16 without a mark hold many.
+    character, as files in UTF-16 without a mark have. pandas would pad or cut the
+    lines.
     """
     n_rows, n_columns = 0, 0
     with path.open(encoding="utf-8-sig", newline="") as file:
@@ -80,13 +79,11 @@ def read_columns(
     n_header: int = 1,
     names: Sequence[str] | None = None,
 ) -> "pd.DataFrame":
-    """
-    Read columns of a csv file whose lines must all be of the same length.
+    """Read columns of a csv file whose lines must all be of the same length.
 
-    Columns in `leave_out`, a collection or an expression for their names, are not read.
-    Those in `numbers` must hold numbers, empty cells are NaN. Those in `text` stay as
-    they are written. All others become numbers if all their cells are. `names` are by
-    default those of the first line; `n_header` lines come before the first row.
+    Columns in `leave_out`, names or an expression for them, are not read. Those in
+    `numbers` must hold numbers, empty cells are NaN. Those in `text` stay text, others
+    become numbers if all their cells are. `n_header` lines come before the first row.
     """
     pd = import_optional("pandas", extra="io")
     names = header_names(path) if names is None else names

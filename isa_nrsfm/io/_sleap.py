@@ -31,15 +31,14 @@ def is_sleap(path: Path) -> bool:
 
 
 def read_sleap(path: Path) -> Landmarks:
-    """
-    Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
+    """Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
 
-    In an h5 file, ``tracks`` has the points, in the order of axes that its attribute
-    ``dims``, or without it (track, xy, node, frame), as SLEAP writes it;
-    ``point_scores`` has their confidences, ``instance_scores`` those of the instances,
-    and ``edge_names`` the pairs of nodes that the skeleton joins.
-    A csv file has a row for each instance, ``track, frame_idx, instance.score`` and
-    ``x``, ``y`` and ``score`` of each node. Frames are counted from 0.
+    In an h5 file, ``tracks`` has the points, in the order of axes of its attribute
+    ``dims``, by default (track, xy, node, frame). ``point_scores`` and
+    ``instance_scores`` have confidences, ``edge_names`` the pairs of nodes that the
+    skeleton joins. A csv file has a row for each instance, ``track, frame_idx,
+    instance.score`` and ``x``, ``y`` and ``score`` of each node. Frames are counted
+    from 0.
     """
     return _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
 

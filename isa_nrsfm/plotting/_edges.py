@@ -71,7 +71,7 @@ def choose_origin(
 ) -> Literal["upper", "lower"]:
     """Return whether y points down in the image of a shape ("upper") or up ("lower").
 
-    Hands can be in any direction, which determines nothing.
+    Hands determine nothing.
     """
     if origin == "auto":
         if layout is None or not layout.up or layout.kind == "hand":

@@ -28,10 +28,9 @@ def grid(n_axes: int, n_columns: int, **options: Any) -> NDArray[Any]:
 def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     """Return the part of space to draw each block of shapes in, and its reduction.
 
-    Blocks are (n_shapes, n_points, 3), the mean shape alone comes first. Limits
-    (n_blocks, 3, 2) have the same proportions in all blocks and one scale, except for
-    blocks whose extent, relative to that of the first one, is more than twice the
-    median: they are drawn smaller by the factors reduction (n_blocks,).
+    Blocks are (n_shapes, n_points, 3), the mean shape first. Limits (n_blocks, 3, 2)
+    have one scale. Blocks whose extent relative to the first exceeds twice the median
+    are drawn smaller, by the factors reduction (n_blocks,).
     """
     low = np.array([block.min(axis=(0, 1)) for block in blocks])
     high = np.array([block.max(axis=(0, 1)) for block in blocks])

@@ -1,10 +1,9 @@
-"""The frame in which shapes are looked at.
+"""The frame in which shapes are viewed.
 
-A factorisation into affine cameras and shapes is known up to one 3x3 affinity of
-space. Drawn as they are, the shapes look squashed and sheared. The functions here find
-the affinity under which the cameras are as nearly as possible scaled orthographic
-(weak perspective) ones, and turn the shapes until they face the mean camera. Shapes of
-calibrated cameras have true proportions as they are, and are only turned.
+Affine cameras and shapes are known up to one 3x3 affinity of space: drawn as they are,
+the shapes look squashed and sheared. Here the affinity is found under which the cameras
+are most nearly weak-perspective ones, and shapes face the mean camera. Shapes of
+calibrated cameras are only turned.
 """
 
 from typing import Any, Literal
@@ -32,9 +31,8 @@ def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray
     """Return the directions of space (2, 3) that the front view shows right and down.
 
     They are nearest to the reference camera (2, 3). Unit cameras (n_frames, 2, 3) that
-    go round the object have no common view, but one direction of their axis in the
-    images: it is kept, and the object, with the covariance `spread` of its points, is
-    turned to where it is broadest.
+    go round the object have one direction of their axis in the images: it is kept, and
+    the object, with the covariance `spread` of its points, shown at its broadest.
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
@@ -82,10 +80,10 @@ def euclidean_axes(estimator: Any) -> NDArray:
 def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
     """Return the transform T (3, 3) of affine space into the viewing frame.
 
-    In that frame, ``shape @ T.T``, the cameras (n_frames, 2, 3) are as nearly as
-    possible scaled rows of a rotation, and the median camera has rows of length one. If
-    `metric_quadric` finds nothing, the mean of ``M_i^T M_i`` over the unit cameras is
-    made isotropic. The x and y axes are `front_axes`; T has a non-negative determinant.
+    There, ``shape @ T.T``, the cameras (n_frames, 2, 3) are most nearly scaled rows of
+    a rotation, and the median camera has rows of length one. If `metric_quadric` finds
+    nothing, the mean of ``M_i^T M_i`` over the unit cameras is made isotropic. The x
+    and y axes are `front_axes`; T has a non-negative determinant.
     """
     G = metric_quadric(motion)
     if G is None:
