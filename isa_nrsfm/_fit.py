@@ -91,12 +91,14 @@ class Limits(NamedTuple):
     sample: number of frames of the first sample of a large table.
     small_table: tables with fewer coordinates are fitted without a sample.
     model_frames: most frames from which outliers and missing points are modelled.
+    errors: whether the errors of fits with calibrated cameras are estimated.
     """
 
     dense: int = 1500
     sample: int = 600
     small_table: int = 150_000
     model_frames: int = 5_000
+    errors: bool = True
     joint: JointOptions = JointOptions()
 
 
@@ -200,6 +202,7 @@ def _count_components(estimator: TableTransformer, source: Table) -> int:
     # Outliers that count a little look like shapes: a fit with final weights decides.
     while found > 1 and estimator.loss != "linear":
         trial = copy.copy(estimator)
+        trial._limits = trial._limits._replace(errors=False)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             fit_ready_table(trial, table, found, NoProgress())
@@ -358,7 +361,7 @@ def _joint_frames(
         FrameMap.identity(len(shapes) - 1),
         estimator.camera,
     )
-    if estimator.camera != "affine":
+    if estimator.camera != "affine" and estimator._limits.errors:
         frames = replace(frames, certainty=depth_certainty(frames, table.rows))
         estimator.depth_uncertainty_ = frames.certainty.total
     posteriors = posterior_blocks(frames, tracks, table.rows)

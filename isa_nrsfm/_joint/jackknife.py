@@ -33,7 +33,7 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 N_GROUPS = 5
 # Largest number of steps of a fit, and its convergence tolerance. Where the depth is
 # determined some 50 steps are enough.
-MOST_STEPS, TOL = 100, 1e-6
+MOST_STEPS, TOL = 100, 1e-3
 # Frames and points of the fits.
 MOST_FRAMES, MOST_POINTS = 200, 200
 # Points of a frame that each fit needs.
