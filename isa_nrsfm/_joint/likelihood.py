@@ -97,7 +97,9 @@ class MarginalLikelihood:
             # With one curvature for all points the shapes are centred already.
             penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
             value += weight * penalty
-            shape_gradient = shape_gradient + weight * slope
+            # Points that no frame shows stay in place: they have no curvature.
+            seen = curvature.any(axis=(1, 2))
+            shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
         return terms._replace(
             value=float(value),
             shape_gradient=shape_gradient,

@@ -55,4 +55,8 @@ def warn_if_other_layout(
 def _rigid_noise(centred: NDArray, sizes: NDArray) -> float:
     """Return the noise variance of tracks (I, J, 2) over sizes, as a rigid object."""
     rows = (centred / sizes[:, None, None]).transpose(0, 2, 1)
+    if np.isfinite(rows).all():
+        W = rows.reshape(-1, rows.shape[2])
+        energy = np.linalg.eigvalsh(W.T @ W if len(W) > W.shape[1] else W @ W.T)
+        return max(float(energy[:-3].sum()), 0.0) / W.size
     return completion_model(np.ascontiguousarray(rows), rank=3).noise

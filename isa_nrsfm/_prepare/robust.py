@@ -81,7 +81,7 @@ def _squares(tracks: NDArray) -> NDArray:
 
 def _sizes(square: NDArray) -> NDArray:
     """Return the sizes (I,) of frames from the squared distances (I, J) of points."""
-    median, upper = np.nanquantile(square, [0.5, 0.75], axis=1)
+    median, upper = (np.nanquantile(square, q, axis=1) for q in (0.5, 0.75))
     # If half of the points coincide the median is rounding error: take the mean.
     mean = np.nanmean(square, axis=1)
     return np.sqrt(np.where(median > OF_DISTANCES * upper, median, mean) / 2)
