@@ -45,8 +45,7 @@ class Diagnostics(NamedTuple):
         stacked cameras, divided by the root of the number of rows. Frames have size
         one, and the mean shape is white.
     deformation_amplitude : float
-        Root mean square of the deformation over that of the mean shape, in the space in
-        which the mean shape is white.
+        RMS of the deformation over that of the mean shape, where this is white.
     reliability : ndarray of shape (n_components,)
         Shares of the variance of the coefficients that are not uncertainty, of their
         own or of the shapes, along uncorrelated directions, decreasing. Directions near
@@ -64,9 +63,8 @@ class Diagnostics(NamedTuple):
         coefficient. Calibrated cameras absorb rotations only: for them these are upper
         bounds.
     depth_uncertainty : float
-        Expected root mean square error of the depths of the frames, relative to their
-        root mean square. NaN for affine cameras, whose depth is known
-        up to an affinity only.
+        Expected RMS error of the depths of the frames, relative to their RMS. NaN for
+        affine cameras, whose depth is known up to an affinity only.
     camera_noise_ratio : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
         with affine ones; NaN for models that were saved before it was measured.
@@ -82,7 +80,7 @@ class Diagnostics(NamedTuple):
     outliers : ndarray of shape (n_outliers, 2)
         Row and point of each gross residual, the largest first.
     messages : tuple of str
-        What the figures mean for people, a sentence or two each; empty if all is well.
+        Interpretation of the figures, a sentence or two each; empty if all is well.
         If the table has outliers, and the loss is linear, only they are named.
     """
 
@@ -159,9 +157,9 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
     """Return the share of the variance of coefficients (n_components,) that is pose.
 
-    Leave-one-out R^2 of a linear regression on the nine entries of the rotations
-    nearest to affine cameras. These span yaw, pitch, roll, their squares and products,
-    to second order. NaN for coefficients that are zero, or with fewer than 20 frames.
+    Leave-one-out R^2 of a regression on the nine entries of the nearest rotations,
+    second order in yaw, pitch and roll. NaN for zero coefficients, or fewer than 20
+    frames.
     """
     if len(alpha) < 20:
         return np.full(alpha.shape[1], np.nan)
@@ -250,10 +248,7 @@ def _of_support(found: Diagnostics, loss: str) -> str:
 def _of_coefficients(
     found: Diagnostics, alpha: NDArray, rows: Any, layout: Skeleton | None
 ) -> list[str]:
-    """Return messages on coefficients that a handful of frames decide, or the pose.
-
-    The pose is only named if the layout of the points has a contour.
-    """
+    """Return messages on coefficients that a handful of frames or the pose decide."""
     messages = []
     n_frames, effective = (
         np.count_nonzero(~np.isnan(alpha[:, 0])),

@@ -111,9 +111,8 @@ def sequences_of(
 ) -> tuple[list[tuple[NDArray, NDArray]], float]:
     """Return the rows and steps of each sequence, and the time of a step (the median).
 
-    Times rise within each of the numbered groups. A gap of more than max_gap steps
-    begins a new sequence. Raises ValueError if times do not rise, or if no group has
-    two rows.
+    A gap of more than max_gap steps begins a new sequence. Refuses times that do not
+    rise within groups, and groups that have only one row each.
     """
     if groups is None:
         groups = np.zeros(len(time), dtype=int)
@@ -188,10 +187,7 @@ def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
 def estimated_dynamics(
     sequences: Sequence[Observations], max_iter: int, tol: float, intercepts: bool
 ) -> Dynamics | None:
-    """Estimate the autoregression by expectation maximisation; None without dynamics.
-
-    With intercepts the states of the sequences are (x_t, u).
-    """
+    """Estimate the autoregression by expectation maximisation; None without one."""
     K = sequences[0].information.shape[1] // (1 + intercepts)
     options = sequences, max_iter, tol, intercepts
     found = _most_likely(0.5 * np.eye(K), *options)

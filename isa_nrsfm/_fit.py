@@ -125,10 +125,7 @@ def fit_ready_table(
     progress: FitProgress | NoProgress,
     starts: Sequence[Start] = (),
 ) -> Decomposition:
-    """Fit a table that is checked, centred and scaled, as in `fit_table`.
-
-    Without `starts` the joint refinement searches for them.
-    """
+    """Fit a checked and scaled table, as `fit_table`."""
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(estimator, table, n_components, progress)
     factors = factorised.factors
@@ -348,10 +345,7 @@ def _joint_frames(
     tracks: JointFrames,
     alpha: NDArray,
 ) -> Decomposition:
-    """Return the frames of a joint fit in the independent gauge, and set the model.
-
-    `tracks` are the frames as they were fitted, `alpha` coefficients of some frames.
-    """
+    """Return the frames of a joint fit in the independent gauge, and set the model."""
     shapes, _, noise_variance = fitted.state
     frames = PosteriorFrames(
         shapes,

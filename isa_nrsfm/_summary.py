@@ -10,19 +10,7 @@ from isa_nrsfm._diagnostics import camera_meaning
 
 
 def summary_html(model: Any) -> str:
-    """
-    Return the key figures of a fitted model as an HTML table.
-
-    Parameters
-    ----------
-    model : AffineNRSfM
-        The fitted estimator.
-
-    Returns
-    -------
-    str
-        A table in HTML.
-    """
+    """Return the key figures of a fitted model as an HTML table."""
     rows = "".join(
         f'<tr><th scope="row" style="text-align: left">{html.escape(name)}</th>'
         f'<td style="text-align: left">{html.escape(value)}</td></tr>'

@@ -575,7 +575,7 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
 
 
 def check_frames_kept(estimator: Any, what: str) -> None:
-    """Refuse what depends on the frames of the fit where they were not kept."""
+    """Refuse methods that need the frames of the fit where they were not kept."""
     if not hasattr(estimator, "motion_"):
         raise ValueError(
             f"{what} needs the cameras and coefficients of the fitted table: fit with "

@@ -40,9 +40,8 @@ def without_callbacks(estimator: Any) -> Any:
 class FitProgress:
     """Reports the stages of a fit, and the steps of the stage `stepwise`.
 
-    For callbacks the fit is a task with its stages as subtasks, and steps as subtasks
-    of that. With `verbose`, a line is printed at the end of each stage; above one, the
-    current stage and step are printed and overwritten. Callbacks get X and y as `data`.
+    Callbacks get tasks for the fit, its stages and their steps. `verbose` prints a line
+    after each stage; above one it overwrites the current step.
     """
 
     def __init__(

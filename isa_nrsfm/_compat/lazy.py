@@ -1,8 +1,6 @@
 """Public names that are imported when they are first used (SPEC 1).
 
-An ``__init__.py`` lists its public names twice: under `TYPE_CHECKING`, for type
-checkers and editors, and for `lazy_names`. See
-https://scientific-python.org/specs/spec-0001/.
+An ``__init__.py`` lists them under `TYPE_CHECKING` and for `lazy_names`.
 """
 
 import os

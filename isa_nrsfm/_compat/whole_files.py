@@ -60,8 +60,7 @@ def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
 def files_together(folder: StrPath, *, removed: Iterable[str] = ()) -> Iterator[Path]:
     """Write files to a new folder, which move to a folder after the block.
 
-    If the block fails all old files stay. Otherwise files in `removed` are deleted, and
-    the new ones move. A process that is stopped meanwhile leaves old and new files.
+    If the block fails all old files stay. Otherwise files in `removed` are deleted.
     """
     folder = Path(folder)
     stage = _aside(folder)

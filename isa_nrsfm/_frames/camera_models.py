@@ -65,7 +65,7 @@ class AffineCameras:
         return G.reshape(6, -1)[: self.n_parameters]
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
-        """Return what `product` takes, for curvatures (6, n) by a row of the camera."""
+        """Return the argument of `product` for curvatures (6, n) by a row."""
         return inverse3(curvature)
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:

@@ -73,8 +73,8 @@ class FrameMap(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Return cameras, coefficients and standard deviations for the new shapes.
 
-        Motion is (n, 2, 3), alpha (n, K), covariance (n, K, K) or None. Standard
-        deviations (n, K) are to first order, NaN without covariances.
+        Standard deviations (n, K) are to first order, NaN without covariances (n, K,
+        K).
         """
         new, deviation, scale = self.coefficients(alpha, covariance)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
@@ -211,11 +211,7 @@ class PosteriorFrames:
         return replace(self, gauge=self.gauge._replace(space=space))
 
     def of_points(self, kept: NDArray) -> "PosteriorFrames":
-        """Return the model of frames that have only some of the points (n_points,).
-
-        It is faster than frames with missing points. Positions are images of the
-        centroid of these points.
-        """
+        """Return the model of frames that have only some of the points (n_points,)."""
         shapes = self.shapes[:, :, kept]
         return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
@@ -247,10 +243,7 @@ class PosteriorFrames:
         )
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
-        """Return the fit of prepared frames of size one, before the gauge.
-
-        Points or directions, as the shapes are, with weights zero or one.
-        """
+        """Return the fit of prepared frames of size one, before the gauge."""
         return fit_frames(block, self._search, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:

@@ -1,8 +1,6 @@
 """Camera, position and coefficients of single frames, for given shapes and noise.
 
-Frames are fitted in blocks by the search for their camera model, from coefficients of
-zero. Those whose objective is much larger than the noise explains start again from
-other coefficients.
+Blocks of frames start from zero coefficients, badly fitted frames again from others.
 """
 
 import numpy as np
@@ -43,8 +41,7 @@ def fit_tracks(
 ) -> FramePosterior:
     """Fit tracks (I, J, 2), NaN where a point is missing, as `fit_frames` does.
 
-    The noise variance is at least 1e-13 of the energy of a frame. Weights (I, J) are by
-    default 1 for all points that are not NaN.
+    The noise variance is at least 1e-13 of the energy. Weights (I, J) are 1 by default.
     """
     tracks = np.asarray(tracks)
     n_frames = len(tracks)

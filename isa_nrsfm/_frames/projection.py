@@ -1,4 +1,4 @@
-"""Images of shapes, and how far they are from what frames show."""
+"""Images of shapes, and their distances from the visible points of frames."""
 
 from functools import partial
 

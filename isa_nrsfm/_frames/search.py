@@ -1,8 +1,7 @@
 """Newton's method for cameras and coefficients of many frames at once.
 
-Each frame has an objective of its own. The frame is the last index of all arrays. Steps
-are damped where the Hessian is not positive definite or a step has raised the
-objective, so that this never rises, up to rounding. Frames leave when they have ended.
+The frame is the last index of all arrays. Steps are damped where the Hessian is not
+positive definite or a step has raised the objective of a frame, so that it never rises.
 """
 
 from typing import Any, NamedTuple, Self
@@ -80,11 +79,10 @@ class FrameProblem(NamedTuple):
 
 
 class State(NamedTuple):
-    """The objectives of frames at some positions, and their derivatives.
+    """
+    The objectives of frames at some positions, up to constants, and their derivatives.
 
-    position (..., n): coefficients or cameras.
-    value (n,): the objectives, up to a constant of each frame.
-    slope (n_parameters, n): minus half the gradient.
+    position (..., n): coefficients or cameras; slope: minus half the gradient.
     definite (n_pairs, n): a semidefinite part of the Hessian, packed, for damping.
     hessian (n_pairs, n): half the Hessian, packed.
     """
@@ -213,8 +211,7 @@ class FrameSearch:
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
-        A frame is given up where the predicted gain is so small that its objective will
-        not fall below its limit (n,).
+        A frame is given up where its objective will not fall below its limit (n,).
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)

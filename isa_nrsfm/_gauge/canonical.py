@@ -64,10 +64,7 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
 def euclidean_space(
     mean_shape: NDArray, motion: NDArray, size: float | None
 ) -> NDArray:
-    """Return `canonical_rotation` times a size, for calibrated cameras (I, 2, 3).
-
-    None gives the coordinates of the mean shape (J, 3) the mean square one.
-    """
+    """Return `canonical_rotation` times a size; None: RMS of the mean shape one."""
     if size is None:
         size = 1.0 / (np.sqrt(np.mean(mean_shape**2)) or 1.0)
     return size * canonical_rotation(mean_shape, motion)

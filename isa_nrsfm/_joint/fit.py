@@ -209,8 +209,7 @@ def _continued_fit(
 ) -> tuple[JointFit, JointState]:
     """Return the fit from the best of given starts, and that start.
 
-    Starts after the first go on only if they can catch up: they may not lack more,
-    after some steps, than the second half of these gained.
+    Starts after the first must be able to catch up by the gain of their second half.
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]

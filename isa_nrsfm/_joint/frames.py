@@ -1,8 +1,7 @@
 """Frames as the joint refinement passes over them: by points or by directions.
 
-The shapes of greatest likelihood are linear combinations of the rows of the measurement
-matrix. If no point is missing, the objective depends on a frame only through its energy
-and its products with directions that span the shapes: cheap for any number of points.
+If no point is missing, the objective depends on a frame only through its energy and its
+products with directions that span the shapes: cheap for any number of points.
 """
 
 from dataclasses import dataclass

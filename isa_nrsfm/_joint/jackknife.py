@@ -44,10 +44,7 @@ OUTLYING = 4.0
 
 
 def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """Estimate the errors of a fit from some of its frames (n_frames, 2, n_points).
-
-    The result has no estimates if too few points or frames are left.
-    """
+    """Estimate the errors of a fit from some of its frames (I, 2, J), if enough."""
     n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)

@@ -119,11 +119,7 @@ class JointProblem:
         max_iter: int | None = None,
         tol: float | None = None,
     ) -> JointFit:
-        """Return the joint refinement of a state, by default with the settings.
-
-        By default `least_noise` is that of a model that may be wrong, and `tol` a tenth
-        of the user's for small tables.
-        """
+        """Return the joint refinement of a state, by default with the settings."""
         settings, likelihood = self.settings, self.likelihood
         if tol is None:
             tol = settings.tol * (0.1 if self.thorough else 1.0)

@@ -120,10 +120,7 @@ def extended_shapes(
 def affine_start(
     problem: JointProblem, W: NDArray, paper_shapes: NDArray
 ) -> JointState:
-    """Return the paper's result, rigid cameras and scaled basis shapes, as a start.
-
-    W (2 * n_frames, n_points) is the completed measurement matrix of the problem.
-    """
+    """Return the paper's result, rigid cameras and scaled basis shapes, as a start."""
     shapes = problem.frames.coordinates(paper_shapes)
     W = problem.frames.coordinates(W)
     rows, motion = W.reshape(len(W) // 2, 2, -1), rigid_cameras(W, shapes[0].T)
@@ -252,10 +249,9 @@ def likely_basis(
 
 
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
-    """Return shapes (n, 3, J) scaled by the standard deviation of their coefficients.
+    """Return shapes (n, 3, J) over the standard deviation of their coefficients.
 
-    These are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``, as shapes are
-    orthogonal.
+    These are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``: shapes are orthogonal.
     """
     images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
     along = np.einsum("ikrj,irj->ik", images, rows)

@@ -25,10 +25,7 @@ def in_lanes(frames: NDArray) -> NDArray:
 
 
 def of_frames(values: NDArray, frames: NDArray | slice) -> NDArray:
-    """Return the values (..., n_taken) of some frames, of values (..., n_frames).
-
-    The frame stays the last axis in memory, which determines the rounding of sums.
-    """
+    """Return values (..., n_taken) of frames, which stay the last axis in memory."""
     if isinstance(frames, slice):
         return values[..., frames]
     return np.take(values, frames, axis=-1)

@@ -200,8 +200,8 @@ def _orthonormal_columns(motion: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     Return indices of independent columns, an orthogonal basis of them, and its mixing.
 
-    ``basis = motion[:, kept] @ inverse`` with a triangular `inverse`: the first n
-    columns span the same space. They have the mean length of columns of cameras.
+    ``basis = motion[:, kept] @ inverse``, triangular: first columns span the same
+    space.
     """
     lengths = np.linalg.norm(motion, axis=0)
     kept = np.flatnonzero(lengths > 0)

@@ -99,10 +99,7 @@ def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
 
 
 def _patterns(camera: CameraModel) -> NDArray:
-    """Return symmetric F_c (n, 2, 2): residual c is ``<F_c, M_i G M_i^T>``.
-
-    That is before it is shifted (orthographic) or divided by the trace.
-    """
+    """Return symmetric F_c (n, 2, 2): raw residuals ``<F_c, M_i G M_i^T>``."""
     if camera == "orthographic":
         across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
         return np.stack([np.diag([1.0, 0.0]), across, np.diag([0.0, 1.0])])

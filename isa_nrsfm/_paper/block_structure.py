@@ -1,8 +1,7 @@
 """Block structure of the motion: 3x3 matrices that map subspaces to the rigid motion.
 
-The motion of subspace k is known up to a 3x3 matrix. With the right D_k it is the rigid
-motion times a coefficient, ``M_ik D_k ~ alpha_ik M_0^i`` (Brandt et al. 2018, appendix
-A). Only the products in `MotionProducts` are needed.
+With the right D_k the motion of subspace k is the rigid motion times a coefficient,
+``M_ik D_k ~ alpha_ik M_0^i`` (Brandt et al. 2018, appendix A).
 """
 
 from typing import NamedTuple
@@ -124,18 +123,12 @@ def lifted_blocks(moments: NDArray, subspaces: NDArray) -> NDArray:
 
 
 def structure_energies(moments: NDArray, subspaces: NDArray) -> NDArray:
-    """Return the energies (n_subspaces,) of lifted motion with block structure.
-
-    The largest eigenvalue of `lifted_blocks`: energy of a coefficient times one E_k.
-    """
+    """Return the largest eigenvalues (n,) of `lifted_blocks`: energies of blocks."""
     return np.linalg.eigvalsh(lifted_blocks(moments, subspaces))[:, -1]
 
 
 def leading_blocks(moments: NDArray, subspaces: NDArray, n_leading: int = 2) -> NDArray:
-    """Return leading eigenvectors of `lifted_blocks` (n_subspaces, n_leading, 3, 3).
-
-    They are candidates for E_k, the likeliest first.
-    """
+    """Return leading eigenvectors (n, n_leading, 3, 3) of `lifted_blocks`, for E_k."""
     vectors = np.linalg.eigh(lifted_blocks(moments, subspaces))[1]
     leading = vectors[:, :, : -n_leading - 1 : -1].swapaxes(1, 2)
     return leading.reshape(-1, n_leading, 3, 3)

@@ -1,1 +1,1 @@
-"""What the parameters of the public classes may be, for all who ask before a fit."""
+"""Permitted values of the parameters of the public classes."""

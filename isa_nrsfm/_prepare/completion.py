@@ -80,10 +80,10 @@ def complete_rows(
 def completion_model(
     rows: NDArray, rank: int, tol: float = 0.02, max_iter: int = 200
 ) -> CompletionModel:
-    """Fit the low-rank model to frames (n_frames, 2, n_points), NaN where not seen.
+    """
+    Fit the low-rank model to frames (I, 2, J), until EM gains less than a share `tol`.
 
-    EM ends when a step lowers the noise variance by less than a share `tol`: later
-    steps mostly fit the noise.
+    Later steps mostly fit the noise.
     """
     frames = _Frames.of_rows(rows)
     # Centred points have n_points - 1 directions, of which the noise needs one.

@@ -1,8 +1,7 @@
 """Robust losses: points far from the model count less.
 
-Minimised by iteratively reweighted least squares (Holland, Welsch, "Robust regression
-using iteratively reweighted least-squares", 1977). Fit and weights alternate until they
-agree.
+Iteratively reweighted least squares (Holland, Welsch, "Robust regression using
+iteratively reweighted least-squares", 1977), until fit and weights agree.
 """
 
 from collections.abc import Callable

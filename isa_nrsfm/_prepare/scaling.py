@@ -79,10 +79,7 @@ def scaled_table(
     scale_frames: bool,
     robust: bool,
 ) -> ScaledTable:
-    """Check a table, then centre and scale its frames.
-
-    `robust` takes `spatial_median` and `robust_sizes`, otherwise means and RMS.
-    """
+    """Check a table, centre and scale its frames, robustly if `robust`."""
     blocks, n_columns, dtype = table
     n_points = n_columns // 2
     refuse_odd(n_columns)
@@ -135,11 +132,7 @@ def scaled_table(
 
 
 def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]:
-    """Return arrays for all checks of some rows (n_rows, 2 * n_points) of a table.
-
-    Numbers and first of half points, visible points, largest magnitudes of coordinates,
-    and the fields of a `FrameReport`.
-    """
+    """Return half points, visible points, magnitudes and reports of some rows."""
     tracks, n_half, first = without_half_points(table_to_tracks(rows, layout))
     _, report = centred_frames(tracks)
     shown = report.n_seen > 0

@@ -1,1 +1,1 @@
-"""Choice of the number of basis shapes: a path over K, and what is chosen on it."""
+"""Choice of the number of basis shapes: a path over K, and the selection on it."""

@@ -419,7 +419,7 @@ class AffineNRSfMCV(
 
     @property
     def _n_features_out(self) -> int:
-        """Number of columns of what `transform` returns."""
+        """Number of columns of the result of `transform`."""
         return self.n_components_
 
     def get_metadata_routing(self) -> MetadataRouter:

@@ -37,12 +37,7 @@ Scorer = Callable[[AffineNRSfM, NDArray], float]
 
 
 class Row(NamedTuple):
-    """Scores and times of one number of basis shapes.
-
-    Held-out scores and seconds of each split, (n_splits,), seconds of the fit of all
-    rows (zero where no fit starts from it), and the number of fits that did not
-    converge.
-    """
+    """Scores, seconds and counts of failed convergence of one number of shapes."""
 
     n_components: int
     scores: NDArray
@@ -180,8 +175,8 @@ def _fitted(
 ) -> Fitted:
     """Return the fit of a part with K basis shapes, and its score if it is a split.
 
-    It starts from the fits with fewer basis shapes of the same part, `before`, and of
-    all of the table, `every`. Without them it searches for its starts.
+    It starts from `before`, its fit with fewer basis shapes, and `every`, of all
+    frames.
     """
     since = time.perf_counter()
     estimator, X, table, split = part

@@ -1,1 +1,1 @@
-"""What comes in and where it lies: layouts, columns, blocks of frames."""
+"""Input tables: layouts, columns, blocks of frames."""

@@ -14,8 +14,8 @@ from isa_nrsfm._tables.blocks import FrameBlocks, chosen_rows
 class DaskBlocks(FrameBlocks):
     """Blocks, a sequence of Delayed, on the workers of the active dask scheduler.
 
-    Derived blocks stay on the workers. Only `map` brings results back. If a worker is
-    lost, the scheduler computes its blocks again. Blocks without frames are left out.
+    Derived blocks stay on the workers, or are computed again if one is lost. Only `map`
+    brings results back. Blocks without frames are left out.
     """
 
     def __init__(self, blocks: Sequence[Any], lengths: Sequence[int]):

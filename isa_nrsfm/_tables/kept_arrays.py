@@ -20,9 +20,9 @@ Keep = Callable[[Mapping[str, NDArray]], dict[str, NDArray]]
 def kept_arrays(path: str | os.PathLike[str] | None) -> Iterator[Keep]:
     """Keep arrays in files of a folder, and remove the files if the block fails.
 
-    Yields a function that maps arrays by name to memory maps by name, or to themselves
-    if the path is None. Each block writes to a new folder in the given one, which is
-    made if necessary: no other fit or process writes to files that are mapped.
+    Yields a function that maps arrays by name to memory maps, or to themselves if the
+    path is None. Each block writes to a new folder: no other process writes to mapped
+    files.
     """
     if path is None:
         yield dict

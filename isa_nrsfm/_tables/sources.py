@@ -1,4 +1,4 @@
-"""What a table may come as: an array, or something that is read block by block."""
+"""Sources of a table: an array, or an object that is read block by block."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

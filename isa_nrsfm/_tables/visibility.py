@@ -87,11 +87,7 @@ def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
 def _collinear(
     centred: NDArray, place: NDArray, n_seen: NDArray, eps: float
 ) -> NDArray:
-    """Return in which centred frames (n, J, 2) the visible points are on a line.
-
-    Missing points are zero; `place` (n,) is the distance of the centroid from the
-    origin.
-    """
+    """Return in which centred frames (n, J, 2) the visible points are on a line."""
     x, y = centred[..., 0], centred[..., 1]
     # The principal axis by its angle. Eigenvalues of the 2x2 second moment would square
     # the distances from it, and lose half of their digits.

@@ -1,4 +1,4 @@
-"""Names, suffixes and frames of what is exported."""
+"""Names, suffixes and frames of exported files."""
 
 import os
 from collections.abc import Sequence

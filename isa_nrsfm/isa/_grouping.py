@@ -56,10 +56,7 @@ def covariance_gains(covariance: NDArray) -> Gains:
 
 
 def value_gains(value: Callable[[NDArray], NDArray], n_signals: int) -> Gains:
-    """Return the gains for an objective that is a sum of the values of groups.
-
-    `value` takes groups of signals, ints (n_groups, subspace_size) in any order inside.
-    """
+    """Return the gains for a sum of values of groups (n_groups, subspace_size)."""
     # with_b[a, b] is the value of the subspace of a with a replaced by b. Row a depends
     # only on the mates of a, the signals of its subspace. A swap changes the mates of
     # two subspaces, so only their rows are computed again.

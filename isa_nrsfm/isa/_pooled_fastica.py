@@ -236,8 +236,7 @@ def _objective(
 ) -> tuple[Gains, Callable[[NDArray], float]]:
     """Return the gains of swaps of rows of W, and the value of the rows in an order.
 
-    The value is the share of the energy of the covariance inside the blocks, or without
-    a covariance the log-likelihood of W and Z (n_signals, n_samples).
+    The share of energy of the covariance inside the blocks, or the log-likelihood.
     """
     if covariance is None:
         density, size = SqrtDensity(), int(np.count_nonzero(in_order == 0))

@@ -93,10 +93,7 @@ def _whitening(rows: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _few_samples(Z: NDArray) -> NDArray:
-    """Return some of many samples, spread evenly from the smallest to the largest.
-
-    The order of samples and orthogonal mixings of the signals do not change the choice.
-    """
+    """Return some of many samples, spread evenly from the smallest to the largest."""
     if Z.shape[1] <= 3000:
         return Z
     order = np.argsort(np.einsum("kjc,kjc->j", Z, Z), kind="stable")
@@ -218,11 +215,7 @@ def _maximise(W: NDArray, Z: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _newton(W: NDArray, Z: NDArray, tails: NDArray) -> NDArray:
-    """
-    Maximise the likelihood over all mixings W for fixed densities `tails` (n_signals,).
-
-    The Newton steps are relative, ``W <- exp(E) W``, and damped (Levenberg-Marquardt).
-    """
+    """Maximise the likelihood over W by relative, damped steps ``W <- exp(E) W``."""
     size = Z.shape[2]
     tail = tails[:, None]
 

@@ -78,8 +78,8 @@ def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> MatchedBases:
 def without_mean_shape(shapes: NDArray, mean_shape: NDArray) -> NDArray:
     """Take multiples of the mean shape out of unit shapes; return unit shapes.
 
-    What is left is orthogonal to the mean shape in the coordinates in which the mean
-    shape is white. So the multiples do not change under an affinity of both.
+    The rest is orthogonal to the mean shape in the coordinates in which that is white,
+    so that the multiples do not change under an affinity of both.
     """
     dual = np.linalg.pinv(mean_shape).T
     multiples = np.sum(shapes * dual, axis=(1, 2)) / np.sum(mean_shape * dual)

@@ -140,7 +140,7 @@ def _centred(shapes: NDArray) -> NDArray:
 
 
 def _rest(truth: NDArray, shapes: NDArray, scale: bool) -> NDArray:
-    """Return what orthogonal matrices, and scales, leave of each pair of shapes."""
+    """Return residuals of pairs of shapes after orthogonal matrices, and scales."""
     left, shared, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ truth)
     aligned = shapes @ (left @ right)
     if scale:
