@@ -38,7 +38,7 @@ class Interval(_Interval):
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:
-    """Return a decorator of `fit` that checks parameters (nested: of estimators)."""
+    """Return a decorator of `fit` that checks parameters, nested ones included."""
     decorate: Callable[[Function], Function] = _fit_context(
         prefer_skip_nested_validation=not nested
     )

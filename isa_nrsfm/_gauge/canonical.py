@@ -64,7 +64,7 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
 def euclidean_space(
     mean_shape: NDArray, motion: NDArray, size: float | None
 ) -> NDArray:
-    """Return `canonical_rotation` times a size; None: RMS of the mean shape one."""
+    """Return `canonical_rotation` times a size; None makes the shape's RMS one."""
     if size is None:
         size = 1.0 / (np.sqrt(np.mean(mean_shape**2)) or 1.0)
     return size * canonical_rotation(mean_shape, motion)

@@ -18,11 +18,7 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 def posterior_blocks(
     model: PosteriorFrames, frames: JointFrames, rows: FrameBlocks
 ) -> FrameBlocks:
-    """Return the fits of all frames of a table, before the gauge.
-
-    The model is in points. The frames are those of the joint refinement, in points or
-    directions, of the rows (n_frames, 2, n_points). Returns blocks of FramePosterior.
-    """
+    """Return the fits of all frames in blocks of FramePosterior, before the gauge."""
     if model.loss != "linear":
         return rows.derive(partial(_row_posterior, model=model))
     shapes = frames.coordinates(model.shapes)

@@ -269,10 +269,7 @@ def refine_metric(
     reach = 1.0 + np.abs(alpha).sum(axis=1).max(initial=0.0)
 
     def evaluated(fit: MetricFit) -> tuple[float, NDArray, NDArray]:
-        """Return the objective; infinite where space hardly has depth.
-
-        Noisy cameras that hardly turn fit the better, the deeper space becomes.
-        """
+        """Return the objective; infinite where space hardly has depth."""
         values = np.linalg.eigvalsh(fit.Q.T @ gram @ fit.Q)
         deep = values[0] > OF_RANKS * values[-1]
         cost = fit.cost + ridge * float(np.sum(fit.strain**2)) if deep else np.inf

@@ -43,10 +43,7 @@ def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
 
 
 def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
-    """Return tracks (I, J, 2) centred over their visible points, and centroids.
-
-    Frames whose visible points are all equal are refused.
-    """
+    """Return tracks (I, J, 2) centred over their visible points, and centroids."""
     centred, report = centred_frames(tracks)
     refuse_one_place(report, tracks.shape[1])
     return centred, report.translation
