@@ -67,7 +67,12 @@ def data_path():
 @pytest.fixture(scope="session")
 def load_data(data_path):
     """Return a function from the name of a data set to its arrays."""
-    return lambda name: np.load(data_path(f"{name}.npz"), allow_pickle=False)
+
+    def load(name):
+        with np.load(data_path(f"{name}.npz"), allow_pickle=False) as file:
+            return dict(file)
+
+    return load
 
 
 @pytest.fixture

@@ -425,7 +425,7 @@ class TestCompressible:
             0,
             [
                 ("akhter_drink", "block matrix", 11, 1.32e-5, 0.0227),
-                ("akhter_pickup", "block matrix", 11, 4.09e-5, 0.0485),
+                ("akhter_pickup", "block matrix", 11, 4.09e-5, 0.0479),
                 ("akhter_drink", "pseudo-inverse", 11, 6.90e-5, 0.446),
                 ("akhter_pickup", "pseudo-inverse", 11, 2.67e-4, 0.547),
             ],

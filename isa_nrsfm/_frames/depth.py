@@ -29,15 +29,12 @@ class DepthCertainty(NamedTuple):
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None
         Variance of the depths of the points, for frames of size one.
-    alpha : ndarray of shape (n_components, n_components) or None
-        Covariance of the coefficients before the gauge.
     """
 
     total: float = np.nan
     turning: float = np.nan
     turns: NDArray | None = None
     points: NDArray | None = None
-    alpha: NDArray | None = None
 
     @property
     def turning_deviation(self) -> float:

@@ -227,15 +227,11 @@ class PosteriorFrames:
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
-        covariance: NDArray | None = posterior.covariance
-        if posterior.covariance.shape[1] != len(self.shapes) - 1:
-            covariance = None
-        elif self.certainty.alpha is not None:
-            covariance = posterior.covariance + self.certainty.alpha
+        covariance = posterior.covariance
         motion, alpha, deviation = self.gauge.apply(
             posterior.motion,
             posterior.alpha,
-            covariance,
+            covariance if covariance.shape[1] == len(self.shapes) - 1 else None,
         )
         translation = posterior.translation * sizes[:, None]
         return Decomposition(

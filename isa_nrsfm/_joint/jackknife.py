@@ -67,7 +67,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     )
     whole = fit(np.ones(len(points), dtype=bool))
     errors = [fit(~group).errors(whole) for group in left_out]
-    total, turns, variances, alpha = (
+    total, turns, variances = (
         (N_GROUPS - 1) / N_GROUPS * np.sum(each, axis=0)
         for each in zip(*errors, strict=True)
     )
@@ -77,14 +77,14 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     # Rotations out of the image plane; the coefficients cannot predict their rest.
     mean_view = Rotation.from_matrix(whole.rotations).mean()
     turning = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
-    rest = _unpredicted(turning[:, :2], whole.alpha)
-    freedom = max(len(rest) - whole.alpha.shape[1] - 1, 1)
+    known = np.column_stack([np.ones(len(turning)), whole.alpha])
+    rest = turning[:, :2] - known @ np.linalg.lstsq(known, turning[:, :2])[0]
+    freedom = max(len(rest) - known.shape[1], 1)
     return DepthCertainty(
         float(np.sqrt(total)),
         float(np.sqrt(np.sum(rest**2) / freedom)),
         turns,
         variances[nearest],
-        alpha,
     )
 
 
@@ -135,11 +135,11 @@ class _Refit:
         z = scales[:, None] * (z[:, 0] + np.einsum("ik,ikj->ij", self.alpha, z[:, 1:]))
         self.depths = z - z.mean(axis=1, keepdims=True)
 
-    def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray, NDArray]:
+    def errors(self, whole: "_Refit") -> tuple[float, NDArray, NDArray]:
         """Compute squared differences from the fit of all points.
 
         Relative square of the depths; mean products of the rotation vectors (3, 3);
-        mean squares of the depths (n_points,); mean products of the coefficients.
+        mean squares of the depths (n_points,).
         """
         z = whole.depths[:, self.kept]
         z = z - z.mean(axis=1, keepdims=True)
@@ -153,13 +153,4 @@ class _Refit:
         w = (turned * (turned.inv() * rotations).mean() * rotations.inv()).as_rotvec()
         turns = w.T @ w / len(w)
         turns[2, :2] = turns[:2, 2] = 0.0  # the mirror image has the other sign
-        # Coefficients up to an affinity
-        rest = _unpredicted(whole.alpha, self.alpha)
-        relative = float(np.sum(off**2) / np.sum(z**2))
-        return relative, turns, points, rest.T @ rest / len(w)
-
-
-def _unpredicted(values: NDArray, alpha: NDArray) -> NDArray:
-    """Regress values (n, m) on alpha (n, K) and a constant; return the residuals."""
-    known = np.column_stack([np.ones(len(alpha)), alpha])
-    return np.asarray(values - known @ np.linalg.lstsq(known, values)[0])
+        return float(np.sum(off**2) / np.sum(z**2)), turns, points

@@ -256,7 +256,6 @@ def _check_shapes(values: dict[str, Any]) -> None:
         "certainty": (2,),
         "turns": (3, 3),
         "depth_variances": (P,),
-        "alpha_covariance": (K, K),
     }
     single = ("noise_variance", "unit", "n_features_in_", "n_iter_", "inverse_snr_")
     shapes |= dict.fromkeys(single, ())
@@ -293,7 +292,6 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "certainty": np.array(frames.certainty[:2]),
         "turns": frames.certainty.turns,
         "depth_variances": frames.certainty.points,
-        "alpha_covariance": frames.certainty.alpha,
     }
 
 
@@ -314,6 +312,5 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
             turning,
             entries["turns"],
             entries["depth_variances"],
-            entries["alpha_covariance"],
         ),
     )
