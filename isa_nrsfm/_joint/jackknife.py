@@ -77,9 +77,9 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     # Rotations out of the image plane; the coefficients cannot predict their rest.
     mean_view = Rotation.from_matrix(whole.rotations).mean()
     turning = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
-    known = np.column_stack([np.ones(len(turning)), whole.alpha])
-    rest = turning[:, :2] - known @ np.linalg.lstsq(known, turning[:, :2])[0]
-    freedom = max(len(rest) - known.shape[1], 1)
+    predictors = np.column_stack([np.ones(len(turning)), whole.alpha])
+    rest = turning[:, :2] - predictors @ np.linalg.lstsq(predictors, turning[:, :2])[0]
+    freedom = max(len(rest) - predictors.shape[1], 1)
     return DepthCertainty(
         float(np.sqrt(total)),
         float(np.sqrt(np.sum(rest**2) / freedom)),
