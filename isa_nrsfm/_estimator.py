@@ -248,7 +248,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     (5, 4)
     """
 
-    _limits: Limits = Limits()  # others: `limited`
+    _limits: ClassVar[Limits] = Limits()  # others: `limited`
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [
             Interval(Integral, 1, None, closed="left"),

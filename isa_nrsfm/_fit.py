@@ -60,7 +60,7 @@ from isa_nrsfm._joint.starts import rigid_start
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
-from isa_nrsfm._paper.svd import block_triplets
+from isa_nrsfm._paper.svd import DENSE, block_triplets
 from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
@@ -91,14 +91,12 @@ class Limits(NamedTuple):
     sample: number of frames of the first sample of a large table.
     small_table: tables with fewer coordinates are fitted without a sample.
     model_frames: most frames from which outliers and missing points are modelled.
-    errors: whether the errors of fits with calibrated cameras are estimated.
     """
 
-    dense: int = 1500
+    dense: int = DENSE
     sample: int = 600
     small_table: int = 150_000
     model_frames: int = 5_000
-    errors: bool = True
     joint: JointOptions = JointOptions()
 
 
@@ -114,7 +112,10 @@ def fit_table(
     if n_components == "auto":
         n_components = _count_components(estimator, source)
     table = ready_table(estimator, source, n_components)
-    return fit_ready_table(estimator, table, n_components, progress)
+    frames = fit_ready_table(estimator, table, n_components, progress)
+    if estimator.camera != "affine":
+        _estimate_errors(estimator, table)
+    return frames
 
 
 @one_blas_thread
@@ -185,6 +186,16 @@ def fit_ready_table(
 
 
 @one_blas_thread
+def _estimate_errors(estimator: TableTransformer, table: ScaledTable) -> None:
+    """Estimate the errors of a joint fit with calibrated cameras, and set them."""
+    frames = estimator._model.frames
+    if isinstance(frames, PosteriorFrames):
+        frames = replace(frames, certainty=depth_certainty(frames, table.rows))
+        estimator._model = estimator._model._replace(frames=frames)
+        estimator.depth_uncertainty_ = frames.certainty.total
+
+
+@one_blas_thread
 def _count_components(estimator: TableTransformer, source: Table) -> int:
     """Return the number of basis shapes that a table supports, of at most twelve."""
     with warnings.catch_warnings():
@@ -199,7 +210,6 @@ def _count_components(estimator: TableTransformer, source: Table) -> int:
     # Outliers that count a little look like shapes: a fit with final weights decides.
     while found > 1 and estimator.loss != "linear":
         trial = copy.copy(estimator)
-        trial._limits = trial._limits._replace(errors=False)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             fit_ready_table(trial, table, found, NoProgress())
@@ -355,9 +365,6 @@ def _joint_frames(
         FrameMap.identity(len(shapes) - 1),
         estimator.camera,
     )
-    if estimator.camera != "affine" and estimator._limits.errors:
-        frames = replace(frames, certainty=depth_certainty(frames, table.rows))
-        estimator.depth_uncertainty_ = frames.certainty.total
     posteriors = posterior_blocks(frames, tracks, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     unknown = np.isnan(motion).any(axis=(1, 2))

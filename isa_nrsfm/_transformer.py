@@ -2,7 +2,7 @@
 
 import copy
 from numbers import Integral, Real
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +124,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
     n_features_in_: int
     feature_names_in_: NDArray
 
-    _limits: Any
+    _limits: ClassVar[Any]
     _model: TableModel
     _frame_sizes: NDArray
 

@@ -3,7 +3,6 @@
 Callbacks are new and experimental in scikit-learn 1.9. Only this module uses them.
 """
 
-import copy
 import time
 from collections.abc import Sequence
 from typing import Any, Self
@@ -28,13 +27,6 @@ class _NoContext:
         return self
 
     subcontext = call_on_fit_task_begin = call_on_fit_task_end = _itself
-
-
-def without_callbacks(estimator: Any) -> Any:
-    """Return a shallow copy of an estimator, without its callbacks."""
-    copied = copy.copy(estimator)
-    vars(copied).pop("_skl_callbacks", None)
-    return copied
 
 
 class FitProgress:

@@ -158,11 +158,8 @@ def _problems(
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
-    # Penalty of sum_i ||M_i B_k||^2 for the prior of basis shapes in frames of mean
-    # square energy / n_numbers. The prior counts once, not for each frame.
-    n_numbers, energy = frames.totals
-    penalty = n_numbers / (options.basis_std**2 * energy * frames.n_frames)
     thorough = frames.n_frames <= options.few_frames
+    penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
     # Each number that is fitted lowers the objective by about one by chance. Steps on a
     # sample end when they gain less than 3 % of that for all shapes together.

@@ -55,6 +55,15 @@ class JointFrames:
         n_seen, square = np.sum(list(self.blocks.map(_totals)), axis=0)
         return float(n_seen), float(square)
 
+    def basis_penalty(self, basis_std: float) -> float:
+        """Compute the factor of ``sum_i ||M_i B_k||^2`` in the prior of basis shapes.
+
+        `basis_std` is relative to the root mean square of the coordinates. The prior
+        counts once, not for each frame.
+        """
+        n_numbers, energy = self.totals
+        return n_numbers / (basis_std**2 * energy * self.n_frames)
+
     @classmethod
     def from_points(cls, rows: FrameBlocks, complete: bool) -> Self:
         """Return frames by points, from blocks of rows (n, 2, J); weights are one."""

@@ -29,15 +29,17 @@ from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.visibility import FEWEST_POINTS
 
+# Groups of equal size: those of k-means overstate the errors by half.
 N_GROUPS = 5
-# Largest number of steps of a fit, and its convergence tolerance. Where the depth is
-# determined some 50 steps are enough.
+# Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
+# the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less
+# than 2 %; 1e-2 understates undetermined ones.
 MOST_STEPS, TOL = 100, 1e-3
-# Frames and points of the fits.
+# Frames and points of the fits. With 100 frames one deviation changed from
+# 12 to 19 %. Points are assigned to groups in cubic time.
 MOST_FRAMES, MOST_POINTS = 200, 200
-# Points of a frame that each fit needs.
-LEAST_SEEN = 4
 # Residuals that are longer, in standard deviations of a coordinate, are left out of the
 # fits of tables with a robust loss: one of 3,000 points without outliers.
 OUTLYING = 4.0
@@ -59,7 +61,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
     seen = np.asarray(np.isfinite(part).all(axis=1))
     least = np.min([seen[:, ~group].sum(axis=1) for group in left_out], axis=0)
-    known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= LEAST_SEEN)
+    known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
     fit = partial(
@@ -117,7 +119,7 @@ class _Refit:
         complete = bool(np.isfinite(rows).all())
         part = JointFrames.from_points(FrameBlocks.of_array(rows, len(rows)), complete)
         n_numbers, energy = part.totals
-        penalty = n_numbers / (JOINT_OPTIONS.basis_std**2 * energy * len(rows))
+        penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
         noise = frames.noise_variance
         least_noise = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)

@@ -193,7 +193,6 @@ def _fitted(
                     starts.append(known)
                 starts.append(known._replace(calibrated_first=True))
             model = copy.copy(estimator).set_params(n_components=n_components)
-            model._limits = model._limits._replace(errors=split is None)
             found = fit_ready_table(model, table, n_components, NoProgress(), starts)
             model._set_frames(*found)
         else:
