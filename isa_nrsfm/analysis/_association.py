@@ -20,11 +20,7 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.frame_columns import (
-    checked_column,
-    checked_times,
-    group_numbers,
-)
+from isa_nrsfm._tables.frame_columns import checked_column, checked_times, group_numbers
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.analysis._permutations import (
     FrameOrder,

@@ -22,62 +22,37 @@ length, the coordinate axes, and whether the depth has the right sign: the mirro
 of everything, ``z -> -z``, has the same images.
 """
 
-from typing import TYPE_CHECKING
+from isa_nrsfm._metric_upgrade.deforming import (
+    DeformationMetric,
+    EuclideanFrames,
+    deformation_metric,
+    euclidean_frames,
+)
+from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
+    OrthonormalCameras,
+    orthonormal_cameras,
+)
+from isa_nrsfm._metric_upgrade.rigid import (
+    MetricUpgrade,
+    euclidean_shapes,
+    metric_upgrade,
+)
+from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from isa_nrsfm.calibration._view_angles import ViewAngles, angle_deviations, view_angles
 
-from isa_nrsfm._compat.lazy import lazy_names
-
-if TYPE_CHECKING:
-    from isa_nrsfm._metric_upgrade.deforming import (
-        DeformationMetric as DeformationMetric,
-        EuclideanFrames as EuclideanFrames,
-        deformation_metric as deformation_metric,
-        euclidean_frames as euclidean_frames,
-    )
-    from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-        OrthonormalCameras as OrthonormalCameras,
-        orthonormal_cameras as orthonormal_cameras,
-    )
-    from isa_nrsfm._metric_upgrade.rigid import (
-        MetricUpgrade as MetricUpgrade,
-        euclidean_shapes as euclidean_shapes,
-        metric_upgrade as metric_upgrade,
-    )
-    from isa_nrsfm.calibration._canonical_pose import (
-        CanonicalPose as CanonicalPose,
-        canonical_pose as canonical_pose,
-    )
-    from isa_nrsfm.calibration._view_angles import (
-        ViewAngles as ViewAngles,
-        angle_deviations as angle_deviations,
-        view_angles as view_angles,
-    )
-else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "isa_nrsfm._metric_upgrade.deforming": [
-                "DeformationMetric",
-                "EuclideanFrames",
-                "deformation_metric",
-                "euclidean_frames",
-            ],
-            "isa_nrsfm._metric_upgrade.orthonormal_cameras": [
-                "OrthonormalCameras",
-                "orthonormal_cameras",
-            ],
-            "isa_nrsfm._metric_upgrade.rigid": [
-                "MetricUpgrade",
-                "euclidean_shapes",
-                "metric_upgrade",
-            ],
-            "isa_nrsfm.calibration._canonical_pose": [
-                "CanonicalPose",
-                "canonical_pose",
-            ],
-            "isa_nrsfm.calibration._view_angles": [
-                "ViewAngles",
-                "angle_deviations",
-                "view_angles",
-            ],
-        },
-    )
+__all__ = [
+    "CanonicalPose",
+    "DeformationMetric",
+    "EuclideanFrames",
+    "MetricUpgrade",
+    "OrthonormalCameras",
+    "ViewAngles",
+    "angle_deviations",
+    "canonical_pose",
+    "deformation_metric",
+    "euclidean_frames",
+    "euclidean_shapes",
+    "metric_upgrade",
+    "orthonormal_cameras",
+    "view_angles",
+]

@@ -20,11 +20,7 @@ from isa_nrsfm.export._drawing import (
     vertex_normals,
 )
 from isa_nrsfm.export._names import names_of_components, suffix_of
-from isa_nrsfm.export._upright import (
-    Camera,
-    upright_basis,
-    upright_space,
-)
+from isa_nrsfm.export._upright import Camera, upright_basis, upright_space
 from isa_nrsfm.plotting._axes import is_dense
 from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
 

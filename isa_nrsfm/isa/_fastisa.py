@@ -15,11 +15,7 @@ from isa_nrsfm._compat.scikit_learn import HasMethods, fit_context
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis
 from isa_nrsfm.isa._density import SqrtDensity, SubspaceDensity
 from isa_nrsfm.isa._fixed_point import iterate, log_likelihood, orthogonalise
-from isa_nrsfm.isa._grouping import (
-    likelihood_gains,
-    rows_by_subspace,
-    swap_until_best,
-)
+from isa_nrsfm.isa._grouping import likelihood_gains, rows_by_subspace, swap_until_best
 
 
 class FastISA(BaseSubspaceAnalysis):
