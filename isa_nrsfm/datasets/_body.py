@@ -10,8 +10,8 @@ from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
 from isa_nrsfm._tables.layout import Layout
-from isa_nrsfm.datasets._performers import perform, wander
-from isa_nrsfm.datasets._scene import PARAMETERS, Camera
+from isa_nrsfm.datasets._performers import film, perform, wander
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera, observe
 from isa_nrsfm.skeletons import get_skeleton
 
 ACTIONS = ("walk", "reach", "squat")
@@ -149,20 +149,12 @@ def make_body_tracks(
         joints = _joints(time, weights, rng)
         return np.stack([joints[name] for name in names], axis=1)
 
-    return perform(
-        n_frames,
-        n_people,
-        ACTIONS,
-        build,
-        largest_angles=(80.0, 20.0, 8.0),
-        scales=(0.2, 0.5),
-        camera=camera,
-        rng=check_random_state(random_state),
-        noise=noise,
-        missing=missing,
-        layout=layout,
-        point_names=list(names),
-    )
+    rng = check_random_state(random_state)
+    shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
+    angles, *cameras = film(path, (80.0, 20.0, 8.0), (0.2, 0.5), camera, rng)
+    table = observe(shapes, *cameras, rng, noise=noise, missing=missing, layout=layout)
+    point_names = list(names)
+    return Bunch(**table, **truths, angles=angles, point_names=point_names)
 
 
 def _angles(time: NDArray, weights: NDArray, rng: RandomState) -> dict[str, NDArray]:

@@ -177,14 +177,12 @@ def make_face_tracks(
     rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
     motion = draw_motion(rotations, camera, (1.0, 4.0), rng)
     translation = rng.uniform((320.0, 240.0), (960.0, 720.0), size=(n_frames, 2))
-    return observe(
-        mean_shape + np.tensordot(alpha, basis, 1),
-        motion,
-        translation,
-        noise=noise,
-        missing=missing,
-        layout=layout,
-        rng=rng,
+    shapes = mean_shape + np.tensordot(alpha, basis, 1)
+    table = observe(
+        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
+    )
+    return Bunch(
+        **table,
         mean_shape=mean_shape,
         basis=basis,
         alpha=alpha,

@@ -9,6 +9,8 @@ written down, at the indices of the iBUG-68 scheme; the other half is the mirror
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm.skeletons import get_skeleton
+
 N_POINTS = 68
 
 # fmt: off
@@ -94,16 +96,10 @@ SIGNED_COMPONENTS = ("face width",)
 
 def mirror_points() -> NDArray[np.intp]:
     """Return the point that mirrors each of the 68 points, in iBUG-68 order."""
-    return np.r_[
-        16:-1:-1,  # jaw
-        26:16:-1,  # brows
-        27:31,  # bridge of the nose
-        35:30:-1,  # nostrils
-        45:41:-1, 47, 46,  # right eye
-        39:35:-1, 41, 40,  # left eye
-        54:47:-1, 59:54:-1,  # outer lips
-        64:59:-1, 67:64:-1,  # inner lips
-    ]  # fmt: skip
+    face = get_skeleton("ibug-68")
+    mirror = np.arange(N_POINTS)
+    mirror[[*face.left, *face.right]] = [*face.right, *face.left]
+    return mirror
 
 
 def neutral_shape() -> NDArray[np.float64]:

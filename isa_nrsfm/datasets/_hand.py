@@ -9,8 +9,8 @@ from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._tables.layout import Layout
-from isa_nrsfm.datasets._performers import perform, wander
-from isa_nrsfm.datasets._scene import PARAMETERS, Camera
+from isa_nrsfm.datasets._performers import film, perform, wander
+from isa_nrsfm.datasets._scene import PARAMETERS, Camera, observe
 from isa_nrsfm.skeletons import get_skeleton
 
 POSES = ("open", "fist", "point")
@@ -141,20 +141,12 @@ def make_hand_tracks(
     >>> sorted(set(hands.labels.tolist())), sorted(set(hands.groups.tolist()))
     (['fist', 'open', 'point'], [0, 1])
     """
-    return perform(
-        n_frames,
-        n_people,
-        POSES,
-        _hand,
-        largest_angles=(60.0, 35.0, 35.0),
-        scales=(1.0, 3.0),
-        camera=camera,
-        rng=check_random_state(random_state),
-        noise=noise,
-        missing=missing,
-        layout=layout,
-        point_names=list(get_skeleton("hand-21").point_names or ()),
-    )
+    rng = check_random_state(random_state)
+    shapes, path, truths = perform(n_frames, n_people, POSES, _hand, rng)
+    angles, *cameras = film(path, (60.0, 35.0, 35.0), (1.0, 3.0), camera, rng)
+    table = observe(shapes, *cameras, rng, noise=noise, missing=missing, layout=layout)
+    point_names = list(get_skeleton("hand-21").point_names or ())
+    return Bunch(**table, **truths, angles=angles, point_names=point_names)
 
 
 def _hand(time: NDArray, weights: NDArray, rng: RandomState) -> NDArray[np.float64]:

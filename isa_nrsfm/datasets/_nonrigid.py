@@ -163,18 +163,16 @@ def make_nonrigid_tracks(
         basis *= amplitude / size
     rotations = Rotation.from_quat(rng.standard_normal((n_frames, 4))).as_matrix()
     motion = draw_motion(rotations, camera, (2 / 3, 3 / 2), rng)
-    return observe(
+    table = observe(
         mean_shape + np.tensordot(alpha, basis, 1),
         motion,
         rng.standard_normal((n_frames, 2)),
+        rng,
         noise=noise,
         missing=missing,
         layout=layout,
-        rng=rng,
-        mean_shape=mean_shape,
-        basis=basis,
-        alpha=alpha,
     )
+    return Bunch(**table, mean_shape=mean_shape, basis=basis, alpha=alpha)
 
 
 def _root_mean_square_length(vectors: NDArray) -> float:

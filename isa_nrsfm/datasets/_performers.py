@@ -1,20 +1,17 @@
 """People who do one thing after the other before a moving camera."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from sklearn.utils import Bunch
 
 from isa_nrsfm.datasets._scene import (
     FRAMES_A_SECOND,
     Camera,
     centre_shapes,
     draw_motion,
-    observe,
 )
 
 
@@ -23,57 +20,51 @@ def perform(
     n_people: int,
     poses: tuple[str, ...],
     build: Callable[[NDArray, NDArray, RandomState], NDArray],
-    *,
-    largest_angles: tuple[float, float, float],
-    scales: tuple[float, float],
-    camera: Camera,
     rng: RandomState,
-    **options: Any,
-) -> Bunch:
-    """Return the table of people who take poses in turn, with all truths.
+) -> tuple[NDArray, NDArray, dict[str, NDArray]]:
+    """Return shapes of people who take poses in turn, a path (n, 6), and the truths.
 
     ``build(time, weights, rng)`` returns the shapes (n, n_points, 3) of a new person, x
     to the right, y down, z away, for weights (n, n_poses) that add up to one.
-    `largest_angles` are yaw, pitch and roll in degrees, `scales` the least and most
-    pixels a millimetre.
     """
     if n_frames < 2 * n_people:
         raise ValueError(
             f"n_frames must be at least 2 frames for each of {n_people} people; got "
             f"{n_frames}"
         )
-    parts = [len(part) for part in np.array_split(np.arange(n_frames), n_people)]
-    shapes, labels, groups, times, angles, sizes, centres = ([] for _ in range(7))
-    for person, length in enumerate(parts):
-        time = np.arange(length) / FRAMES_A_SECOND
+    people = []
+    for person, rows in enumerate(np.array_split(np.arange(n_frames), n_people)):
+        time = np.arange(len(rows)) / FRAMES_A_SECOND
         weights = _take_turns(time, len(poses), rng)
-        shapes.append(centre_shapes(build(time, weights, rng)))
-        labels.append(np.array(poses)[weights.argmax(axis=1)])
-        groups.append(np.full(length, person))
-        times.append(time)
-        angles.append(wander(time, 3, rng) * largest_angles)
-        shortest, longest = np.log(scales)
-        share = (1 + wander(time, 1, rng)[:, 0]) / 2
-        sizes.append(np.exp(shortest + (longest - shortest) * share))
-        centres.append((640.0, 480.0) + wander(time, 2, rng) * (160.0, 100.0))
-    angle, size = np.concatenate(angles), np.concatenate(sizes)
-    rotations = Rotation.from_euler("yxz", angle, degrees=True).as_matrix()
-    motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
+        shapes = centre_shapes(build(time, weights, rng))
+        path = np.hstack([wander(time, n, rng) for n in (3, 1, 2)])
+        labels = np.array(poses)[weights.argmax(axis=1)]
+        people.append((shapes, path, labels, np.full(len(rows), person), time))
+    shapes, path, labels, groups, time = map(np.concatenate, zip(*people, strict=True))
+    truths = {"labels": labels, "groups": groups, "time": time}
+    return shapes, path, truths | {"mean_shape": shapes.mean(axis=0)}
+
+
+def film(
+    path: NDArray,
+    largest_angles: tuple[float, float, float],
+    scales: tuple[float, float],
+    camera: Camera,
+    rng: RandomState,
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return yaw, pitch and roll in degrees, the motion and translation of a path.
+
+    The path (n, 6) is between -1 and 1, `scales` are the least and most pixels a unit.
+    """
+    angles = path[:, :3] * largest_angles
+    shortest, longest = np.log(scales)
+    sizes = np.exp(shortest + (longest - shortest) * ((1 + path[:, 3]) / 2))
     if camera == "orthographic":
-        size = np.full(n_frames, np.sqrt(np.prod(scales)))
-    all_shapes = np.concatenate(shapes)
-    return observe(
-        all_shapes,
-        size[:, None, None] * motion,
-        np.concatenate(centres),
-        rng=rng,
-        mean_shape=all_shapes.mean(axis=0),
-        labels=np.concatenate(labels),
-        groups=np.concatenate(groups),
-        time=np.concatenate(times),
-        angles=angle,
-        **options,
-    )
+        sizes = np.full(len(path), np.sqrt(np.prod(scales)))
+    rotations = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+    motion = draw_motion(rotations, camera, (1.0, 1.0), rng)
+    translation = (640.0, 480.0) + path[:, 4:] * (160.0, 100.0)
+    return angles, sizes[:, None, None] * motion, translation
 
 
 def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:

@@ -33,44 +33,34 @@ def fetch_file(
     else:
         folder = Path(data_home).expanduser()
     path = folder / remote.name
+    by_hand = (
+        f"To put it there by hand, take it from {remote.url}; its sha256 is "
+        f"{remote.sha256}"
+    )
+    absent = f"{remote.name} is not in the folder {folder}, and"
+    if not path.exists() and not download_if_missing:
+        raise FileNotFoundError(f"{absent} download_if_missing is False. {by_hand}")
     if not path.exists():
-        if not download_if_missing:
-            why = "download_if_missing is False"
-            raise FileNotFoundError(_not_there(remote, folder, why))
-        _download(remote, folder)
+        try:
+            import_optional("pooch", extra="datasets").retrieve(
+                remote.url,
+                known_hash=f"sha256:{remote.sha256}",
+                fname=remote.name,
+                path=folder,
+            )
+        except ImportError as error:
+            raise ImportError(f"{absent} {error}. {by_hand}") from error
+        # Of the network and the disk; a wrong checksum is a ValueError.
+        except (OSError, ValueError) as error:
+            raise OSError(
+                f"{absent} it could not be downloaded ({error}). {by_hand}"
+            ) from error
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     if sha256 != remote.sha256:
         raise OSError(
-            f"{path} is not the file that is expected under this name: its sha256 is "
-            f"{sha256} instead of {remote.sha256}. Remove it to download the right "
-            f"one, or put that there by hand, from {remote.url}"
+            f"{path} is damaged, or it is another file of the same name: its sha256 is "
+            f"{sha256}. Remove it, and the next call downloads the right file. "
+            f"{by_hand}"
         )
     return path
-
-
-def _download(remote: RemoteFile, folder: Path) -> None:
-    """Put a file into the folder, which is created if need be."""
-    try:
-        pooch = import_optional("pooch", extra="datasets")
-    except ImportError as error:
-        raise ImportError(_not_there(remote, folder, str(error))) from error
-    try:
-        pooch.retrieve(
-            remote.url,
-            known_hash=f"sha256:{remote.sha256}",
-            fname=remote.name,
-            path=folder,
-        )
-    # Errors of the network and the disk are OSErrors; a wrong checksum is a ValueError.
-    except (OSError, ValueError) as error:
-        why = f"it could not be downloaded ({error})"
-        raise OSError(_not_there(remote, folder, why)) from error
-
-
-def _not_there(remote: RemoteFile, folder: Path, why: str) -> str:
-    """Say that a file is missing, why, and how to put it there by hand."""
-    return (
-        f"{remote.name} is not in the folder {folder}, and {why}. To put it there by "
-        f"hand, take it from {remote.url}; its sha256 is {remote.sha256}"
-    )

@@ -6,7 +6,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.random import RandomState
 from numpy.typing import NDArray
-from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions
 from isa_nrsfm._tables.layout import LAYOUTS, Layout, tracks_to_table
@@ -68,14 +67,13 @@ def observe(
     shapes: NDArray,
     motion: NDArray,
     translation: NDArray,
+    rng: RandomState,
     *,
     noise: float,
     missing: float,
     layout: Layout,
-    rng: RandomState,
-    **more: Any,
-) -> Bunch:
-    """Return the table of shapes seen by cameras, and the truth with all of `more`."""
+) -> dict[str, Any]:
+    """Return the table of shapes seen by cameras, and what is true of it."""
     clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
     centred = clean - clean.mean(axis=1, keepdims=True)
     noise_variance = noise**2 * np.mean(centred**2)
@@ -87,15 +85,14 @@ def observe(
     tracks[~visible] = np.nan
 
     names = np.array([[f"{axis}_{j}" for axis in "xy"] for j in range(clean.shape[1])])
-    return Bunch(
-        data=tracks_to_table(tracks, layout),
-        tracks=tracks,
-        clean=clean,
-        visible=visible,
-        motion=motion,
-        translation=translation,
-        shapes=shapes,
-        noise_variance=float(noise_variance),
-        feature_names=tracks_to_table(names[None], layout)[0].tolist(),
-        **more,
-    )
+    return {
+        "data": tracks_to_table(tracks, layout),
+        "tracks": tracks,
+        "clean": clean,
+        "visible": visible,
+        "motion": motion,
+        "translation": translation,
+        "shapes": shapes,
+        "noise_variance": float(noise_variance),
+        "feature_names": tracks_to_table(names[None], layout)[0].tolist(),
+    }

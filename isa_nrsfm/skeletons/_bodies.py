@@ -1,12 +1,42 @@
 """Layouts of hands, of bodies and of both with the face."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import chain
+from typing import Any
 
 from isa_nrsfm.skeletons._faces import IBUG_68
-from isa_nrsfm.skeletons._skeleton import Skeleton, run, shifted
+from isa_nrsfm.skeletons._skeleton import Skeleton, run, sides_of_names
 
-_FINGERS = ("index_finger", "middle_finger", "ring_finger", "pinky")
+_BOTH = ("left", "right")
+_TOES = ("big_toe", "small_toe", "heel")
+
+
+def _each(firsts: Iterable[str], seconds: Sequence[str]) -> tuple[str, ...]:
+    """Return all pairs of words as names, one first word after the other."""
+    return tuple(f"{first}_{second}" for first in firsts for second in seconds)
+
+
+def _of_both_sides(
+    parts: Iterable[str], sides: Sequence[str] = _BOTH
+) -> tuple[str, ...]:
+    """Return parts on two sides as names, one part after the other."""
+    return tuple(f"{side}_{part}" for part in parts for side in sides)
+
+
+def _body(name: str, point_names: tuple[str, ...], **parts: Any) -> Skeleton:
+    """Return a layout of points whose names have the sides."""
+    left, right = sides_of_names(point_names)
+    return Skeleton(
+        name=name,
+        kind="body",
+        n_points=len(point_names),
+        point_names=point_names,
+        left=left,
+        right=right,
+        **parts,
+    )
+
+
 HAND_21 = Skeleton(
     name="hand-21",
     kind="hand",
@@ -24,34 +54,22 @@ HAND_21 = Skeleton(
     ),
     point_names=(
         "wrist",
-        *(f"thumb_{joint}" for joint in ("cmc", "mcp", "ip", "tip")),
-        *(f"{f}_{joint}" for f in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
+        *_each(["thumb"], ("cmc", "mcp", "ip", "tip")),
+        *_each(
+            ("index_finger", "middle_finger", "ring_finger", "pinky"),
+            ("mcp", "pip", "dip", "tip"),
+        ),
     ),
     # A table of one hand does not determine the side that is seen, nor which hand.
     up=((0, 9),),
 )
 
 
-def _sides(names: tuple[str, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the points of the left side and, in the same order, of the right."""
-    left = [name for name in names if name.startswith("left_")]
-    right = [f"right_{name.removeprefix('left_')}" for name in left]
-    return tuple(map(names.index, left)), tuple(map(names.index, right))
-
-
-_COCO_NAMES = (
-    "nose",
-    *(
-        f"{side}_{part}"
-        for part in ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-        for side in ("left", "right")
-    ),
-)
-_LEFT, _RIGHT = _sides(_COCO_NAMES)
-COCO_17 = Skeleton(
-    name="coco-17",
-    kind="body",
-    n_points=17,
+_ARM, _LEG = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
+_COCO_NAMES = ("nose", *_of_both_sides(("eye", "ear", *_ARM, *_LEG)))
+COCO_17 = _body(
+    "coco-17",
+    _COCO_NAMES,
     curves=(
         (3, 1, 0, 2, 4),  # ears, eyes and nose
         (1, 2),
@@ -68,29 +86,19 @@ COCO_17 = Skeleton(
         "https://cocodataset.org/#format-data, "
         "annotations/person_keypoints_val2017.json"
     ),
-    point_names=_COCO_NAMES,
-    left=_LEFT,
-    right=_RIGHT,
     up=((11, 5), (12, 6)),
     front=((3, 0), (4, 0)),
     across=((6, 5), (12, 11)),
 )
 
+_RIGHT_FIRST = ("right", "left")
 _H36M_NAMES = (
-    "pelvis",
-    *(f"{side}_{j}" for side in ("right", "left") for j in ("hip", "knee", "foot")),
-    *("spine", "thorax", "nose", "head"),
-    *(
-        f"{side}_{j}"
-        for side in ("left", "right")
-        for j in ("shoulder", "elbow", "wrist")
-    ),
+    *("pelvis", *_each(_RIGHT_FIRST, ("hip", "knee", "foot"))),
+    *("spine", "thorax", "nose", "head", *_each(_BOTH, _ARM)),
 )
-_LEFT, _RIGHT = _sides(_H36M_NAMES)
-H36M_17 = Skeleton(
-    name="h36m-17",
-    kind="body",
-    n_points=17,
+H36M_17 = _body(
+    "h36m-17",
+    _H36M_NAMES,
     curves=(
         (0, 7, 8, 9, 10),  # spine and head
         (0, 1, 2, 3),  # legs
@@ -104,9 +112,6 @@ H36M_17 = Skeleton(
         "Simple yet Effective Baseline for 3D Human Pose Estimation, ICCV 2017, and "
         "https://github.com/facebookresearch/VideoPose3D"
     ),
-    point_names=_H36M_NAMES,
-    left=_LEFT,
-    right=_RIGHT,
     up=((0, 8),),
     # The nose is in front of the line from the thorax to the top of the head.
     front=((8, 9), (10, 9)),
@@ -114,26 +119,13 @@ H36M_17 = Skeleton(
 )
 
 _BODY_25_NAMES = (
-    *("nose", "neck"),
-    *(
-        f"{side}_{j}"
-        for side in ("right", "left")
-        for j in ("shoulder", "elbow", "wrist")
-    ),
-    "mid_hip",
-    *(f"{side}_{j}" for side in ("right", "left") for j in ("hip", "knee", "ankle")),
-    *(f"{side}_{part}" for part in ("eye", "ear") for side in ("right", "left")),
-    *(
-        f"{side}_{part}"
-        for side in ("left", "right")
-        for part in ("big_toe", "small_toe", "heel")
-    ),
+    *("nose", "neck", *_each(_RIGHT_FIRST, _ARM)),
+    *("mid_hip", *_each(_RIGHT_FIRST, _LEG)),
+    *(*_of_both_sides(("eye", "ear"), _RIGHT_FIRST), *_each(_BOTH, _TOES)),
 )
-_LEFT, _RIGHT = _sides(_BODY_25_NAMES)
-BODY_25 = Skeleton(
-    name="body-25",
-    kind="body",
-    n_points=25,
+BODY_25 = _body(
+    "body-25",
+    _BODY_25_NAMES,
     curves=(
         (17, 15, 0, 16, 18),  # ears, eyes and nose
         (0, 1, 8),  # neck and trunk
@@ -149,33 +141,20 @@ BODY_25 = Skeleton(
         "Intelligence 43, 2021; "
         "https://github.com/CMU-Perceptual-Computing-Lab/openpose, doc/02_output.md"
     ),
-    point_names=_BODY_25_NAMES,
-    left=_LEFT,
-    right=_RIGHT,
     up=((8, 1),),
     front=((17, 0), (18, 0), (21, 19), (24, 22)),
     across=((2, 5), (9, 12)),
 )
 
-_POSE_PARTS = (
-    *("shoulder", "elbow", "wrist", "pinky", "index", "thumb"),
-    *("hip", "knee", "ankle", "heel", "foot_index"),
-)
 _POSE_NAMES = (
-    "nose",
-    *(
-        f"{side}_eye{part}"
-        for side in ("left", "right")
-        for part in ("_inner", "", "_outer")
-    ),
+    *("nose", "left_eye_inner", "left_eye", "left_eye_outer"),
+    *("right_eye_inner", "right_eye", "right_eye_outer"),
     *("left_ear", "right_ear", "mouth_left", "mouth_right"),
-    *(f"{side}_{part}" for part in _POSE_PARTS for side in ("left", "right")),
+    *_of_both_sides((*_ARM, "pinky", "index", "thumb", *_LEG, "heel", "foot_index")),
 )
-_LEFT, _RIGHT = _sides(_POSE_NAMES)
-POSE_33 = Skeleton(
-    name="mediapipe-pose-33",
-    kind="body",
-    n_points=33,
+POSE_33 = _body(
+    "mediapipe-pose-33",
+    _POSE_NAMES,
     curves=(
         (7, 3, 2, 1, 0, 4, 5, 6, 8),  # ears, eyes and nose
         (9, 10),  # mouth
@@ -190,9 +169,6 @@ POSE_33 = Skeleton(
         "2020; https://github.com/google-ai-edge/mediapipe, "
         "mediapipe/python/solutions/pose_connections.py"
     ),
-    point_names=_POSE_NAMES,
-    left=(*_LEFT, 9),
-    right=(*_RIGHT, 10),
     up=((23, 11), (24, 12)),
     front=((7, 0), (8, 0), (29, 31), (30, 32)),
     across=((12, 11), (24, 23)),
@@ -200,6 +176,20 @@ POSE_33 = Skeleton(
 
 _FACE, _LEFT_HAND, _RIGHT_HAND = 23, 91, 112
 _COCO_FINGERS = ("thumb", "forefinger", "middle_finger", "ring_finger", "pinky_finger")
+_COCO_HAND = ("hand_root", *(f"{f}{j}" for f in _COCO_FINGERS for j in (1, 2, 3, 4)))
+_WHOLE_NAMES = (
+    *(*_COCO_NAMES, *_each(_BOTH, _TOES)),
+    *(f"face-{j}" for j in range(68)),
+    *_each(_BOTH, _COCO_HAND),
+)
+_LEFT, _RIGHT = sides_of_names(_WHOLE_NAMES)
+
+
+def _shifted(curve: Iterable[int], offset: int = _FACE) -> tuple[int, ...]:
+    """Return points whose indices are larger by an offset."""
+    return tuple(j + offset for j in curve)
+
+
 WHOLE_BODY_133 = replace(
     COCO_17,
     name="coco-wholebody-133",
@@ -209,9 +199,9 @@ WHOLE_BODY_133 = replace(
         *COCO_17.curves,
         (19, 15, 17, 18),  # feet
         (22, 16, 20, 21),
-        *shifted(IBUG_68.curves, _FACE),
-        *shifted(HAND_21.curves, _LEFT_HAND),
-        *shifted(HAND_21.curves, _RIGHT_HAND),
+        *map(_shifted, IBUG_68.curves),
+        *(_shifted(curve, _LEFT_HAND) for curve in HAND_21.curves),
+        *(_shifted(curve, _RIGHT_HAND) for curve in HAND_21.curves),
         (9, _LEFT_HAND),
         (10, _RIGHT_HAND),
     ),
@@ -221,36 +211,11 @@ WHOLE_BODY_133 = replace(
         "https://github.com/open-mmlab/mmpose, "
         "configs/_base_/datasets/coco_wholebody.py"
     ),
-    point_names=(
-        *_COCO_NAMES,
-        *(
-            f"{side}_{part}"
-            for side in ("left", "right")
-            for part in ("big_toe", "small_toe", "heel")
-        ),
-        *(f"face-{j}" for j in range(68)),
-        *chain.from_iterable(
-            (
-                f"{side}_hand_root",
-                *(f"{side}_{f}{j}" for f in _COCO_FINGERS for j in (1, 2, 3, 4)),
-            )
-            for side in ("left", "right")
-        ),
-    ),
-    left=(
-        *COCO_17.left,
-        *range(17, 20),
-        *(j + _FACE for j in IBUG_68.left),
-        *range(_LEFT_HAND, _RIGHT_HAND),
-    ),
-    right=(
-        *COCO_17.right,
-        *range(20, 23),
-        *(j + _FACE for j in IBUG_68.right),
-        *range(_RIGHT_HAND, 133),
-    ),
+    point_names=_WHOLE_NAMES,
+    left=(*_LEFT, *_shifted(IBUG_68.left)),
+    right=(*_RIGHT, *_shifted(IBUG_68.right)),
     front=(*COCO_17.front, (19, 17), (22, 20)),
-    contour=tuple(j + _FACE for j in IBUG_68.contour),
+    contour=_shifted(IBUG_68.contour),
 )
 
 BODIES = (HAND_21, COCO_17, H36M_17, BODY_25, POSE_33, WHOLE_BODY_133)

@@ -7,7 +7,9 @@ of the person's right eye, which an image shows on its left.
 from dataclasses import replace
 from itertools import chain
 
-from isa_nrsfm.skeletons._skeleton import Pairs, Skeleton, run
+import numpy as np
+
+from isa_nrsfm.skeletons._skeleton import Pairs, Skeleton, listed, run
 
 IBUG_68 = Skeleton(
     name="ibug-68",
@@ -28,19 +30,9 @@ IBUG_68 = Skeleton(
         "C. Sagonas et al., 300 Faces in-the-Wild Challenge, ICCV Workshops 2013; "
         "https://ibug.doc.ic.ac.uk/resources/facial-point-annotations/"
     ),
-    right=(
-        *range(0, 8),
-        *range(17, 22),
-        *(31, 32),
-        *range(36, 42),
-        *(48, 49, 50, 58, 59, 60, 61, 67),
-    ),
-    left=(
-        *range(16, 8, -1),
-        *range(26, 21, -1),
-        *(35, 34),
-        *(45, 44, 43, 42, 47, 46),
-        *(54, 53, 52, 56, 55, 64, 63, 65),
+    right=listed(np.r_[0:8, 17:22, 31, 32, 36:42, 48:51, 58:62, 67]),
+    left=listed(
+        np.r_[16:8:-1, 26:21:-1, 35, 34, 45:41:-1, 47, 46, 54:51:-1, 56, 55, 64, 63, 65]
     ),
     up=((8, 27),),
     front=((0, 30), (16, 30)),
@@ -80,22 +72,8 @@ XM2VTS_68 = Skeleton(
         "S. Milborrow et al., The MUCT Landmarked Face Database, PRASA 2010, "
         "http://www.milbo.org/muct"
     ),
-    right=(
-        *range(0, 7),
-        *range(21, 27),
-        *range(27, 32),
-        *range(37, 41),
-        46,
-        *(48, 49, 50, 59, 58, 60, 65),
-    ),
-    left=(
-        *range(14, 7, -1),
-        *range(15, 21),
-        *range(32, 37),
-        *range(45, 41, -1),
-        47,
-        *(54, 53, 52, 55, 56, 62, 63),
-    ),
+    right=listed(np.r_[0:7, 21:32, 37:41, 46, 48:51, 59, 58, 60, 65]),
+    left=listed(np.r_[14:7:-1, 15:21, 32:37, 45:41:-1, 47, 54:51:-1, 55, 56, 62, 63]),
     up=((7, 37), (7, 45)),
     front=((0, 67), (14, 67)),
     contour=run(0, 14),
@@ -147,19 +125,10 @@ WFLW_98 = Skeleton(
         "CVPR 2018, https://wywu.github.io/projects/LAB/WFLW.html; mirror images: "
         "https://github.com/open-mmlab/mmpose, configs/_base_/datasets/wflw.py"
     ),
-    right=(
-        *range(0, 16),
-        *range(33, 42),
-        *(55, 56),
-        *range(60, 68),
-        *(76, 77, 78, 87, 86, 88, 89, 95, 96),
-    ),
+    right=listed(np.r_[0:16, 33:42, 55, 56, 60:68, 76:79, 87, 86, 88, 89, 95, 96]),
     left=(
-        *range(32, 16, -1),
-        *(46, 45, 44, 43, 42, 50, 49, 48, 47),
-        *(59, 58),
-        *(72, 71, 70, 69, 68, 75, 74, 73),
-        *(82, 81, 80, 83, 84, 92, 91, 93, 97),
+        *listed(np.r_[32:16:-1, 46:41:-1, 50:46:-1, 59, 58, 72:67:-1, 75:72:-1]),
+        *listed(np.r_[82:79:-1, 83, 84, 92, 91, 93, 97]),
     ),
     up=((16, 51),),
     front=((0, 54), (32, 54)),

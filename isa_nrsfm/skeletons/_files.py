@@ -1,16 +1,14 @@
 """Skeletons that other programs keep beside their points."""
 
 import os
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.skeletons._skeleton import Skeleton
+from isa_nrsfm.skeletons._skeleton import Skeleton, sides_of_names
 
 SUFFIXES = (".yaml", ".yml")
-_LEFT_WORD = re.compile(r"left", re.IGNORECASE)
 
 
 def skeleton_of_names(
@@ -62,12 +60,7 @@ def skeleton_of_names(
                 f"{', '.join(names[:6])}{', ...' if len(names) > 6 else ''}; got "
                 f"{edge!r}"
             )
-    partners = [(point, _LEFT_WORD.sub(_right_word, point)) for point in names]
-    pairs = [
-        (place[left], place[right])
-        for left, right in partners
-        if left != right and right in place
-    ]
+    left, right = sides_of_names(names)
     return Skeleton(
         name=name,
         kind="other",
@@ -75,8 +68,8 @@ def skeleton_of_names(
         curves=tuple((place[a], place[b]) for a, b in edges),
         source=source,
         point_names=tuple(names),
-        left=tuple(left for left, _ in pairs),
-        right=tuple(right for _, right in pairs),
+        left=left,
+        right=right,
     )
 
 
@@ -132,11 +125,3 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _right_word(match: re.Match[str]) -> str:
-    """Return right, written as left was."""
-    word = match[0]
-    if word.isupper():
-        return "RIGHT"
-    return "Right" if word[0].isupper() else "right"

@@ -1,5 +1,6 @@
 """A layout of landmarks."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
@@ -13,6 +14,7 @@ KINDS: tuple[Kind, ...] = ("face", "hand", "body", "whole body", "other")
 MIDDLE, LEFT, RIGHT = 0, 1, 2
 
 Pairs = tuple[tuple[int, int], ...]
+_LEFT_WORD = re.compile(r"left", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -225,26 +227,8 @@ class Skeleton:
         """
         if self.point_names is None or sorted(names) != sorted(self.point_names):
             raise ValueError(f"these are not the names of the points of {self.name!r}")
-        place = {name: j for j, name in enumerate(names)}
-        new = [place[name] for name in self.point_names]
-
-        def moved(points: Iterable[int]) -> tuple[int, ...]:
-            return tuple(new[j] for j in points)
-
-        def moved_pairs(pairs: Pairs) -> Pairs:
-            return tuple((new[a], new[b]) for a, b in pairs)
-
-        return replace(
-            self,
-            curves=tuple(moved(curve) for curve in self.curves),
-            point_names=tuple(names),
-            left=moved(self.left),
-            right=moved(self.right),
-            up=moved_pairs(self.up),
-            front=moved_pairs(self.front),
-            across=moved_pairs(self.across),
-            contour=moved(self.contour),
-        )
+        order = [self.point_names.index(name) for name in names]
+        return replace(self.subset(order), name=self.name)
 
 
 def sides_of_edges(sides: NDArray, edges: NDArray) -> NDArray[np.intp]:
@@ -262,8 +246,22 @@ def run(first: int, last: int, *, closed: bool = False) -> tuple[int, ...]:
     return (*range(first, last + 1), *((first,) if closed else ()))
 
 
-def shifted(
-    curves: Iterable[Iterable[int]], offset: int
-) -> tuple[tuple[int, ...], ...]:
-    """Return the same curves of points whose indices are larger by an offset."""
-    return tuple(tuple(j + offset for j in curve) for curve in curves)
+def listed(points: NDArray) -> tuple[int, ...]:
+    """Return an array of points, of `numpy.r_` say, as a tuple."""
+    return tuple(points.tolist())
+
+
+def sides_of_names(names: Sequence[str]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the points called left, and those called right otherwise by that name."""
+    place = {name: j for j, name in enumerate(names)}
+    mirror = [place.get(_LEFT_WORD.sub(_right_word, name)) for name in names]
+    pairs = [(j, k) for j, k in enumerate(mirror) if k not in (j, None)]
+    return tuple(j for j, _ in pairs), tuple(k for _, k in pairs)
+
+
+def _right_word(match: re.Match[str]) -> str:
+    """Return right, written as left was."""
+    word = match[0]
+    if word.isupper():
+        return "RIGHT"
+    return "Right" if word[0].isupper() else "right"
