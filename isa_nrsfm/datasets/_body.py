@@ -151,8 +151,10 @@ def make_body_tracks(
 
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, ACTIONS, build, rng)
-    angles, *cameras = film(path, (80.0, 20.0, 8.0), (0.2, 0.5), camera, rng)
-    table = observe(shapes, *cameras, rng, noise=noise, missing=missing, layout=layout)
+    angles, motion, translation = film(path, (80.0, 20.0, 8.0), (0.2, 0.5), camera, rng)
+    table = observe(
+        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
+    )
     point_names = list(names)
     return Bunch(**table, **truths, angles=angles, point_names=point_names)
 

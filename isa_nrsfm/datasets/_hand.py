@@ -143,8 +143,12 @@ def make_hand_tracks(
     """
     rng = check_random_state(random_state)
     shapes, path, truths = perform(n_frames, n_people, POSES, _hand, rng)
-    angles, *cameras = film(path, (60.0, 35.0, 35.0), (1.0, 3.0), camera, rng)
-    table = observe(shapes, *cameras, rng, noise=noise, missing=missing, layout=layout)
+    angles, motion, translation = film(
+        path, (60.0, 35.0, 35.0), (1.0, 3.0), camera, rng
+    )
+    table = observe(
+        shapes, motion, translation, rng, noise=noise, missing=missing, layout=layout
+    )
     point_names = list(get_skeleton("hand-21").point_names or ())
     return Bunch(**table, **truths, angles=angles, point_names=point_names)
 
