@@ -42,13 +42,3 @@ def misbehave(measured, how):
             os._exit(3)
         if how == "hang":
             time.sleep(60)
-
-
-def count_run(measured, path, ends):
-    """Add a line to a file; then return at once, or not for a minute."""
-    with path.open("a") as file:
-        file.write("run\n")
-    if not ends:
-        with measured():
-            time.sleep(60)
-    return {"ends": ends}, {"array": np.arange(3)}

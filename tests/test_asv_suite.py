@@ -75,15 +75,6 @@ def test_fits(kind):
     assert 0 < tracked["affine_shape_error"] < 0.1
 
 
-def test_tables_without_a_file_are_left_out(monkeypatch, tmp_path):
-    monkeypatch.setenv("ISA_NRSFM_DATA", str(tmp_path))
-    assert {name for name in _measured.TABLES if _measured.load(name) is None} == set(
-        _measured.REAL
-    )
-    with pytest.raises(NotImplementedError):
-        fits.OfTables().setup(_measured.REAL[0])
-
-
 def test_the_configuration_finds_the_suite():
     path = Path(stages.__file__).parents[1] / "asv.conf.json"
     settings = json.loads(path.read_text(encoding="utf-8"))

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from isolated_runs import MEGABYTE, count_run, misbehave, use_memory
+from isolated_runs import MEGABYTE, misbehave, use_memory
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
 from benchmarks import (
-    _data,
     _fits,
     accuracy,
     questions,
@@ -19,9 +18,8 @@ from benchmarks import (
 )
 from benchmarks._agreement import compare
 from benchmarks._isolated import run_isolated
-from benchmarks._jobs import Job, Limits, run_jobs
-from benchmarks._markdown import cell, number, value
-from benchmarks._methods import METHODS, Found, TruncatedTable
+from benchmarks._markdown import cell, value
+from benchmarks._methods import METHODS, Found
 from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
@@ -88,89 +86,7 @@ def test_what_a_method_does_wrong_is_reported(how, status, message):
     assert outcome.seconds is None
 
 
-@pytest.mark.subprocess
-def test_what_was_too_slow_is_not_run_again(tmp_path):
-    # What is measured of the slow method does not end, of the fast one nothing is.
-    jobs = [
-        Job("truth", "drink", method, seed, count_run, arguments, {})
-        for seed in (0, 1)
-        for method, arguments in (
-            ("slow", {"path": tmp_path / "slow", "ends": False}),
-            ("fast", {"path": tmp_path / "fast", "ends": True}),
-        )
-    ]
-    limits = Limits(time=0.5, memory=None, threads=1)
-    done = list(run_jobs(jobs, limits, 1, "now"))
-    assert (tmp_path / "slow").read_text() == "run\n"
-    assert (tmp_path / "fast").read_text() == "run\nrun\n"
-    assert {(r.method, r.seed, r.status) for r, _ in done} == {
-        ("slow", 0, "over time"),
-        ("slow", 1, "over time"),
-        ("fast", 0, "ok"),
-        ("fast", 1, "ok"),
-    }
-    for kept, arrays in done:
-        if kept.status == "ok":
-            assert kept.values == {"ends": True}
-            np.testing.assert_array_equal(arrays["array"], [0, 1, 2])
-        else:
-            assert kept.message == "over 0.5 s"
-            assert kept.values == {}
-            assert arrays == {}
-
-
 # Results and tables
-
-
-def test_results_are_kept_rounded_and_replaced_as_a_group(tmp_path):
-    path = tmp_path / "folder" / "results.json"
-    first = Results(path)
-    key = first.begin(threads=1)
-    values = {"a": np.float64(1 / 3), "b": np.nan, "c": np.arange(2), "d": None}
-    for seed in range(3):
-        first.add(record(seed=seed, values=values, environment=key))
-    first.add(record(section="held_out", environment=key))
-    first.save()
-
-    second = Results(path)
-    assert [r.seed for r in second.of("truth")] == [0, 1, 2]
-    assert second.records[0].values == {
-        "a": 0.333333,
-        "b": None,
-        "c": [0, 1],
-        "d": None,
-    }
-    assert second.environments[key]["threads"] == 1
-    assert second.environments[key]["numpy"] == np.__version__
-    # Two seeds take the place of three, other groups stay.
-    second.environments["later"] = {"threads": 2}
-    for seed in range(2):
-        second.add(record(seed=seed, environment="later"))
-    second.save()
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    assert [(r["section"], r["seed"]) for r in stored["records"]] == [
-        ("held_out", 0),
-        ("truth", 0),
-        ("truth", 1),
-    ]
-    assert set(stored["environments"]) == {key, "later"}
-
-
-@pytest.mark.parametrize(
-    ("figure", "text"),
-    [
-        (None, ""),
-        (0.0, "0"),
-        (1e-29, "0"),
-        (0.0012345, "0.00123"),
-        (12.3456, "12.3"),
-        (1234.6, "1235"),
-        (1.5e-7, "1.50e-07"),
-        (3.1e7, "3.10e+07"),
-    ],
-)
-def test_numbers(figure, text):
-    assert number(figure) == text
 
 
 def test_cells_say_median_range_and_failures():
@@ -188,28 +104,6 @@ def test_cells_say_median_range_and_failures():
 
 
 # Sets and methods
-
-
-def test_dense_shapes_and_tracks_follow_their_model():
-    rng = np.random.default_rng(0)
-    arrays = {
-        "mean": rng.normal(size=(6, 3)),
-        "identity": rng.normal(size=(2, 6, 3)),
-        "expression": rng.normal(size=(3, 6, 3)),
-        "identity_coeffs": rng.normal(size=(250, 2)),
-        "expression_coeffs": rng.normal(size=(250, 3)),
-        "R": np.array([random_rotation(i) for i in range(250)]),
-    }
-    i = 249
-    shape = arrays["mean"].copy()
-    for k in range(2):
-        shape += arrays["identity_coeffs"][i, k] * arrays["identity"][k]
-    for k in range(3):
-        shape += arrays["expression_coeffs"][i, k] * arrays["expression"][k]
-    tracks = _data.dense_tracks(arrays)
-    assert tracks.shape == (250, 6, 2)
-    np.testing.assert_allclose(tracks[i], shape @ arrays["R"][i, :2].T)
-    np.testing.assert_allclose(_data.dense_shapes(arrays, [i])[0], shape)
 
 
 @pytest.fixture(scope="module")
@@ -266,32 +160,6 @@ def test_all_limits_of_a_fit_can_be_varied():
     assert known == stages
 
 
-def test_limits_are_halved_and_doubled(capsys):
-    seen = []
-
-    def case(estimator):
-        seen.append(estimator._limits)
-        return 1.0
-
-    sensitivity.stage("fit", {"case": case}, None)
-    usual = FitLimits()
-    assert seen[:2] == [usual, usual]
-    for name, factor in (("sample", 0.5), ("sample", 2.0), ("small_table", 0.5)):
-        value = round(factor * getattr(usual, name))
-        assert usual._replace(**{name: value}) in seen[2:]
-    lines = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
-    assert ["sample", "300"] in lines
-
-
-@pytest.mark.parametrize("scale_frames", [True, False])
-def test_rank_floor_is_that_of_a_fit(scale_frames):
-    tracks = make_nonrigid_tracks(60, 40, 2, noise=0.01, random_state=0)
-    model = AffineNRSfM(2, scale_frames=scale_frames, random_state=0).fit(tracks.data)
-    floor = TruncatedTable(9, scale_frames).fit(tracks.data)
-    error = inverse_snr(tracks.data, floor.X_, scale_frames=scale_frames)
-    np.testing.assert_allclose(error, model.rank_floor_, rtol=1e-8)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_what_methods_find_explains_the_table(tracks, method):
     kind = METHODS[method]
@@ -338,9 +206,6 @@ def test_equal_fits_agree(tracks):
     assert same["shapes"] == pytest.approx(0.0, abs=1e-7)
     assert same["basis"] == pytest.approx(1.0)
     assert same["mean_basis"] == pytest.approx(1.0)
-
-
-# Pictures
 
 
 # The command

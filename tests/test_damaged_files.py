@@ -20,10 +20,10 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
+from layers import slow_after
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import PointDistributionModel, read_pdm, write_pdm
 from isa_nrsfm.io import (
@@ -43,7 +43,6 @@ for library in ("h5py", "tables", "pyarrow"):
 REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
 # What the reading of a small file may take: seconds, and bytes besides what is used.
 SECONDS, MEMORY = 60, 2**31
-QUICK, ALL = 8, 250
 
 FACES = make_face_tracks(20, n_components=1, random_state=0).data[:, :28]
 PDM = PointDistributionModel(
@@ -179,25 +178,6 @@ def read_shape_model(path):
     assert all(np.isfinite(part).all() for part in (mean, modes, eigenvalues))
 
 
-def export_edges(path):
-    """Draw the edges of a file with the command line; raise what it says."""
-    output = path.with_name("a.glb")
-    said = path.with_name("said")
-    with said.open("w") as file, contextlib.redirect_stderr(file):
-        with contextlib.redirect_stdout(None):
-            model = path.with_name("a.npz")
-            code = main(
-                ["export", str(model), "--edges", str(path), "--output", str(output)]
-            )
-    message = said.read_text()
-    said.unlink()
-    assert output.exists() == (code == 0)
-    output.unlink(missing_ok=True)
-    if code:
-        assert code == 1
-        raise ValueError(message)
-
-
 # --- formats ------------------------------------------------------------------------
 
 
@@ -233,12 +213,6 @@ def write_model(path):
     return path
 
 
-def write_edges(path):
-    write_model(path.with_name("a.npz"))
-    path.write_text("0,1\n1,2\n2,3\n3,4\n")
-    return path
-
-
 def write_shape_model(path):
     write_pdm(PDM, path)
     return path
@@ -252,7 +226,6 @@ FORMATS = {
     "model": (lambda d: write_model(d / "a.npz"), read_model),
     "pdm npz": (lambda d: write_shape_model(d / "a.npz"), read_shape_model),
     "pdm txt": (lambda d: write_shape_model(d / "a.txt"), read_shape_model),
-    "edges": (lambda d: write_edges(d / "a.csv"), export_edges),
     "npy folder": (lambda d: write_parts(d / "a", ".npy"), read_stored),
     "parquet folder": (lambda d: write_parts(d / "a", ".parquet"), read_stored),
     **{name: (write, read_format(name)) for name, write in files.WRITERS.items()},
@@ -333,14 +306,16 @@ def tried(format, numbers, folder):
     return outcomes, broken
 
 
+# Few damages of a variant of each format are quick.
+QUICK = [n for n in FORMATS if "-" not in n] + ["deeplabcut-table", "mediapipe-sizes"]
+OTHERS = [(n, range(6)) for n in FORMATS if n not in QUICK]
+OTHERS += [(n, range(6, 250)) for n in FORMATS]
+
+
 @pytest.mark.parametrize(
-    "numbers",
-    [
-        pytest.param(range(QUICK), id="few"),
-        pytest.param(range(QUICK, ALL), id="many", marks=pytest.mark.slow),
-    ],
+    ("format", "numbers"),
+    slow_after(len(QUICK), [(n, range(6)) for n in QUICK] + OTHERS, together=True),
 )
-@pytest.mark.parametrize("format", FORMATS)
 def test_damaged_files_are_read_or_refused(format, numbers, tmp_path):
     for folder in ("first", "corpus"):
         (tmp_path / folder).mkdir()

@@ -97,14 +97,6 @@ class TestSmoother:
             values.append((smoothed(data, dynamics).log_likelihood, dense / 2))
         assert_allclose(*np.transpose(values))
 
-    def test_without_transition_frames_keep_their_posterior(self):
-        rng = np.random.default_rng(1)
-        mean, covariance = observed(rng.normal(size=(20, K)), rng)
-        still = Dynamics(np.zeros((K, K)), np.eye(K), np.eye(K))
-        got = smoothed(observations(mean, covariance), still)
-        assert_allclose(got.mean, mean, atol=1e-10)
-        assert_allclose(got.covariance, covariance, atol=1e-10)
-
     def test_frames_without_a_fit_tell_nothing(self):
         rng = np.random.default_rng(2)
         mean, covariance = observed(rng.normal(size=(5, K)), rng)
@@ -112,13 +104,6 @@ class TestSmoother:
         data = observations(mean, covariance)
         assert_array_equal(data.precision[2], 0)
         assert_array_equal(data.information[2], 0)
-
-    def test_one_frame(self):
-        rng = np.random.default_rng(3)
-        mean, covariance = observed(rng.normal(size=(1, K)), rng)
-        got = smoothed(observations(mean, covariance), random_dynamics())
-        assert_allclose(got.mean, mean)
-        assert got.lagged.shape == (0, K, K)
 
 
 class TestEstimation:
@@ -131,15 +116,6 @@ class TestEstimation:
         found = estimated_dynamics(data, 60, 1e-4, False)
         assert_allclose(found.transition, true.transition, atol=0.06)
         assert_allclose(found.innovation, true.innovation, atol=0.06)
-
-    def test_smoothing_is_nearer_to_the_truth(self):
-        rng, true = np.random.default_rng(1), random_dynamics(1, 0.98)
-        x = simulated(true, 300, rng)
-        mean, covariance = observed(x, rng, 2.0)
-        data = observations(mean, covariance)
-        found = estimated_dynamics([data], 100, 1e-4, False)
-        error = np.linalg.norm(smoothed(data, found).mean - x)
-        assert error < 0.6 * np.linalg.norm(mean - x)
 
     @pytest.mark.parametrize("seed", range(8))
     def test_independent_frames_have_none(self, seed):

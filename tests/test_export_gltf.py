@@ -1,11 +1,6 @@
-import json
-import os
-import shutil
-import subprocess
-
 import numpy as np
 import pytest
-from export_models import N_COMPONENTS, blob_model, calibrated_model, face_model
+from export_models import N_COMPONENTS, calibrated_model, face_model
 from exported_files import TYPES, Read
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -16,12 +11,6 @@ from isa_nrsfm.export._drawing import (
     vertex_normals,
 )
 from isa_nrsfm.export._upright import upright_basis, upright_space
-
-VALIDATE = """
-const validator = require("gltf-validator");
-const content = new Uint8Array(require("fs").readFileSync(process.argv[1]));
-validator.validateBytes(content).then((r) => console.log(JSON.stringify(r.issues)));
-"""
 
 
 @pytest.fixture
@@ -34,55 +23,6 @@ def written(tmp_path):
         return Read(path)
 
     return write
-
-
-@pytest.fixture(scope="module")
-def validate():
-    """Return a function that returns what the validator of Khronos finds."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
-    found = subprocess.run(
-        [node, "-e", 'require("gltf-validator")'], capture_output=True, env=os.environ
-    )
-    if found.returncode:
-        pytest.skip("gltf-validator is not installed: npm install, and set NODE_PATH")
-
-    def issues(path):
-        done = subprocess.run(
-            [node, "-e", VALIDATE, str(path)], capture_output=True, check=True
-        )
-        return json.loads(done.stdout)
-
-    return issues
-
-
-@pytest.mark.subprocess
-@pytest.mark.parametrize(
-    ("make", "options"),
-    [
-        (face_model, {}),
-        (face_model, {"edges": [[0, 1], [1, 2]], "camera": None}),
-        (face_model, {"edges": [[36, 39, 27], [27, 42, 45]]}),
-        (face_model, {"edges": None, "names": ["jaw", "é", '"</x>"']}),
-        (blob_model, {"mirrored": True}),
-    ],
-    ids=["surface", "edges", "triangles", "points", "mirrored"],
-)
-def test_the_validator_of_khronos_finds_nothing(validate, tmp_path, make, options):
-    path = tmp_path / "model.glb"
-    write_glb(make(), path, **options)
-    issues = validate(path)
-    assert issues["messages"] == []
-    assert issues["numErrors"] == issues["numWarnings"] == 0
-
-
-@pytest.mark.subprocess
-def test_the_validator_would_find_something(validate, tmp_path, monkeypatch):
-    monkeypatch.setattr(_gltf, "vertex_normals", lambda mean, links: 2 * mean)
-    path = tmp_path / "model.glb"
-    write_glb(face_model(), path)
-    assert validate(path)["numErrors"] > 0
 
 
 @pytest.mark.parametrize("make", [face_model, calibrated_model])

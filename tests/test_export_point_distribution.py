@@ -11,9 +11,8 @@ from export_models import (
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat, savemat
-from scipy.linalg import subspace_angles
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.export import (
     PointDistributionModel,
     point_distribution_model,
@@ -100,26 +99,6 @@ def test_euclidean_shapes_of_the_frames_are_reproduced(pdm):
     assert errors[1] < 1.01e-4
 
 
-def test_the_principal_axes_are_those_of_the_truth():
-    bunch = faces(noise=0.0)
-    pdm = point_distribution_model(face_model(noise=0.0))
-    mean = aligned(bunch.mean_shape, pdm.mean)
-    for _ in range(20):
-        shapes = on_tangent_space(bunch.shapes, mean)
-        mean = aligned(shapes.mean(axis=0), pdm.mean)
-    shapes = on_tangent_space(bunch.shapes, mean)
-    mean = shapes.mean(axis=0)
-    flat = (shapes - mean).reshape(len(shapes), -1)
-    _, values, axes = np.linalg.svd(flat, full_matrices=False)
-    size = np.linalg.norm(pdm.mean) / np.linalg.norm(mean)
-    assert_allclose(pdm.mean, size * mean, atol=1e-5 * size * np.abs(mean).max())
-    found = pdm.modes.reshape(N_COMPONENTS, -1)
-    angles = subspace_angles(found.T, axes[:N_COMPONENTS].T)
-    assert np.degrees(angles).max() < 1e-3
-    expected = size**2 * values[:N_COMPONENTS] ** 2 / len(flat)
-    assert_allclose(pdm.eigenvalues, expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
     truth, model = faces(camera=camera), calibrated_model(camera)
@@ -141,12 +120,6 @@ def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
     assert len(recwarn) == 0
 
 
-def test_modes_are_not_the_independent_basis(pdm):
-    other = point_distribution_model(face_model(seed=1))
-    assert_allclose(other.mean, pdm.mean, atol=1e-3 * np.abs(pdm.mean).max())
-    assert_allclose(other.eigenvalues, pdm.eigenvalues, rtol=1e-2)
-
-
 def test_affine_shapes_have_as_many_modes_as_basis_shapes():
     model = face_model()
     pdm = point_distribution_model(model, camera=None, n_modes=0.999999)
@@ -155,15 +128,14 @@ def test_affine_shapes_have_as_many_modes_as_basis_shapes():
         point_distribution_model(model, camera=None, n_modes=4)
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", None])
-def test_rows_without_points_are_left_out(camera):
-    table = faces().data.copy()
-    model = AffineNRSfM(N_COMPONENTS, random_state=0).fit(table[:100])
-    table[100:] = np.nan
+def test_rows_without_points_are_left_out():
+    table = faces().data[:60].copy()
+    options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+    model = AffineNRSfM(1, **options).fit(table[:40])
+    table[40:] = np.nan
     with pytest.warns(UserWarning, match="show no point"):
-        with_empty = AffineNRSfM(N_COMPONENTS, random_state=0).fit(table)
-    found = point_distribution_model(with_empty, camera=camera)
-    expected = point_distribution_model(model, camera=camera)
+        with_empty = AffineNRSfM(1, **options).fit(table)
+    found, expected = map(point_distribution_model, (with_empty, model))
     for one, other in zip(found, expected, strict=True):
         assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 

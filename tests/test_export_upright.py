@@ -3,7 +3,6 @@ import pytest
 from export_models import aligned, blob_model, calibrated_model, face_model, faces
 from numpy.testing import assert_allclose
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm.export._upright import upright_basis, upright_frames, upright_space
 
@@ -129,11 +128,3 @@ class TestCalibratedCameras:
         expected = project(shapes, model.motion_, 0.0 * model.translation_)
         images = frames.scales[:, None, None] * images
         assert_allclose(images, expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_calibrated_cameras_that_see_one_side_only_are_no_error(recwarn):
-    table = faces().data[np.abs(faces().angles).max(axis=1) < 20]
-    model = AffineNRSfM(1, camera="weak_perspective", random_state=0).fit(table)
-    recwarn.clear()
-    upright_basis(space_of(model), model)
-    assert len(recwarn) == 0

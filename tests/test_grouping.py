@@ -100,18 +100,6 @@ class TestGains:
         for assignment in random_assignments(0, 4):
             self.check(gains, objective, assignment)
 
-    def test_values_are_asked_for_whole_groups(self):
-        asked = []
-
-        def value(groups):
-            asked.append(groups)
-            return np.zeros(len(groups))
-
-        value_gains(value, 12)(np.arange(12) // 4)
-        groups = np.vstack(asked)
-        assert groups.shape[1] == 4
-        assert all(len(set(group)) == 4 for group in groups.tolist())
-
     def test_only_changed_subspaces_are_valued_again(self):
         n_asked = []
 

@@ -7,7 +7,6 @@ What is held here is which modules are loaded. How long a start takes is measure
 import ast
 import importlib
 import os
-import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +15,7 @@ import pandas as pd
 import pytest
 
 import isa_nrsfm
-from isa_nrsfm import AffineNRSfM, Decomposition
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.lazy import lazy_names
 from isa_nrsfm.cli._parser import build_parser
 from isa_nrsfm.datasets import make_face_tracks
@@ -107,11 +106,6 @@ def test_the_error_of_an_import_comes_through(monkeypatch):
     monkeypatch.setenv("EAGER_IMPORT", "1")
     with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
         lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
-
-
-def test_classes_are_pickled_by_where_they_are_defined():
-    for kind in (AffineNRSfM, Decomposition):
-        assert pickle.loads(pickle.dumps(kind)) is kind
 
 
 @pytest.mark.subprocess

@@ -9,8 +9,6 @@ from benchmarks.load import (
     BACKENDS,
     Load,
     described,
-    difference,
-    drawn_table,
     under_load,
 )
 
@@ -18,39 +16,21 @@ MEMORY = [90.0, 100.0, *[130.0] * 16, 103.0, 104.0]
 FINE = Load(190.0, 3, 1, [0.0, 1e-12], MEMORY, (8, 8), (5, 4))
 
 
-class TestHarm:
-    def test_there_is_none(self):
-        assert FINE.growth == 1.04
-        assert FINE.harm == []
-        assert "no harm" in described("dask", FINE)
-
-    @pytest.mark.parametrize(
-        ("changes", "harm"),
-        [
-            ({"differences": [0.0, 1e-6, 0.0]}, "results differ"),
-            ({"differences": [0.0, np.nan]}, "results differ"),
-            ({"memory": [*MEMORY[:-1], 106.0]}, "memory grows"),
-            ({"handles": (8, 9)}, "file handles are left"),
-            ({"threads": (5, 6)}, "threads are left"),
-        ],
-    )
-    def test_is_named(self, changes, harm):
-        load = FINE._replace(**changes)
-        assert load.harm == [harm]
-        assert harm in described("loky", load)
-
-    def test_difference_is_relative_to_the_largest_number(self):
-        expected = {"a": np.array([1.0, -4.0]), "b": np.array([100.0])}
-        found = {"a": np.array([1.0, -4.2]), "b": np.array([101.0])}
-        assert difference(found, expected) == pytest.approx(0.05)
-        assert difference(expected, expected) == 0.0
-
-
-def test_every_other_table_misses_points():
-    rng = np.random.default_rng(0)
-    tables = [drawn_table(rng) for _ in range(20)]
-    assert 4 < sum(np.isnan(X).any() for X in tables) < 16
-    assert len({X.shape for X in tables}) == 20
+@pytest.mark.parametrize(
+    ("changes", "harm"),
+    [
+        ({}, []),
+        ({"differences": [0.0, 1e-6, 0.0]}, ["results differ"]),
+        ({"differences": [0.0, np.nan]}, ["results differ"]),
+        ({"memory": [*MEMORY[:-1], 106.0]}, ["memory grows"]),
+        ({"handles": (8, 9)}, ["file handles are left"]),
+        ({"threads": (5, 6)}, ["threads are left"]),
+    ],
+)
+def test_harm_is_named(changes, harm):
+    load = FINE._replace(**changes)
+    assert load.harm == harm
+    assert (harm or ["no harm"])[0] in described("loky", load)
 
 
 @pytest.mark.filterwarnings("ignore")  # of fits

@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import check_grad, minimize
+from scipy.optimize import minimize
 from scipy.stats import ortho_group
 
 from isa_nrsfm._tables.layout import tracks_to_table
@@ -16,13 +16,14 @@ from isa_nrsfm.metrics import (
     inverse_snr,
     subspace_distance,
 )
-from isa_nrsfm.metrics._alignment import _squared_cosines, best_affinity, unit_shapes
+from isa_nrsfm.metrics._alignment import best_affinity, unit_shapes
 
 AFFINITIES = [
     np.diag([1.0, -1.0, 1.0]),
     np.array([[1.0, 0.5, 0.2], [0.0, 2.0, -0.3], [0.3, 0.0, 0.4]]),
     np.diag([1.0, 1e3, 1e-3]),
 ]
+FLAT = np.array([[0.0, 0.0, 2.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
 
 
 @pytest.fixture
@@ -85,51 +86,29 @@ class TestInverseSNR:
         changed = fitted.copy()
         changed[:, 4] = 1e6
         changed[:, 5] = np.nan
-        seen = [t[:, :4].reshape(4, -1) for t in (tracks, fitted)]
-        assert_allclose(
-            inverse_snr(
-                partial.reshape(4, -1),
-                changed.reshape(4, -1),
-                scale_frames=scale_frames,
-            ),
-            inverse_snr(*seen, scale_frames=scale_frames),
-        )
-
-    @pytest.mark.parametrize("scale_frames", [False, True])
-    def test_frames_without_points_do_not_count(self, rng, scale_frames):
-        X, X_hat = rng.standard_normal((2, 3, 8))
-        empty = np.full((1, 8), np.nan)
-        assert inverse_snr(
-            np.vstack([X, empty]), np.vstack([X_hat, empty]), scale_frames=scale_frames
-        ) == inverse_snr(X, X_hat, scale_frames=scale_frames)
+        # A frame without points does not count.
+        seen = [t[:3, :4].reshape(3, -1) for t in (tracks, fitted)]
+        partial[3] = np.nan
+        partial, changed = partial.reshape(4, -1), changed.reshape(4, -1)
+        found = inverse_snr(partial, changed, scale_frames=scale_frames)
+        assert_allclose(found, inverse_snr(*seen, scale_frames=scale_frames))
 
     @pytest.mark.parametrize(
-        ("X", "X_hat", "message"),
+        ("X", "X_hat", "options", "message"),
         [
-            (np.ones((2, 4)), np.ones((3, 4)), r"got \(2, 4\) and \(3, 4\)"),
-            (np.ones((2, 5)), np.ones((2, 5)), "even number; got n_features=5"),
-            (np.ones((2, 4)), np.ones((2, 4)), "X has no energy"),
-            (np.full((2, 4), np.nan), np.ones((2, 4)), "X has no energy"),
-            (np.full((2, 4), np.inf), np.ones((2, 4)), "Input X contains infinity"),
-            (
-                np.eye(4),
-                np.where(np.eye(4)[::-1], np.nan, 1),
-                r"X_hat is NaN at 4 point\(s\) that are seen in X, the first in row 0",
-            ),
+            (np.ones((2, 4)), np.ones((3, 4)), {}, r"got \(2, 4\) and \(3, 4\)"),
+            (np.ones((2, 5)), np.ones((2, 5)), {}, "even number; got n_features=5"),
+            (np.ones((2, 4)), np.ones((2, 4)), {}, "X has no energy"),
+            (np.full((2, 4), np.nan), np.ones((2, 4)), {}, "X has no energy"),
+            (np.full((2, 4), np.inf), np.ones((2, 4)), {}, "X contains infinity"),
+            (np.eye(4), np.diag(4 * [np.nan]), {}, r"NaN at 4 point\(s\) .* in row 0"),
+            (FLAT, FLAT, {"scale_frames": True}, r"1 frame\(s\), the first is row 1"),
+            (np.eye(4), np.eye(4), {"layout": "rows"}, "layout must be .* got 'rows'"),
         ],
     )
-    def test_errors(self, X, X_hat, message):
+    def test_refusals(self, X, X_hat, options, message):
         with pytest.raises(ValueError, match=message):
-            inverse_snr(X, X_hat)
-
-    def test_scaling_needs_extended_frames(self):
-        X = np.array([[0.0, 0.0, 2.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
-        with pytest.raises(ValueError, match=r"in 1 frame\(s\), the first is row 1"):
-            inverse_snr(X, X, scale_frames=True)
-
-    def test_unknown_layout(self):
-        with pytest.raises(ValueError, match=r"layout must be one of .* got 'rows'"):
-            inverse_snr(np.eye(4), np.eye(4), layout="rows")
+            inverse_snr(X, X_hat, **options)
 
 
 class TestAffineShapeError:
@@ -168,34 +147,6 @@ class TestAffineShapeError:
         others = [minimize(cost, rng.standard_normal(9)).fun for _ in range(5)]
         assert found <= min(others) + 1e-7
 
-    def test_derivatives(self, rng):
-        cross = rng.standard_normal((5, 9))
-        factors = rng.standard_normal((5, 3, 3))
-        scatter = factors @ factors.transpose(0, 2, 1)
-        a = rng.standard_normal(9)
-        value, gradient, hessian = _squared_cosines(a, cross, scatter)
-        assert (
-            check_grad(
-                lambda x: _squared_cosines(x, cross, scatter)[0],
-                lambda x: _squared_cosines(x, cross, scatter)[1],
-                a,
-            )
-            < 1e-5 * value
-        )
-        step = 1e-6 * rng.standard_normal(9)
-        difference = (
-            _squared_cosines(a + step, cross, scatter)[1]
-            - _squared_cosines(a - step, cross, scatter)[1]
-        )
-        assert_allclose(hessian @ step * 2, difference, rtol=1e-5, atol=1e-12)
-        assert_allclose(gradient @ a, 0, atol=1e-12)  # constant along a
-
-    def test_mean_shape_leaves_the_deformation(self):
-        scene = make_nonrigid_tracks(500, 40, 2, amplitude=0.05, random_state=0)
-        rigid = np.broadcast_to(scene.mean_shape, scene.shapes.shape)
-        error = affine_shape_error(scene.shapes, rigid)
-        assert 0.03 < error < 0.05  # less than the amplitude, of which a part is affine
-
     def test_planar_and_zero_estimates(self, scene):
         flat = scene.shapes * (1, 1, 0)
         error = affine_shape_error(scene.shapes, flat)
@@ -207,25 +158,6 @@ class TestAffineShapeError:
         X = scene.shapes.copy()
         X[7] = 5.0
         assert_allclose(affine_shape_error(scene.shapes, X), 1 / 60, atol=1e-12)
-
-    @pytest.mark.parametrize(
-        ("S", "X", "message"),
-        [
-            (np.ones((2, 5, 3)), np.ones((2, 6, 3)), r"S and X must be of the same"),
-            (np.ones((5, 3)), np.ones((5, 3)), r"S must be of the shape .* \(5, 3\)"),
-            (np.ones((2, 5, 2)), np.ones((2, 5, 2)), r"got \(2, 5, 2\)"),
-            (np.ones((0, 5, 3)), np.ones((0, 5, 3)), r"got \(0, 5, 3\)"),
-            (np.ones((2, 5, 3)), np.ones((2, 5, 3)), r"2 frame\(s\) of S, .* is 0"),
-            (
-                np.ones((2, 5, 3)),
-                np.full((2, 5, 3), np.nan),
-                "X must be finite; 30 entries",
-            ),
-        ],
-    )
-    def test_errors(self, S, X, message):
-        with pytest.raises(ValueError, match=message):
-            affine_shape_error(S, X)
 
 
 def orthonormal_shapes(rng, n):
@@ -252,21 +184,6 @@ class TestBasisSimilarity:
         assert_allclose(similarity, 1, atol=1e-10)
         assert_array_equal(matching, [1, 2, 0])
         assert_array_equal(basis_similarity(scene.basis, estimate, **means), similarity)
-
-    @pytest.mark.parametrize("with_mean", [False, True])
-    def test_invariance_of_inexact_bases(self, scene, rng, with_mean):
-        noisy = scene.basis + 0.05 * rng.standard_normal(scene.basis.shape)
-        affinity = AFFINITIES[1]
-
-        def value(basis, mean):
-            means = {"mean_shape_true": scene.mean_shape, "mean_shape": mean}
-            return basis_similarity(scene.basis, basis, **(means if with_mean else {}))
-
-        expected = value(noisy, scene.mean_shape)
-        assert (0.5 < expected).all()
-        assert (expected < 0.99).all()
-        moved = value(-7 * noisy[::-1] @ affinity, scene.mean_shape @ affinity)
-        assert_allclose(moved, expected, atol=1e-10)
 
     def test_known_cosines(self, rng):
         # The mean shapes are equal, so that A is the unit matrix.
@@ -435,28 +352,11 @@ class TestSubspaceDistance:
             distance = subspace_distance(a.reshape(8, 5), b.reshape(8, 5), 2)
             assert_allclose(distance, expected)
 
-    def test_triangle_inequality(self, rng):
-        for _ in range(50):
-            a, b, c = rng.standard_normal((3, 6, 4))
-            direct = subspace_distance(a, c, 2)
-            detour = subspace_distance(a, b, 2) + subspace_distance(b, c, 2)
-            assert direct <= detour + 1e-12
-
     @pytest.mark.parametrize(
         ("a", "b", "size", "message"),
         [
-            (
-                np.eye(6),
-                np.eye(7)[:6],
-                3,
-                "components_b must be of the same shape",
-            ),
-            (
-                np.eye(6),
-                np.eye(6)[:3],
-                3,
-                "components_b must be of the same shape",
-            ),
+            (np.eye(6), np.eye(7)[:6], 3, "components_b must be of the same shape"),
+            (np.eye(6), np.eye(6)[:3], 3, "components_b must be of the same shape"),
             (np.eye(5), np.eye(5), 3, r"components_a .* subspace_size=3 .*\(5, 5\)"),
             (np.ones(6), np.eye(6), 3, r"got the shape \(6,\)"),
             (np.eye(6), np.eye(6), 0, "positive integer; got 0"),
@@ -466,6 +366,6 @@ class TestSubspaceDistance:
             (np.eye(6), np.full((6, 6), np.nan), 3, "components_b must be finite"),
         ],
     )
-    def test_errors(self, a, b, size, message):
+    def test_refusals(self, a, b, size, message):
         with pytest.raises(ValueError, match=message):
             subspace_distance(a, b, size)
