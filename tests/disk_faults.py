@@ -33,9 +33,7 @@ def interrupt(_path):
 # happens after the operation instead of before it. A killed process does nothing more.
 STRIKES = {
     "disk full": (disk_error(errno.ENOSPC), "writes", False),
-    "disk full for a moment": (disk_error(errno.ENOSPC), "none", False),
     "access denied": (disk_error(errno.EACCES), "none", False),
-    "disk broken": (disk_error(errno.EIO), "none", False),
     "interrupted before": (interrupt, "none", False),
     "interrupted after": (interrupt, "none", True),
     "killed": (interrupt, "all", False),

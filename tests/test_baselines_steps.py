@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import measurements, random_cameras, random_rotation
@@ -14,7 +13,6 @@ from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
-    block_ksvd,
     code_frames,
     group_sparse_factors,
     shrink_blocks,
@@ -322,17 +320,6 @@ class TestBlockDictionary:
         expected = weight[:, None, None] * blocks[large]
         assert_allclose(pull[large], expected, rtol=1e-2, atol=1e-6)
 
-    def test_frames_that_no_atom_explains(self):
-        # The first half of the frames has a tenth of its energy in each of two atoms.
-        rng = rng_of(0)
-        axes = np.linalg.qr(rng.normal(size=(20, 9)))[0].T.reshape(3, 3, 20)
-        shares = np.repeat([[0.1, 0.12, 0.78], [0.5, 0.4, 0.1]], 10, axis=0)
-        cameras = random_cameras(rng, 20) / np.sqrt(2)
-        frames = np.einsum("il,irc,lcp->irp", np.sqrt(shares), cameras, axes)
-        blocks, active = code_frames(frames, axes[:2], 2, 0.05)
-        assert_array_equal(active, [[False, True]] * 10 + [[True, True]] * 10)
-        assert_allclose(blocks[:10, 1], np.sqrt(0.12) * cameras[:10], atol=1e-12)
-
     def test_units_rotations_and_batches_of_frames(self):
         frames = sparse_scene(0).frames
         atoms, *_ = true_code(sparse_scene(0))
@@ -395,36 +382,6 @@ class TestBlockDictionary:
         assert_array_equal(used, active)
         if n_users < 2:
             assert_array_equal(kept[[1, 2]], atoms[[1, 2]])
-
-    def learn(self, scene, atoms, ridge=0.01, max_iter=60, sparsity=2):
-        return block_ksvd(
-            scene.frames, atoms, sparsity, ridge=ridge, max_iter=max_iter, tol=1e-8
-        )
-
-    def start(self, scene):
-        random_state = np.random.RandomState(0)
-        n_atoms = len(scene.atoms)
-        return group_sparse_factors(scene.frames, n_atoms, 0.06, random_state)[1]
-
-    def test_exact_frames_of_one_atom(self):
-        scene = sparse_scene(0, 120, 30, sparsity=1)
-        *_, residual, n_iter = self.learn(scene, self.start(scene), sparsity=1)
-        assert residual < 1e-25
-        assert n_iter < 20
-
-    @pytest.mark.parametrize("seed", slow_after(1, [0, 1]))
-    def test_exact_frames_of_two_atoms(self, seed):
-        scene = sparse_scene(seed, 300, 50, 5)
-        found, *_, residual, _ = self.learn(scene, self.start(scene))
-        assert residual < 1e-3
-        # The price biases the blocks; without it the same atoms become exact.
-        exact, _, active, residual, _ = self.learn(scene, found, 1e-8)
-        assert residual < 1e-9
-        assert (active.sum(axis=1) == 2).mean() > 0.97
-        # Each true atom is one of those found: the same three-dimensional span.
-        products = true_code(scene)[0][:, None] @ exact.swapaxes(1, 2)
-        overlap = np.linalg.svd(products, compute_uv=False)[..., 2]
-        assert (np.sum(overlap > 1 - 1e-4, axis=1) == 1).all()
 
 
 class TestMetricCorrection:

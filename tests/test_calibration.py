@@ -9,13 +9,11 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.calibration import (
-    canonical_pose,
     deformation_metric,
     euclidean_frames,
     euclidean_shapes,
     metric_upgrade,
 )
-from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 CAMERAS = ["orthographic", "weak_perspective"]
@@ -136,19 +134,6 @@ class TestMetricUpgrade:
         assert two.condition_number == pytest.approx(one.condition_number, rel=1e-6)
 
     @both_cameras
-    def test_follows_roll_order_and_unit_of_the_frames(self, camera):
-        motion, *_ = scene(5, camera)
-        rng = np.random.default_rng(5)
-        motion += 0.1 * rng.standard_normal(motion.shape)
-        order = rng.permutation(20)
-        roll = Rotation.from_rotvec(rng.uniform(0, 6, (20, 1)) * [0, 0, 1]).as_matrix()
-        turned = 3.0 * (roll[:, :2, :2] @ motion[order])
-        one, two = metric_upgrade(motion, camera), metric_upgrade(turned, camera)
-        assert_allclose(3 * two.Q, one.Q, rtol=1e-7, atol=1e-9)
-        assert_allclose(two.scales, one.scales[order], rtol=1e-7)
-        assert_allclose(two.rotations, roll @ one.rotations[order], atol=1e-7)
-
-    @both_cameras
     def test_leaves_out_frames_without_camera(self, camera):
         motion, *_ = scene(7, camera)
         whole = np.full((23, 2, 3), np.nan)
@@ -216,24 +201,12 @@ class TestDegenerateCameras:
     @pytest.mark.parametrize(
         ("motion", "camera", "message"),
         [
-            (
-                np.ones((4, 3, 3)),
-                "orthographic",
-                r"\(n_frames, 2, 3\); got \(4, 3, 3\)",
-            ),
-            (
-                np.ones((0, 2, 3)),
-                "orthographic",
-                r"\(n_frames, 2, 3\); got \(0, 2, 3\)",
-            ),
+            (np.ones((4, 3, 3)), "orthographic", r"2, 3\); got \(4, 3, 3\)"),
+            (np.ones((0, 2, 3)), "orthographic", r"2, 3\); got \(0, 2, 3\)"),
             (np.full((4, 2, 3), np.inf), "orthographic", "infinite; 24 entries"),
             (np.zeros((4, 2, 3)), "orthographic", "the 0 usable cameras see 0"),
             (np.ones((4, 2, 3)), "weak_perspective", "the 4 usable cameras see 1"),
-            (
-                np.ones((4, 2, 3)),
-                "perspective",
-                "camera must be one of .*'perspective'",
-            ),
+            (np.ones((4, 2, 3)), "perspective", "must be one of .*'perspective'"),
         ],
     )
     def test_refuses(self, motion, camera, message):
@@ -357,26 +330,6 @@ class TestDeformationMetric:
             deformation_metric(motion, alpha[:-1])
 
 
-def hidden_part_errors(amplitude):
-    """Return the errors with one metric for all frames and with one for each."""
-    tracks = make_nonrigid_tracks(
-        200, 40, 2, camera="orthographic", noise=0, amplitude=amplitude, random_state=0
-    )
-    root = 0.25 * amplitude * np.random.default_rng(0).standard_normal((2, 3, 3))
-    V = root + root.transpose(0, 2, 1)
-    basis = tracks.basis + tracks.mean_shape @ V
-    hidden = np.eye(3) + np.tensordot(tracks.alpha, V, 1)
-    motion = tracks.motion @ np.linalg.inv(hidden)
-    metric = deformation_metric(motion, tracks.alpha)
-    frames = euclidean_frames(metric, motion, tracks.alpha, tracks.mean_shape, basis)
-    affine = tracks.mean_shape + np.tensordot(tracks.alpha, basis, 1)
-    common = euclidean_shapes(affine, metric_upgrade(motion).Q)
-    return [
-        mean_shape_error_3d(tracks.shapes, shapes, convention="frame")
-        for shapes in (common, frames.shapes)
-    ]
-
-
 class TestEuclideanFrames:
     @pytest.fixture
     def fitted(self):
@@ -454,15 +407,6 @@ class TestEuclideanFrames:
             assert (seen > np.exp(-0.5) * least * (1 - 1e-9)).all()
             assert (seen < np.exp(0.5) * largest * (1 + 1e-9)).all()
 
-    def test_what_cameras_absorb_comes_back(self):
-        # Basis shapes B_k + V_k B_0 and cameras that hide it, to first order: what is
-        # left is of second order in the deformation.
-        errors = np.array([hidden_part_errors(amplitude) for amplitude in (0.2, 0.05)])
-        before, after = errors.T
-        assert before[0] > 0.1
-        assert before[0] / before[1] == pytest.approx(4, rel=0.15)
-        assert after[0] / after[1] > 12
-
     @pytest.mark.parametrize(
         ("index", "value", "message"),
         [
@@ -498,14 +442,3 @@ class TestModelsWithCalibratedCameras:
         )
         shapes = model.reconstruct(faces().data)
         assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6
-
-    def test_rotations_are_the_pose_of_the_head(self, camera):
-        model, truth = face_model(camera=camera), faces()
-        turn = canonical_pose(model.mean_shape_, scheme="ibug-68").rotation
-        true = canonical_pose(truth.mean_shape, scheme="ibug-68").rotation
-        mirror = np.diag([1.0, 1.0, np.linalg.det(turn)])
-        found = Rotation.from_matrix(mirror @ model.rotations_ @ turn.T)
-        expected = Rotation.from_euler("yxz", truth.angles, degrees=True)
-        expected *= Rotation.from_matrix(true).inv()
-        apart = np.rad2deg((found * expected.inv()).magnitude())
-        assert apart.mean() < 1.0

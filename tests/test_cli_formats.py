@@ -13,7 +13,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
-QUICK = "-k 1 --isa fast --n-init 2 --no-figures".split()
+QUICK = "-k 1 --isa fast --n-init 2 --refinement none --no-figures".split()
 NODES = [f"node {j}" for j in range(20)]
 
 
@@ -22,7 +22,7 @@ def tracks():
     """Return tracks by their number of points."""
     table = make_face_tracks(N_FRAMES, n_components=1, random_state=0).data
     found = {68: table}
-    for n_points in (20, 98, 478):
+    for n_points in (20, 478):
         found[n_points] = make_nonrigid_tracks(
             N_FRAMES, n_points, 1, random_state=0
         ).data
@@ -58,27 +58,13 @@ def write_mediapipe(folder, tracks, lost):
     return path, ["--image-size", "640x480"], {"code"}
 
 
-def write_pyfeat(folder, tracks, lost):
-    path = folder / "feat.csv"
-    return files.write_pyfeat(path, lost, detector="MPDetector"), [], {"input"}
-
-
 def write_pts(folder, tracks, lost):
     return files.write_pts(folder / "300W", tracks[68]), [], {"file"}
-
-
-def write_wflw(folder, tracks, lost):
-    return files.write_wflw(folder / "list.txt", tracks[98]), [], {"image", "blur"}
 
 
 def write_deeplabcut(folder, tracks, lost):
     frame = files.deeplabcut_frame(lost, bodyparts=NODES)
     return files.write_deeplabcut(folder / "mouse.csv", frame), [], {"frame"}
-
-
-def write_deeplabcut_h5(folder, tracks, lost):
-    frame = files.deeplabcut_frame(lost, bodyparts=NODES, individuals=["a"])
-    return files.write_deeplabcut(folder / "mouse.h5", frame), [], {"individual"}
 
 
 def write_sleap(folder, tracks, lost):
@@ -88,26 +74,10 @@ def write_sleap(folder, tracks, lost):
     return path, ["--skip-rows", "individual=^b$"], {"individual", "instance_score"}
 
 
-def write_coco(folder, tracks, lost):
-    content = files.coco_annotations(lost, names=NODES)
-    return files.write_json(folder / "people.json", content), [], {"file_name"}
-
-
 @pytest.mark.parametrize(
     "write",
     slow_after(
-        4,
-        [
-            write_openface,
-            write_pyfeat,
-            write_mediapipe,
-            write_pts,
-            write_wflw,
-            write_deeplabcut,
-            write_deeplabcut_h5,
-            write_sleap,
-            write_coco,
-        ],
+        3, [write_openface, write_pts, write_sleap, write_mediapipe, write_deeplabcut]
     ),
     ids=lambda write: write.__name__.removeprefix("write_"),
 )
@@ -117,7 +87,7 @@ def test_files_are_fitted_and_transformed(write, run, tracks, lost, tmp_path):
     code, out, err = run("fit", path, "-o", folder, *options, *QUICK)
     assert (code, err) == (0, "")
     table = json.loads((folder / "report.json").read_text())["table"]
-    name = write.__name__.removeprefix("write_").removesuffix("_h5")
+    name = write.__name__.removeprefix("write_")
     assert table["format"] == name
     assert f"{path} (" in out
     n_points = len(np.load(folder / "shapes.npz")["mean_shape"])
@@ -125,7 +95,7 @@ def test_files_are_fitted_and_transformed(write, run, tracks, lost, tmp_path):
     alpha = pd.read_csv(folder / "alpha.csv")
     assert kept <= set(alpha)
     assert "x_0" not in alpha
-    empty = {"mediapipe": [], "pts": [], "wflw": [], "openface": [LOST, EMPTY]}
+    empty = {"mediapipe": [], "pts": [], "openface": [LOST, EMPTY]}
     missing = np.flatnonzero(alpha["alpha_1"].isna())
     assert list(alpha["frame" if "frame" in alpha else "row"][missing]) == [
         i + (name == "openface") for i in empty.get(name, [EMPTY])

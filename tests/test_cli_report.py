@@ -13,7 +13,7 @@ pytest.importorskip("matplotlib")
 
 from fit_runs import MODEL  # noqa: E402
 
-from isa_nrsfm import AffineNRSfM  # noqa: E402
+from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
 from isa_nrsfm.cli import main  # noqa: E402
 from isa_nrsfm.cli._choice import (  # noqa: E402
@@ -180,7 +180,7 @@ def test_a_later_run_removes_figures_of_labels(tmp_path, capsys):
     assert main([*arguments, "--label", "mood", "--fps", "25"]) == 0
     assert "Time       seconds: " in capsys.readouterr().out
     assert (tmp_path / "label_1.png").exists()
-    assert main([*arguments, "--no-figures"]) == 0
+    assert main([*arguments, "--no-figures", "--refinement", "none"]) == 0
     assert not (tmp_path / "label_1.png").exists()
     assert "labels" not in report_of(tmp_path)
 
@@ -235,6 +235,7 @@ def test_columns_are_refused_before_the_fit(tmp_path, capsys, options, message):
 def test_groups_are_held_out_together(tmp_path, capsys):
     table_of().to_csv(tmp_path / "table.csv", index=False)
     arguments = ["fit", str(tmp_path / "table.csv"), "-k", "1,2", "--no-figures"]
+    arguments += ["--refinement", "none", "--isa", "fast", "--n-init", "1"]
     assert main([*arguments, "--group", "person", "-o", str(tmp_path / "out")]) == 0
     parts = report_of(tmp_path / "out")["choice"]["held_out_error_of_parts"]
     assert np.shape(parts) == (2, 3)
@@ -243,7 +244,7 @@ def test_groups_are_held_out_together(tmp_path, capsys):
 
 
 X = pd.DataFrame(make_nonrigid_tracks(48, 20, 2, noise=0.01, random_state=0).data)
-ESTIMATOR = AffineNRSfM(refinement=None, random_state=0)
+ESTIMATOR = AffineNRSfM(isa=FastISA(n_init=6), refinement=None, random_state=0)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

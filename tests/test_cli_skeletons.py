@@ -205,11 +205,7 @@ def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, opt
 
 @pytest.mark.parametrize(
     ("points", "kept"),
-    [
-        ("without:0-16", range(17, 68)),
-        ("17-67", range(17, 68)),
-        ("36-47, 30,48-67,30", [30, *range(36, 68)]),
-    ],
+    [("without:0-16", range(17, 68)), ("36-47, 30,48-67,30", [30, *range(36, 68)])],
 )
 def test_points_are_named(run, faces, tmp_path, points, kept):
     fit = ["fit", faces, "-o", tmp_path, "--no-figures", "--points", points, *QUICK]

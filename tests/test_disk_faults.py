@@ -15,7 +15,6 @@ from numpy.testing import assert_array_equal
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import (
     point_distribution_model,
@@ -312,32 +311,6 @@ class TestFit:
         assert code == 1
         assert f"{folder / 'alpha.csv'}: is no plain file" in err
         assert os.listdir(folder) == ["alpha.csv"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("strike", ["disk full", "interrupted before", "killed"])
-@pytest.mark.parametrize("command", ["transform", "export"])
-def test_transform_and_export(capsys, landmarks, old_run, tmp_path, strike, command):
-    name = {"transform": "a.csv", "export": "a.html"}[command]
-    output = tmp_path / "folder" / name
-    table = [str(landmarks)] * (command == "transform")
-    argv = [command, str(old_run / "model.npz"), *table, "-o", str(output)]
-    assert main([*argv[:-1], str(tmp_path / name)]) == 0
-    codes = []
-    for raised, before, operations in every_fault(
-        output.parent,
-        strike,
-        lambda: output.write_bytes(OLD),
-        lambda: codes.append(main(argv)),
-    ):
-        assert raised is None
-        assert strike == "killed" or leftovers(output.parent) == [], operations
-        err = capsys.readouterr().err
-        if codes[-1] == 1:
-            assert err.startswith(f"isa-nrsfm: error: {output}: ")
-        if codes[-1] == 0 or readable(output.parent) != before:
-            assert output.read_bytes() == (tmp_path / name).read_bytes()
-    assert set(codes) == {0, 130 if STRIKES[strike][0] is interrupt else 1}
 
 
 class TestRunsThatAreMixed:

@@ -19,11 +19,8 @@ from isa_nrsfm.plotting import (
     ReprojectionDisplay,
 )
 from isa_nrsfm.plotting._axes import (
-    check_names,
     draw_points,
     percent,
-    row_width,
-    wrap_title,
 )
 from isa_nrsfm.plotting._edges import (
     choose_layout,
@@ -216,11 +213,6 @@ def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
         kind(**DISPLAYS[kind][0]).plot(**arguments)
 
 
-def test_names_are_counted():
-    assert check_names(None, 2) == ["1", "2"]
-    assert check_names(("a", "b"), 2) == ["a", "b"]
-
-
 @pytest.mark.parametrize(
     ("fraction", "text"),
     [
@@ -245,30 +237,6 @@ def test_many_points_are_small_and_rasterized():
     assert not few.get_rasterized()
     assert many.get_rasterized()
     assert many.get_sizes()[0] < few.get_sizes()[0]
-
-
-@pytest.mark.parametrize("layout", [None, "constrained"])
-def test_the_width_of_a_row(layout):
-    figure, axes = plt.subplots(2, 4, width_ratios=[1, 3, 1, 3], layout=layout)
-    figure.set_size_inches(8, 3)
-    for ax in figure.axes:
-        ax.set(xticks=[], yticks=[])
-    pair, alone = row_width(axes[0, :2]), row_width(axes[0, 1:2])
-    assert alone < pair <= 4.0
-    figure.canvas.draw()
-    boxes = [ax.get_position() for ax in axes[0, :2]]
-    assert pair == pytest.approx(8 * (boxes[1].x1 - boxes[0].x0), rel=0.1)
-    # One above the other: the width of the first.
-    assert row_width(axes[::-1, 0]) == pytest.approx(row_width(axes[:1, 0]), rel=0.2)
-
-
-def test_long_titles_are_broken():
-    figure, axes = plt.subplots(1, 2)
-    figure.set_size_inches(2, 2)
-    title = wrap_title("Basis shape 12 (43 % of energy)", axes)
-    assert title == "Basis shape 12\n(43 % of energy)"
-    figure.set_size_inches(7, 2)
-    assert wrap_title("Basis shape 12 (43 %)", axes) == "Basis shape 12 (43 %)"
 
 
 def test_shapes_are_inside_limits_of_one_scale():

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from cameras import affinity, lorentz_cameras, rotations, weak_perspective
+from cameras import affinity, lorentz_cameras, weak_perspective
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -24,15 +24,6 @@ def test_weak_perspective_cameras_give_the_shape_up_to_a_rotation(seed):
     assert_allclose(grams, np.einsum("i,ab->iab", grams[:, 0, 0], np.eye(2)), atol=1e-8)
 
 
-def test_few_cameras_suffice():
-    rng = np.random.default_rng(0)
-    A = affinity(rng)
-    motion = weak_perspective(rng, 3) @ np.linalg.inv(A)
-    from_truth = viewing_transform(motion, motion[0]) @ A
-    scale = np.cbrt(abs(np.linalg.det(from_truth)))
-    assert_allclose(from_truth @ from_truth.T / scale**2, np.eye(3), atol=1e-8)
-
-
 def test_the_front_view_is_the_reference_camera():
     rng = np.random.default_rng(1)
     A = affinity(rng)
@@ -49,16 +40,6 @@ def test_the_scale_is_that_of_the_median_camera():
     motion = weak_perspective(rng, 5, scales)
     T = viewing_transform(motion, motion.mean(axis=0))
     assert_allclose(T @ T.T, 9 * np.eye(3), atol=1e-7)
-
-
-def test_little_depth_is_not_taken_for_none():
-    # Faces that hardly turn: a solution that keeps the norm of Q constant, not the
-    # size of the cameras, would let depth vanish.
-    rng = np.random.default_rng(5)
-    cameras = rotations(rng, 2000, spread=0.1)[:, :2]
-    noise = 0.02 * rng.standard_normal(cameras.shape) * [1, 1, 0.1]
-    T = viewing_transform(cameras + noise, cameras.mean(axis=0))
-    assert_allclose(np.linalg.svd(T, compute_uv=False), 1, atol=0.2)
 
 
 def test_cameras_that_say_nothing_about_depth():
@@ -106,21 +87,3 @@ def test_frames_without_camera_are_left_out():
     )
     with pytest.raises(ValueError, match="none among the 3 cameras"):
         viewing_transform(more[-3:], reference)
-
-
-def test_true_proportions_of_faces(load_data):
-    # Rigid factorisation of images of faces: the affinity is found, not given.
-    data = load_data("ict_bu3dfe_like_68")
-    W = data["W2d"] - data["W2d"].mean(axis=1, keepdims=True)
-    U, s, Vt = np.linalg.svd(
-        W.transpose(0, 2, 1).reshape(-1, W.shape[1]), full_matrices=False
-    )
-    shape = np.sqrt(W.shape[1]) * Vt[:3].T
-    motion = (U[:, :3] * s[:3] / np.sqrt(W.shape[1])).reshape(-1, 2, 3)
-    seen = shape @ viewing_transform(motion, motion.mean(axis=0)).T
-    truth = (data["S3d"] - data["S3d"].mean(axis=1, keepdims=True)).mean(axis=0)
-    assert_allclose(
-        np.linalg.svd(seen, compute_uv=False),
-        np.linalg.svd(truth, compute_uv=False),
-        rtol=0.03,
-    )
