@@ -24,8 +24,8 @@ from isa_nrsfm.plotting._axes import (
 )
 from isa_nrsfm.plotting._edges import (
     choose_layout,
+    choose_lines,
     choose_origin,
-    choose_skeleton,
     upright_turn,
 )
 from isa_nrsfm.plotting._page import (
@@ -292,15 +292,20 @@ BODY = make_body_tracks(n_frames=60, random_state=0).mean_shape
 IBUG, COCO, HAND_21 = map(get_skeleton, ("ibug-68", "coco-17", "hand-21"))
 
 
+def lines_of(edges, shape, names=None):
+    """Return what is drawn of a shape."""
+    return choose_lines(edges, "auto", shape, names)[1]
+
+
 def test_layouts_are_recognised_named_or_given():
-    assert choose_skeleton("auto", FACE) is IBUG
-    assert choose_skeleton("auto", HAND) is HAND_21
-    assert choose_skeleton("auto", BODY) is None
-    assert choose_skeleton("auto", BODY, COCO.point_names) == COCO
-    assert choose_skeleton("coco-17", BODY) is COCO
-    assert choose_skeleton(COCO, BODY) is COCO
-    assert choose_skeleton(None, BODY) is None
-    found = choose_skeleton([(0, 1), (4, 2)], BODY)
+    assert lines_of("auto", FACE) is IBUG
+    assert lines_of("auto", HAND) is HAND_21
+    assert lines_of("auto", BODY) is None
+    assert lines_of("auto", BODY, COCO.point_names) == COCO
+    assert lines_of("coco-17", BODY) is COCO
+    assert lines_of(COCO, BODY) is COCO
+    assert lines_of(None, BODY) is None
+    found = lines_of([(0, 1), (4, 2)], BODY)
     assert_array_equal(found.edges, [[0, 1], [4, 2]])
     assert not found.sides.any()
     # The layout is known whatever is drawn.
@@ -312,9 +317,9 @@ def test_layouts_are_recognised_named_or_given():
 @pytest.mark.parametrize(
     ("edges", "message"),
     [
-        ("tree", "edges must be .* Skeleton or the name of one .*; got 'tree'"),
+        ("tree", "the skeletons are ibug-68, .*; got 'tree'"),
         ("hand-21", "'hand-21' has 21 points, the shape 5"),
-        ([0, 1], r"shape \(n_edges, 2\).* got shape \(2,\)"),
+        ([0, 1], r"shape \(n_pairs, 2\).* got shape \(2,\)"),
         ([[0.0, 1.0]], "must be integers"),
         ([[0, 1, 2]], "got shape"),
         ([[0, 5]], "points 0 to 4; got 0 to 5"),
@@ -323,7 +328,7 @@ def test_layouts_are_recognised_named_or_given():
 )
 def test_bad_edges(edges, message):
     with pytest.raises(ValueError, match=message):
-        choose_skeleton(edges, np.zeros((5, 3)))
+        lines_of(edges, np.zeros((5, 3)))
 
 
 @pytest.mark.parametrize(
@@ -347,5 +352,5 @@ def test_layouts_determine_which_way_is_up(shape, layout):
         assert_allclose(turned, expected, atol=1e-9 * np.abs(shape).max())
         below, above = turned[np.array(layout.up), 1].mean(axis=0)
         assert (above < below) == (origin == "upper")
-    for unknown in (None, choose_skeleton([[0, 1]], shape)):
+    for unknown in (None, lines_of([[0, 1]], shape)):
         assert_array_equal(upright_turn(shape, unknown, "upper"), np.eye(3))

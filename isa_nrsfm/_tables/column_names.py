@@ -119,3 +119,13 @@ def names_of_points(model: Any) -> tuple[str, ...]:
         return tuple(map(str, range(n_points)))
     names = [str(name).strip() for name in columns]
     return point_names(names[:n_points] if model.layout == "planar" else names[::2])
+
+
+def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
+    """Return names as text; None means the default ones, and there must be as many."""
+    names = [str(name) for name in (default if names is None else names)]
+    if len(names) != len(default):
+        raise ValueError(
+            f"{parameter} must hold {len(default)} names; got {len(names)}"
+        )
+    return names

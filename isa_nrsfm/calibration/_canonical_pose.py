@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 
-from isa_nrsfm.skeletons import SKELETONS, Skeleton
+from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
 
 
 class CanonicalPose(NamedTuple):
@@ -201,30 +202,15 @@ def _direction(name: str, points: NDArray, given: ArrayLike) -> NDArray:
 
 def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:
     """Return the differences (n_pairs, 3) of the points of pairs."""
-    index = np.asarray(pairs)
-    if index.ndim != 2 or index.shape[1] != 2 or index.dtype.kind not in "iu":
-        raise ValueError(
-            f"{name} must be integers of shape (n_pairs, 2), two points a pair; got "
-            f"shape {index.shape} and dtype {index.dtype}"
-        )
-    if not index.size or index.min() < 0 or index.max() >= len(points):
-        found = f"{index.min()} to {index.max()}" if index.size else "none"
-        raise ValueError(f"{name} must name points 0 to {len(points) - 1}; got {found}")
+    index = checked_links(name, pairs, len(points))
+    if not index.size:
+        raise ValueError(f"{name} must name a pair of points; got none")
     return points[index[:, 1]] - points[index[:, 0]]
 
 
 def _scheme_pairs(scheme: Any, n_points: int) -> dict[str, Any]:
     """Return the pairs of points of a layout, None if undefined."""
-    if isinstance(scheme, str):
-        if scheme not in SKELETONS:
-            raise ValueError(f"scheme must be one of {(*SKELETONS,)}; got {scheme!r}")
-        scheme = SKELETONS[scheme]
-    if not isinstance(scheme, Skeleton):
-        raise ValueError(f"scheme must be a Skeleton or its name; got {scheme!r}")
-    if scheme.n_points != n_points:
-        raise ValueError(
-            f"scheme={scheme.name!r} needs {scheme.n_points} points; got {n_points}"
-        )
+    scheme = checked_skeleton(scheme, n_points)
     if not scheme.up:
         raise ValueError(f"scheme={scheme.name!r} does not define which way is up")
     pairs = {

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from isa_nrsfm.plotting._edges import checked_links
 from isa_nrsfm.skeletons import Skeleton
+from isa_nrsfm.skeletons._recognition import checked_links
 from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
 # "auto" or the name of a layout, the layout, pairs of points, or triangles.
@@ -43,7 +43,7 @@ def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawin
     if edges is None:
         return Drawing(links, sides)
     if not isinstance(edges, str | Skeleton):
-        links = checked_links(edges, n_points, triangles=True)
+        links = checked_links("edges", edges, n_points, triangles=True)
     elif layout is not None:
         links = layout.edges
     return Drawing(links, sides if layout is None else layout.sides)

@@ -7,18 +7,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from isa_nrsfm._tables.column_names import checked_names
+
 
 def names_of_components(names: Any, n_components: int) -> list[str]:
     """Return the names of the coefficients, by default alpha_1, alpha_2, ..."""
-    if names is None:
-        return [f"alpha_{k + 1}" for k in range(n_components)]
-    names = [str(name) for name in names]
-    if len(names) != n_components:
-        raise ValueError(
-            f"names must hold {n_components} names, one for each basis shape; got "
-            f"{len(names)}"
-        )
-    return names
+    default = [f"alpha_{k + 1}" for k in range(n_components)]
+    return checked_names("names", names, default)
 
 
 def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:

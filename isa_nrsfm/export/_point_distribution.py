@@ -10,8 +10,10 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
+from sklearn.decomposition import PCA
 
 from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm._compat.whole_files import whole_file, write_whole
 from isa_nrsfm._frames.projection import compose
@@ -69,6 +71,15 @@ class PointDistributionModel(NamedTuple):
         )
 
 
+@checked_parameters(
+    {
+        "n_modes": [
+            Interval(Integral, 1, None, closed="left"),
+            Interval(Real, 0, 1, closed="neither"),
+            None,
+        ]
+    }
+)
 def point_distribution_model(
     model: Any,
     *,
@@ -144,7 +155,6 @@ def point_distribution_model(
     >>> pdm.mean.shape, pdm.modes.shape, pdm.eigenvalues.shape
     ((68, 3), (2, 68, 3), (2,))
     """
-    _check_n_modes(n_modes)
     space = upright_space(model, camera, origin, mirrored)
     if space.camera is None:
         shapes = compose(model.mean_shape_, model.basis_, model.alpha_)
@@ -324,19 +334,6 @@ def _read_matrices(path: str | os.PathLike[str]) -> list[NDArray]:
     return matrices
 
 
-def _check_n_modes(n_modes: Any) -> None:
-    """Raise unless this is None, a number of modes or a share of the variance."""
-    if n_modes is None:
-        return
-    whole = isinstance(n_modes, Integral) and not isinstance(n_modes, bool)
-    share = isinstance(n_modes, Real) and not isinstance(n_modes, Integral)
-    if not (whole and n_modes >= 1) and not (share and 0 < n_modes < 1):
-        raise ValueError(
-            "n_modes must be None, a whole number of at least 1 or a share between 0 "
-            f"and 1; got {n_modes!r}"
-        )
-
-
 def _number_of_modes(n_modes: Any, n_components: int, variances: NDArray) -> int:
     """Return how many of the principal axes are wanted."""
     n_axes = len(variances)
@@ -375,15 +372,8 @@ def _aligned(shapes: NDArray) -> NDArray:
 def _principal_axes(rows: NDArray) -> tuple[NDArray, NDArray]:
     """Return orthonormal principal axes of centred rows and the variances on them."""
     wide = len(rows) < rows.shape[1]
-    gram = rows @ rows.T if wide else rows.T @ rows
-    energies, vectors = np.linalg.eigh(gram)
+    pca = PCA(svd_solver="full" if wide else "covariance_eigh").fit(rows)
+    variances = pca.explained_variance_ * (1 - 1 / len(rows))
     # Axes with a smaller share of the largest variance are rounding errors.
-    large = energies > 1e-10 * max(energies[-1], 0.0)
-    energies, vectors = energies[large][::-1], vectors[:, large][:, ::-1]
-    if wide:
-        # The products are orthogonal up to the rounding errors of the Gram matrix.
-        vectors = np.linalg.qr(rows.T @ vectors)[0]
-    axes = vectors.T
-    largest = np.abs(axes).argmax(axis=1, keepdims=True)
-    axes = axes * np.sign(np.take_along_axis(axes, largest, axis=1))
-    return axes, energies / len(rows)
+    large = variances > 1e-10 * variances[0]
+    return pca.components_[large], variances[large]

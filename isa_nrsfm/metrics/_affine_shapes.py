@@ -1,9 +1,9 @@
 """Measures of shapes up to an affinity of space, which images leave undetermined."""
 
-from typing import Literal, overload
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from isa_nrsfm.metrics._alignment import (
     best_affinity,
@@ -80,30 +80,6 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     return float(np.mean(np.linalg.norm(residuals, axis=(1, 2))))
 
 
-@overload
-def basis_similarity(
-    basis_true: ArrayLike,
-    basis: ArrayLike,
-    *,
-    mean_shape_true: ArrayLike | None = ...,
-    mean_shape: ArrayLike | None = ...,
-    modulo_mean_shape: bool = ...,
-    return_matching: Literal[False] = ...,
-) -> NDArray[np.float64]: ...
-
-
-@overload
-def basis_similarity(
-    basis_true: ArrayLike,
-    basis: ArrayLike,
-    *,
-    mean_shape_true: ArrayLike | None = ...,
-    mean_shape: ArrayLike | None = ...,
-    modulo_mean_shape: bool = ...,
-    return_matching: Literal[True],
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]: ...
-
-
 def basis_similarity(
     basis_true: ArrayLike,
     basis: ArrayLike,
@@ -112,7 +88,7 @@ def basis_similarity(
     mean_shape: ArrayLike | None = None,
     modulo_mean_shape: bool = False,
     return_matching: bool = False,
-) -> NDArray[np.float64] | tuple[NDArray[np.float64], NDArray[np.intp]]:
+) -> Any:
     r"""
     Match basis shapes with the true ones and measure how similar they are.
 

@@ -24,19 +24,6 @@ def check_axes(ax: Any, n_axes: int, content: str) -> NDArray:
     return axes
 
 
-def check_names(names: Any, n_components: int) -> list[str]:
-    """Return one name a basis shape, by default the numbers from 1."""
-    if names is None:
-        return [str(k + 1) for k in range(n_components)]
-    names = [str(name) for name in names]
-    if len(names) != n_components:
-        raise ValueError(
-            f"component_names must hold {n_components} names, one for each basis "
-            f"shape; got {len(names)}"
-        )
-    return names
-
-
 def hide_frame(ax: Any) -> None:
     """Remove ticks and frame, but keep title and labels."""
     ax.set(xticks=[], yticks=[])

@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm.plotting._axes import (
     MEAN_COLOUR,
     MINUS_COLOUR,
     PLUS_COLOUR,
     check_axes,
-    check_names,
     draw_points,
     draw_segments,
     hide_frame,
@@ -24,14 +24,7 @@ from isa_nrsfm.plotting._axes import (
     side_entries,
     wrap_title,
 )
-from isa_nrsfm.plotting._edges import (
-    Edges,
-    Origin,
-    choose_layout,
-    choose_origin,
-    choose_skeleton,
-    upright_turn,
-)
+from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines, upright_turn
 from isa_nrsfm.plotting._page import (
     VIEWS,
     add_legend,
@@ -180,11 +173,11 @@ class BasisShapeDisplay:
                     f"energy_share must hold {n_components} numbers, one a basis "
                     f"shape; got shape {self.energy_share.shape}"
                 )
-        self.component_names = check_names(component_names, n_components)
-        layout = choose_layout(edges, self.mean_shape)
-        self.skeleton = choose_skeleton(edges, self.mean_shape)
+        self.component_names = checked_names(
+            "component_names", component_names, range(1, n_components + 1)
+        )
+        _, self.skeleton, self.origin = choose_lines(edges, origin, self.mean_shape)
         self.edges = None if self.skeleton is None else self.skeleton.edges
-        self.origin = choose_origin(origin, self.mean_shape, layout)
 
     @classmethod
     def from_estimator(

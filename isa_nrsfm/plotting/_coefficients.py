@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm._tables.frame_columns import checked_column
 from isa_nrsfm.analysis._labels import kind_of
 from isa_nrsfm.plotting._axes import (
     MINUS_COLOUR,
     OBSERVED_COLOUR,
     check_axes,
-    check_names,
 )
 from isa_nrsfm.plotting._page import PAGE_WIDTH, grid
 
@@ -111,7 +111,9 @@ class CoefficientsDisplay:
             for name, values in (("y", y), ("time", time), ("groups", groups))
         )
         self.label = "label" if label is None else label
-        self.component_names = check_names(component_names, n_components)
+        self.component_names = checked_names(
+            "component_names", component_names, range(1, n_components + 1)
+        )
 
     @classmethod
     def from_estimator(

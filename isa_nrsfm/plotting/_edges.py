@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm.calibration import canonical_pose
-from isa_nrsfm.skeletons import SKELETONS, Skeleton, find_skeleton
+from isa_nrsfm.skeletons import Skeleton, find_skeleton
+from isa_nrsfm.skeletons._recognition import checked_links, checked_skeleton
 
 # A name of a layout or "auto", the layout itself, or pairs of points.
 Edges = ArrayLike | Skeleton | str | None
@@ -15,55 +16,29 @@ Origin = Literal["auto", "upper", "lower"]
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 
-def choose_skeleton(
-    edges: Edges, shape: NDArray, names: tuple[str, ...] | None = None
-) -> Skeleton | None:
-    """Return the lines to draw of a shape (n_points, 2 or 3), None for only points."""
-    if edges is None or isinstance(edges, str | Skeleton):
-        return None if edges is None else choose_layout(edges, shape, names)
-    pairs = checked_links(edges, len(shape)).tolist()
-    return Skeleton("edges", "other", len(shape), tuple(map(tuple, pairs)), "the user")
+def choose_lines(
+    edges: Edges, origin: Origin, shape: NDArray, names: tuple[str, ...] | None = None
+) -> tuple[Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
+    """Return layout, lines to draw and origin of a shape (n_points, 2 or 3).
+
+    Without lines only the points are drawn.
+    """
+    layout = choose_layout(edges, shape, names)
+    lines = None if edges is None else layout
+    if edges is not None and not isinstance(edges, str | Skeleton):
+        pairs = checked_links("edges", edges, len(shape)).tolist()
+        curves = tuple(map(tuple, pairs))
+        lines = Skeleton("edges", "other", len(shape), curves, "the user")
+    return layout, lines, choose_origin(origin, shape, layout)
 
 
 def choose_layout(
     edges: Any, shape: NDArray, names: tuple[str, ...] | None = None
 ) -> Skeleton | None:
     """Return the layout of points that `edges` is or names, or that is recognised."""
-    if isinstance(edges, str) and edges != "auto":
-        if edges not in SKELETONS:
-            raise ValueError(
-                f'edges must be "auto", None, an array of pairs of points, a Skeleton '
-                f"or the name of one ({', '.join(SKELETONS)}); got {edges!r}"
-            )
-        edges = SKELETONS[edges]
-    if not isinstance(edges, Skeleton):
-        return find_skeleton(len(shape), names, shape=shape)
-    if edges.n_points != len(shape):
-        raise ValueError(
-            f"the skeleton {edges.name!r} has {edges.n_points} points, the shape "
-            f"{len(shape)}"
-        )
-    return edges
-
-
-def checked_links(
-    edges: Any, n_points: int, *, triangles: bool = False
-) -> NDArray[np.intp]:
-    """Return pairs of points, or triangles if these are allowed, or raise."""
-    links = np.asarray(edges)
-    widths = (2, 3) if triangles else (2,)
-    if links.ndim != 2 or links.shape[1] not in widths or links.dtype.kind not in "iu":
-        other = ", or (n_triangles, 3)" * triangles
-        raise ValueError(
-            "edges must be integers of shape (n_edges, 2), a pair of points per "
-            f"edge{other}; got shape {links.shape} and dtype {links.dtype}"
-        )
-    if links.size and (links.min() < 0 or links.max() >= n_points):
-        raise ValueError(
-            f"edges must name points 0 to {n_points - 1}; "
-            f"got {links.min()} to {links.max()}"
-        )
-    return links.astype(np.intp)
+    if isinstance(edges, Skeleton) or (isinstance(edges, str) and edges != "auto"):
+        return checked_skeleton(edges, len(shape))
+    return find_skeleton(len(shape), names, shape=shape)
 
 
 def choose_origin(

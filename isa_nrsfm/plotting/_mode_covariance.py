@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm.plotting._axes import check_axes, check_names
+from isa_nrsfm._tables.column_names import checked_names
+from isa_nrsfm.plotting._axes import check_axes
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, where colours cease to be linear
@@ -98,7 +99,9 @@ class ModeCovarianceDisplay:
                 f"shape; got shape {matrix.shape}"
             )
         self.mode_covariance = matrix
-        self.component_names = check_names(component_names, n_modes // BLOCK)
+        self.component_names = checked_names(
+            "component_names", component_names, range(1, n_modes // BLOCK + 1)
+        )
 
     @property
     def off_block_share(self) -> float:

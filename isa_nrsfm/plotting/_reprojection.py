@@ -11,6 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
+from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm.metrics import inverse_snr
@@ -26,13 +27,7 @@ from isa_nrsfm.plotting._axes import (
     side_colours,
     side_entries,
 )
-from isa_nrsfm.plotting._edges import (
-    Edges,
-    Origin,
-    choose_layout,
-    choose_origin,
-    choose_skeleton,
-)
+from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines
 from isa_nrsfm.plotting._page import LEGEND_HEIGHT, add_legend, chosen_numbers, grid
 from isa_nrsfm.plotting._views import view_and_layout
 
@@ -161,19 +156,10 @@ class ReprojectionDisplay:
             raise ValueError(
                 f"frames must name the {shape[0]} frames; got shape {self.frames.shape}"
             )
-        self.frame_names = list(map(str, self.frames))
-        if frame_names is not None:
-            self.frame_names = list(frame_names)
-            if len(self.frame_names) != len(self.frames):
-                raise ValueError(
-                    f"frame_names must hold {len(self.frames)} names, one a frame; "
-                    f"got {len(self.frame_names)}"
-                )
+        self.frame_names = checked_names("frame_names", frame_names, self.frames)
         first = self.reprojected[0]
-        self.skeleton = choose_skeleton(edges, first)
+        _, self.skeleton, self.origin = choose_lines(edges, origin, first)
         self.edges = None if self.skeleton is None else self.skeleton.edges
-        layout = choose_layout(edges, first, None) if origin == "auto" else None
-        self.origin = choose_origin(origin, first, layout)
         self.inverse_snr = np.array(
             [
                 inverse_snr(tracks_to_table(seen[None]), tracks_to_table(fitted[None]))

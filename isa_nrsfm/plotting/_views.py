@@ -18,12 +18,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
     unit_cameras,
 )
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.plotting._edges import (
-    Origin,
-    choose_layout,
-    choose_origin,
-    choose_skeleton,
-)
+from isa_nrsfm.plotting._edges import Origin, choose_lines
 from isa_nrsfm.skeletons import Skeleton
 
 
@@ -61,9 +56,7 @@ def view_and_layout(
     """Return the view of a fitted model, its layout, the lines to draw, the origin."""
     view = view_of(estimator)
     shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
-    layout = choose_layout(edges, shape, names)
-    skeleton = choose_skeleton(edges, shape, names)
-    return view, layout, skeleton, choose_origin(origin, shape, layout)
+    return view, *choose_lines(edges, origin, shape, names)
 
 
 def euclidean_axes(estimator: Any) -> NDArray:

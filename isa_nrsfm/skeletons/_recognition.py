@@ -76,9 +76,40 @@ def get_skeleton(name: str) -> Skeleton:
     >>> get_skeleton("hand-21").point_names[:3]
     ('wrist', 'thumb_cmc', 'thumb_mcp')
     """
-    if name not in SKELETONS:
+    if not isinstance(name, str) or name not in SKELETONS:
         raise ValueError(f"the skeletons are {', '.join(SKELETONS)}; got {name!r}")
     return SKELETONS[name]
+
+
+def checked_skeleton(given: Any, n_points: int) -> Skeleton:
+    """Return a layout that is given itself or by name, of so many points, or raise."""
+    skeleton = given if isinstance(given, Skeleton) else get_skeleton(given)
+    if skeleton.n_points != n_points:
+        raise ValueError(
+            f"the skeleton {skeleton.name!r} has {skeleton.n_points} points, the shape "
+            f"{n_points}"
+        )
+    return skeleton
+
+
+def checked_links(
+    name: str, links: Any, n_points: int, *, triangles: bool = False
+) -> NDArray[np.intp]:
+    """Return pairs of points, or triangles if these are allowed, or raise."""
+    found = np.asarray(links)
+    widths = (2, 3) if triangles else (2,)
+    if found.ndim != 2 or found.shape[1] not in widths or found.dtype.kind not in "iu":
+        other = " or (n_triangles, 3)" * triangles
+        raise ValueError(
+            f"{name} must be integers of shape (n_pairs, 2){other}, the numbers of "
+            f"points; got shape {found.shape} and dtype {found.dtype}"
+        )
+    if found.size and (found.min() < 0 or found.max() >= n_points):
+        raise ValueError(
+            f"{name} must name points 0 to {n_points - 1}; got {found.min()} to "
+            f"{found.max()}"
+        )
+    return found.astype(np.intp)
 
 
 def find_skeleton(
