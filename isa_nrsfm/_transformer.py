@@ -21,7 +21,7 @@ from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
-from isa_nrsfm._metric_upgrade.refinement import CAMERA_MODELS
+from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.layout import Layout, tracks_to_table
 from isa_nrsfm._tables.sources import (

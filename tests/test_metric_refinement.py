@@ -8,10 +8,13 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.vectors import frames_last
-from isa_nrsfm._metric_upgrade.quadric import metric_quadric
+from isa_nrsfm._metric_upgrade.quadric import (
+    CAMERA_MODELS,
+    metric_quadric,
+    strain_basis,
+)
 from isa_nrsfm._metric_upgrade.refinement import (
     BLOCK_FRAMES,
-    CAMERA_MODELS,
     STRETCH_OF_START,
     _linearised,
     _normal_equations,
@@ -20,7 +23,6 @@ from isa_nrsfm._metric_upgrade.refinement import (
     orthonormality,
     refine_metric,
     safe_start,
-    strain_basis,
 )
 
 both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)

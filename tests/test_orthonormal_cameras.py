@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-    NOISE_PRICE,
     _linearised,
-    orthonormal_cameras,
     orthonormal_mixture,
     orthonormality_residuals,
     principal_columns,
 )
 from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
+from isa_nrsfm.calibration import orthonormal_cameras
+from isa_nrsfm.calibration._orthonormal_cameras import NOISE_PRICE
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 N_COMPONENTS = 2

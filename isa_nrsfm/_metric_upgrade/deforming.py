@@ -7,13 +7,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import polar
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera, strain_basis
 from isa_nrsfm._metric_upgrade.refinement import (
-    CameraModel,
     MetricFit,
     exponential,
     fit_at,
     refine_metric,
-    strain_basis,
 )
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
@@ -250,7 +249,7 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
 
     Starts without strains. Usable cameras are (I, 2, 3), coefficients (I, K).
     """
-    camera: CameraModel = "weak_perspective"
+    camera: CalibratedCamera = "weak_perspective"
     size = len(strain_basis(camera))
     n_equations = 2 * len(cameras)
     noise = max(rigid.cost / n_equations, OF_DIFFERENCES**2)

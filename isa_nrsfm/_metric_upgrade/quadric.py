@@ -8,6 +8,8 @@ Poelman, Kanade, "A paraperspective factorization method for shape and motion re
 Q is known up to a rotation.
 """
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,9 +19,8 @@ from isa_nrsfm._linalg.rounding import OF_RANKS
 # where the cameras hardly show the depth, which noise then stretches without limit.
 LARGEST_STRETCH = 20.0
 
-# The six unknowns of a symmetric 3x3 matrix are its diagonal, and sqrt(2) times the
-# entries above it. Their norm is the Frobenius norm of the matrix.
-_ROWS, _COLUMNS = [0, 0, 1], [1, 2, 2]
+CalibratedCamera = Literal["orthographic", "weak_perspective"]
+CAMERA_MODELS = ("orthographic", "weak_perspective")
 
 
 def unit_cameras(motion: NDArray) -> NDArray:
@@ -46,29 +47,30 @@ def symmetric_power(matrix: NDArray, power: float) -> NDArray:
     return (vectors * np.maximum(eigenvalues, 0) ** power) @ vectors.T
 
 
+def strain_basis(camera: CalibratedCamera) -> NDArray:
+    """Return an orthonormal basis of the strains that change the residuals.
+
+    Six symmetric matrices for orthographic cameras, five without trace for
+    weak-perspective ones: the trace only changes the scales of the frames.
+    """
+    basis = np.zeros((6, 3, 3))
+    diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
+    basis[[[0], [1], [5]], [0, 1, 2], [0, 1, 2]] = diagonal
+    first, second = [0, 0, 1], [1, 2, 2]
+    basis[[2, 3, 4], first, second] = basis[[2, 3, 4], second, first] = np.sqrt(0.5)
+    return basis if camera == "orthographic" else basis[:5]
+
+
 def conformal_equations(cameras: NDArray) -> NDArray:
     """Return the linear equations of weak-perspective cameras for the metric of space.
 
     For cameras (I, 2, 3) with rows m1 and m2 these are the coefficients (2 I, 6) of
-    ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the unknowns of G, see
-    `symmetric_matrix`. Roll of a frame turns the two into each other.
+    ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the coordinates of G in
+    `strain_basis`. Roll of a frame turns the two into each other.
     """
-    m1, m2 = np.moveaxis(cameras, 1, 0)
-    alike = _quadratic_terms(m1, m1) - _quadratic_terms(m2, m2)
-    return np.vstack([alike, 2 * _quadratic_terms(m1, m2)])
-
-
-def _quadratic_terms(a: NDArray, b: NDArray) -> NDArray:
-    """Return the coefficients of a G b^T in the six unknowns of G, one row a pair."""
-    mixed = a[:, _ROWS] * b[:, _COLUMNS] + a[:, _COLUMNS] * b[:, _ROWS]
-    return np.hstack([a * b, mixed / np.sqrt(2)])
-
-
-def symmetric_matrix(unknowns: NDArray) -> NDArray:
-    """Return the symmetric 3x3 matrix of six unknowns."""
-    matrix = np.diag(unknowns[:3])
-    matrix[_ROWS, _COLUMNS] = matrix[_COLUMNS, _ROWS] = unknowns[3:] / np.sqrt(2)
-    return matrix
+    basis = strain_basis("orthographic")
+    (xx, xy), (_, yy) = np.einsum("ira,nab,isb->rsin", cameras, basis, cameras)
+    return np.vstack([xx - yy, 2 * xy])
 
 
 def metric_quadric(motion: NDArray) -> NDArray | None:
@@ -88,14 +90,13 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     # is the trace of G. So G is I / 3 plus a matrix without trace, of five unknowns.
     whitening = symmetric_power(gram, -0.5)
     equations = conformal_equations(cameras @ whitening)
-    trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-    traceless = np.linalg.svd(trace[None])[2][1:].T
     unknowns, _, _, singular_values = np.linalg.lstsq(
-        equations @ traceless, -equations @ trace / 3
+        equations[:, :5], -equations[:, 5] / np.sqrt(3)
     )
     if len(singular_values) < 5 or singular_values[-1] <= 1e-6 * singular_values[0]:
         return None
-    G = whitening @ symmetric_matrix(trace / 3 + traceless @ unknowns) @ whitening
+    G = np.tensordot(unknowns, strain_basis("weak_perspective"), 1) + np.eye(3) / 3
+    G = whitening @ G @ whitening
     # Eigenvalues of G are squares of the stretches of space.
     eigenvalues = np.linalg.eigvalsh(G)
     return G if eigenvalues[0] * LARGEST_STRETCH**2 > eigenvalues[-1] else None

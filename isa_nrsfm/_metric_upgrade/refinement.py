@@ -17,17 +17,20 @@ only the sums ``J^T J`` and ``J^T r`` over the frames are formed.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
 from isa_nrsfm._linalg.vectors import frames_last
-from isa_nrsfm._metric_upgrade.quadric import mean_gram, symmetric_power, unit_cameras
-
-CameraModel = Literal["orthographic", "weak_perspective"]
-CAMERA_MODELS = ("orthographic", "weak_perspective")
+from isa_nrsfm._metric_upgrade.quadric import (
+    CalibratedCamera,
+    mean_gram,
+    strain_basis,
+    symmetric_power,
+    unit_cameras,
+)
 
 # Frames taken at a time, for which all that a step needs stays in the cache.
 BLOCK_FRAMES = 2048
@@ -70,21 +73,7 @@ class MetricFit(NamedTuple):
         return float(np.sqrt(values[-1] / values[0]))
 
 
-def strain_basis(camera: CameraModel) -> NDArray:
-    """Return an orthonormal basis of the strains that change the residuals.
-
-    Six symmetric matrices for orthographic cameras, five without trace for
-    weak-perspective ones: the trace only changes the scales of the frames.
-    """
-    basis = np.zeros((6, 3, 3))
-    diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
-    basis[[[0], [1], [5]], [0, 1, 2], [0, 1, 2]] = diagonal
-    first, second = [0, 0, 1], [1, 2, 2]
-    basis[[2, 3, 4], first, second] = basis[[2, 3, 4], second, first] = np.sqrt(0.5)
-    return basis if camera == "orthographic" else basis[:5]
-
-
-def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
+def orthonormality(gram: NDArray, camera: CalibratedCamera) -> NDArray:
     """Return residuals (n, n_frames) of the products ``M_i G M_i^T`` (2, 2, n_frames).
 
     For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i G
@@ -98,7 +87,7 @@ def orthonormality(gram: NDArray, camera: CameraModel) -> NDArray:
     return entries / (gram[0, 0] + gram[1, 1])
 
 
-def _patterns(camera: CameraModel) -> NDArray:
+def _patterns(camera: CalibratedCamera) -> NDArray:
     """Return symmetric F_c (n, 2, 2): raw residuals ``<F_c, M_i G M_i^T>``."""
     if camera == "orthographic":
         across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
@@ -107,7 +96,11 @@ def _patterns(camera: CameraModel) -> NDArray:
 
 
 def fit_at(
-    motion: NDArray, alpha: NDArray, Q: NDArray, strain: NDArray, camera: CameraModel
+    motion: NDArray,
+    alpha: NDArray,
+    Q: NDArray,
+    strain: NDArray,
+    camera: CalibratedCamera,
 ) -> MetricFit:
     """Evaluate a metric for cameras (I, 2, 3) and strain coefficients (I, K)."""
     parts = []
@@ -122,7 +115,7 @@ def fit_at(
 
 
 def _linearised(
-    MQ: NDArray, strain: NDArray, alpha: NDArray, camera: CameraModel
+    MQ: NDArray, strain: NDArray, alpha: NDArray, camera: CalibratedCamera
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return residuals (n, I) of cameras ``M_i Q`` (2, 3, I), and two derivatives.
 
@@ -232,7 +225,7 @@ def levenberg_marquardt(
     return state, cost
 
 
-def safe_start(motion: NDArray, G: NDArray, camera: CameraModel) -> NDArray:
+def safe_start(motion: NDArray, G: NDArray, camera: CalibratedCamera) -> NDArray:
     """Return Q of a positive definite metric near to a symmetric G, to start from.
 
     Where the mean of ``M_i^T M_i`` is the identity, it has the axes of G, and stretches
@@ -251,7 +244,7 @@ def refine_metric(
     motion: NDArray,
     alpha: NDArray,
     start: MetricFit,
-    camera: CameraModel,
+    camera: CalibratedCamera,
     ridge: float = 0.0,
     shortest_step: float = 1e-9,
 ) -> MetricFit:

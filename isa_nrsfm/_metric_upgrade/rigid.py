@@ -1,7 +1,5 @@
 """Metric upgrade: the affinity of space that makes affine cameras Euclidean ones."""
 
-from typing import NamedTuple, Self
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
@@ -10,13 +8,12 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import (
+    CalibratedCamera,
     mean_gram,
     metric_quadric,
     unit_cameras,
 )
 from isa_nrsfm._metric_upgrade.refinement import (
-    CAMERA_MODELS,
-    CameraModel,
     MetricFit,
     fit_at,
     refine_metric,
@@ -26,194 +23,6 @@ from isa_nrsfm._metric_upgrade.refinement import (
 # Above this condition number the cameras hardly determine the metric. Rotations by
 # about five degrees have it.
 LARGEST_CONDITION = 50.0
-
-
-class MetricUpgrade(NamedTuple):
-    """
-    The upgrade of affine cameras to orthographic or weak-perspective ones.
-
-    Attributes
-    ----------
-    Q : ndarray of shape (3, 3)
-        ``motion_i @ Q`` is nearly ``scales_i * rotations_i[:2]``. Symmetric and
-        positive definite: of all matrices ``Q O`` with O orthogonal, which fit as well,
-        the one that leaves the coordinate axes as near as possible to where they are,
-        and does not change the handedness of the space. The root mean square of the
-        scales is one, so that Euclidean shapes are in units of the images.
-    rotations : ndarray of shape (n_frames, 3, 3)
-        Rotations, of determinant one: the rows are the axes of the image, x, y and z.
-        NaN for frames without camera.
-    scales : ndarray of shape (n_frames,)
-        Scales of the cameras, not negative; all equal to one for orthographic cameras.
-        NaN for frames without camera.
-    residual : float
-        Deviation from Euclidean cameras, zero for perfect ones. For weak-perspective
-        cameras it is the root mean square over the frames of ``(s1^2 - s2^2) / (s1^2 +
-        s2^2)``, with the singular values s1 and s2 of ``motion_i @ Q``. For
-        orthographic ones it is that of ``||M_i Q Q^T M_i^T - I||_F``.
-    condition_number : float
-        Largest over smallest amplification of errors of the cameras, over the
-        directions of space. It is about one for cameras all round the object, 2.5 for a
-        full turn about an axis in the image, 4 for rotations of about 20 degrees, 14
-        for 10, and 54 for 5. It is about twice as large for rotations about one axis,
-        and infinite if Q is not determined, as for rotations about the viewing
-        direction alone.
-    """
-
-    Q: NDArray
-    rotations: NDArray
-    scales: NDArray
-    residual: float
-    condition_number: float
-
-    def mirrored(self) -> Self:
-        """
-        Return the other upgrade, which fits as well: that to the mirror image.
-
-        Returns
-        -------
-        MetricUpgrade
-            With ``Q @ diag(1, 1, -1)``; Euclidean shapes become their mirror images
-            with the opposite sign of z, and rotations ``D R D`` with ``D = diag(1, 1,
-            -1)``.
-        """
-        depth = np.array([1.0, 1.0, -1.0])
-        rotations = depth[:, None] * self.rotations * depth
-        return self._replace(Q=self.Q * depth, rotations=rotations)
-
-
-def metric_upgrade(
-    motion: ArrayLike, camera: CameraModel = "weak_perspective"
-) -> MetricUpgrade:
-    """
-    Find the coordinates of space in which affine cameras are Euclidean ones.
-
-    The 3x3 matrix Q makes ``M_i Q`` as nearly as possible ``s_i R_i``, the first two
-    rows of a rotation times a scale.
-
-    Parameters
-    ----------
-    motion : array-like of shape (n_frames, 2, 3)
-        Affine cameras, such as `AffineNRSfM.motion_`. Those that are zero or NaN are
-        left out.
-    camera : {"weak_perspective", "orthographic"}, default="weak_perspective"
-        Whether each camera has a scale of its own or all have the same. Only cameras of
-        a rigid shape can have a common scale: for a shape that deforms, scales are a
-        matter of convention.
-
-    Returns
-    -------
-    MetricUpgrade
-        Named tuple of Q, rotations, scales, residual and condition_number. Q and ``Q @
-        diag(1, 1, -1)`` fit the cameras equally well. The returned Q has a positive
-        determinant; `MetricUpgrade.mirrored` returns the other one.
-
-    Raises
-    ------
-    ValueError
-        If `motion` is not of the shape above, has infinite entries, if `camera` is
-        none of the two, or if the cameras together see less than three directions of
-        space.
-
-    Warns
-    -----
-    UserWarning
-        If the condition number is above 50: the cameras turn too little, or there are
-        too few, to say how deep the object is.
-
-    See Also
-    --------
-    euclidean_shapes : Take shapes to the new coordinates.
-    deformation_metric : The same for a shape that deforms.
-
-    Notes
-    -----
-    ``G = Q Q^T`` solves ``M_i G M_i^T = s_i^2 I``, equations that are linear in G
-    (Tomasi, Kanade 1992; Poelman, Kanade 1997). If there is no exact solution, that of
-    least squares minimises an algebraic error, and may not be positive definite. It is
-    only a start for the minimisation of the sum of squares of `residual` over positive
-    definite matrices. A second start is the metric in which the cameras see all
-    directions alike. The better of the two results is taken.
-
-    References
-    ----------
-    C. Tomasi, T. Kanade, "Shape and motion from image streams under orthography: a
-    factorization method", International Journal of Computer Vision 9, 1992.
-
-    C. Poelman, T. Kanade, "A paraperspective factorization method for shape and motion
-    recovery", IEEE Transactions on Pattern Analysis and Machine Intelligence 19, 1997.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from isa_nrsfm.calibration import euclidean_shapes, metric_upgrade
-    >>> from isa_nrsfm.datasets import make_face_tracks
-    >>> faces = make_face_tracks(n_frames=50, random_state=0)
-    >>> affinity = np.array([[1.0, 0.5, 0.0], [0.0, 2.0, 0.0], [0.3, 0.0, 0.4]])
-    >>> upgrade = metric_upgrade(faces.motion @ affinity)
-    >>> upgrade.residual < 1e-10, round(upgrade.condition_number, 1)
-    (True, 3.8)
-
-    The face has true proportions again: distances between its points are those of the
-    truth up to one factor.
-
-    >>> affine = faces.mean_shape @ np.linalg.inv(affinity).T
-    >>> shape = euclidean_shapes(affine, upgrade.Q)
-    >>> ratio = [np.linalg.norm(s[36] - s[45]) / np.linalg.norm(s[8] - s[27])
-    ...          for s in (affine, shape, faces.mean_shape)]
-    >>> np.round(ratio, 3)
-    array([1.502, 0.781, 0.781])
-    """
-    cameras, usable = usable_cameras(motion)
-    if camera not in CAMERA_MODELS:
-        raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
-    fit = fit_metric(cameras[usable], camera)
-    Q = scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
-    rotations, stretches = nearest_rotations(cameras[usable] @ Q)
-    scales = np.trace(stretches, axis1=1, axis2=2) / 2
-    if camera == "orthographic":
-        scales = np.ones(len(scales))
-    rotations, scales = (of_all_frames(each, usable) for each in (rotations, scales))
-    warn_if_degenerate(fit.condition_number)
-    return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
-
-
-def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
-    """
-    Take shapes to the coordinates in which the cameras are Euclidean ones.
-
-    Parameters
-    ----------
-    shapes : array-like of shape (..., n_points, 3)
-        A mean shape (n_points, 3), basis shapes (n_components, n_points, 3) or the
-        shapes of frames (n_frames, n_points, 3), in the coordinates of the affine
-        cameras.
-    Q : array-like of shape (3, 3)
-        Of `metric_upgrade`.
-
-    Returns
-    -------
-    ndarray of shape (..., n_points, 3)
-        ``Q^-1 b`` for each point b. Cameras go with ``M Q``, so that the images stay
-        what they are.
-
-    Raises
-    ------
-    ValueError
-        If the arrays are not of the shapes above, or Q is singular.
-    """
-    points = np.asarray(shapes, dtype=np.float64)
-    if points.ndim < 2 or points.shape[-1] != 3:
-        raise ValueError(
-            f"shapes must be of the shape (..., n_points, 3); got {points.shape}"
-        )
-    matrix = np.asarray(Q, dtype=np.float64)
-    if matrix.shape != (3, 3) or not np.linalg.matrix_rank(matrix) == 3:
-        raise ValueError(
-            "Q must be a 3x3 matrix that is not singular; got "
-            f"{'a singular one' if matrix.shape == (3, 3) else matrix.shape}"
-        )
-    return points @ np.linalg.inv(matrix).T
 
 
 def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
@@ -231,7 +40,7 @@ def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]
     return cameras, np.asarray(usable)
 
 
-def fit_metric(cameras: NDArray, camera: CameraModel) -> MetricFit:
+def fit_metric(cameras: NDArray, camera: CalibratedCamera) -> MetricFit:
     """Return the best metric of usable cameras (n_frames, 2, 3), from two starts."""
     eigenvalues = np.zeros(3)
     if len(cameras):

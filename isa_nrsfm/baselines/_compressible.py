@@ -18,7 +18,7 @@ from isa_nrsfm._linalg.vectors import polar
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
     conformal_equations,
-    symmetric_matrix,
+    strain_basis,
 )
 from isa_nrsfm._tables.layout import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
@@ -43,8 +43,9 @@ def metric_correction(blocks: NDArray) -> NDArray:
     _, values, vectors = np.linalg.svd(equations, full_matrices=len(equations) < 6)
     n_determined = min(int(np.sum(values > OF_RANKS * values[0])), 5)
     solutions = vectors[n_determined:]
-    traces = solutions[:, :3].sum(axis=1)
-    eigenvalues, axes = np.linalg.eigh(symmetric_matrix(traces @ solutions))
+    basis = strain_basis("orthographic")  # the last one is the identity / sqrt(3)
+    nearest = np.sqrt(3) * solutions[:, 5] @ solutions
+    eigenvalues, axes = np.linalg.eigh(np.tensordot(nearest, basis, 1))
     eigenvalues = np.maximum(eigenvalues, eigenvalues[-1] / LARGEST_STRETCH**2)
     return axes * np.sqrt(eigenvalues)
 

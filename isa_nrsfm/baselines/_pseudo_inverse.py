@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.vectors import polar
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import orthonormal_cameras
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
+from isa_nrsfm.calibration import orthonormal_cameras
 
 
 def orthographic_cameras(W: NDArray, rank: int) -> NDArray:

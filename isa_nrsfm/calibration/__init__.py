@@ -28,16 +28,16 @@ from isa_nrsfm._metric_upgrade.deforming import (
     deformation_metric,
     euclidean_frames,
 )
-from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
-    OrthonormalCameras,
-    orthonormal_cameras,
-)
-from isa_nrsfm._metric_upgrade.rigid import (
+from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from isa_nrsfm.calibration._metric_upgrade import (
     MetricUpgrade,
     euclidean_shapes,
     metric_upgrade,
 )
-from isa_nrsfm.calibration._canonical_pose import CanonicalPose, canonical_pose
+from isa_nrsfm.calibration._orthonormal_cameras import (
+    OrthonormalCameras,
+    orthonormal_cameras,
+)
 from isa_nrsfm.calibration._view_angles import ViewAngles, angle_deviations, view_angles
 
 __all__ = [
