@@ -371,8 +371,9 @@ def _joint_frames(
     if unknown.any():
         row = np.flatnonzero(table.shown)[unknown.argmax()]
         raise ValueError(
-            f"{unknown.sum()} of {len(unknown)} frame(s) (first: row {row}) do not "
-            "determine a camera: their visible points are coplanar. Remove these rows."
+            f"the visible points of {unknown.sum()} of {len(unknown)} frames (first: "
+            f"row {row}) are coplanar, which does not determine a camera. Leave out "
+            "these rows"
         )
     # Gauge of shapes, cameras and coefficients
     gauge, frame_map = independent_gauge(

@@ -578,6 +578,6 @@ def check_frames_kept(estimator: Any, what: str) -> None:
     """Refuse methods that need the frames of the fit where they were not kept."""
     if not hasattr(estimator, "motion_"):
         raise ValueError(
-            f"{what} needs the cameras and coefficients of the fitted table: fit with "
-            f"keep_frames=True; got keep_frames={estimator.keep_frames!r}"
+            f"{what} needs the cameras and coefficients of the fitted table, which "
+            "were not kept: got keep_frames=False. Fit again with keep_frames=True"
         )

@@ -171,7 +171,7 @@ class TestContract:
             (
                 np.where(np.arange(60)[:, None] == 2, 1.0, X),
                 2,
-                r"equal in 1 frame\(s\)",
+                "equal in 1 of 60 frames",
             ),
         ):
             with pytest.raises(ValueError, match=message):

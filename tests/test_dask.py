@@ -74,7 +74,7 @@ class TestThreads:
         empty[70:220] = True  # a whole chunk
         expected = AffineNRSfM(K, random_state=0).fit(X[~empty])
         X[empty] = np.nan
-        with pytest.warns(UserWarning, match=rf"{empty.sum()} of 300 row\(s\)"):
+        with pytest.warns(UserWarning, match=f"{empty.sum()} of 300 rows"):
             model = AffineNRSfM(K, random_state=0).fit(chunked(X))
         assert model.alpha_.chunks[0] == (70, 150, 80)
         found = np.asarray(model.alpha_)

@@ -638,7 +638,7 @@ BAD_TABLES = {
     "minus infinity": (with_value(-np.inf), "X contains infinity"),
     "equal points": (
         with_equal_points(5, 11),
-        r"all points are equal in 2 frame\(s\), the first is row 5",
+        r"all points are equal in 2 of \d+ frames \(first: row 5\)",
     ),
     "one point": (TABLE[:, :2], "needs at least 13 points, X has 1;"),
     "six points": (TABLE[:, :12], "at least 7 points are needed for n_components=1"),

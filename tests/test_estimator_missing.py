@@ -150,7 +150,7 @@ def with_empty_rows(table):
 
 def fitted_with_empty_rows(**params):
     """Return the model of a table with rows of NaN, which are warned of."""
-    message = r"5 of 90 row\(s\) .* first is row 0"
+    message = r"5 of 90 rows \(first: row 0\)"
     with pytest.warns(UserWarning, match=message) as found:
         fitted = estimator(**params).fit(with_empty_rows(HOLED.data))
     assert found[0].filename == __file__
@@ -188,10 +188,10 @@ def test_methods_make_nothing_of_rows_that_show_nothing():
 def test_rows_that_show_nothing_in_a_search():
     table = with_empty_rows(COMPLETE.data)
     search = GridSearchCV(estimator(refinement=None), {"n_components": [1, K]}, cv=2)
-    with pytest.warns(UserWarning, match="show no point"):
+    with pytest.warns(UserWarning, match="no point is visible"):
         search.fit(table)
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
-    with pytest.warns(UserWarning, match="show no point"):
+    with pytest.warns(UserWarning, match="no point is visible"):
         found = search.best_estimator_.fit_transform(table)
     assert_array_equal(found, search.best_estimator_.alpha_)
 
@@ -210,17 +210,17 @@ ALL_FRAMES, ALL_POINTS = np.arange(90), np.arange(30)
 BAD = {
     "a point nowhere": (
         without(ALL_FRAMES, [7]),
-        r"every point in at least 5 frames; 1 of 30 point\(s\) .* point 7, seen in 0",
+        r"every point in at least 5 frames; .* 1 of 30 points \(first: point 7, in 0 ",
     ),
     "points in too few frames": (
         without(ALL_FRAMES[4:], [11, 12]),
-        r"at least 5 frames; 2 of 30 point\(s\) .* point 11, seen in 4",
+        r"at least 5 frames; .* 2 of 30 points \(first: point 11, in 4 of 90 frames",
     ),
     "a frame with too few points": (
         without([5], ALL_POINTS[3:]),
-        r"at least 4 points .*; 1 of 90 frame\(s\) .* row 5 with 3 point\(s\)",
+        r"fewer than 4 points are visible in 1 of 90 frames \(first: row 5, with 3\)",
     ),
-    "nothing": (without(ALL_FRAMES, ALL_POINTS), r"no point: all 90 row\(s\)"),
+    "nothing": (without(ALL_FRAMES, ALL_POINTS), "no point is visible: all 90 rows"),
 }
 
 
@@ -234,7 +234,7 @@ def test_tables_that_show_too_little_are_refused(name, refinement):
 
 @pytest.mark.parametrize(
     ("spoilt", "message"),
-    [(np.nan, "row 5 with 3 point"), (0.1, r"equal in 1 frame\(s\), .* row 5")],
+    [(np.nan, "row 5, with 3"), (0.1, r"equal in 1 of 90 frames .* row 5\)")],
 )
 def test_rows_are_counted_from_the_first_one_where_some_show_nothing(spoilt, message):
     tracks = COMPLETE.tracks.copy()
@@ -256,7 +256,7 @@ def test_rows_that_show_nothing_are_no_frames():
 def test_missing_points_of_dataframes_are_named():
     pandas = pytest.importorskip("pandas")
     table = pandas.DataFrame(without(ALL_FRAMES, [7]), columns=COMPLETE.feature_names)
-    with pytest.raises(ValueError, match=r"point 7 \(x_7, y_7\), seen in 0"):
+    with pytest.raises(ValueError, match=r"point 7 \(x_7, y_7\), in 0 of 90"):
         estimator().fit(table)
 
 
@@ -266,13 +266,11 @@ def test_points_with_one_coordinate_count_as_missing_and_warn(complete_model, me
     half[4, 7] = np.nan
     whole[4, 6:8] = np.nan
     if method == "fit":
-        with pytest.warns(
-            UserWarning, match=r"1 point\(s\) in 1 row.* point 3 in row 4"
-        ):
+        with pytest.warns(UserWarning, match="in 1 of 90 rows .* point 3 in row 4"):
             first = estimator().fit(half)
         assert_array_equal(first.alpha_, estimator().fit(whole).alpha_)
         return
-    with pytest.warns(UserWarning, match=r"1 point\(s\) in 1 row"):
+    with pytest.warns(UserWarning, match="in 1 of 90 rows points have"):
         result = getattr(complete_model, method)(half)
     assert_array_equal(result, getattr(complete_model, method)(whole))
 

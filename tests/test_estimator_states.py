@@ -368,8 +368,8 @@ def test_frames_whose_points_lie_in_a_plane_of_the_object_are_refused():
     pairs[3, 5:] = np.nan
     X = np.vstack([np.full((1, 24), np.nan), pairs.reshape(60, -1)])
     with (
-        pytest.warns(UserWarning, match="show no point"),
-        pytest.raises(ValueError, match=r"\(first: row 4\) do not determine a camera"),
+        pytest.warns(UserWarning, match="no point is visible"),
+        pytest.raises(ValueError, match=r"\(first: row 4\) are coplanar"),
     ):
         AffineNRSfM(1, random_state=0).fit(X)
 

@@ -133,7 +133,7 @@ def test_rows_without_points_are_left_out():
     options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
     model = AffineNRSfM(1, **options).fit(table[:40])
     table[40:] = np.nan
-    with pytest.warns(UserWarning, match="show no point"):
+    with pytest.warns(UserWarning, match="no point is visible"):
         with_empty = AffineNRSfM(1, **options).fit(table)
     found, expected = map(point_distribution_model, (with_empty, model))
     for one, other in zip(found, expected, strict=True):

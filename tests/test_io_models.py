@@ -110,7 +110,7 @@ def fitted(tmp_path_factory):
             parameters["frames_folder"] = folder if kind is not str else str(folder)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)
-            warnings.filterwarnings("ignore", "1 of 20 row.* show no point")
+            warnings.filterwarnings("ignore", "no point is visible in 1 of 20")
             warnings.filterwarnings(
                 "ignore", "the depth of the shapes is not determined"
             )

@@ -240,7 +240,7 @@ def test_frames_of_equal_points_are_refused(table, rows, value, dtype):
     assume(max(rows) < len(tracks))
     broken = tracks.astype(dtype)
     broken[sorted(rows)] = np.array([value, -3.0 * value], dtype)
-    message = rf"equal in {len(rows)} frame\(s\), the first is row {min(rows)}$"
+    message = rf"equal in {len(rows)} of \d+ frames \(first: row {min(rows)}\)"
     with pytest.raises(ValueError, match=message):
         fit(broken, n_components)
     # New frames of this kind have no camera.

@@ -94,7 +94,7 @@ class TestFit:
         model = estimator(
             SAMPLED, working_memory=0.02, frames_folder=tmp_path / "found"
         )
-        with pytest.warns(UserWarning, match=rf"{empty.sum()} of 150 row\(s\)"):
+        with pytest.warns(UserWarning, match=f"{empty.sum()} of 150 rows"):
             model.fit(memmap(X, tmp_path))
         for name in OF_SHAPES:
             assert_array_equal(getattr(model, name), getattr(expected, name))
@@ -278,8 +278,8 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("row", "message"),
         [
-            (FEW_POINTS, r"1 of 150 frame\(s\) show fewer .* the first is row 120"),
-            (1.0, r"equal in 1 frame\(s\), the first is row 120"),
+            (FEW_POINTS, r"fewer than 4 .* in 1 of 150 frames \(first: row 120"),
+            (1.0, r"equal in 1 of 150 frames \(first: row 120\)"),
         ],
         ids=["few points", "equal points"],
     )
@@ -292,9 +292,7 @@ class TestErrors:
     def test_half_points_are_warned_of_once(self, tmp_path):
         X = table()
         X[[40, 120], 3] = np.nan
-        with pytest.warns(
-            UserWarning, match=r"2 point\(s\) in 2 row\(s\).*row 40"
-        ) as w:
+        with pytest.warns(UserWarning, match="in 2 of 150 rows .*row 40") as w:
             estimator(working_memory=0.05).fit(memmap(X, tmp_path))
         assert len(w) == 1
 

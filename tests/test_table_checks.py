@@ -44,8 +44,8 @@ class TestHalfPoints:
         before = tracks.copy()
         with pytest.warns(
             UserWarning,
-            match=r"3 point\(s\) in 2 row\(s\) have only one of their two coordinates "
-            r"and count as missing; the first is point 7 in row 1$",
+            match=r"in 2 of 6 rows points have only one of their two coordinates \(3 "
+            r"in all; first: point 7 in row 1\). They count as missing$",
         ):
             clean = clean_tracks(tracks)
         assert_array_equal(tracks, before)
@@ -55,7 +55,7 @@ class TestHalfPoints:
         assert clean.dtype == tracks.dtype
 
     def test_single_precision_stays(self, rng):
-        with pytest.warns(UserWarning, match="3 point"):
+        with pytest.warns(UserWarning, match="3 in all"):
             assert clean_tracks(self.half(rng).astype(np.float32)).dtype == np.float32
 
     @pytest.mark.parametrize(
@@ -85,9 +85,8 @@ class TestPoints:
         names = np.array([f"{axis}_{j}" for axis in "xy" for j in range(16)])
         with pytest.raises(
             ValueError,
-            match=r"n_components=3 needs every point in at least 6 frames; 2 of 16 "
-            r"point\(s\) are seen in fewer, the first is point 4 \(x_4, y_4\), seen in "
-            r"5",
+            match=r"n_components=3 needs every point in at least 6 frames; fewer show "
+            r"2 of 16 points \(first: point 4 \(x_4, y_4\), in 5 of 50 frames\)",
         ):
             checked(tracks, 3, "planar", names)
 
@@ -110,8 +109,8 @@ class TestPoints:
         assert np.isnan(tracks).any(axis=2).sum() == n_hidden
         with pytest.raises(
             ValueError,
-            match=rf"too few points are seen for n_components={K}: .* equations, but "
-            r"the shapes have \d+ unknowns",
+            match=rf"too few points are visible for n_components={K}: they determine "
+            r"\d+ numbers of the shapes, which have \d+\.",
         ):
             checked(tracks, K)
 
@@ -121,8 +120,8 @@ class TestPoints:
         tracks[50:, :12] = np.nan
         with pytest.raises(
             ValueError,
-            match=r"2 groups, and no frame shows points of two of them; point 12 is "
-            r"the first that is never seen with point 0 or others of its group",
+            match=r"2 groups that no frame shows together, .* \(first: point 12 is "
+            r"never visible with point 0 and its group\)",
         ):
             checked(tracks, 1)
         tracks[7] = 0.0

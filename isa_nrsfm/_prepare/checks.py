@@ -30,9 +30,10 @@ def warn_of_half_points(
         return
     row = int((n_half > 0).argmax())
     warn_caller(
-        f"{n_half.sum()} point(s) in {np.count_nonzero(n_half)} row(s) have only one "
-        "of their two coordinates and count as missing; the first is "
-        f"{_describe_point(int(first[row]), layout, names)} in row {row}",
+        f"in {np.count_nonzero(n_half)} of {len(n_half)} rows points have only one of "
+        f"their two coordinates ({n_half.sum()} in all; first: "
+        f"{_describe_point(int(first[row]), layout, names)} in row {row}). They count "
+        "as missing"
     )
 
 
@@ -149,25 +150,27 @@ def check_points(
         point = int(few.argmax())
         raise ValueError(
             f"n_components={n_components} needs every point in at least {least} "
-            f"frames; {few.sum()} of {n_points} point(s) are seen in fewer, the first "
-            f"is {_describe_point(point, layout, names)}, seen in {n_frames[point]}"
+            f"frames; fewer show {few.sum()} of {n_points} points (first: "
+            f"{_describe_point(point, layout, names)}, in {n_frames[point]} of "
+            f"{counts.sum()} frames). Leave out these points, or take fewer basis "
+            "shapes"
         )
     equations = counts @ np.maximum(2 * seen.sum(axis=1) - 8 - n_components, 0)
     unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
     if equations < unknowns:
         raise ValueError(
-            f"too few points are seen for n_components={n_components}: beyond cameras "
-            f"and coefficients they give {equations} equations, but the shapes have "
-            f"{unknowns} unknowns; take fewer basis shapes or leave out points that "
-            "are rarely seen"
+            f"too few points are visible for n_components={n_components}: they "
+            f"determine {equations} numbers of the shapes, which have {unknowns}. Take "
+            "fewer basis shapes, or leave out points that are rarely visible"
         )
     group = _groups(seen)
     if group.any():
         raise ValueError(
-            f"the points fall into {group.max() + 1} groups, and no frame shows points "
-            f"of two of them; {_describe_point(int(group.argmax()), layout, names)} is "
-            "the first that is never seen with "
-            f"{_describe_point(0, layout, names)} or others of its group"
+            f"the points fall into {group.max() + 1} groups that no frame shows "
+            "together, so that they cannot be joined to one object (first: "
+            f"{_describe_point(int(group.argmax()), layout, names)} is never visible "
+            f"with {_describe_point(0, layout, names)} and its group). Add frames that "
+            "show points of both, or fit each group by itself"
         )
 
 

@@ -93,10 +93,14 @@ def scaled_table(
     shown = report.n_seen > 0
     if not shown.all():
         if not shown.any():
-            raise ValueError(f"X shows no point: all {len(shown)} row(s) are NaN")
+            raise ValueError(
+                f"no point is visible: all {len(shown)} rows of X are NaN. Check how "
+                "the table was read"
+            )
         warn_caller(
-            f"{np.count_nonzero(~shown)} of {len(shown)} row(s) show no point and are "
-            f"left out of the fit, the first is row {shown.argmin()}",
+            f"no point is visible in {np.count_nonzero(~shown)} of {len(shown)} rows "
+            f"(first: row {shown.argmin()}). They are left out of the fit, and their "
+            "results are NaN"
         )
         check_size(int(shown.sum()), n_points, n_components)
         blocks, report = blocks.subset(shown), report.of_frames(shown)

@@ -54,8 +54,9 @@ def selected(scores: NDArray, select: str) -> int:
     mean = scores.mean(axis=1)
     if np.isnan(mean).all():
         raise ValueError(
-            "no score is a number: too few points are seen to choose n_components by "
-            "points that are held out"
+            "n_components cannot be chosen by points that are held out of each frame: "
+            "too few points are visible. Give n_components, or take frames with more "
+            "visible points"
         )
     best = int(np.nanargmax(mean))
     if select == "best":
@@ -102,7 +103,7 @@ def warn_of_unconverged(rows: Sequence[Row]) -> None:
     if which:
         n_fits = sum(row.n_unconverged for row in rows)
         warn_caller(
-            f"{n_fits} fit(s) did not converge while n_components was chosen, with "
-            f"n_components of {', '.join(which)}; increase max_iter or tol",
+            f"not all fits converged while n_components was chosen: {n_fits} with "
+            f"n_components of {', '.join(which)} did not. Increase max_iter or tol",
             ConvergenceWarning,
         )

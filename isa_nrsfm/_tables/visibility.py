@@ -105,17 +105,16 @@ def check_frames(report: FrameReport, n_points: int) -> None:
     if few.any():
         row = few.argmax()
         raise ValueError(
-            f"each frame must show at least {FEWEST_POINTS} points to determine its "
-            f"camera; {few.sum()} of {n_frames} frame(s) show fewer (the others are "
-            f"NaN), the first is row {row} with {n_seen[row]} point(s): leave such "
-            "rows out"
+            f"fewer than {FEWEST_POINTS} points are visible in {few.sum()} of "
+            f"{n_frames} frames (first: row {row}, with {n_seen[row]}), too few to "
+            "determine a camera. Leave out these rows"
         )
     line = report.on_line & ~report.in_one_place
     if line.any():
         raise ValueError(
-            "the points that a frame shows must not all lie on one line where others "
-            f"are missing (NaN); they do in {line.sum()} of {n_frames} frame(s), "
-            f"the first is row {line.argmax()}: leave such rows out"
+            f"points are missing in {line.sum()} of {n_frames} frames (first: row "
+            f"{line.argmax()}) and the others lie on one line, which does not "
+            "determine a camera. Leave out these rows"
         )
     refuse_one_place(report, n_points)
 
@@ -126,6 +125,6 @@ def refuse_one_place(report: FrameReport, n_points: int) -> None:
     if one.any():
         which = "seen points" if (report.n_seen[one] < n_points).any() else "points"
         raise ValueError(
-            f"each frame must have at least two different points; all {which} are "
-            f"equal in {one.sum()} frame(s), the first is row {one.argmax()}"
+            f"all {which} are equal in {one.sum()} of {len(one)} frames (first: row "
+            f"{one.argmax()}), so that they show no shape. Leave out these rows"
         )
