@@ -1,4 +1,22 @@
-"""MUCT: public landmarks of real faces, some of them hidden."""
+"""MUCT: public landmarks of real faces, some of them hidden.
+
+68 landmarks that were marked by hand in 3755 photos, 480 x 640 pixels, of the faces of
+276 people: two or three lightings (q to z), each seen by five cameras (a to e) at once.
+Camera a is in front of the face. Points that the face itself hides are missing: 2544
+points in 840 photos, all of them from the cameras b and c. Subjects 247 and 248 are
+identical twins.
+
+The landmarks are in the order of XM2VTS. The database has 76 a face; of these the
+file, whose name keeps the number, has 68.
+
+A photo is named like i000qa-fn: the subject, the lighting, the camera, the sex, and
+whether glasses are worn (g) or not (n). Three names have a number in the last place, so
+that the glasses are taken from the tag. Names of mirror images begin with ir; their
+points are renumbered such that those on the left of a face are on its left again.
+
+S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
+Recognition Association of South Africa, 2010. http://www.milbo.org/muct
+"""
 
 import os
 from pathlib import Path
@@ -23,28 +41,7 @@ MUCT = RemoteFile(
     sha256="e5f393a52b6c8b1cdd945063d450476c0ca6be6ac07b3b2cd3cd5357f202c0eb",
 )
 
-DESCR = f"""\
-MUCT landmarks
-
-68 landmarks that were marked by hand in 3755 photos, 480 x 640 pixels, of the faces of
-276 people: two or three lightings (q to z), each seen by five cameras (a to e) at once.
-Camera a is in front of the face. Points that the face itself hides are missing: 2544
-points in 840 photos, all of them from the cameras b and c. Subjects 247 and 248 are
-identical twins.
-
-The landmarks are in the order of XM2VTS. The database has 76 a face; of these the
-file, whose name keeps the number, has 68.
-
-A photo is named like i000qa-fn: the subject, the lighting, the camera, the sex, and
-whether glasses are worn (g) or not (n). Three names have a number in the last place, so
-that the glasses are taken from the tag. Names of mirror images begin with ir; their
-points are renumbered such that those on the left of a face are on its left again.
-
-Source: free for academic use, {MUCT.url}
-
-S. Milborrow, J. Morkel, F. Nicolls: The MUCT Landmarked Face Database. Pattern
-Recognition Association of South Africa, 2010. http://www.milbo.org/muct
-"""
+DESCR = f"{__doc__}\nSource: free for academic use, {MUCT.url}\n"
 
 
 @checked_parameters(

@@ -1,4 +1,16 @@
-"""The shark: a public sequence of a deforming shape, with its truth."""
+"""The shark: a public sequence of a deforming shape, with its truth.
+
+An artificial shark of 91 points that moves and bends, in 240 frames, with the true 3D
+points of every frame. The images are orthographic and without noise: the first two
+coordinates of the points in the frame of the camera.
+
+The centred measurement matrix has rank 5: that of a mean shape and of one basis shape
+of rank 2. The file is that of Torresani's code for non-rigid structure from motion.
+
+L. Torresani, A. Hertzmann, C. Bregler: Nonrigid Structure-from-Motion: Estimating Shape
+and Motion with Hierarchical Priors. IEEE Transactions on Pattern Analysis and Machine
+Intelligence 30 (2008), 878-892.
+"""
 
 import os
 
@@ -18,23 +30,7 @@ JAWS = RemoteFile(
     sha256="e962fe60aaed847397d922889496519310d34374a098c6d6f9282232d0635fcc",
 )
 
-DESCR = f"""\
-Shark
-
-An artificial shark of 91 points that moves and bends, in 240 frames, with the true 3D
-points of every frame. The images are orthographic and without noise: the first two
-coordinates of the points in the frame of the camera.
-
-The centred measurement matrix has rank 5: that of a mean shape and of one basis shape
-of rank 2.
-
-Source: the file of Torresani's code for non-rigid structure from motion, free for
-non-commercial use, {JAWS.url}
-
-L. Torresani, A. Hertzmann, C. Bregler: Nonrigid Structure-from-Motion: Estimating Shape
-and Motion with Hierarchical Priors. IEEE Transactions on Pattern Analysis and Machine
-Intelligence 30 (2008), 878-892.
-"""
+DESCR = f"{__doc__}\nSource: free for non-commercial use, {JAWS.url}\n"
 
 
 @checked_parameters(
