@@ -155,9 +155,8 @@ class TestContract:
         X, make = table().data, METHODS[method]
         model = fitted(method)
         message = (
-            rf"{type(model).__name__} takes no missing points \(NaN\); X has \d+ "
-            r"missing value\(s\) in \d+ of 60 row\(s\), the first is row \d+: leave "
-            "such rows out, or use AffineNRSfM"
+            rf"{type(model).__name__} takes no missing points \(NaN\), which \d+ of 60 "
+            r"rows have \(first: row \d+\). Remove these rows, or use AffineNRSfM"
         )
         for refusing in (make(2).fit, model.transform):
             with pytest.raises(ValueError, match=message):

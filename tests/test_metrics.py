@@ -98,11 +98,16 @@ class TestInverseSNR:
         [
             (np.ones((2, 4)), np.ones((3, 4)), {}, r"got \(2, 4\) and \(3, 4\)"),
             (np.ones((2, 5)), np.ones((2, 5)), {}, "even number; got n_features=5"),
-            (np.ones((2, 4)), np.ones((2, 4)), {}, "X has no energy"),
-            (np.full((2, 4), np.nan), np.ones((2, 4)), {}, "X has no energy"),
+            (np.ones((2, 4)), np.ones((2, 4)), {}, "seen points are in one"),
+            (np.full((2, 4), np.nan), np.ones((2, 4)), {}, "seen points are in one"),
             (np.full((2, 4), np.inf), np.ones((2, 4)), {}, "X contains infinity"),
-            (np.eye(4), np.diag(4 * [np.nan]), {}, r"NaN at 4 point\(s\) .* in row 0"),
-            (FLAT, FLAT, {"scale_frames": True}, r"1 frame\(s\), the first is row 1"),
+            (
+                np.eye(4),
+                np.diag(4 * [np.nan]),
+                {},
+                r"NaN\): 4 in 4 .* \(first: row 0\)",
+            ),
+            (FLAT, FLAT, {"scale_frames": True}, r"place: 1 of 2 \(first: row 1\)"),
             (np.eye(4), np.eye(4), {"layout": "rows"}, "layout must be .* got 'rows'"),
         ],
     )

@@ -101,7 +101,11 @@ class TestDegenerateInput:
             (np.ones((1, 3, 3)), np.ones((1, 4, 3)), r"S and X .*\(1, 3, 3\) and \(1,"),
             (np.eye(3)[None], np.full((1, 3, 3), np.nan), "X must be finite; 9 entr"),
             (np.full((1, 3, 3), np.inf), np.eye(3)[None], "S must be finite; 9 entr"),
-            (np.full((2, 3, 3), 0.1), np.ones((2, 3, 3)), r"2 frame\(s\) of S, the f"),
+            (
+                np.full((2, 3, 3), 0.1),
+                np.ones((2, 3, 3)),
+                r"of S whose.*: 2 of 2 \(first: 0",
+            ),
         ],
     )
     def test_refusals(self, measure, S, X, message):

@@ -188,7 +188,7 @@ def test_styles_can_be_changed():
         (ReprojectionDisplay, {"frame_names": ["a"]}, "must hold 6 names"),
         (ReprojectionDisplay, {"edges": [[0, 10]]}, "points 0 to 9"),
         (ReprojectionDisplay, {"origin": "down"}, "got 'down'"),
-        (ReprojectionDisplay, {"observed": 0 * POINTS}, "X has no energy"),
+        (ReprojectionDisplay, {"observed": 0 * POINTS}, "seen points are in one place"),
     ],
 )
 def test_bad_arguments_are_refused(kind, changed, message):

@@ -188,11 +188,14 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
     found, numbers = np.unique(names, return_inverse=True)
     sizes = np.bincount(numbers[used], minlength=len(found))
     if not sizes.all():
-        what = "a frame with coefficients" if neutral is None else "a neutral frame"
         empty = [str(each) for each in found[sizes == 0]]
+        what, remedy = "frame with coefficients", ""
+        if neutral is not None:
+            what, remedy = "neutral frame", ", or mark one of their frames as neutral"
         raise ValueError(
-            f"each group needs {what}; {len(empty)} of {len(found)} have none: "
-            f"{', '.join(empty[:5])}"
+            f"groups without a {what}: {len(empty)} of {len(found)} (first: "
+            f"{', '.join(empty[:5])}). Their coefficients have nothing to be compared "
+            f"with. Remove these groups{remedy}"
         )
     sums = np.stack(
         [np.bincount(numbers[used], column, len(found)) for column in X[used].T], axis=1
@@ -202,10 +205,12 @@ def _group_means(X: NDArray, groups: Any, neutral: Any) -> tuple[NDArray, NDArra
 
 def _warn_of_single_frames(names: NDArray) -> None:
     """Warn of groups with one frame."""
-    single = int(np.sum(np.unique(names, return_counts=True)[1] == 1))
-    if single:
+    single = np.unique(names, return_counts=True)[1] == 1
+    if single.any():
         warn_caller(
-            f"{single} groups have one frame only: relative to their mean it is zero"
+            f"groups with a single frame: {single.sum()} of {len(single)}. Relative to "
+            "itself this frame is zero. Remove these groups, or say which frames are "
+            "neutral"
         )
 
 

@@ -294,9 +294,9 @@ class ShapeSequenceNRSfM(
         if missing.any():
             rows = np.flatnonzero(missing.any(axis=1))
             raise ValueError(
-                f"{type(self).__name__} takes no missing points (NaN); X has "
-                f"{missing.sum()} missing value(s) in {len(rows)} of {len(X)} row(s), "
-                f"the first is row {rows[0]}: leave such rows out, or use AffineNRSfM"
+                f"{type(self).__name__} takes no missing points (NaN), which "
+                f"{len(rows)} of {len(X)} rows have (first: row {rows[0]}). Remove "
+                "these rows, or use AffineNRSfM"
             )
         return X
 

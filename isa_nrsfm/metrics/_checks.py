@@ -61,7 +61,8 @@ def as_pair(
     flat = np.flatnonzero(~truth.any(axis=(1, 2)))
     if len(flat):
         raise ValueError(
-            "each true shape must have at least two different points; all points are "
-            f"equal in {len(flat)} frame(s) of S, the first is {flat[0]}"
+            f"frames of S whose points are all in one place: {len(flat)} of "
+            f"{len(truth)} (first: {flat[0]}). Errors cannot be related to their size. "
+            "Remove these frames from S and X"
         )
     return truth, centre(shapes)

@@ -66,13 +66,17 @@ def inverse_snr(
         flat = np.flatnonzero(used & (energy == 0))
         if len(flat):
             raise ValueError(
-                "scale_frames=True needs two different seen points in each frame; all "
-                f"are equal in {len(flat)} frame(s), the first is row {flat[0]}"
+                f"frames of X whose seen points are all in one place: {len(flat)} of "
+                f"{len(energy)} (first: row {flat[0]}). They have no size to scale "
+                "them by. Remove them, or use scale_frames=False"
             )
         weights = seen.sum(axis=1)[used] / energy[used]
         energy, error = energy[used] * weights, error[used] * weights
     if not energy.sum() > 0:
-        raise ValueError("X has no energy: all seen points are equal in every frame")
+        raise ValueError(
+            "in each frame of X all seen points are in one place, so that errors "
+            "cannot be related to a size. Check how X was read"
+        )
     return float(error.sum() / energy.sum())
 
 
@@ -94,10 +98,11 @@ def frame_energies(
     seen = ~np.isnan(truth).any(axis=2)
     lost = seen & np.isnan(fitted).any(axis=2)
     if lost.any():
-        row = np.flatnonzero(lost.any(axis=1))[0]
+        rows = np.flatnonzero(lost.any(axis=1))
         raise ValueError(
-            f"X_hat is NaN at {lost.sum()} point(s) that are seen in X, the first in "
-            f"row {row}"
+            f"X_hat lacks points that X shows (NaN): {lost.sum()} in {len(rows)} of "
+            f"{len(lost)} frames (first: row {rows[0]}). Fill them in, or make them "
+            "NaN in X"
         )
     truth, fitted = (_centre_seen(tracks, seen) for tracks in (truth, fitted))
     energy = np.sum(truth**2, axis=(1, 2))
