@@ -22,7 +22,7 @@ from layers import slow_after
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat.whole_files import files_together
 from isa_nrsfm.cli import _demo, _fit, main
-from isa_nrsfm.cli._parser import build_parser
+from isa_nrsfm.cli._options import build_parser
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import inverse_snr
@@ -371,7 +371,9 @@ def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
     assert code == 0
     zeros, few = report_of(tmp_path)["warnings"]
     assert "".join(f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)) == err
-    assert zeros.startswith("2 point(s) in 2 row(s) are at exactly (0, 0).")
+    assert zeros.startswith(
+        "points at exactly (0, 0) were found in 2 of 60 rows, 2 in all."
+    )
     assert "--zeros-missing" in zeros
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 

@@ -16,7 +16,7 @@ from fit_runs import MODEL  # noqa: E402
 from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
 from isa_nrsfm.cli import main  # noqa: E402
-from isa_nrsfm.cli._choice import (  # noqa: E402
+from isa_nrsfm.cli._fit import (  # noqa: E402
     choice_report,
     choose_n_components,
     extrapolated,

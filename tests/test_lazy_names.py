@@ -17,7 +17,7 @@ import pytest
 import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.lazy import lazy_names
-from isa_nrsfm.cli._parser import build_parser
+from isa_nrsfm.cli._options import build_parser
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import FORMATS, save_model, write_table
 from isa_nrsfm.isa import FastISA, PooledFastICA

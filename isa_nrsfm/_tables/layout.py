@@ -37,9 +37,10 @@ def refuse_odd(n_columns: int) -> None:
 
 def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
     """Return tracks as a table, the inverse of `table_to_tracks`."""
+    n_frames, n_points, _ = tracks.shape
     if layout == "planar":
         tracks = tracks.transpose(0, 2, 1)
-    return tracks.reshape(len(tracks), -1)
+    return tracks.reshape(n_frames, 2 * n_points)
 
 
 def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:

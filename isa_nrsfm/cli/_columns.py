@@ -24,7 +24,6 @@ from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, column_named
 from isa_nrsfm.export import point_distances
-from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.export._poses import point_numbers
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ class Label(NamedTuple):
     name: str
     kind: Literal["classes", "number"]
     values: NDArray
-    known: NDArray[np.bool_]
+    known: NDArray
 
     def is_of_classes(self, most: int) -> bool:
         """Return whether the label has at most so many classes."""
@@ -56,31 +55,21 @@ class Columns(NamedTuple):
 
 def asked_columns(args: Namespace, frames: Frames) -> Columns:
     """Return the columns that the options name; raise if they cannot be used."""
-    table = frames.other[frames.usable]
+    table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
-    groups = times = None
-    if args.group is not None:
-        column = _cells(table, args.group, "--group")
-        if column.isna().any():
-            raise ValueError(
-                f"--group: {column.isna().sum()} of {len(column)} frames have no "
-                f"{args.group!r}"
-            )
-        groups = column.to_numpy()
+    groups = None if args.group is None else _groups(table, args.group)
+    times = None
     if args.time is not None:
         times = _times(_cells(table, args.time, "--time"))
     elif args.fps is not None:
-        times = np.asarray(frames.X.index) / args.fps
+        times = np.asarray(table.index) / args.fps
     if times is not None:
-        n_frames = len(times)
         try:
-            sequences_of(
-                checked_times(times, n_frames), group_numbers(groups, n_frames), 1
-            )
+            times_in_seconds = checked_times(times, len(table))
+            sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
             raise ValueError(f"--time {args.time}: {error}{hint}") from error
-    names = frames.columns.points
     distances = [_numbered(pair, names, "--distance") for pair in args.distance]
     unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
     if unit is not None and not distances:
@@ -92,11 +81,9 @@ def column_results(
     args: Namespace, asked: Columns, estimator: AffineNRSfM, X: "pd.DataFrame"
 ) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
     """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
-    pd = import_optional("pandas", extra="io")
-    alpha, names = estimator.alpha_, names_of_components(None, len(estimator.basis_))
+    alpha, smooth = estimator.alpha_, None
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
-    smooth = None
     if asked.labels:
         aligned = _aligned_pca(estimator, X)
         report["labels"] = [
@@ -110,38 +97,39 @@ def column_results(
         except ValueError as error:  # one group, or groups of one frame
             report["groups"]["not_divided"] = str(error)
         within = WithinGroups().fit_transform(alpha, groups=asked.groups)
-        columns |= {f"{name}_within": within[:, k] for k, name in enumerate(names)}
+        columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if asked.times is not None and estimator.refinement == "joint":
         show_stage("smoothing")
         smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
+        found = smooth.alpha
         report["time"] = {
             "column": args.time or "seconds",
             "time_scales": smooth.time_scales,
-            "changed_by": np.sqrt(np.nanmean((smooth.alpha - alpha) ** 2)),
+            "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
         }
-        found = smooth.alpha
-        columns |= {f"{name}_smooth": found[:, k] for k, name in enumerate(names)}
+        columns |= {f"alpha_{k}_smooth": each for k, each in enumerate(found.T, 1)}
     if asked.distances:
+        names = [f"distance_{a}_{b}" for a, b in asked.distances]
         try:
             found = point_distances(
                 estimator, asked.distances, unit=asked.unit, length=args.length
             )
-            columns |= {
-                f"distance_{a}_{b}": found[:, i]
-                for i, (a, b) in enumerate(asked.distances)
-            }
+            columns |= zip(names, found.T, strict=True)
         except ValueError as error:
             warn_caller(f"alpha.csv has no distances: {error}")
-    return report, pd.DataFrame(columns, index=X.index), smooth
+    return report, X[[]].assign(**columns), smooth
 
 
-def class_means(label: Label, alpha: NDArray) -> NDArray:
-    """Return the mean coefficients of each class (n_classes, K), standardised."""
+def class_means(label: Label, alpha: NDArray) -> dict[str, NDArray]:
+    """Return the mean of the standardised coefficients in each class."""
     deviation = alpha.std(axis=0)
     standard = np.zeros_like(alpha)
     np.divide(alpha - alpha.mean(axis=0), deviation, where=deviation > 0, out=standard)
-    of_class = label.values == np.unique(label.values)[:, None]
-    return of_class @ standard[label.known] / of_class.sum(axis=1, keepdims=True)
+    known = standard[label.known]
+    return {
+        str(name): known[label.values == name].mean(axis=0)
+        for name in np.unique(label.values)
+    }
 
 
 def _numbered(
@@ -171,6 +159,16 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
         return Label(name, kind_of(values, kind), values, known)
     except ValueError as error:
         raise ValueError(f"--label {text}: {error}") from error
+
+
+def _groups(table: "pd.DataFrame", name: str) -> NDArray:
+    """Return the column with the group of each frame."""
+    column = _cells(table, name, "--group")
+    if column.isna().any():
+        raise ValueError(
+            f"--group: {column.isna().sum()} of {len(column)} frames have no {name!r}"
+        )
+    return np.asarray(column.to_numpy())
 
 
 def _cells(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
@@ -229,7 +227,7 @@ def _label_report(
         "column": label.name,
         "kind": label.kind,
         "n_frames": found.n_frames,
-        "n_without_label": int(np.sum(~known)),
+        "n_without_label": np.sum(~known),
         "statistic": "eta_squared" if classes else "spearman",
         "values": found.statistic,
         "p_values": found.p_value,
@@ -238,10 +236,9 @@ def _label_report(
     }
     if classes:
         names, counts = np.unique(label.values, return_counts=True)
-        report["classes"] = {str(c): int(n) for c, n in zip(names, counts, strict=True)}
+        report["classes"] = dict(zip(map(str, names), counts, strict=True))
         report["largest_class"] = counts.max() / len(label.values)
-        means = class_means(label, alpha)
-        report["class_means"] = dict(zip(report["classes"], means, strict=True))
+        report["class_means"] = class_means(label, alpha)
     try:
         report["cross_validated"] = predictability(alpha[known], **options).mean()
         report["cross_validated_pca"] = predictability(aligned[known], **options).mean()

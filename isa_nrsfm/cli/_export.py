@@ -5,12 +5,16 @@ from pathlib import Path
 from typing import Any
 
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.cli._drawing import chosen_edges, drawing_files
-from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS
-from isa_nrsfm.cli._outputs import refuse_overwriting
-from isa_nrsfm.cli._reading import as_fitted, column_named, read_frames
+from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
+from isa_nrsfm.cli._outputs import refuse_overwriting, warn_of_mixed_runs
+from isa_nrsfm.cli._reading import (
+    as_fitted,
+    chosen_edges,
+    column_named,
+    drawing_files,
+    read_frames,
+)
 from isa_nrsfm.cli._report import table_report
-from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.cli._sections import table_section, text_of
 from isa_nrsfm.export import (
     point_distribution_model,
@@ -29,6 +33,7 @@ _OPTIONS = {
     "pdm": ("n_modes", *_POSE),
     "shapes": (),
 }
+_WRITERS = {"viewer": write_viewer, "glb": write_glb, "shapes": write_shapes}
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -40,7 +45,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     warn_of_mixed_runs(args.model)
     sources = filter(None, (args.model, args.table, *drawing_files(args)))
     refuse_overwriting(sources, [output])
-    sections = {"Model": [args.model]}
+    sections: dict[str, Any] = {"Model": [args.model]}
     stored = None
     if args.table is not None:
         frames = read_frames(args, estimator)
@@ -59,16 +64,12 @@ def run(args: Namespace, warned: list[str]) -> str:
         options["camera"] = None
 
     lines = [str(output)]
-    if content == "viewer":
-        write_viewer(estimator, output, **options)
-    elif content == "glb":
-        write_glb(estimator, output, **options)
-    elif content == "pdm":
+    if content == "pdm":
         pdm = point_distribution_model(estimator, **options)
         write_pdm(pdm, output)
         lines.append(f"{len(pdm.eigenvalues)} modes of {len(pdm.mean)} points")
     else:
-        write_shapes(estimator, output)
+        _WRITERS[content](estimator, output, **options)
     lines.append(f"{output.stat().st_size} bytes")
     return text_of("", sections | {"Output": lines})
 
@@ -97,23 +98,20 @@ def _content(output: Path, content: str | None) -> str:
 
 def _given(args: Namespace, content: str) -> dict[str, Any]:
     """Return the options that are given; raise if the content does not have them."""
-    having: dict[str, list[str]] = {}
-    for kind, own in _OPTIONS.items():
-        for name in own:
-            having.setdefault(name, []).append(kind)
-    given = {name: getattr(args, name) for name in having}
-    given = {name: each for name, each in given.items() if each not in (None, False)}
-    for name in given:
-        if content not in having[name]:
-            option = "TABLE" if name == "table" else f"--{name.replace('_', '-')}"
+    given = {}
+    for name in [name for own in _OPTIONS.values() for name in own]:
+        if getattr(args, name) in (None, False):
+            continue
+        having = [kind for kind, own in _OPTIONS.items() if name in own]
+        if content not in having:
             raise ValueError(
-                f"{option} is an option of {' and '.join(having[name])}; "
+                f"{flag_of(name)} is an option of {' and '.join(having)}; "
                 f"{args.output} is {content}"
             )
+        if name not in ("table", "label", "skeleton"):
+            given[name] = getattr(args, name)
     if args.table is None:
         for name in (*TABLE_OPTIONS, "label"):
             if getattr(args, name) not in (None, False, [], "auto"):
-                raise ValueError(f"--{name.replace('_', '-')} needs a TABLE")
-    for name in ("table", "label", "skeleton"):
-        given.pop(name, None)
+                raise ValueError(f"{flag_of(name)} needs a TABLE")
     return given

@@ -1,9 +1,8 @@
 """The figures of a fit."""
 
-import contextlib
 import io
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,9 +29,6 @@ from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
 if TYPE_CHECKING:
     import pandas as pd
 
-# The figures of every fit.
-ALWAYS = ("basis_shapes.png", "mode_covariance.png", "reprojection.png")
-
 
 class Fit(NamedTuple):
     """A fit to draw: model, table, search, smoothed coefficients, lines to draw."""
@@ -44,24 +40,31 @@ class Fit(NamedTuple):
     drawn: dict[str, Any]
 
 
+# By name: the caption, and the function that draws the figure.
 Figures = dict[str, tuple[str, Callable[[Fit], Any]]]
+
+# The figures of every fit.
+ALWAYS: Figures = {
+    "basis_shapes.png": (
+        "mean shape and basis shapes",
+        lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
+    ),
+    "mode_covariance.png": (
+        "covariance of the deformations in the images, 3x3 blocks",
+        lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
+    ),
+    "reprojection.png": (
+        "some frames: observed points and points of the model",
+        lambda fit: ReprojectionDisplay.from_estimator(
+            fit.estimator, fit.X, random_state=fit.estimator.random_state, **fit.drawn
+        ),
+    ),
+}
 
 
 def figures_of(args: Namespace, asked: Columns) -> Figures:
-    """Return names of figures, their captions, and the functions that draw them."""
-    captions = (
-        "mean shape and basis shapes",
-        "covariance of the deformations in the images, 3x3 blocks",
-        "some frames: observed points and points of the model",
-    )
-    draw: tuple[Callable[[Fit], Any], ...] = (
-        lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
-        lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
-        lambda fit: ReprojectionDisplay.from_estimator(
-            fit.estimator, fit.X, random_state=args.random_state, **fit.drawn
-        ),
-    )
-    figures = dict(zip(ALWAYS, zip(captions, draw, strict=True), strict=True))
+    """Return the figures that the options ask for."""
+    figures = dict(ALWAYS)
     if len(args.n_components) > 1:
         figures["choice.png"] = (
             "held-out error by the number of basis shapes",
@@ -92,25 +95,17 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     drawn = {}
     for name, (caption, draw) in figures.items():
         show_stage(name)
-        with _shown_as_warning(name):
-            figure = draw(fit).figure_
-            image = io.BytesIO()
+        try:
+            figure, image = draw(fit).figure_, io.BytesIO()
             figure.savefig(image, format="png", dpi=150)
             plt.close(figure)
             write_whole(folder / name, image.getvalue())
             drawn[name] = caption
+        except OSError:
+            raise
+        except Exception as error:  # results do not depend on it
+            warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
     return drawn
-
-
-@contextlib.contextmanager
-def _shown_as_warning(name: str) -> Iterator[None]:
-    """Warn if a figure cannot be drawn: results do not depend on it."""
-    try:
-        yield
-    except OSError:
-        raise
-    except Exception as error:
-        warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
 
 
 def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
@@ -144,7 +139,7 @@ def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
     whole = BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn)
     import_optional("matplotlib.pyplot", extra="plot").close(whole.figure_)
     mean = whole.mean_shape
-    means = class_means(label, fit.estimator.alpha_)
+    means = [*class_means(label, fit.estimator.alpha_).values()]
     shapes = mean + np.tensordot(means, whole.basis, 1)
     (limits,), _ = block_limits([np.concatenate([mean[None], shapes])])
     axes = new_page(len(shapes), np.ptp(limits, axis=1), None).reshape(-1, 2)

@@ -1,14 +1,17 @@
 """The command fit."""
 
+import contextlib
+import sys
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
 from isa_nrsfm._compat.caller import warn_caller
@@ -18,28 +21,34 @@ from isa_nrsfm._compat.whole_files import (
     files_together,
     folder_for_writing,
 )
-from isa_nrsfm.cli._choice import choice_report, choose_n_components
+from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
+from isa_nrsfm._selection.choice import standard_errors
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
-from isa_nrsfm.cli._drawing import chosen_edges, drawing_files
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, NONE
 from isa_nrsfm.cli._outputs import (
+    REPORT,
     RESULTS,
+    entry_of_report,
+    is_of_run,
     refuse_overwriting,
+    write_alpha,
     write_report,
     write_results,
 )
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import read_frames, take_frames
+from isa_nrsfm.cli._reading import chosen_edges, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
-from isa_nrsfm.cli._runs import REPORT, files_of_report, is_of_run
 from isa_nrsfm.cli._sections import fit_text, write_page
 from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
-from isa_nrsfm.io._landmark_columns import find_landmark_columns
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Parts of the table that are held out in turn: blocks of rows, because neighbours are
+# often alike.
+N_PARTS = 3
 
 
 def run(args: Namespace, warned: list[str]) -> str:
@@ -61,15 +70,8 @@ def fit_table(
     report.
     """
     _check_options(args)
-    folder = Path(args.output)
-    clock = {"": args.since}
-    results, inputs = RESULTS, [args.table, *drawing_files(args)]
-    if table is None:
-        frames = read_frames(args)
-    else:
-        args.format = "table"
-        frames = take_frames(args, table, find_landmark_columns(table.columns))
-        results, inputs = results | {Path(args.table).name: "the table"}, inputs[1:]
+    folder, clock = Path(args.output), {"": args.since}
+    frames = read_frames(args, table=table)
     X = frames.X
     if X.empty:
         out = ", ".join(
@@ -80,6 +82,11 @@ def fit_table(
     figures = {} if args.no_figures else figures_of(args, asked)
     edges = chosen_edges(args, frames.columns.points, frames.skeleton)
     drawn: dict[str, Any] = {"edges": edges, "origin": args.origin or "auto"}
+    results, inputs = RESULTS, drawing_files(args)
+    if table is None:
+        inputs.append(args.table)
+    else:
+        results = results | {Path(args.table).name: "the table"}
     with folder_for_writing(folder):
         files = [*results, *figures, REPORT]
         refuse_overwriting(inputs, [folder / name for name in files])
@@ -94,23 +101,17 @@ def fit_table(
         with files_together(folder, removed=removed) as new:
             if table is not None:
                 write_table(table, new / Path(args.table).name)
-            write_results(
-                new,
-                estimator,
-                frames,
-                columns,
-                std=args.std,
-                drawn=drawn,
-                labels=_first_classes(asked, X),
-                times=asked.times,
-            )
+            std = estimator.alpha_std_ if args.std else None
+            write_alpha(new / "alpha.csv", frames, estimator.alpha_, std, columns)
+            shown = {"labels": _first_classes(asked, X), "times": asked.times}
+            write_results(new, estimator, frames, drawn, **shown)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args.table, args.format, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, X, frames, edges),
+                "model": model_report(estimator, X, edges),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
@@ -136,13 +137,12 @@ def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
-    if args.refinement == "joint":
-        return
-    got = f"needs --refinement joint; got --refinement {args.refinement}"
-    if args.std:
-        raise ValueError(f"--std {got}")
-    if args.n_components[0] == AUTO:
-        raise ValueError(f"--n-components auto {got}")
+    auto = args.n_components[0] == AUTO
+    for option in ["--std"] * args.std + ["--n-components auto"] * auto:
+        if args.refinement != "joint":
+            raise ValueError(
+                f"{option} needs --refinement joint; got --refinement {args.refinement}"
+            )
 
 
 def _written(
@@ -168,12 +168,13 @@ def _fitted(
     clock: dict[str, float],
 ) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
     """Return the model that the options ask for, and the search for its K."""
-    strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
-    options = {} if args.n_init is None else {"n_init": args.n_init}
-    default = args.isa == "pooled" and args.n_init is None
+    isa = None
+    if args.isa == "fast" or args.n_init is not None:
+        strategy = {"pooled": PooledFastICA, "fast": FastISA}[args.isa]
+        isa = strategy(**({} if args.n_init is None else {"n_init": args.n_init}))
     estimator = AffineNRSfM(
         args.n_components[0],
-        isa=None if default else strategy(**options),
+        isa=isa,
         block_recovery=args.block_recovery,
         refinement=None if args.refinement == NONE else args.refinement,
         camera=args.camera,
@@ -199,8 +200,8 @@ def _fitted(
 
 def _old_figures(folder: Path, new: list[str]) -> list[str]:
     """Return the figures that the report of an earlier run lists; warn of others."""
-    old = [name for name in files_of_report(folder) if name.endswith(".png")]
-    others = sorted({*ALWAYS} - {*old, *new})
+    old = [name for name in entry_of_report(folder, "files") if name.endswith(".png")]
+    others = [name for name in sorted(ALWAYS) if name not in (*old, *new)]
     others = [name for name in others if (folder / name).exists()]
     if others:
         warn_caller(f"{folder} has figures of an earlier run: {', '.join(others)}")
@@ -216,3 +217,72 @@ def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
             values[label.known] = [str(value) for value in label.values]
             return values
     return None
+
+
+def choose_n_components(
+    estimator: AffineNRSfM,
+    X: "pd.DataFrame",
+    candidates: Sequence[int],
+    groups: NDArray | None = None,
+) -> AffineNRSfMCV:
+    """Return the fitted search for the number that best predicts held-out frames.
+
+    Frames of one group are held out together. Results are printed at once.
+    """
+    splitter: Any = N_PARTS
+    if groups is not None:
+        n_groups = len(np.unique(groups.astype(str)))
+        if n_groups < 2:
+            raise ValueError(
+                "--group: numbers of basis shapes are compared on held-out groups, "
+                f"which needs two groups; got {n_groups}"
+            )
+        splitter = GroupKFold(min(N_PARTS, n_groups))
+    search = AffineNRSfMCV(candidates, estimator=estimator, cv=splitter, verbose=1)
+    with contextlib.redirect_stdout(sys.stderr):
+        return search.fit(X, groups=groups)
+
+
+def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
+    """Return the numbers tried, their held-out errors, seconds, and the one chosen.
+
+    If that is the largest, also the next numbers with their expected seconds.
+    """
+    results, n_parts = search.cv_results_, search.n_splits_
+    seconds = results["path_fit_time"] + n_parts * (
+        results["mean_fit_time"] + results["mean_score_time"]
+    )
+    tried = results["param_n_components"]
+    scores = [results[f"split{part}_test_score"] for part in range(n_parts)]
+    of_parts = -np.transpose(scores)
+    report = {
+        "n_components": tried.tolist(),
+        "held_out_error": -results["mean_test_score"],
+        "held_out_error_standard_error": standard_errors(of_parts),
+        "held_out_error_of_parts": of_parts,
+        "seconds": seconds,
+        "chosen": search.n_components_,
+    }
+    fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
+    most = min(largest_n_components(X.shape[1] // 2), most_for_frames(fitted))
+    following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
+    if search.n_components_ == tried[-1] and len(following):
+        report["next"] = {
+            "n_components": following.tolist(),
+            "seconds": float(extrapolated(tried, seconds, following).sum()),
+        }
+    return report
+
+
+def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArray:
+    """Return the expected seconds of further numbers of basis shapes.
+
+    The least squares line, and at least the seconds of the largest number. The first of
+    three or more numbers is left out: it includes the search for starts.
+    """
+    if len(tried) > 2:
+        tried, seconds = tried[1:], seconds[1:]
+    degree = min(len(tried) - 1, 1)
+    # The numbers as they are: one alone has no range to be scaled by.
+    line = np.polynomial.Polynomial.fit(tried, seconds, degree, domain=[])
+    return np.maximum(line(following), seconds[-1])

@@ -11,7 +11,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from isa_nrsfm.cli._parser import PROGRAM, build_parser
+from isa_nrsfm.cli._options import PROGRAM, build_parser, flag_of
 from isa_nrsfm.cli._progress import show_stage, shown_progress
 
 # Parameters that messages name, as options of the same names.
@@ -71,9 +71,9 @@ def _with_options(text: str, args: Namespace) -> str:
     """Join the lines of a message, and name options instead of parameters of Python."""
     text = " ".join(text.split())
     for name in filter(partial(hasattr, args), _PARAMETERS):
-        option = f"--{name.replace('_', '-')}"
         value = r"=(?P<quote>['\"]?)(?P<value>[\w.-]*\w)(?P=quote)"
-        text = re.sub(rf"(?<![\w/\\-]){name}{value}", rf"{option} \g<value>", text)
+        option = rf"{flag_of(name)} \g<value>"
+        text = re.sub(rf"(?<![\w/\\-]){name}{value}", option, text)
     if hasattr(args, "n_components"):
         text = re.sub(r"(?<![\w'\"-])n_components\b", "--n-components", text)
     return text

@@ -1,15 +1,16 @@
-"""The options of all commands, each written once.
+"""The commands of the command line, their options, and the parser.
 
 ``--help`` must not wait for imports of the estimator or a reader. `tests/test_cli.py`
 compares the defaults with those of `AffineNRSfM` and its strategies.
 """
 
+import argparse
 import re
-from argparse import ArgumentTypeError
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from isa_nrsfm import __version__
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
     CAMERA_NAMES,
@@ -20,6 +21,7 @@ from isa_nrsfm._parameters.choices import (
 )
 from isa_nrsfm.io._formats import FORMATS, TABLE
 
+PROGRAM = "isa-nrsfm"
 # The number of basis shapes that the table determines.
 AUTO = "auto"
 # The value of an option that switches something off.
@@ -35,145 +37,139 @@ SUFFIXES = {
 }
 
 
-def a_path(text: str) -> str:
+def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Return a function that reads a value, and shows what is expected if it fails."""
+
+    def reader(text: str) -> Any:
+        try:
+            return read(text)
+        except ValueError:
+            raise _wrong(expected, repr(text)) from None
+
+    return reader
+
+
+def _wrong(expected: str, got: str) -> argparse.ArgumentTypeError:
+    """Return the error of a value that is not as expected."""
+    return argparse.ArgumentTypeError(f"expected {expected}; got {got}")
+
+
+def _path(text: str) -> str:
     """Read the path of a file or a folder."""
     if not text.strip():
-        raise ArgumentTypeError("expected a path; got an empty text")
+        raise _wrong("a path", "an empty text")
     return text
 
 
-def whole_number(smallest: int, largest: int = 2**31 - 1) -> Callable[[str], int]:
+def _whole_number(smallest: int, largest: int = 2**31 - 1) -> Callable[[str], int]:
     """Return a function that reads a whole number in a range."""
 
     def read(text: str) -> int:
-        try:
-            number = int(text)
-        except ValueError:
-            number = smallest - 1
+        number = int(text)
         if not smallest <= number <= largest:
-            raise ArgumentTypeError(
-                f"expected a whole number from {smallest} to {largest}; got {text!r}"
-            )
+            raise ValueError
         return number
 
-    return read
+    return _reader(f"a whole number from {smallest} to {largest}", read)
 
 
-def numbers_of_shapes(text: str) -> tuple[int | str, ...]:
+def _numbers_of_shapes(text: str) -> tuple[int | str, ...]:
     """Read numbers of basis shapes, such as 9, 1-8 or 3,6,9, ascending; or auto."""
     if text.strip() == AUTO:
         return (AUTO,)
     numbers: set[int] = set()
     for part in text.split(","):
         bounds = re.fullmatch(r"(\d+)\s*-\s*(\d+)", part.strip())
-        ends = bounds.groups() if bounds else (part, part)
-        low, high = map(whole_number(1), ends)
+        low, high = map(_whole_number(1), bounds.groups() if bounds else (part, part))
         if not low <= high < low + 100:
-            raise ArgumentTypeError(
-                "expected a range of at most 100 numbers, the smaller one first, such "
-                f"as 1-8; got {part!r}"
+            raise _wrong(
+                "a range of at most 100 numbers, the smaller one first, such as 1-8",
+                repr(part),
             )
         numbers.update(range(low, high + 1))
     return tuple(sorted(numbers))
 
 
-def number_of_modes(text: str) -> float:
-    """Read a whole number of at least 1, or a share between 0 and 1."""
-    number = _float(text)
-    if 0 < number < 1:
-        return number
-    if number < 1 or not number.is_integer():
-        raise ArgumentTypeError(
-            f"expected a whole number or a share between 0 and 1; got {text!r}"
-        )
-    return int(number)
+def _number_of_modes(text: str) -> float:
+    """Read a whole number above zero, or a share between 0 and 1."""
+    number = float(text)
+    if not (0 < number < 1 or (number >= 1 and number.is_integer())):
+        raise ValueError
+    return number if number < 1 else int(number)
 
 
-def positive_number(text: str) -> float:
+def _positive_number(text: str) -> float:
     """Read a finite number above zero."""
-    number = _float(text)
+    number = float(text)
     if not 0 < number < float("inf"):
-        raise ArgumentTypeError(f"expected a number above zero; got {text!r}")
+        raise ValueError
     return number
 
 
-def _float(text: str) -> float:
-    """Read a number; zero where it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return 0.0
-
-
-def image_size(text: str) -> tuple[int, int]:
+def _image_size(text: str) -> tuple[int, int]:
     """Read WIDTHxHEIGHT."""
     match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
     if match is None:
-        raise ArgumentTypeError(
-            f"expected WIDTHxHEIGHT, such as 1920x1080; got {text!r}"
-        )
+        raise ValueError
     return int(match[1]), int(match[2])
 
 
-def row_rule(text: str) -> tuple[str, re.Pattern[str]]:
+def _row_rule(text: str) -> tuple[str, re.Pattern[str]]:
     """Read COLUMN=REGEX."""
     column, equals, expression = text.partition("=")
     if not (column.strip() and equals and expression):
-        raise ArgumentTypeError(
-            f"expected COLUMN=REGEX, such as 'name=^ir'; got {text!r}"
-        )
+        raise ValueError
     try:
         return column.strip(), re.compile(expression)
     except re.error as error:
-        raise ArgumentTypeError(
+        raise argparse.ArgumentTypeError(
             f"{expression!r} is not a regular expression: {error}"
         ) from error
 
 
-def point_pair(text: str) -> tuple[str, ...]:
+def _point_pair(text: str) -> tuple[str, ...]:
     """Read two points with a comma between them."""
-    points = tuple(each.strip() for each in text.split(","))
-    if len(points) != 2 or not all(points):
-        raise ArgumentTypeError(
-            "expected two points with a comma between them, such as 48,54; "
-            f"got {text!r}"
-        )
-    return points
+    first, second = _names(text)
+    if not (first and second):
+        raise ValueError
+    return first, second
 
 
-def skeleton_name(text: str) -> str:
+def _skeleton(text: str) -> str:
     """Read the name of a layout, or the path of a configuration of DeepLabCut."""
-    if text in SKELETON_NAMES or Path(text).suffix.lower() in CONFIGURATIONS:
-        return text
-    raise ArgumentTypeError(
-        f"expected one of {', '.join(SKELETON_NAMES)}, or a .yaml file; got {text!r}"
-    )
+    if text not in SKELETON_NAMES and Path(text).suffix.lower() not in CONFIGURATIONS:
+        raise ValueError
+    return text
 
 
-def listed_names(text: str) -> list[str]:
+def _names(text: str) -> list[str]:
     """Read names with commas between them."""
     return [name.strip() for name in text.split(",")]
 
 
 # How the values of options are read, by their names in the help; others are texts.
 TYPES: dict[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("FILE", "DIR", "TABLE", "MODEL"), a_path),
-    "COLUMN=REGEX": row_rule,
+    **dict.fromkeys(("FILE", "DIR", "TABLE", "MODEL"), _path),
+    "COLUMN=REGEX": _reader("COLUMN=REGEX, such as 'name=^ir'", _row_rule),
     "CONFIDENCE": float,
-    "K": numbers_of_shapes,
-    "LAYOUT": skeleton_name,
-    "MODES": number_of_modes,
+    "K": _numbers_of_shapes,
+    "LAYOUT": _reader(
+        f"one of {', '.join(SKELETON_NAMES)}, or a .yaml file", _skeleton
+    ),
+    "MODES": _reader("a whole number or a share between 0 and 1", _number_of_modes),
     "N": int,
-    "NAMES": listed_names,
-    "NUMBER": positive_number,
-    "POINT,POINT": point_pair,
-    "SEED": whole_number(0, 2**32 - 1),
-    "STARTS": whole_number(1),
-    "WIDTHxHEIGHT": image_size,
+    "NAMES": _names,
+    "NUMBER": _reader("a number above zero", _positive_number),
+    "POINT,POINT": _reader(
+        "two points with a comma between them, such as 48,54", _point_pair
+    ),
+    "SEED": _whole_number(0, 2**32 - 1),
+    "STARTS": _whole_number(1),
+    "WIDTHxHEIGHT": _reader("WIDTHxHEIGHT, such as 1920x1080", _image_size),
 }
 
 
-def _option(help: str, metavar: str, **settings: Any) -> dict[str, Any]:
+def _option(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
     """Return the arguments of `add_argument` for an option with a value."""
     return {"help": help, "metavar": metavar, "type": TYPES.get(metavar)} | settings
 
@@ -183,13 +179,13 @@ def _flag(help: str) -> dict[str, Any]:
     return {"help": help, "action": "store_true"}
 
 
-def _list(help: str, metavar: str, **settings: Any) -> dict[str, Any]:
+def _list(metavar: str, help: str, **settings: Any) -> dict[str, Any]:
     """Return the arguments of `add_argument` for an option that may be repeated."""
     settings |= {"action": "append", "default": []}
-    return _option(f"{help}; may be repeated", metavar, **settings)
+    return _option(metavar, f"{help}; may be repeated", **settings)
 
 
-def _choice(help: str, choices: tuple[str, ...]) -> dict[str, Any]:
+def _choice(choices: tuple[str, ...], help: str) -> dict[str, Any]:
     """Return the arguments of `add_argument` for a choice, whose first one is taken."""
     help = f"{help} (default: {choices[0]})"
     return {"help": help, "choices": choices, "default": choices[0]}
@@ -197,64 +193,62 @@ def _choice(help: str, choices: tuple[str, ...]) -> dict[str, Any]:
 
 # Arguments without a leading -- in the command line.
 POSITIONAL = ("table", "model")
-SHORT = {"output": "-o", "n_components": "-k"}
+SHORT = {"output": ["-o"], "n_components": ["-k"]}
 OPTIONS: dict[str, dict[str, Any]] = {
-    "model": _option("model.npz, written by fit", "MODEL"),
+    "model": _option("MODEL", "model.npz, written by fit"),
     # The table.
     "table": _option(
-        "a .csv, .tsv or .parquet file, or a file or folder of another format", "TABLE"
+        "TABLE", "a .csv, .tsv or .parquet file, or a file or folder of another format"
     ),
     "format": _option(
+        "FORMAT",
         "the program that wrote the table: "
         f"{', '.join(name for name in FORMATS if name != TABLE)}, or {TABLE} for "
         "any table with named columns (default: auto, recognised by the beginning of "
         "the file)",
-        "FORMAT",
         choices=["auto", *FORMATS],
         default="auto",
     ),
     "columns": _option(
+        "PATTERN",
         "patterns of the x and y columns, if their names are ambiguous: # for a "
         "number, * for any text, such as 'x_#,y_#' or '*.px,*.py'",
-        "PATTERN",
     ),
     "skip_rows": _list(
-        "leave out rows whose column matches the expression, such as 'name=^ir'",
         "COLUMN=REGEX",
+        "leave out rows whose column matches the expression, such as 'name=^ir'",
     ),
     "zeros_missing": _flag("treat points at exactly (0, 0) as missing"),
     "min_confidence": _option(
-        "treat points with a lower confidence as missing",
-        "CONFIDENCE",
+        "CONFIDENCE", "treat points with a lower confidence as missing"
     ),
     "image_size": _option(
-        "size of the images for MediaPipe, in pixels, such as 1920x1080",
-        "WIDTHxHEIGHT",
+        "WIDTHxHEIGHT", "size of the images for MediaPipe, in pixels, such as 1920x1080"
     ),
     "points": _option(
+        "POINTS",
         "fit some of the points: inner (without the visible outline of a face, which "
         "slides over the surface as the head turns), or names, numbers and ranges such "
         "as nose,36-47 or without:0-16",
-        "POINTS",
     ),
     # What is written.
     "output": _option(
-        "folder for the results, created if absent", "DIR", required=True
+        "DIR", "folder for the results, created if absent", required=True
     ),
     "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
     "std": _flag(
         "add the standard deviation of each coefficient, in columns such as alpha_1_std"
     ),
-    "viewer": _option("write a page that shows the new frames in 3D (.html)", "FILE"),
+    "viewer": _option("FILE", "write a page that shows the new frames in 3D (.html)"),
     "edges": _option(
+        "FILE",
         "lines to draw between points: a .csv file with the names of two points per "
         "line, or of three for a surface; 'none' draws only points",
-        "FILE",
     ),
     "skeleton": _option(
+        "LAYOUT",
         "the layout of the points, if names, number and order of the points do not "
         f"determine it: {', '.join(SKELETON_NAMES)}, or the config.yaml of DeepLabCut",
-        "LAYOUT",
     ),
     "origin": {
         "help": "where y is zero: upper in images, whose y points down, lower if y "
@@ -263,86 +257,78 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     # Other columns.
     "label": _list(
+        "COLUMN",
         "a class or a number for each frame, such as an expression or an age: reports "
         "the dependence of the coefficients on it. Whole numbers are classes unless "
         "given as COLUMN:number",
-        "COLUMN",
     ),
     "group": _option(
+        "COLUMN",
         "people, videos or files: reports the variance between and within groups. "
         "Held-out frames come from other groups; smoothing stops at their borders",
-        "COLUMN",
     ),
     "distance": _list(
+        "POINT,POINT",
         "add the distance of two points of the 3D shapes to alpha.csv, in units of the "
         "distance between the outer corners of the eyes",
-        "POINT,POINT",
     ),
     "unit": _option(
-        "two points whose distance in the mean shape is the unit of --distance",
         "POINT,POINT",
+        "two points whose distance in the mean shape is the unit of --distance",
     ),
     "length": _option(
-        "the length of that unit, such as 90 for millimetres (default: 1)",
         "NUMBER",
+        "the length of that unit, such as 90 for millimetres (default: 1)",
         default=1.0,
     ),
     "time": _option(
-        "times of the frames, numbers or dates: adds smoothed coefficients",
-        "COLUMN",
+        "COLUMN", "times of the frames, numbers or dates: adds smoothed coefficients"
     ),
-    "fps": _option(
-        "instead of --time, the frames per second of a video",
-        "NUMBER",
-    ),
+    "fps": _option("NUMBER", "instead of --time, the frames per second of a video"),
     # The method.
     "n_components": _option(
+        "K",
         "number of basis shapes (default: 3). Of several, such as 1-8 or 3,6,9, the "
         "best in cross-validation is used; auto uses as many as the table determines, "
         "at most twelve",
-        "K",
         default="3",
     ),
     "camera": _choice(
+        CAMERA_NAMES,
         "camera model: affine (no assumption), weak_perspective (a rotation and a "
         "scale per frame), or orthographic (one scale). With the last two, shapes have "
         "true proportions",
-        CAMERA_NAMES,
     ),
     "isa": _choice(
-        "independent subspace analysis: FastICA with pooled components, or FastISA",
         ("pooled", "fast"),
+        "independent subspace analysis: FastICA with pooled components, or FastISA",
     ),
     "n_init": _option(
-        "number of random starts (default: 16 of pooled, 30 of fast)",
-        "STARTS",
+        "STARTS", "number of random starts (default: 16 of pooled, 30 of fast)"
     ),
     "block_recovery": _choice(
-        "algorithm that finds the block structure", BLOCK_RECOVERIES
+        BLOCK_RECOVERIES, "algorithm that finds the block structure"
     ),
     "refinement": _choice(
+        (*REFINEMENTS, NONE),
         "joint: cameras, coefficients and basis shapes together; alternating: the "
         "refinement of the paper, with cameras of the rigid part",
-        (*REFINEMENTS, NONE),
     ),
     "independence": _choice(
-        "joint refinement: independent basis shapes, or independent coefficients",
         (*INDEPENDENCE, NONE),
+        "joint refinement: independent basis shapes, or independent coefficients",
     ),
     "loss": _choice(
-        "joint refinement: huber and cauchy limit the influence of outliers", LOSSES
+        LOSSES, "joint refinement: huber and cauchy limit the influence of outliers"
     ),
     "no_scale_frames": _flag(
         "weight frames by their size in the image, as orthographic cameras always do"
     ),
     "random_state": _option(
-        "seed of the random starts (default: 0)",
-        "SEED",
-        default=0,
+        "SEED", "seed of the random starts (default: 0)", default=0
     ),
     "n_jobs": _option(
-        "processes for the random starts, -1 for all processors (default: 1)",
-        "N",
+        "N", "processes for the random starts, -1 for all processors (default: 1)"
     ),
     # Export.
     "content": {
@@ -351,14 +337,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "choices": list(SUFFIXES),
     },
     "n_modes": _option(
+        "MODES",
         "for a point distribution model, the number of modes, or the share of the "
         "variance that they explain, such as 0.98 (default: number of basis shapes)",
-        "MODES",
     ),
     "names": _option(
-        "for .html and .glb, names of the basis shapes with commas", "NAMES"
+        "NAMES", "for .html and .glb, names of the basis shapes with commas"
     ),
-    "n_frames": _option("for .html, the largest number of frames (default: 1000)", "N"),
+    "n_frames": _option("N", "for .html, the largest number of frames (default: 1000)"),
     "mirrored": _flag("take the mirror image in depth, which has the same images"),
 }
 # Where an option of one command differs from that of the others.
@@ -394,3 +380,150 @@ TABLE_OPTIONS = (
     "image_size",
 )
 DRAWING = (("edges", "skeleton"), "origin")
+
+_OVERVIEW = """\
+Factorise a table of 2D landmarks (one row per frame) into a mean 3D shape, basis shapes
+and, for every frame, coefficients that do not depend on the viewpoint."""
+
+_EXAMPLES = """\
+examples:
+  isa-nrsfm demo
+      fit an artificial table of faces
+  isa-nrsfm fit faces.csv --n-components 9 --output results
+      fit a table and write coefficients, shapes, cameras, figures and the model
+  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
+      coefficients of new frames
+  isa-nrsfm export results/model.npz --output faces.glb
+      the shapes for other programs
+
+Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
+such as x0, y0 or nose_x, nose_y; all other columns are copied to the results. Files of
+OpenFace, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO and WFLW, and folders of .pts
+files, are recognised automatically."""
+
+# Of each command: its line in the overview, description, examples, and the options of
+# each group. Of the options in a pair only one may be given.
+_COMMANDS: dict[str, tuple[str, str, str, dict[str, tuple]]] = {
+    "fit": (
+        "fit a table",
+        "Fit basis shapes and coefficients to a table of landmarks.",
+        """\
+examples:
+  isa-nrsfm fit faces.csv --n-components 9 --output results
+  isa-nrsfm fit faces.csv --n-components 1-12 --output results
+  isa-nrsfm fit body.csv --camera weak_perspective -k auto --output results
+  isa-nrsfm fit muct76-opencv.csv --skip-rows 'name=^ir' --zeros-missing \\
+      --n-components 9 --output muct
+  isa-nrsfm fit openface.csv --min-confidence 0.8 --n-components 5 --output results
+  isa-nrsfm fit 300W/01_Indoor --points inner --n-components 5 --output results
+
+Cells of missing points are empty. Rows with too few points are counted and have empty
+coefficients. The results replace those of an earlier run in the output folder.""",
+        {
+            "table": ("table", *TABLE_OPTIONS, "points"),
+            "output": ("output", "no_figures", "std", *DRAWING),
+            "other columns": (
+                *("label", "group", "distance", "unit", "length", ("time", "fps")),
+            ),
+            "method": (
+                *("n_components", "camera", "isa", "n_init", "block_recovery"),
+                *("refinement", "independence", "loss", "no_scale_frames"),
+                *("random_state", "n_jobs"),
+            ),
+        },
+    ),
+    "transform": (
+        "coefficients of new frames",
+        "Compute the coefficients of new frames with a fitted model.",
+        """\
+example:
+  isa-nrsfm transform results/model.npz new.csv --output new-alpha.csv
+
+The table must have the landmark columns of the fitted table. The output has a row for
+every row of the table; rows with too few points have empty coefficients.""",
+        {
+            "model": ("model",),
+            "table": ("table", *TABLE_OPTIONS),
+            "output": ("output", "std", "viewer", *DRAWING),
+        },
+    ),
+    "export": (
+        "shape models, animated 3D, a viewer",
+        """\
+Write a fitted model for other programs. The suffix of the output determines the format:
+  .html        a page that shows the shapes and frames in 3D, for any browser
+  .glb         glTF 2.0: the mean shape with the basis shapes as morph targets
+  .txt         a point distribution model for OpenFace and the CLM framework
+  .npz, .mat   the arrays of the model for NumPy, MATLAB and Octave""",
+        """\
+examples:
+  isa-nrsfm export results/model.npz --output faces.glb
+  isa-nrsfm export results/model.npz --output pdm.txt --n-modes 0.98
+  isa-nrsfm export results/model.npz --output pdm.mat --content pdm
+  isa-nrsfm export results/model.npz faces.csv --label expression --output faces.html
+
+Shapes are upright and frontal, with the proportions that weak-perspective cameras
+determine; .npz and .mat have the arrays of the model unchanged. Models of
+'fit --camera weak_perspective' or 'orthographic' have true proportions already.""",
+        {
+            "model": ("model",),
+            "output": (
+                *("output", "content", "n_modes", *DRAWING, "names", "label"),
+                *("n_frames", "camera", "mirrored"),
+            ),
+            "table": ("table", *TABLE_OPTIONS),
+        },
+    ),
+    "demo": (
+        "fit an artificial table of faces",
+        "Fit an artificial table of faces and compare the result with the truth.",
+        """\
+example:
+  isa-nrsfm demo --output faces
+
+The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
+        {"output": ("output", "no_figures", *DRAWING)},
+    ),
+}
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    parser = argparse.ArgumentParser(PROGRAM, **_manners(_OVERVIEW, _EXAMPLES))
+    parser.add_argument(
+        "--version", action="version", version=f"{PROGRAM} {__version__}"
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command, (line, description, examples, groups) in _COMMANDS.items():
+        own = commands.add_parser(command, help=line, **_manners(description, examples))
+        for title, entries in groups.items():
+            group = own.add_argument_group(title)
+            for entry in entries:
+                if isinstance(entry, str):
+                    _add(group, command, entry)
+                    continue
+                either = group.add_mutually_exclusive_group()
+                for name in entry:
+                    _add(either, command, name)
+    return parser
+
+
+def flag_of(name: str) -> str:
+    """Return how an argument is written in the command line."""
+    return name.upper() if name in POSITIONAL else f"--{name.replace('_', '-')}"
+
+
+def _add(group: argparse._ActionsContainer, command: str, name: str) -> None:
+    """Add an option of a command."""
+    flags = [name] if name in POSITIONAL else [*SHORT.get(name, []), flag_of(name)]
+    group.add_argument(*flags, **OPTIONS[name] | DIFFERENT.get((command, name), {}))
+
+
+def _manners(description: str, epilog: str) -> dict[str, Any]:
+    """Return the settings of all parsers: help as it is written, exact options."""
+    return {
+        "description": description,
+        "epilog": epilog,
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+        "allow_abbrev": False,
+    }

@@ -1,21 +1,25 @@
-"""Write the results of a fit to a folder."""
+"""Write the results of a fit to a folder, and find out which run its files are of.
 
+The report has the SHA-256 digests of the model and the other files of its run.
+"""
+
+import hashlib
 import json
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, Decomposition, export
+from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._reading import Frames
-from isa_nrsfm.cli._runs import DIGESTS, REPORT, digests_of
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PAGE = "report.html"
+REPORT = "report.json"
 # The files of every fit and their contents, of which the text has the first clause.
 RESULTS = {
     PAGE: "this report with its figures, for any browser",
@@ -51,56 +56,65 @@ def refuse_overwriting(sources: Iterable[str], targets: Iterable[Path]) -> None:
             )
 
 
-def beside_other_columns(
-    results: "pd.DataFrame", other: "pd.DataFrame"
-) -> "pd.DataFrame":
-    """Put the row number and a table's other columns in front of the results.
+def write_alpha(
+    path: Path,
+    frames: Frames,
+    alpha: NDArray,
+    std: NDArray | None,
+    further: "pd.DataFrame | None" = None,
+) -> None:
+    """Write coefficients after the row number and the other columns of the table.
 
-    Results with the name of another column get an underscore.
+    Frames that could not be fitted have empty coefficients. Results with the name of
+    another column get an underscore.
     """
     pd = import_optional("pandas", extra="io")
-    taken = {str(name) for name in other.columns}
-    names = {"row": "row"} | {str(name): str(name) for name in results.columns}
-    for name in names:
-        while names[name] in taken:
-            names[name] += "_"
-    renamed = [f"{new} (not {name})" for name, new in names.items() if new != name]
+    names = names_of_components(None, alpha.shape[1])
+    results = pd.DataFrame(alpha, index=frames.X.index, columns=names)
+    if std is not None:
+        results[[f"{name}_std" for name in names]] = std
+    if further is not None:
+        results = results.join(further)
+    results = results.reindex(frames.points.index)
+    results.insert(0, "row", results.index)
+    taken = {str(name) for name in frames.other.columns}
+    renamed = {}
+    for name in filter(taken.__contains__, results):
+        renamed[name] = f"{name}_"
+        while renamed[name] in taken:
+            renamed[name] += "_"
     if renamed:
+        listed = ", ".join(f"{new} (not {name})" for name, new in renamed.items())
         warn_caller(
             "the table has columns with the names of results, which were renamed to "
-            f"{', '.join(renamed)}",
+            + listed
         )
-    row = pd.Series(results.index, index=results.index, name=names["row"])
-    return pd.concat([row, other, results.rename(columns=names)], axis=1)
+    results = results.rename(columns=renamed)
+    parts = [results.iloc[:, :1], frames.other, results.iloc[:, 1:]]
+    write_table(pd.concat(parts, axis=1), path)
 
 
 def write_results(
     folder: Path,
     estimator: AffineNRSfM,
     frames: Frames,
-    further: "pd.DataFrame",
-    *,
-    std: bool,
     drawn: dict[str, Any],
     **shown: Any,
 ) -> None:
-    """Write model, coefficients with further columns, cameras, shapes and the viewer.
+    """Write the cameras, the shapes, the viewer with what it shows, and the model.
 
-    The tables have a row for each frame, empty if it could not be fitted.
+    The cameras have a row for each frame, empty if it could not be fitted.
     """
     pd = import_optional("pandas", extra="io")
-    fit, X = fitted_frames(estimator), frames.X
-    alpha = alpha_table(fit, frames, std=std).join(further)
-    write_table(beside_other_columns(alpha, frames.other), folder / "alpha.csv")
-
+    X, motion = frames.X, estimator.motion_
     cameras = pd.DataFrame(
-        np.hstack([fit.motion.reshape(-1, 6), fit.translation]),
+        np.hstack([motion.reshape(-1, 6), estimator.translation_]),
         index=X.index,
         columns=[*(f"m{i}{j}" for i in range(2) for j in range(3)), "tx", "ty"],
     )
-    energy, error, _ = frame_energies(X, fitted_table(estimator, fit), estimator.layout)
+    energy, error, _ = frame_energies(X, fitted_table(estimator), estimator.layout)
     cameras["inverse_snr"] = error / energy
-    camera: Literal["weak_perspective"] | None = None
+    shown["camera"] = None
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:
             with warnings.catch_warnings():
@@ -109,7 +123,7 @@ def write_results(
             columns = pd.DataFrame(poses._asdict(), index=X.index)
             columns = columns.dropna(axis="columns", how="all")
             cameras = cameras.join(columns)
-            camera = "weak_perspective" if len(columns.columns) else None
+            shown["camera"] = "weak_perspective" if len(columns.columns) else None
         except (ValueError, UserWarning) as error:
             warn_caller(
                 f"viewer.html has affine shapes, and cameras.csv has no angles: {error}"
@@ -117,41 +131,22 @@ def write_results(
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)
     write_table(cameras, folder / "cameras.csv")
-
     export.write_shapes(estimator, folder / "shapes.npz")
-    export.write_viewer(
-        estimator, folder / "viewer.html", X=X, camera=camera, **drawn, **shown
-    )
+    export.write_viewer(estimator, folder / "viewer.html", X=X, **drawn, **shown)
     save_model(estimator, folder / "model.npz")
 
 
-def alpha_table(fit: Decomposition, frames: Frames, *, std: bool) -> "pd.DataFrame":
-    """Return the coefficients of all frames, empty for those that are not usable."""
-    pd = import_optional("pandas", extra="io")
-    names = names_of_components(None, fit.alpha.shape[1])
-    alpha = pd.DataFrame(fit.alpha, columns=names)
-    if std:
-        alpha[[f"{name}_std" for name in names]] = fit.alpha_std
-    alpha.index = frames.X.index
-    return alpha.reindex(frames.points.index)
-
-
-def fitted_frames(estimator: AffineNRSfM) -> Decomposition:
-    """Return cameras and coefficients of the table that a model was fitted to."""
-    alpha = estimator.alpha_
-    std = getattr(estimator, "alpha_std_", np.full_like(alpha, np.nan))
-    return Decomposition(estimator.motion_, estimator.translation_, alpha, std)
-
-
-def fitted_table(estimator: AffineNRSfM, fit: Decomposition) -> np.ndarray:
-    """Return the table of the model."""
-    return estimator.inverse_transform(fit.alpha, fit.motion, fit.translation)
+def fitted_table(estimator: AffineNRSfM) -> NDArray:
+    """Return the table of the model, in the frames that it was fitted to."""
+    return estimator.inverse_transform(
+        estimator.alpha_, estimator.motion_, estimator.translation_
+    )
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
     """Write the report and digests of its files as JSON, NaN as null; return it."""
-    digests = report.get(DIGESTS, {}) | digests_of(folder, report["files"])
-    report = report | {DIGESTS: digests}
+    digests = report.get("sha256", {}) | _digests(folder, report["files"])
+    report = report | {"sha256": digests}
     text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
     write_whole(folder / REPORT, f"{text}\n".encode())
     return report
@@ -170,3 +165,43 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, int):
         return value
     return as_utf8(value if isinstance(value, str) else repr(value))
+
+
+def is_of_run(folder: Path, report: dict[str, Any]) -> bool:
+    """Return whether the files in a folder are those that a report has digests of."""
+    return _digests(folder, report["sha256"]) == report["sha256"]
+
+
+def warn_of_mixed_runs(model: str) -> None:
+    """Warn if files beside a model are not of the run that the report is of."""
+    folder, name = Path(model).parent, Path(model).name
+    recorded = entry_of_report(folder, "sha256")
+    # A report that does not know the model is of something else.
+    if name not in recorded:
+        return
+    beside = _digests(folder, (name for name in recorded if Path(name).name == name))
+    differing = [name for name in beside if beside[name] != recorded[name]]
+    if differing:
+        warn_caller(
+            f"{folder / REPORT} is of another run than {', '.join(differing)} beside "
+            "it, or these were changed since"
+        )
+
+
+def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
+    """Return an entry of the report in a folder, without one an empty dict."""
+    try:
+        report = json.loads((folder / REPORT).read_text(encoding="utf-8"))
+        return dict(report[name])
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}
+
+
+def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    """Return the digests of those of the files that are in a folder."""
+    found = {}
+    for name in names:
+        if (folder / name).is_file():
+            with (folder / name).open("rb") as file:
+                found[name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return found

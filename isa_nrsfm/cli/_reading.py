@@ -1,7 +1,8 @@
-"""Read the table of a command: its landmarks, its other columns and unusable rows."""
+"""Read the table of a command: landmarks, layout, other columns, unusable rows."""
 
 from argparse import Namespace
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -9,17 +10,16 @@ from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm._prepare.checks import clean_tracks
-from isa_nrsfm._tables.column_names import parse_coordinate, point_names
-from isa_nrsfm._tables.visibility import (
-    FEWEST_POINTS,
-    FrameReport,
-    centred_frames,
-    seen_points,
-)
-from isa_nrsfm.cli._drawing import is_configuration
+from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
+from isa_nrsfm._tables.layout import tracks_to_table
+from isa_nrsfm._tables.visibility import FEWEST_POINTS, FrameReport, centred_frames
+from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
+from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
@@ -45,19 +45,17 @@ class Frames(NamedTuple):
 
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     are not skipped, by the number of the row in the table. ``usable`` marks the rows
-    that can be fitted, ``seen`` their visible points. ``left_out`` has reason, rows,
-    and whether they were skipped on request, ``not_used`` the sizes of unused sets of
-    coordinates.
+    that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
+    request, ``not_used`` the sizes of unused sets of coordinates.
     """
 
     points: "pd.DataFrame"
     other: "pd.DataFrame"
-    usable: NDArray[np.bool_]
-    seen: NDArray[np.bool_]
+    usable: NDArray
     columns: LandmarkColumns
     not_used: dict[str, int]
     n_rows: int
-    left_out: list[tuple[str, NDArray[np.intp], bool]]
+    left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
 
     @property
@@ -66,15 +64,18 @@ class Frames(NamedTuple):
         return self.points[self.usable]
 
 
-def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames:
-    """Read the table and take its frames, for a model those with its points."""
-    args.format = _format(args)
-    skeleton = failed = chosen = None
-    if args.format == "table":
-        table = read_table(args.table)
-        if args.columns is not None:
-            chosen = find_landmark_columns(table.columns, args.columns)
-    else:
+def read_frames(
+    args: Namespace,
+    estimator: AffineNRSfM | None = None,
+    table: "pd.DataFrame | None" = None,
+) -> Frames:
+    """Read the table if none is given, and take its frames; those of a model's points.
+
+    The format in the options becomes the one found.
+    """
+    chosen = failed = layout = None
+    args.format = _format(args) if table is None else TABLE
+    if args.format != TABLE:
         pd = import_optional("pandas", extra="io")
         options = {} if args.image_size is None else {"image_size": args.image_size}
         found = read_landmarks(
@@ -82,75 +83,32 @@ def read_frames(args: Namespace, estimator: AffineNRSfM | None = None) -> Frames
         )
         table = pd.concat([found.frames, found.points], axis=1)
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
-        pattern = f"those of {args.format}"
-        chosen = LandmarkColumns(pattern, found.point_names, x, y, (), ())
-        failed, skeleton = found.failed, found.skeleton
+        chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
+        failed, layout = found.failed, found.skeleton
+    elif table is None:
+        table = read_table(args.table)
+        if args.columns is not None:
+            chosen = find_landmark_columns(table.columns, args.columns)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
-        if chosen is not None and skeleton is not None:
-            places = [chosen.x.index(name) for name in columns.x]
-            if sorted(places) != list(range(len(chosen.x))):
-                skeleton = _part_of_layout(skeleton, places)
-        return take_frames(args, table, columns, failed, skeleton)
+        if chosen is not None:
+            kept = [chosen.x.index(name) for name in columns.x]
+            layout = _part_of_layout(layout, kept)
+        return _frames(args, table, columns, failed, layout)
     columns = chosen or find_landmark_columns(table.columns)
     if args.points is None:
-        return take_frames(args, table, columns, failed, skeleton)
-    layout = _layout(args, table, columns, skeleton)
-    kept = _kept_points(args.points, columns.points, layout)
+        return _frames(args, table, columns, failed, layout)
+    layout = _layout(args, table, columns, layout)
+    left = _kept_points(args.points, columns.points, layout)
     names, x, y = (
-        tuple(each[j] for j in kept) for each in (columns.points, columns.x, columns.y)
+        tuple(each[j] for j in left) for each in (columns.points, columns.x, columns.y)
     )
-    out = [name for name in columns.interleaved if name not in {*x, *y}]
-    frames = take_frames(
-        args,
-        table.drop(columns=out),
-        columns._replace(points=names, x=x, y=y),
-        failed,
-        _part_of_layout(layout, kept),
-    )
-    not_used = frames.not_used | {f"--points {args.points}": len(out) // 2}
-    return frames._replace(not_used=not_used)
-
-
-def take_frames(
-    args: Namespace,
-    table: "pd.DataFrame",
-    columns: LandmarkColumns,
-    failed: NDArray[np.bool_] | None = None,
-    skeleton: Skeleton | None = None,
-) -> Frames:
-    """Take the frames of a table; failed marks rows in which tracking failed."""
-    pd = import_optional("pandas", extra="io")
-    kept, left_out = _rows_to_keep(args, table)
-    rows, names = np.flatnonzero(kept), columns.interleaved
-    stripped = [name.strip() for name in names]
-    tracks = _tracks(args, table, columns, kept)
-    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
-    _, report = centred_frames(tracks)
-    usable = report.usable
-    reasons = _reasons(report, None if failed is None else failed[rows])
-    left_out += [(reason, rows[which], False) for reason, which in reasons]
-    at_origin = (tracks[usable] == 0).all(axis=2)
-    if at_origin.any():
-        n_points, n_rows = at_origin.sum(), at_origin.any(axis=1).sum()
-        warn_caller(
-            f"{n_points} point(s) in {n_rows} row(s) are at exactly (0, 0). If these "
-            "points are missing, use --zeros-missing"
-        )
-    # A format knows which of its columns are landmarks.
-    not_used = {} if failed is not None else _sets_not_used(table, columns)
-    values = tracks.reshape(len(rows), len(names))
-    return Frames(
-        points=pd.DataFrame(values, index=rows, columns=stripped),
-        other=table.loc[kept].drop(columns=names),
-        usable=usable,
-        seen=seen_points(tracks)[usable],
-        columns=columns,
-        not_used=not_used,
-        n_rows=len(table),
-        left_out=[out for out in left_out if len(out[1])],
-        skeleton=skeleton,
-    )
+    dropped = [name for name in columns.interleaved if name not in {*x, *y}]
+    columns = columns._replace(points=names, x=x, y=y)
+    layout = _part_of_layout(layout, left)
+    frames = _frames(args, table.drop(columns=dropped), columns, failed, layout)
+    frames.not_used[f"--points {args.points}"] = len(dropped) // 2
+    return frames
 
 
 def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
@@ -169,41 +127,78 @@ def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:
     """Return a table of landmarks with the columns that the model was fitted to."""
     fitted = getattr(estimator, "feature_names_in_", None)
     if fitted is None:
-        x_then_y = points.to_numpy().reshape(len(points), -1, 2).swapaxes(1, 2)
-        planar = estimator.layout == "planar"
-        return x_then_y.reshape(points.shape) if planar else points.to_numpy()
+        tracks = points.to_numpy().reshape(len(points), len(estimator.mean_shape_), 2)
+        return tracks_to_table(tracks, estimator.layout)
     in_order = points[[str(name).strip() for name in fitted]]
     return in_order.set_axis(list(fitted), axis=1)
 
 
 def _format(args: Namespace) -> str:
     """Return the format of the table, and refuse options of another one."""
-    found = args.format
+    found: str = args.format
     if found == "auto":
-        found = "table" if args.columns is not None else find_format(args.table)
-    if args.columns is not None and found != "table":
+        found = TABLE if args.columns is not None else find_format(args.table)
+    if args.columns is not None and found != TABLE:
         raise ValueError(f"--columns needs --format table; got --format {found}")
     if args.image_size is not None and "image_size" not in FORMATS[found].options:
         raise ValueError(
             f"--image-size needs --format mediapipe; {args.table} has format {found}"
         )
-    if args.min_confidence is not None and found == "table":
+    if args.min_confidence is not None and found == TABLE:
         raise ValueError(
             f"--min-confidence: {args.table} has format table, which has no confidences"
         )
     return found
 
 
+def _frames(
+    args: Namespace,
+    table: "pd.DataFrame",
+    columns: LandmarkColumns,
+    failed: NDArray | None,
+    skeleton: Skeleton | None,
+) -> Frames:
+    """Take the frames of a table; failed marks rows in which tracking failed."""
+    pd = import_optional("pandas", extra="io")
+    kept, left_out = _rows_to_keep(args, table)
+    rows, names = np.flatnonzero(kept), columns.interleaved
+    stripped = [name.strip() for name in names]
+    tracks = _tracks(args, table, columns, kept)
+    tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    _, report = centred_frames(tracks)
+    reasons = _reasons(report, None if failed is None else failed[rows])
+    left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
+    at_origin = (tracks[report.usable] == 0).all(axis=2)
+    if at_origin.any():
+        n_points, n_rows = at_origin.sum(), at_origin.any(axis=1).sum()
+        warn_caller(
+            f"points at exactly (0, 0) were found in {n_rows} of {len(at_origin)} "
+            f"rows, {n_points} in all. If these points are missing, use --zeros-missing"
+        )
+    # A format knows which of its columns are landmarks.
+    not_used = {} if failed is not None else _sets_not_used(table, columns)
+    return Frames(
+        points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
+        other=table.loc[kept].drop(columns=names),
+        usable=report.usable,
+        columns=columns,
+        not_used=not_used,
+        n_rows=len(table),
+        left_out=[out for out in left_out if len(out[1])],
+        skeleton=skeleton,
+    )
+
+
 def _rows_to_keep(
     args: Namespace, table: "pd.DataFrame"
-) -> tuple[NDArray[np.bool_], list[tuple[str, NDArray[np.intp], bool]]]:
+) -> tuple[NDArray, list[tuple[str, NDArray, bool]]]:
     """Return which rows no rule skips, and the rows that each rule skips."""
     kept = np.ones(len(table), dtype=bool)
     skipped = []
     for column, expression in args.skip_rows:
         cells = column_named(table, column, "--skip-rows")
-        texts = cells.astype(object).where(cells.notna(), "")
-        found = [expression.search(str(text)) is not None for text in texts]
+        texts = cells.astype(object).where(cells.notna(), "").astype(str)
+        found = [expression.search(text) is not None for text in texts]
         matches = kept & np.array(found, dtype=bool)
         reason = f"{column} matches {expression.pattern!r}"
         skipped.append((reason, np.flatnonzero(matches), True))
@@ -215,8 +210,8 @@ def _tracks(
     args: Namespace,
     table: "pd.DataFrame",
     columns: LandmarkColumns,
-    kept: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+    kept: NDArray,
+) -> NDArray:
     """Return the points of all rows of the table, NaN where missing or not kept."""
     cells = table.loc[kept, columns.interleaved]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
@@ -227,25 +222,22 @@ def _tracks(
     return tracks
 
 
-def _reasons(
-    report: FrameReport, failed: NDArray[np.bool_] | None
-) -> list[tuple[str, NDArray[np.bool_]]]:
+def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:
     """Return reasons why frames cannot be fitted, and the frames of each."""
-    n_seen = report.n_seen
-    few = n_seen < FEWEST_POINTS
-    in_one_place = report.in_one_place & ~few
-    none: list[tuple[str, NDArray[np.bool_]]] = [("all points missing", n_seen == 0)]
+    nothing = report.n_seen == 0
+    reasons = {"all points missing": nothing}
     if failed is not None:
-        none = [
-            ("tracking failed", failed),
-            ("all points missing or uncertain", (n_seen == 0) & ~failed),
-        ]
-    return [
-        *none,
-        (f"fewer than {FEWEST_POINTS} points", few & (n_seen > 0)),
-        ("all points in one place", in_one_place),
-        ("points on one line, others missing", ~report.usable & ~few & ~in_one_place),
-    ]
+        reasons = {
+            "tracking failed": failed,
+            "all points missing or uncertain": nothing & ~failed,
+        }
+    few = report.n_seen < FEWEST_POINTS
+    in_one_place = report.in_one_place & ~few
+    return reasons | {
+        f"fewer than {FEWEST_POINTS} points": few & ~nothing,
+        "all points in one place": in_one_place,
+        "points on one line, others missing": ~(report.usable | few | in_one_place),
+    }
 
 
 def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, int]:
@@ -272,19 +264,14 @@ def _columns_of_model(
             )
         return found
     names = [str(name).strip() for name in fitted]
-    x, y = names[::2], names[1::2]
     if estimator.layout == "planar":
-        x, y = names[:n_points], names[n_points:]
+        names = np.reshape(names, (2, n_points)).T.ravel().tolist()
     in_table = {str(name).strip(): name for name in table.columns}
-    candidates = (
-        [name for name in table.columns if parse_coordinate(name) is not None]
-        if chosen is None
-        else chosen.interleaved
-    )
-    coordinates = [str(name).strip() for name in candidates]
-    present = in_table if chosen is None else coordinates
-    absent = [name for pair in zip(x, y, strict=True) for name in pair]
-    absent = [name for name in absent if name not in present]
+    present = list(in_table)
+    coordinates = [name for name in present if parse_coordinate(name) is not None]
+    if chosen is not None:
+        present = coordinates = [name.strip() for name in chosen.interleaved]
+    absent = [name for name in names if name not in present]
     surplus = [name for name in coordinates if name not in names]
     # Points after those of the model are of another layout. Others were left out of it.
     first = {*coordinates[: len(names)]}
@@ -297,10 +284,9 @@ def _columns_of_model(
         raise ValueError(
             "the table does not have the points of the model: " + "; ".join(differences)
         )
-    x_columns, y_columns = (tuple(in_table[name] for name in each) for each in (x, y))
-    return LandmarkColumns(
-        "those of the model", point_names(x), x_columns, y_columns, (), ()
-    )
+    columns = [in_table[name] for name in names]
+    x, y = tuple(columns[::2]), tuple(columns[1::2])
+    return LandmarkColumns("those of the model", names_of_points(estimator), x, y)
 
 
 def _layout(
@@ -311,26 +297,31 @@ def _layout(
 ) -> Skeleton | None:
     """Return the layout of all points of a table: given, stored, or recognised."""
     names = columns.points
-    if is_configuration(args.skeleton):
-        return read_skeleton(args.skeleton, names)
     if args.skeleton is not None:
-        named = get_skeleton(args.skeleton)
-        return named if named.n_points == len(names) else None
+        given = _given_layout(args.skeleton, names)
+        return given if given.n_points == len(names) else None
     if stored is not None:
         return stored
     tracks = _tracks(args, table, columns, _rows_to_keep(args, table)[0])
-    tracks = tracks[np.isfinite(tracks).all(axis=(1, 2))]
-    centred = tracks - tracks.mean(axis=1, keepdims=True)
-    sizes = np.linalg.norm(centred, axis=(1, 2), keepdims=True)
-    alike = sizes[:, 0, 0] > 0
-    image = (centred / sizes)[alike].mean(axis=0) if alike.any() else None
-    return find_skeleton(len(names), names, shape=image)
+    centred, report = centred_frames(tracks[np.isfinite(tracks).all(axis=(1, 2))])
+    extended = report.size > 0
+    if not extended.any():
+        return find_skeleton(len(names), names)
+    images = centred[extended] / report.size[extended, None, None]
+    return find_skeleton(len(names), names, shape=images.mean(axis=0))
+
+
+def _given_layout(skeleton: str, names: Sequence[str]) -> Skeleton:
+    """Return the layout that --skeleton names, or that its configuration has."""
+    if Path(skeleton).suffix.lower() in CONFIGURATIONS:
+        return read_skeleton(skeleton, names)
+    return get_skeleton(skeleton)
 
 
 def _part_of_layout(layout: Skeleton | None, points: Sequence[int]) -> Skeleton | None:
     """Return the layout of some of its points, a known one if there is one."""
-    if layout is None:
-        return None
+    if layout is None or {*points} == {*range(layout.n_points)}:
+        return layout
     part = layout.subset(points)
     known = (s for s in SKELETONS.values() if s.n_points == part.n_points)
     return next((s for s in known if s.curves == part.curves), part)
@@ -374,6 +365,75 @@ def _range(part: str, numbers: dict[str, int], names: Sequence[str]) -> range:
         f"{', '.join(names[:4])}, ...; write inner, or names and ranges such as "
         "17-67 or without:0-16"
     )
+
+
+def drawing_options(args: Namespace) -> list[str]:
+    """Return the options of drawing that are given, as words of a command line."""
+    given = {f"--{name}": vars(args)[name] for name in ("edges", "skeleton", "origin")}
+    return [word for pair in given.items() if pair[1] is not None for word in pair]
+
+
+def drawing_files(args: Namespace) -> list[str]:
+    """Return the files that the options of drawing name."""
+    named = [args.edges, args.skeleton]
+    return [each for each in named if each not in (None, NONE, *SKELETON_NAMES)]
+
+
+def chosen_edges(
+    args: Namespace,
+    names: Sequence[str],
+    stored: Skeleton | None = None,
+    *,
+    surfaces: bool = False,
+) -> Any:
+    """Return the lines to draw: an option, or the skeleton stored in the table.
+
+    Triangles become lines unless surfaces are drawn.
+    """
+    if args.edges == NONE:
+        return None
+    if args.edges is not None:
+        links = _read_edges(args.edges, names)
+        if surfaces or links.shape[1] == 2:
+            return links
+        sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        return np.unique(np.sort(sides, axis=1), axis=0)
+    # With --points, --skeleton is the layout of all points, and `stored` of the rest.
+    some_points = stored is not None and getattr(args, "points", None) is not None
+    if args.skeleton is not None and not some_points:
+        skeleton = _given_layout(args.skeleton, names)
+        if skeleton.n_points != len(names):
+            raise ValueError(
+                f"--skeleton {args.skeleton} has {skeleton.n_points} points, the table "
+                f"{len(names)}"
+            )
+        return skeleton
+    if stored is None:
+        return "auto"
+    named = stored.point_names is not None and sorted(stored.point_names)
+    return stored.reordered(names) if named == sorted(names) else stored
+
+
+def _read_edges(path: str, names: Sequence[str]) -> NDArray:
+    """Read pairs or triples of points (n_edges, 2 or 3)."""
+    with reading(path, "a list of edges"):
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    edges: list[list[int]] = []
+    numbers = {name: j for j, name in enumerate(names)}
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        edges.append([numbers.get(name.strip(), -1) for name in line.split(",")])
+        sizes = {len(edge) for edge in edges}
+        if sizes not in ({2}, {3}) or -1 in edges[-1]:
+            raise ValueError(
+                f"{path}, line {number}: expected the names of two or three points "
+                f"with commas between them, such as {', '.join(names[:2])}; got "
+                f"{line!r}"
+            )
+    if not edges:
+        raise ValueError(f"{path} has no edges; use --edges none to draw only points")
+    return np.array(edges)
 
 
 def _shortened(names: Sequence[str], most: int = 4) -> str:

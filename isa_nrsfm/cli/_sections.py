@@ -17,12 +17,12 @@ import numpy as np
 
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._selection.choice import NO_SHAPE
-from isa_nrsfm.cli._options import AUTO
+from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE
-from isa_nrsfm.cli._parser import PROGRAM
 from isa_nrsfm.cli._report import MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
+from isa_nrsfm.io._formats import TABLE
 
 _CAMERAS = {
     "affine": "affine: shapes are known up to an affine transformation of space",
@@ -42,56 +42,40 @@ class Cells(NamedTuple):
 
     def aligned(self) -> list[list[tuple[str, bool]]]:
         """Return the rows, head first, and whether cells are aligned to the right."""
-        lines = [self.head, *self.rows] if self.head else self.rows
-        columns = zip(*self.rows, strict=True)
         numbers = [
-            all(cell[:1] in "+-0123456789" for cell in column) and any(column)
-            for column in columns
+            any(column) and all(cell[:1] in "+-0123456789" for cell in column)
+            for column in zip(*self.rows, strict=True)
         ]
+        lines = [self.head, *self.rows] if self.head else self.rows
         return [list(zip(line, numbers, strict=True)) for line in lines]
 
 
-Sections = Mapping[str, Sequence[str | Cells]]
+Section = Sequence[str | Cells]
+Sections = Mapping[str, Section]
 
 
 def fit_title(report: dict[str, Any]) -> str:
     """Return the title of the report of a fit."""
-    table = report["table"]
+    table, shapes = report["table"], _shapes(report["model"])
     return (
-        f"{_shapes(report['model'])} fitted to {table['n_frames']} frames of "
-        f"{table['n_points']} points"
+        f"{shapes} fitted to {table['n_frames']} frames of {table['n_points']} points"
     )
 
 
-def fit_sections(report: dict[str, Any]) -> dict[str, list[str | Cells]]:
+def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     """Return the sections of the report of a fit, without the files."""
     model = report["model"]
     sections = {"Table": table_section(report["table"])}
     if "choice" in report:
-        sections["Choice"] = _choice_section(report["choice"])
+        sections["Choice"] = _choice(report["choice"])
     elif model["parameters"]["n_components"] == AUTO:
         sections["Choice"] = [f"K = {model['n_components']}: determined by the table"]
-    sections["Fit"] = _fit_section(report)
-    sections["Cameras"] = _camera_section(model)
-    rows = [
-        [
-            row["name"],
-            f"{100 * row['energy_share']:.1f} %",
-            *(f"{row[key]:z.2f}" for key in ("mean", "std", "min", "max")),
-            _pose(row),
-        ]
-        for row in model["alpha"]
-    ]
-    head = ["", "energy", "mean", "std", "min", "max", "pose"]
-    sections["Alpha"] = [Cells(head, rows)]
-    if any(row[-1] for row in rows):
-        sections["Alpha"].append(
-            "pose: variance that yaw, pitch and roll predict, cross-validated"
-        )
+    sections["Fit"] = _fit(report)
+    sections["Cameras"] = _cameras(model)
+    sections["Alpha"] = _alpha(model["alpha"])
     if "labels" in report:
-        sections["Labels"] = [
-            part for label in report["labels"] for part in _label(label)
-        ]
+        labels = [_label(label) for label in report["labels"]]
+        sections["Labels"] = [part for parts in labels for part in parts]
     if "groups" in report:
         sections["Groups"] = _groups(report["groups"])
     if "time" in report:
@@ -99,21 +83,17 @@ def fit_sections(report: dict[str, Any]) -> dict[str, list[str | Cells]]:
     return sections
 
 
-def table_section(
-    table: dict[str, Any], unusable: str = "left out"
-) -> list[str | Cells]:
+def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
     """Return the rows and columns of a table that are used, and the others."""
-    first, last = table["first_columns"], table["last_columns"]
-    format = table["format"]
+    format, n_missing = table["format"], table["n_missing_points"]
+    listed = ", ".join([*table["first_columns"], "...", *table["last_columns"]])
     parts: list[str | Cells] = [
-        table["path"] + ("" if format == "table" else f" ({FORMATS[format].title})"),
-        f"{table['n_points']} points in the columns {', '.join(first)}, ..., "
-        + ", ".join(last),
+        table["path"] + ("" if format == TABLE else f" ({FORMATS[format].title})"),
+        f"{table['n_points']} points in the columns {listed}",
     ]
     if table["absent_numbers"]:
-        absent = ", ".join(map(str, table["absent_numbers"][:MOST_LISTED]))
-        more = ", ..." if len(table["absent_numbers"]) > MOST_LISTED else ""
-        parts.append(f"the table has no points with the numbers {absent}{more}")
+        absent = _listed(table["absent_numbers"], MOST_LISTED)
+        parts.append(f"the table has no points with the numbers {absent}")
     if table["coordinates_not_used"]:
         not_used = table["coordinates_not_used"].items()
         listed = "; ".join(f"{pattern} ({n_points})" for pattern, n_points in not_used)
@@ -123,7 +103,6 @@ def table_section(
         result = "left out" if out["skipped_on_request"] else unusable
         rows.append([f"{out['n_rows']}", f"{result}: {out['reason']}"])
     parts.append(Cells([], [*rows, [f"{table['n_frames']}", "used"]]))
-    n_missing = table["n_missing_points"]
     if n_missing:
         share = n_missing / (table["n_frames"] * table["n_points"])
         parts.append(
@@ -162,40 +141,37 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
         [name, content.partition(";")[0].partition(": the image")[0]]
         for name, content in report["files"].items()
     ]
-    listed: Sections = {"Files": [f"in {folder}", Cells([], described)]}
-    return text_of(fit_title(report), {**fit_sections(report), **listed})
+    listed: Section = [f"in {folder}", Cells([], described)]
+    return text_of(fit_title(report), fit_sections(report) | {"Files": listed})
 
 
 def write_page(folder: Path, report: dict[str, Any]) -> None:
     """Write the report of a fit as a page, with the figures of the folder in it."""
     title = escape(fit_title(report))
-    about = f"{report['table']['path']}, {report['finished']}"
-    parts = [f"<h1>{title}</h1>", f'<p class="quiet">{escape(about)}</p>']
+    about = escape(f"{report['table']['path']}, {report['finished']}")
+    parts = [f"<h1>{title}</h1>", f'<p class="quiet">{about}</p>']
     for warning in report["warnings"]:
         parts.append(f'<p class="advice">{escape(_sentence(warning))}</p>')
-    figures = []
+    sections = fit_sections(report)
+    for name in ("Fit", "Cameras"):
+        parts += _markup(name, sections.pop(name))
     for name, content in report["files"].items():
         if name.endswith(".png"):
             image = base64.b64encode((folder / name).read_bytes()).decode()
             caption = escape(content)
-            figures.append(
+            parts.append(
                 f'<figure><img src="data:image/png;base64,{image}" alt="{caption}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
-    sections = fit_sections(report)
-    for name in ("Fit", "Cameras"):
-        parts += _section(name, sections.pop(name))
-    parts += figures
     sections["Table"] = sections.pop("Table")
     sections["Command"] = [shlex.join([PROGRAM, *report["arguments"]])]
     found = report["versions"].items()
     sections["Versions"] = [", ".join(f"{name} {each}" for name, each in found)]
-    sections["Files"] = [Cells([], [[*each] for each in report["files"].items()])]
+    sections["Files"] = [Cells([], [*report["files"].items()])]
     for name, section in sections.items():
-        parts += _section(name, section)
-    template = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
-    page = template.replace("{{title}}", title)
-    page = page.replace("{{content}}", "\n".join(parts))
+        parts += _markup(name, section)
+    page = (files("isa_nrsfm.cli") / PAGE).read_text(encoding="utf-8")
+    page = page.replace("{{title}}", title).replace("{{content}}", "\n".join(parts))
     write_whole(folder / PAGE, page.encode(errors="replace"))
 
 
@@ -204,43 +180,43 @@ def _lines(part: str | Cells) -> list[str]:
     if isinstance(part, str):
         return textwrap.wrap(part, 90) if part.endswith(".") else [part]
     rows = part.aligned()
-    title = [part.title] if part.title else []
     widths = [
         max(len(cell) for cell, _ in column) for column in zip(*rows, strict=True)
     ]
-    return title + [
-        "  ".join(
+    lines = [part.title] if part.title else []
+    for row in rows:
+        cells = [
             cell.rjust(width) if right else cell.ljust(width)
             for (cell, right), width in zip(row, widths, strict=True)
-        ).rstrip()
-        for row in rows
-    ]
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines
 
 
-def _section(name: str, parts: Sequence[str | Cells]) -> list[str]:
+def _markup(name: str, parts: Section) -> list[str]:
     """Return the HTML of a section."""
-    return [f"<h2>{name}</h2>", *map(_markup, parts)]
+    found = [f"<h2>{name}</h2>"]
+    for part in parts:
+        if isinstance(part, str):
+            found.append(f"<p>{escape(part)}</p>")
+            continue
+        if part.title:
+            found.append(f"<h3>{escape(part.title)}</h3>")
+        found.append('<div class="wide"><table>')
+        for i, row in enumerate(part.aligned()):
+            tag = "th" if part.head and not i else "td"
+            cells = (
+                f"<{tag}{' class=number' * right}>{escape(cell)}</{tag}>"
+                for cell, right in row
+            )
+            found.append(f"<tr>{''.join(cells)}</tr>")
+        found.append("</table></div>")
+    return found
 
 
-def _markup(part: str | Cells) -> str:
-    """Return the HTML of a part."""
-    if isinstance(part, str):
-        return f"<p>{escape(part)}</p>"
-    rows = []
-    for i, row in enumerate(part.aligned()):
-        tag = "th" if part.head and not i else "td"
-        cells = (
-            f"<{tag}{' class=number' * right}>{escape(cell)}</{tag}>"
-            for cell, right in row
-        )
-        rows.append(f"<tr>{''.join(cells)}</tr>")
-    title = f"<h3>{escape(part.title)}</h3>" if part.title else ""
-    return f'{title}<div class="wide"><table>{"".join(rows)}</table></div>'
-
-
-def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
+def _fit(report: dict[str, Any]) -> Section:
     """Return the quality of the fit, its noise and its time."""
-    model = report["model"]
+    model, seconds = report["model"], report["seconds"]
     remark = ""
     if model["parameters"]["loss"] != "linear":
         remark = " (outliers count fully)"
@@ -256,7 +232,6 @@ def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
         parts.append(f"noise {size} (standard deviation of a coordinate)")
     if model["outliers"] is not None and model["outliers"]["message"]:
         parts.append(_sentence(model["outliers"]["message"]))
-    seconds = report["seconds"]
     fit = seconds["fit"] + seconds.get("choose", 0.0)
     parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
@@ -264,27 +239,49 @@ def _fit_section(report: dict[str, Any]) -> list[str | Cells]:
     return parts
 
 
-def _camera_section(model: dict[str, Any]) -> list[str | Cells]:
+def _cameras(model: dict[str, Any]) -> Section:
     """Return the camera model, the certainty of the depth, and advice."""
     title, uncertainty = _CAMERAS[model["camera"]], model["depth_uncertainty"]
+    meaning = model["camera_meaning"]
     if model["depth_advice"]:
         title = (
             f"{title.partition(':')[0]}: {model['depth_advice']}. cameras.csv has no "
             "angles, and proportions in viewer.html are not true."
         )
-    parts: list[str | Cells] = [title]
+        meaning = ""  # the ratio of the noise means nothing
+    parts = [title]
     if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
         parts.append(
             f"depths are known to {100 * uncertainty:.2g} % (root mean square)"
         )
-    # If the depth is not determined, the ratio of the noise means nothing.
-    meaning = "" if model["depth_advice"] else model["camera_meaning"]
-    remark = "; ".join(filter(None, (meaning, model["camera_advice"])))
-    return [*parts, _sentence(remark)] if remark else parts
+    remarks = [each for each in (meaning, model["camera_advice"]) if each]
+    return [*parts, _sentence("; ".join(remarks))] if remarks else parts
 
 
-def _choice_section(choice: dict[str, Any]) -> list[str | Cells]:
+def _alpha(coefficients: list[dict[str, Any]]) -> Section:
+    """Return the distribution of the coefficients, and what the pose predicts."""
+    rows = []
+    for row in coefficients:
+        share = row["pose_share"]
+        known = share is not None and not math.isnan(share)
+        rows.append(
+            [
+                row["name"],
+                f"{100 * row['energy_share']:.1f} %",
+                *(f"{row[key]:z.2f}" for key in ("mean", "std", "min", "max")),
+                f"{100 * max(share, 0):.0f} %" if known else "",
+            ]
+        )
+    cells = Cells(["", "energy", "mean", "std", "min", "max", "pose"], rows)
+    if not any(row[-1] for row in rows):
+        return [cells]
+    return [cells, "pose: variance that yaw, pitch and roll predict, cross-validated"]
+
+
+def _choice(choice: dict[str, Any]) -> Section:
     """Return the held-out error of each number of basis shapes."""
+    tried, errors = choice["n_components"], choice["held_out_error"]
+    deviations = choice["held_out_error_standard_error"]
     rows = [
         [
             f"{k}",
@@ -292,19 +289,13 @@ def _choice_section(choice: dict[str, Any]) -> list[str | Cells]:
             f"{_digits(100 * deviation, 2)} %",
             "the least" * (k == choice["chosen"]),
         ]
-        for k, error, deviation in zip(
-            choice["n_components"],
-            choice["held_out_error"],
-            choice["held_out_error_standard_error"],
-            strict=True,
-        )
+        for k, error, deviation in zip(tried, errors, deviations, strict=True)
     ]
-    parts: list[str | Cells] = [
-        Cells(["K", "held-out error", "standard error", ""], rows)
-    ]
-    if min(choice["held_out_error"]) >= 1:
-        return [*parts, NO_SHAPE]
-    if choice["chosen"] == choice["n_components"][-1]:
+    cells = Cells(["K", "held-out error", "standard error", ""], rows)
+    if min(errors) >= 1:
+        return [cells, NO_SHAPE]
+    parts: list[str | Cells] = [cells]
+    if choice["chosen"] == tried[-1]:
         parts.append("larger K may be better: this is the largest that was tried")
     if "next" in choice:
         following, seconds = choice["next"]["n_components"], choice["next"]["seconds"]
@@ -313,7 +304,7 @@ def _choice_section(choice: dict[str, Any]) -> list[str | Cells]:
     return parts
 
 
-def _label(label: dict[str, Any]) -> list[str | Cells]:
+def _label(label: dict[str, Any]) -> Section:
     """Return how coefficients depend on a label."""
     title = f"{label['column']}: {label['n_frames']} frames"
     if "classes" in label:
@@ -322,72 +313,67 @@ def _label(label: dict[str, Any]) -> list[str | Cells]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
     statistic = "eta squared" if label["statistic"] == "eta_squared" else "Spearman"
-    rows = [
-        [name, f"{value:z.2f}", f"{p:.3f}"]
-        for name, value, p in zip(
-            names, label["values"], label["p_values"], strict=True
-        )
-    ]
-    parts: list[str | Cells] = [Cells(["", statistic, "p"], rows, title)]
-    parts.append(f"p-values: permutations of {label['permuted']}")
-    means = _class_lines(label, names)
+    tests = [*zip(names, label["values"], label["p_values"], strict=True)]
+    rows = [[name, f"{value:z.2f}", f"{p:.3f}"] for name, value, p in tests]
+    means = _class_means(label, names)
     if means:
-        parts.append("mean of each class if p < 0.05, in standard deviations:")
-    parts += means
+        means.insert(0, "mean of each class if p < 0.05, in standard deviations:")
     if "not_cross_validated" in label:
-        return [*parts, f"not cross-validated: {label['not_cross_validated']}"]
-    ours, pca = label["cross_validated"], label["cross_validated_pca"]
-    score = f"cross-validated R^2 {ours:.2f}; PCA of the aligned frames {pca:.2f}"
-    if label["score"] == "accuracy":
+        score = f"not cross-validated: {label['not_cross_validated']}"
+    elif label["score"] == "accuracy":
         score = (
-            f"cross-validated accuracy {100 * ours:.1f} %; PCA of the aligned frames "
-            f"{100 * pca:.1f} %, largest class {100 * label['largest_class']:.1f} %"
+            f"cross-validated accuracy {100 * label['cross_validated']:.1f} %; PCA of "
+            f"the aligned frames {100 * label['cross_validated_pca']:.1f} %, largest "
+            f"class {100 * label['largest_class']:.1f} %"
         )
-    return [*parts, score]
+    else:
+        score = (
+            f"cross-validated R^2 {label['cross_validated']:.2f}; PCA of the aligned "
+            f"frames {label['cross_validated_pca']:.2f}"
+        )
+    return [
+        Cells(["", statistic, "p"], rows, title),
+        f"p-values: permutations of {label['permuted']}",
+        *means,
+        score,
+    ]
 
 
-def _class_lines(label: dict[str, Any], names: Sequence[str]) -> list[str]:
+def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
     """Return the means of the classes of significant coefficients, largest first."""
     lines = []
     for k, (name, p) in enumerate(zip(names, label["p_values"], strict=True)):
         means = {each: mean[k] for each, mean in label.get("class_means", {}).items()}
         if means and p < 0.05:
             order = sorted(means, key=lambda each: -abs(means[each]))
-            shown = [f"{each} {means[each]:+.1f}" for each in order[:4]]
-            lines.append(f"{name}: {', '.join(shown)}" + ", ..." * (len(order) > 4))
+            shown = _listed([f"{each} {means[each]:+.1f}" for each in order])
+            lines.append(f"{name}: {shown}")
     return lines
 
 
-def _groups(groups: dict[str, Any]) -> list[str | Cells]:
+def _groups(groups: dict[str, Any]) -> Section:
     """Return how much coefficients differ between groups."""
+    column = groups["column"]
     if "not_divided" in groups:
-        return [f"{groups['column']}: {groups['not_divided']}"]
-    shares = np.transpose([groups["between"], groups["within"]])
-    rows = [
-        [name, *(f"{100 * share:.1f} %" for share in row)]
-        for name, row in zip(
-            names_of_components(None, len(shares)), shares, strict=True
-        )
-    ]
-    title = (
-        f"{groups['column']}: variance between and within {groups['n_groups']} groups"
-    )
+        return [f"{column}: {groups['not_divided']}"]
+    names = names_of_components(None, len(groups["between"]))
+    shares = zip(names, groups["between"], groups["within"], strict=True)
+    rows = [[name, f"{100 * a:.1f} %", f"{100 * b:.1f} %"] for name, a, b in shares]
+    title = f"{column}: variance between and within {groups['n_groups']} groups"
     return [Cells(["", "between", "within"], rows, title)]
 
 
-def _time(time: dict[str, Any]) -> list[str | Cells]:
+def _time(time: dict[str, Any]) -> Section:
     """Return the result of smoothing in time."""
     scales = np.asarray(time["time_scales"], dtype=float)
     if not len(scales):
         return [f"{time['column']}: no dynamics found, coefficients are not smoothed"]
     fading = scales[np.isfinite(scales)]
-    lasting = len(scales) - len(fading)
     found = []
     if len(fading):
-        listed = ", ".join(f"{each:.3g}" for each in fading[:4])
-        more = ", ..." * (len(fading) > 4)
-        found.append(f"changes of the shape fade within {listed}{more}")
-    if lasting:
+        listed = _listed([f"{each:.3g}" for each in fading])
+        found.append(f"changes of the shape fade within {listed}")
+    if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [
         f"{time['column']}: {'; '.join(found)}",
@@ -401,10 +387,9 @@ def _shapes(model: dict[str, Any]) -> str:
     return f"{n_components} basis shape{'s' * (n_components != 1)}"
 
 
-def _pose(row: dict[str, Any]) -> str:
-    """Return the share of a coefficient that the pose predicts."""
-    share = row["pose_share"]
-    return "" if share is None or math.isnan(share) else f"{100 * max(share, 0):.0f} %"
+def _listed(items: Sequence[Any], most: int = 4) -> str:
+    """List the first items."""
+    return ", ".join(map(str, items[:most])) + ", ..." * (len(items) > most)
 
 
 def _sentence(text: str) -> str:

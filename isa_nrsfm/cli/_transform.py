@@ -5,21 +5,22 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.cli._drawing import chosen_edges, drawing_files, drawing_options
-from isa_nrsfm.cli._outputs import (
-    alpha_table,
-    beside_other_columns,
-    fitted_frames,
-    refuse_overwriting,
+from isa_nrsfm.cli._outputs import refuse_overwriting, warn_of_mixed_runs, write_alpha
+from isa_nrsfm.cli._reading import (
+    as_fitted,
+    chosen_edges,
+    drawing_files,
+    drawing_options,
+    read_frames,
 )
-from isa_nrsfm.cli._reading import as_fitted, read_frames
 from isa_nrsfm.cli._report import quality_report, table_report
-from isa_nrsfm.cli._runs import warn_of_mixed_runs
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
-from isa_nrsfm.io import load_model, write_table
+from isa_nrsfm.io import load_model
 from isa_nrsfm.io._tables import table_suffix
 
 
@@ -38,30 +39,27 @@ def run(args: Namespace, warned: list[str]) -> str:
         raise ValueError("--edges, --skeleton and --origin need --viewer")
     frames = read_frames(args, estimator)
     edges = chosen_edges(args, names_of_points(estimator), frames.skeleton)
-    outputs = [output, *([] if args.viewer is None else [Path(args.viewer)])]
+    outputs = [Path(path) for path in (output, args.viewer) if path is not None]
     refuse_overwriting([args.table, args.model, *drawing_files(args)], outputs)
-    X = as_fitted(estimator, frames.X)
+    X, n_components = as_fitted(estimator, frames.X), len(estimator.basis_)
+    alpha = std = np.empty((0, n_components))
+    quality: Any = ["no frame was fitted"]
     if len(X):
-        fit = estimator.decompose(X)
-        quality = quality_section(quality_report(estimator, X, fit))
-    else:
-        fit = type(fitted_frames(estimator))(*(x[:0] for x in fitted_frames(estimator)))
-        quality = ["no frame was fitted"]
-    results = alpha_table(fit, frames, std=args.std)
-    write_table(beside_other_columns(results, frames.other), output)
+        motion, translation, alpha, std = estimator.decompose(X)
+        explained = estimator.inverse_transform(alpha, motion, translation)
+        quality = quality_section(quality_report(estimator, X, explained))
+    write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
-        _write_viewer(
-            outputs[1], estimator, X=X, edges=edges, origin=args.origin or "auto"
-        )
+        drawn = {"edges": edges, "origin": args.origin or "auto"}
+        _write_viewer(outputs[1], estimator, X=X, **drawn)
     table = table_report(args.table, args.format, frames)
     sections = {
         "Table": table_section(table, unusable="without coefficients"),
         "Model": [args.model],
         "Quality": quality,
-        "Output": [*map(str, outputs), f"{len(results)} rows"],
+        "Output": [*map(str, outputs), f"{len(frames.points)} rows"],
     }
-    title = f"{len(estimator.basis_)} coefficients of {len(X)} frames"
-    return text_of(title, sections)
+    return text_of(f"{n_components} coefficients of {len(X)} frames", sections)
 
 
 def _write_viewer(path: Path, estimator: Any, **options: Any) -> None:

@@ -28,8 +28,8 @@ class LandmarkColumns(NamedTuple):
     points: tuple[str, ...]
     x: tuple[str, ...]
     y: tuple[str, ...]
-    z: tuple[str, ...]
-    gaps: tuple[int, ...]
+    z: tuple[str, ...] = ()
+    gaps: tuple[int, ...] = ()
 
     @property
     def interleaved(self) -> list[str]:
