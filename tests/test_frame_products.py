@@ -85,15 +85,6 @@ class TestProducts:
             assert_array_equal(each[..., 1], 0)
             assert np.isfinite(each).all()
 
-    def test_position_of_the_tracks(self):
-        tracks, shapes, weights = random_problem(0)
-        for w in (None, weights):
-            here = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes))
-            moved = tracks + np.array([1e3, -1e4])
-            there = frame_sums(frame_tracks(moved, w), ShapeProducts(shapes))
-            assert_allclose(there.cross, here.cross, atol=1e-10)
-            assert_allclose(there.energy, here.energy, rtol=1e-10)
-
     def test_memory_order_changes_nothing(self):
         tracks, shapes, weights = random_problem(0)
         for w in (None, weights):
@@ -150,14 +141,6 @@ class TestGram:
         Q = np.einsum("rai,rbi->abi", M, M)
         expected = np.einsum("klabi,abi->kli", G, Q)
         assert_allclose(unpacked(gram.energies(Q[ROWS, COLUMNS])), expected, atol=1e-12)
-
-    def test_moments_are_the_shapes(self, weighted):
-        # c c^T gives S S^T, which is also half the sum of c_k times the products.
-        gram, _ = self.gram(weighted)
-        c = np.random.default_rng(0).normal(size=(3, 6))
-        first, second = pair_indices(3)
-        half = 0.5 * np.einsum("ki,kpi->pi", c, gram.products(c))
-        assert_allclose(gram.moments(c[first] * c[second]), half, atol=1e-12)
 
 
 class TestWhitened:

@@ -53,15 +53,6 @@ class TestExact:
         assert fits.converged.all()
         assert_allclose(fits.objective, 0, atol=1e-9)
 
-    def test_covariance_is_the_scatter_of_the_errors(self, camera):
-        scene = scene_of(camera, n_frames=2000)
-        fits = fitted(scene, camera)
-        spread = np.linalg.inv(np.linalg.cholesky(fits.covariance))
-        scaled = np.einsum("ikl,il->ik", spread, fits.alpha - scene.alpha)
-        # Frames with nearly edge-on cameras are not normal.
-        typical = np.median(np.sum(scaled**2, axis=1))
-        assert_allclose(typical, 2.366, rtol=0.07)  # median of chi-squared, 3
-
     @GAPS
     def test_position_is_that_of_least_squares(self, camera, gaps):
         scene = scene_of(camera, gaps)
@@ -116,23 +107,6 @@ class TestInvariance:
             assert_array_equal(value, expected[name])
 
     @GAPS
-    def test_memory_order_and_single_precision(self, camera, gaps):
-        scene = scene_of(camera, gaps)
-        expected = fitted(scene, camera)
-        got = fitted(
-            scene._replace(
-                tracks=np.asfortranarray(scene.tracks),
-                shapes=np.asfortranarray(scene.shapes),
-            ),
-            camera,
-        )
-        for a, b in zip(got, expected, strict=True):
-            assert_array_equal(a, b)
-        single = scene._replace(tracks=scene.tracks.astype(np.float32))
-        double = scene._replace(tracks=single.tracks.astype(float))
-        assert_array_equal(fitted(single, camera).alpha, fitted(double, camera).alpha)
-
-    @GAPS
     def test_rotation_and_position_of_single_images(self, camera, gaps):
         scene = scene_of(camera, gaps)
         R = np.array([random_rotation(seed, 2) for seed in range(20)])
@@ -143,32 +117,6 @@ class TestInvariance:
         assert_allclose(got.motion, R @ expected.motion, atol=1e-8)
         assert_allclose(got.alpha, expected.alpha, atol=1e-8)
         assert_allclose(got.covariance, expected.covariance, atol=1e-8)
-
-    @GAPS
-    @pytest.mark.parametrize("change", ["rotation", "mirror image", "affinity"])
-    def test_changes_of_space(self, camera, gaps, change):
-        scene = scene_of(camera, gaps)
-        A = random_rotation(0)
-        if change == "mirror image":
-            A = A @ np.diag([1.0, 1.0, -1.0])
-        elif change == "affinity" and camera == "affine":
-            A = A @ np.diag([1e3, 1, 1e-3]) @ random_rotation(1)
-        expected = fitted(scene, camera)
-        got = fitted(scene._replace(shapes=A @ scene.shapes), camera)
-        assert_allclose(got.motion @ A, expected.motion, atol=1e-8)
-        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
-        assert_allclose(got.covariance, expected.covariance, atol=1e-8)
-
-    @GAPS
-    def test_rotation_of_the_coefficients(self, camera, gaps):
-        scene = scene_of(camera, gaps)
-        Q = random_rotation(0)
-        mixed = np.concatenate([scene.shapes[:1], np.tensordot(Q, scene.shapes[1:], 1)])
-        expected = fitted(scene, camera)
-        got = fitted(scene._replace(shapes=mixed), camera)
-        assert_allclose(got.motion, expected.motion, atol=1e-8)
-        assert_allclose(got.alpha @ Q, expected.alpha, atol=1e-8)
-        assert_allclose(Q.T @ got.covariance @ Q, expected.covariance, atol=1e-8)
 
     @GAPS
     @pytest.mark.parametrize("unit", [1e-100, 1e-6, 1e6, 1e100])
@@ -188,33 +136,6 @@ class TestInvariance:
         assert_allclose(got.alpha, expected.alpha, atol=1e-9)
         assert_allclose(got.covariance, expected.covariance, atol=1e-9)
 
-    def test_missing_points_are_points_that_are_not_there(self, camera):
-        scene = scene_of(camera)
-        kept = np.arange(20) % 3 > 0
-        hidden = np.where(kept[:, None], scene.tracks, np.nan)
-        fewer = scene.shapes[:, :, kept]
-        centre = fewer.mean(axis=2)
-        expected = fitted(
-            scene._replace(
-                tracks=scene.tracks[:, kept], shapes=fewer - centre[..., None]
-            ),
-            camera,
-        )
-        got = fitted(scene._replace(tracks=hidden), camera)
-        assert_allclose(got.motion, expected.motion, atol=1e-8)
-        assert_allclose(got.alpha, expected.alpha, atol=1e-8)
-        origin = centre[0] + expected.alpha @ centre[1:]
-        moved = np.einsum("irc,ic->ir", expected.motion, origin)
-        assert_allclose(got.translation, expected.translation - moved, atol=1e-8)
-
-    def test_weights_are_inverse_variances(self, camera):
-        scene = scene_of(camera)
-        expected = fitted(scene, camera)
-        twice = np.full(scene.tracks.shape[:2], 2.0)
-        got = fitted(scene, camera, 2 * NOISE**2, weights=twice)
-        expected = expected._replace(objective=2 * expected.objective)
-        assert_same_fits(got, expected, 1e-9)
-
     def test_weights_count_points_so_often(self, camera):
         scene = scene_of(camera)
         weights = np.random.default_rng(1).integers(0, 3, size=20)
@@ -226,10 +147,6 @@ class TestInvariance:
         got = fitted(scene, camera, weights=np.tile(1.0 * weights, (20, 1)))
         assert_allclose(got.motion, expected.motion, atol=1e-8)
         assert_allclose(got.alpha, expected.alpha, atol=1e-8)
-
-
-def skewed(shapes):
-    return np.array([[0, -1, 0], [1, 0, 0], [0, 0, 0]]) @ shapes
 
 
 # What is done to shapes (4, 3, n_points), in place
@@ -246,7 +163,9 @@ KINDS = {
         B[1], np.diag([1.0, 2.0, 3.0]) @ B[0]
     ),
     "basis shape that a scale makes": lambda B: np.copyto(B[1], 0.5 * B[0]),
-    "basis shape that a turn makes": lambda B: np.copyto(B[1], 0.2 * skewed(B[0])),
+    "basis shape that a turn makes": lambda B: np.copyto(
+        B[1], np.array([[0, -0.2, 0], [0.2, 0, 0], [0, 0, 0]]) @ B[0]
+    ),
     "huge basis shapes": lambda B: np.multiply(B[1:], 1e6, out=B[1:]),
     "tiny basis shapes": lambda B: np.multiply(B[1:], 1e-9, out=B[1:]),
 }

@@ -7,15 +7,12 @@ from scenes import random_rotation, rotate_frames
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera import mean_view
-from isa_nrsfm._frames.models import RigidFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import (
     canonical_gauge,
     canonical_rotation,
     canonical_space,
     euclidean_space,
-    image_energies,
-    mode_covariance,
     reorder_blocks,
 )
 
@@ -72,13 +69,6 @@ class TestSpace:
         assert np.trace(view[:, :2]) > 0
         assert np.linalg.det(view[:, :2]) > 0
 
-    def test_images_stay_as_they_are(self):
-        scene = Scene()
-        A = canonical_space(scene.mean_shape, scene.motion)
-        before = scene.motion @ scene.mean_shape.T
-        after = (scene.motion @ np.linalg.inv(A)) @ (scene.mean_shape @ A.T).T
-        assert_allclose(after, before, atol=1e-12)
-
     @pytest.mark.parametrize("seed", range(4))
     def test_depth_is_skewed_to_the_positive_side(self, seed):
         gauge, _ = Scene(seed).canonical()
@@ -110,15 +100,6 @@ class TestSpace:
         assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-10)
         assert_allclose(gauge.basis, expected.basis, atol=1e-8)
         assert_allclose(motion, expected_motion, atol=1e-10)
-
-    @pytest.mark.parametrize("unit", [1e-9, 1e9])
-    def test_units_of_the_cameras(self, unit):
-        expected, _ = Scene().canonical()
-        scene = Scene()
-        scene.motion = unit * scene.motion
-        gauge, _ = scene.canonical()
-        assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-12)
-        assert_allclose(gauge.basis, expected.basis, atol=1e-11)
 
     def test_rotated_images_of_scattered_views(self):
         # Where no view is common, rotating single images changes nothing.
@@ -181,24 +162,6 @@ class TestEuclideanSpace:
             B = euclidean_space(shape, motion, None)
             assert_allclose(shape @ B.T, scene.mean_shape @ A.T, atol=1e-11)
 
-    def test_a_gauge_in_it_keeps_images(self):
-        scene = self.scene()
-        A = euclidean_space(scene.mean_shape, scene.motion, None)
-        gauge = canonical_gauge(
-            scene.mean_shape, scene.basis, scene.motion, scene.alpha, A
-        )
-        motion = scene.motion @ np.linalg.inv(A)
-        alpha = scene.alpha[:, gauge.order] / gauge.factors
-        assert_allclose(
-            project(compose(gauge.mean_shape, gauge.basis, alpha), motion, np.zeros(2)),
-            project(
-                compose(scene.mean_shape, scene.basis, scene.alpha),
-                scene.motion,
-                np.zeros(2),
-            ),
-            atol=1e-10,
-        )
-
     def test_mean_shape_of_zeros(self):
         scene = self.scene()
         A = euclidean_space(0 * scene.mean_shape, scene.motion, None)
@@ -235,28 +198,6 @@ class TestBasis:
         ]
         assert_array_equal(np.argsort(energies)[::-1], [0, 1, 2])
         assert sorted(gauge.order) == [0, 1, 2]
-
-    def test_energies_by_plain_loops(self):
-        scene = Scene()
-        expected = [
-            sum(
-                np.sum((a * M @ B.T) ** 2)
-                for a, M in zip(scene.alpha[:, k], scene.motion, strict=True)
-            )
-            for k, B in enumerate(scene.basis)
-        ]
-        energies = image_energies(scene.motion, scene.basis, scene.alpha)
-        assert_allclose(energies, expected)
-
-    def test_mode_covariance_by_plain_loops(self):
-        scene = Scene(n_frames=7)
-        expected = np.zeros((9, 9))
-        for M, alpha in zip(scene.motion, scene.alpha, strict=True):
-            for k in range(3):
-                for m in range(3):
-                    block = alpha[k] * alpha[m] * M.T @ M / 14
-                    expected[3 * k : 3 * k + 3, 3 * m : 3 * m + 3] += block
-        assert_allclose(mode_covariance(scene.motion, scene.alpha), expected)
 
     def test_order_signs_and_scales_before_do_not_matter(self):
         scene = Scene()
@@ -297,22 +238,6 @@ class TestBasis:
         scene.basis[1] *= 1e-6
         gauge, _ = scene.canonical()
         assert np.abs(gauge.basis[2]).max() > 1e-7
-
-    def test_basis_shape_of_zeros(self):
-        scene = Scene()
-        scene.basis[0] = 0
-        gauge, _ = scene.canonical()
-        assert_array_equal(gauge.basis[2], 0)
-        assert gauge.order[2] == 0
-
-    def test_frame_fits_to_the_canonical_shapes(self):
-        # The rigid cameras of the canonical shapes are the canonical cameras.
-        scene = Scene()
-        gauge, motion = scene.canonical()
-        tracks = project(gauge.mean_shape, motion, np.zeros(2))
-        frames = RigidFrames(gauge.mean_shape, gauge.basis)
-        fitted = frames.fit(tracks, np.ones(len(tracks)))
-        assert_allclose(fitted.motion, motion, atol=1e-12)
 
 
 class TestReorderBlocks:

@@ -129,13 +129,6 @@ class TestSameFit:
         expected = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         assert_allclose(deviation, expected)
 
-    def test_input_is_not_changed(self):
-        fit = random_fit()
-        copy = Fit(*(each.copy() for each in fit))
-        independent_gauge(*fit, "shapes")
-        for got, expected in zip(fit, copy, strict=True):
-            assert_array_equal(got, expected)
-
 
 class TestConditions:
     @EACH
@@ -181,12 +174,6 @@ class TestConditions:
         gram = flat @ flat.T
         assert_allclose(gram, np.diag(np.diag(gram)), atol=1e-10 * np.trace(gram))
 
-    def test_bases_differ(self):
-        fit = random_fit()
-        bases = [canonical(fit, each)[0].shapes[1:] for each in ALL]
-        for one, other in ((0, 1), (0, 2), (1, 2)):
-            assert np.abs(bases[one] - bases[other]).max() > 0.1
-
 
 def whitened(fit):
     """Return the basis shapes where the mean shape is white, without part along it."""
@@ -208,41 +195,6 @@ class TestInvariance:
             assert_allclose(other.images(), fit.images(), atol=1e-10)
             got, _ = canonical(other, independence)
             assert_same(got, expected)
-
-    @EACH
-    def test_canonical_fits_stay_as_they_are(self, independence):
-        expected, _ = canonical(random_fit(), independence)
-        assert_same(canonical(expected, independence)[0], expected, atol=1e-9)
-
-    @EACH
-    def test_order_of_frames_and_points(self, independence):
-        fit = random_fit()
-        rng = np.random.default_rng(2)
-        frames, points = rng.permutation(60), rng.permutation(80)
-        other = Fit(fit.shapes[:, :, points], fit.motion[frames], fit.alpha[frames])
-        expected, deviation = canonical(fit, independence)
-        got, got_deviation = canonical(other, independence)
-        expected = Fit(
-            expected.shapes[:, :, points],
-            expected.motion[frames],
-            expected.alpha[frames],
-        )
-        assert_same(got, expected)
-        assert_allclose(got_deviation, deviation[frames], rtol=1e-6)
-
-    @EACH
-    def test_rotation_of_single_images(self, independence):
-        fit = random_fit()
-        angle = np.random.default_rng(2).uniform(-0.3, 0.3, 60)
-        c, s = np.cos(angle), np.sin(angle)
-        R = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
-        expected, _ = canonical(fit, independence)
-        got, _ = canonical(fit._replace(motion=R @ fit.motion), independence)
-        # The front view turns a little, about the axis of depth at most a lot.
-        turn = np.linalg.lstsq(got.shapes[0].T, expected.shapes[0].T)[0].T
-        assert_allclose(turn @ turn.T, np.eye(3), atol=1e-10)
-        assert_allclose(got.alpha, expected.alpha, atol=1e-7)
-        assert_allclose(turn @ got.shapes, expected.shapes, atol=1e-7)
 
 
 def calibrated(fit, camera):
@@ -316,12 +268,6 @@ class TestCalibratedCameras:
         assert_allclose(other.images(), fit.images(), atol=1e-10)
         expected, _ = self.canonical(fit, independence, camera)
         assert_same(self.canonical(other, independence, camera)[0], expected)
-
-    @EACH
-    def test_orthographic_shapes_of_frames_are_only_turned(self, independence):
-        fit = calibrated(random_fit(), "orthographic")
-        result, space = self.canonical(fit, independence, "orthographic", 1.0)
-        assert_allclose(space @ fit.frames(), result.frames(), atol=1e-10)
 
 
 class TestStandardDeviations:

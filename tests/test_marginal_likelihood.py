@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from scenes import likelihood_of, random_rotation
+from scenes import likelihood_of
 
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.vectors import frames_first
 
 NOISE = 0.05
 PENALTY = 7.0
@@ -349,26 +349,8 @@ class TestBlocks:
         whole = scene.at(PENALTY, block_frames=len(scene.tracks))
         assert_same(scene.at(PENALTY, block_frames=size), whole)
 
-    @KINDS
-    def test_memory_order_makes_no_difference(self, kind):
-        scene = random_scene(kind)
-        other = scene._replace(
-            tracks=np.asfortranarray(scene.tracks),
-            shapes=np.asfortranarray(scene.shapes),
-            motion=frames_first(frames_last(scene.motion)),
-        )
-        assert_same(other.at(PENALTY), scene.at(PENALTY))
-
 
 class TestWeights:
-    def test_of_one_are_none(self):
-        scene = random_scene("complete")
-        ones = scene._replace(weights=np.ones(scene.tracks.shape[:2]))
-        got, expected = ones.at(PENALTY), scene.at(PENALTY)
-        n_points = scene.tracks.shape[1]
-        same = np.repeat(expected.shape_curvature, n_points, axis=0)
-        assert_same(got, expected._replace(shape_curvature=same))
-
     @pytest.mark.parametrize("hidden", [np.nan, 1e6])
     def test_of_zero_leave_a_point_out(self, hidden):
         # Whatever the table holds there.
@@ -390,110 +372,6 @@ class TestWeights:
             shape_curvature=got.shape_curvature[kept],
         )
         assert_same(got, expected)
-
-    def test_are_inverse_variances(self):
-        # All of them times w is noise divided by w, but for the count of log s2; the
-        # price of the penalty is per weighted energy.
-        scene = random_scene("missing")
-        n_seen = np.isfinite(scene.tracks).sum()
-        doubled = scene._replace(weights=2 * scene.weights)
-        got, expected = doubled.at(0.0, 2 * NOISE), scene.at(0.0, NOISE)
-        assert got.value == pytest.approx(expected.value + n_seen * np.log(2))
-        for name in ("alpha", "shape_gradient", "motion_gradient", "noise_gradient"):
-            assert_allclose(
-                getattr(got, name), getattr(expected, name), rtol=1e-9, atol=1e-9
-            )
-
-
-class TestInvariances:
-    """Of the model, with the penalty, which shares them."""
-
-    @KINDS
-    def test_affinity_of_space(self, kind):
-        scene = random_scene(kind)
-        A = np.random.default_rng(1).normal(size=(3, 3))
-        other = scene._replace(
-            shapes=np.einsum("ab,kbj->kaj", A, scene.shapes),
-            motion=scene.motion @ np.linalg.inv(A),
-        )
-        got, expected = other.at(PENALTY), scene.at(PENALTY)
-        for name in ("value", "alpha", "residual", "noise_gradient"):
-            assert_allclose(getattr(got, name), getattr(expected, name), rtol=1e-8)
-
-    @KINDS
-    def test_rotation_of_the_coefficients(self, kind):
-        scene = random_scene(kind)
-        Q = random_rotation(1)
-        shapes = scene.shapes.copy()
-        shapes[1:] = np.tensordot(Q, shapes[1:], 1)
-        got = scene._replace(shapes=shapes).at(PENALTY)
-        expected = scene.at(PENALTY)
-        assert_allclose(got.value, expected.value, rtol=1e-12)
-        assert_allclose(got.alpha, expected.alpha @ Q.T, atol=1e-10)
-        assert_allclose(got.motion_gradient, expected.motion_gradient, atol=1e-8)
-
-    def test_other_mixings_of_the_coefficients_do_matter(self):
-        # The prior fixes their scale.
-        scene = random_scene("complete")
-        shapes = scene.shapes.copy()
-        shapes[1] *= 1.1
-        assert abs(scene._replace(shapes=shapes).at().value - scene.at().value) > 1e-2
-
-    @KINDS
-    def test_rotation_of_single_frames(self, kind):
-        scene = random_scene(kind)
-        angle = np.random.default_rng(1).uniform(0, 2 * np.pi, len(scene.tracks))
-        c, s = np.cos(angle), np.sin(angle)
-        R = frames_first(np.array([[c, -s], [s, c]]))
-        other = scene._replace(
-            tracks=scene.tracks @ R.swapaxes(1, 2), motion=R @ scene.motion
-        )
-        turned = scene.at(PENALTY)
-        turned = turned._replace(motion_gradient=R @ turned.motion_gradient)
-        assert_same(other.at(PENALTY), turned)
-
-    @KINDS
-    def test_place_of_single_frames(self, kind):
-        scene = random_scene(kind)
-        shift = np.random.default_rng(1).normal(size=(len(scene.tracks), 1, 2))
-        moved = scene._replace(tracks=scene.tracks + 3 * shift)
-        assert_same(moved.at(PENALTY), scene.at(PENALTY))
-
-    @KINDS
-    def test_order_of_frames_and_points(self, kind):
-        scene = random_scene(kind)
-        rng = np.random.default_rng(1)
-        frames = rng.permutation(len(scene.tracks))
-        points = rng.permutation(scene.tracks.shape[1])
-        weights = scene.weights
-        other = Scene(
-            scene.tracks[frames][:, points],
-            None if weights is None else weights[frames][:, points],
-            scene.shapes[..., points],
-            scene.motion[frames],
-        )
-        expected = scene.at(PENALTY)
-        curvature = expected.shape_curvature
-        expected = expected._replace(
-            shape_gradient=expected.shape_gradient[..., points],
-            motion_gradient=expected.motion_gradient[frames],
-            shape_curvature=curvature if weights is None else curvature[points],
-            motion_curvature=expected.motion_curvature[:, frames],
-            alpha=expected.alpha[frames],
-        )
-        assert_same(other.at(PENALTY), expected)
-
-    @KINDS
-    def test_unit_of_the_table(self, kind):
-        scene = random_scene(kind)
-        n_seen = np.isfinite(scene.tracks).sum()
-        got = scene._replace(tracks=10 * scene.tracks, motion=10 * scene.motion).at(
-            noise=100 * NOISE
-        )
-        expected = scene.at()
-        assert got.value == pytest.approx(expected.value + n_seen * np.log(100))
-        assert_allclose(got.alpha, expected.alpha, rtol=1e-9)
-        assert_allclose(got.shape_gradient, expected.shape_gradient, atol=1e-7)
 
 
 class TestDegenerate:
