@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import measurements, permute_frames, rotate_frames
+from scenes import measurements
 
 from isa_nrsfm._linalg.vectors import orientations
 from isa_nrsfm._paper.factors import factorise
@@ -43,21 +43,6 @@ class TestIdentities:
         best = (U[:, :rank] * S[:rank]) @ Vt[:rank]
         assert_allclose(approximation(factorise(W, K)), best, atol=1e-12)
 
-    def test_rigid_part_is_the_best_of_rank_three(self, size, K):
-        W = centred_matrix(0, *size)
-        U, S, Vt = np.linalg.svd(W, full_matrices=False)
-        f = factorise(W, K)
-        best = (U[:, :3] * S[:3]) @ Vt[:3]
-        assert_allclose(f.rigid_motion @ f.rigid_shape, best, atol=1e-12)
-
-    def test_shapes(self, size, K):
-        n_frames, n_points = size
-        f = factorise(centred_matrix(0, *size), K)
-        assert f.rigid_motion.shape == (2 * n_frames, 3)
-        assert f.rigid_shape.shape == (3, n_points)
-        assert f.motion.shape == (2 * n_frames, 3 * K)
-        assert f.signals.shape == (3 * K, n_points)
-
     def test_shape_and_signals_are_centred_and_white_together(self, size, K):
         f = factorise(centred_matrix(0, *size), K)
         rows = np.vstack([f.rigid_shape, f.signals])
@@ -88,37 +73,6 @@ class TestIdentities:
         assert_allclose(g.rigid_shape, f.rigid_shape, atol=1e-11)
         assert_allclose(g.signals, f.signals, atol=1e-10)
         assert_allclose(g.motion / unit, f.motion, atol=1e-11)
-
-    def test_rotation_of_single_frames_turns_the_motion_only(self, size, K):
-        W = centred_matrix(0, *size)
-        f, g = factorise(W, K), factorise(rotate_frames(W, 1), K)
-        assert_allclose(g.rigid_shape, f.rigid_shape, atol=1e-11)
-        assert_allclose(g.signals, f.signals, atol=1e-10)
-        assert_allclose(g.rigid_motion, rotate_frames(f.rigid_motion, 1), atol=1e-11)
-        assert_allclose(g.motion, rotate_frames(f.motion, 1), atol=1e-11)
-
-    def test_permutation_of_frames_permutes_the_motion_only(self, size, K):
-        W = centred_matrix(0, *size)
-        permuted, order = permute_frames(W, 1)
-        f, g = factorise(W, K), factorise(permuted, K)
-        rows = (2 * order[:, None] + [0, 1]).ravel()
-        assert_allclose(g.signals, f.signals, atol=1e-10)
-        assert_allclose(g.rigid_motion, f.rigid_motion[rows], atol=1e-11)
-        assert_allclose(g.motion, f.motion[rows], atol=1e-11)
-
-    def test_permutation_of_points_permutes_the_shapes_only(self, size, K):
-        W = centred_matrix(0, *size)
-        order = np.random.default_rng(1).permutation(size[1])
-        f, g = factorise(W, K), factorise(W[:, order], K)
-        assert_allclose(g.rigid_shape, f.rigid_shape[:, order], atol=1e-11)
-        assert_allclose(g.signals, f.signals[:, order], atol=1e-10)
-        assert_allclose(g.motion, f.motion, atol=1e-11)
-
-    def test_input_stays_as_it_is(self, size, K):
-        W = centred_matrix(0, *size)
-        before = W.copy()
-        factorise(W, K)
-        assert_array_equal(W, before)
 
 
 class TestMissingRank:
@@ -159,13 +113,6 @@ class TestMissingRank:
         assert 1e-10 < S[5] / S[0] < 1e-8
         assert np.linalg.norm(f.motion[:, 2]) > 0
         assert_allclose(f.signals.mean(axis=1), 0, atol=1e-13)
-
-    def test_repeated_frames(self):
-        W = np.tile(centred_matrix(0, 4, 25), (5, 1))  # of rank 8
-        f = factorise(W, 2)
-        assert f.signals.shape == (6, 25)
-        assert_array_equal(f.motion[:, 5], 0)
-        assert_allclose(approximation(f), W, atol=1e-12)
 
     @pytest.mark.parametrize(("K", "n_signals"), [(1, 3), (2, 3), (4, 3)])
     def test_shark_has_two_non_rigid_directions(self, load_data, K, n_signals):
@@ -254,9 +201,3 @@ class TestLargeBothWays:
         S, f = leading_triplets(W, 9, KRYLOV).values, by_krylov(W, 2)
         assert (S[5:] < 1e-12 * S[0]).all()
         assert_allclose(f.signals @ f.signals.T / 70, np.eye(3), atol=1e-12)
-
-    def test_frames_in_another_order(self):
-        W = low_rank(0, 8, 60, 70) + 1e-2 * centred_matrix(1, 60, 70)
-        permuted, _ = permute_frames(W, 3)
-        f, g = by_krylov(W, 2), by_krylov(permuted, 2)
-        assert_allclose(g.signals, f.signals, atol=1e-10)

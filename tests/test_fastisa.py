@@ -11,8 +11,6 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import FastISA
 from isa_nrsfm.isa import SqrtDensity
-from isa_nrsfm.isa._base import whiten
-from isa_nrsfm.isa._fixed_point import log_likelihood, orthogonalise
 from isa_nrsfm.metrics import subspace_distance
 
 
@@ -40,31 +38,10 @@ class CauchyDensity:
 
 
 class TestRecovery:
-    @pytest.mark.parametrize("seed", range(6))
-    def test_spherical_heavy_tailed_sources(self, seed):
-        signals, unmixing = mixed(seed)
-        isa = FastISA(n_init=2, random_state=seed).fit(signals)
-        assert subspace_distance(isa.components_, unmixing) < 0.05
-
-    def test_radii_by_a_student_distribution(self):
-        rng = np.random.default_rng(0)
-        directions = rng.normal(size=(3000, 4, 3))
-        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-        sources = (directions * rng.standard_t(5, size=(3000, 4, 1))).reshape(3000, 12)
-        A = random_rotation(0, 12)
-        isa = FastISA(n_init=2, random_state=0).fit(sources @ A.T)
-        assert subspace_distance(isa.components_, A.T) < 0.06
-
     def test_another_density(self):
         signals, unmixing = mixed(0)
         isa = FastISA(n_init=2, density=CauchyDensity(), random_state=0).fit(signals)
         assert subspace_distance(isa.components_, unmixing) < 0.06
-
-    def test_general_mixing(self):
-        signals, unmixing = mixed(0)
-        A = np.random.default_rng(1).normal(size=(12, 12))
-        isa = FastISA(n_init=2, random_state=0).fit(signals @ A.T)
-        assert subspace_distance(isa.components_ @ A, unmixing) < 0.05
 
 
 class TestOptimality:
@@ -75,20 +52,6 @@ class TestOptimality:
         u = np.repeat(np.sum(Y.reshape(3, 3, -1) ** 2, axis=1), 3, axis=0)
         G = -0.5 / np.sqrt(u + 0.1) * Y @ Y.T / 3000
         assert np.linalg.norm(G - G.T) < 1e-5 * np.linalg.norm(G)
-
-    def test_default_tolerance_is_near_to_the_optimum(self):
-        signals, _ = mixed(0, 3000, n_subspaces=3)
-        near = FastISA(n_init=1, random_state=0).fit(signals)
-        exact = FastISA(n_init=1, tol=1e-13, random_state=0).fit(signals)
-        assert subspace_distance(near.components_, exact.components_) < 0.01
-        assert_allclose(near.log_likelihood_, exact.log_likelihood_, atol=1e-4)
-
-    def test_not_below_the_likelihood_of_the_truth(self):
-        signals, unmixing = mixed(0)
-        isa = FastISA(n_init=2, random_state=0).fit(signals)
-        Z, whitening = whiten(signals - signals.mean(axis=0))
-        truth = orthogonalise((unmixing @ np.linalg.inv(whitening))[None])
-        assert isa.log_likelihood_ > log_likelihood(truth, Z, 3, SqrtDensity())[0]
 
     def test_likelihood_is_that_of_the_sources(self):
         signals = few_samples()
@@ -136,15 +99,6 @@ class TestInvariances:
         assert_array_equal(fewer.log_likelihoods_, more.log_likelihoods_[:n_init])
         assert_array_equal(fewer.n_iters_, more.n_iters_[:n_init])
 
-    def test_seeds_agree_where_samples_are_many(self):
-        signals, _ = mixed(0, n_subspaces=3)
-        results = [
-            FastISA(n_init=1, tol=1e-10, random_state=seed).fit(signals).components_
-            for seed in range(3)
-        ]
-        for other in results[1:]:
-            assert subspace_distance(results[0], other) < 1e-4
-
     def test_general_mixing_leaves_the_subspaces(self):
         signals, _ = mixed(0, n_subspaces=3)
         A = np.random.default_rng(1).normal(size=(9, 9))
@@ -167,12 +121,6 @@ class TestEdges:
             isa = FastISA(n_init=2, random_state=0).fit(signals)
         assert np.isfinite(isa.components_).all()
 
-    def test_repeated_samples(self):
-        signals = few_samples()
-        once = FastISA(n_init=2, random_state=0).fit(signals)
-        twice = FastISA(n_init=2, random_state=0).fit(np.vstack([signals, signals]))
-        assert_allclose(twice.log_likelihood_, once.log_likelihood_, atol=1e-6)
-
     def test_not_converged(self):
         with pytest.warns(
             ConvergenceWarning,
@@ -187,10 +135,6 @@ class TestEdges:
         lines = capsys.readouterr().out.splitlines()
         assert len(lines) == 2
         assert lines[-1] == f"[FastISA] 20/20 starts, best {isa.log_likelihood_:.6g}"
-
-    def test_quiet_by_default(self, capsys):
-        FastISA(n_init=2, random_state=0).fit(few_samples())
-        assert capsys.readouterr().out == ""
 
     @pytest.mark.parametrize("density", [3, "sqrt", object()])
     def test_something_that_is_no_density(self, density):

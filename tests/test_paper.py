@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import (
-    measurements,
-    permute_frames,
     random_rotation,
-    rotate_frames,
     spherical_sources,
 )
 from sklearn.base import BaseEstimator
@@ -162,32 +159,6 @@ class TestIdentities:
             for other in range(k):
                 assert_allclose(shapes[k].T @ shapes[other], 0, atol=1e-10)
 
-    def test_inverse_snr_between_rank_floor_and_rigid_residual(self, faces):
-        result = run(faces, 3)
-        S = np.linalg.svd(faces, compute_uv=False)
-        rigid = np.sum(S[3:] ** 2) / np.sum(S**2)
-        floor = leading_triplets(faces, 12).rest_share
-        assert floor < inverse_snr(faces, result) < rigid
-
-    @pytest.mark.parametrize("method", BLOCK_RECOVERIES)
-    def test_refinement_never_makes_it_worse(self, faces, method):
-        before = run(faces, 3, block_recovery=method, refinement=None)
-        after = run(faces, 3, block_recovery=method)
-        assert inverse_snr(faces, after) <= inverse_snr(faces, before)
-        assert before.n_iter == 1
-        assert before.converged
-        assert after.converged
-
-    def test_mode_covariance(self, faces):
-        # C = (J / 2I) M_ISA^T M_ISA, an orthogonal transform of M'^T M'.
-        result = run(faces, 3)
-        C = result.mode_covariance
-        f = factorise(faces, 3)
-        expected = f.motion.T @ f.motion * 40 / 120
-        assert_allclose(C, C.T)
-        assert_allclose(np.linalg.eigvalsh(C), np.linalg.eigvalsh(expected), rtol=1e-10)
-        assert_allclose(np.trace(C) * 120, np.sum(f.motion**2) * 40)
-
     def test_blocks_of_the_mode_covariance_belong_to_the_basis(self, faces):
         result = run(faces, 3)
         f = factorise(faces, 3)
@@ -214,39 +185,6 @@ class TestIdentities:
             "independent subspaces",
             "block structure and refinement",
         ]
-
-
-class TestInvariances:
-    @pytest.mark.filterwarnings("ignore:FastICA did not converge")
-    @pytest.mark.parametrize(
-        "isa",
-        [
-            FastISA(n_init=2, random_state=0),
-            PooledFastICA(n_init=3, random_state=0),
-        ],
-    )
-    @pytest.mark.parametrize("name", ["akhter_drink", "ict_bu3dfe_like_68"])
-    def test_real_tables(self, load_data, isa, name):
-        # Many starts do not converge here: the paths to them are chaotic.
-        W = measurements(load_data(name)["W2d"][::5])
-        points = np.random.default_rng(1).permutation(W.shape[1])
-        other_W = rotate_frames(permute_frames(W, 1)[0], 1)[:, points]
-        result, other = run(W, 3, isa), run(other_W, 3, isa)
-        assert_same_basis(other.basis, result.basis[:, points], atol=1e-6)
-
-    @pytest.mark.parametrize("unit", [1e-9, 1e9])
-    def test_units(self, faces, unit):
-        result, other = run(faces, 3), run(unit * faces, 3)
-        assert_allclose(other.mean_shape, result.mean_shape, atol=1e-9)
-        assert_same_basis(other.basis, result.basis, atol=1e-6)
-        assert_allclose(
-            other.mode_covariance / unit**2, result.mode_covariance, atol=1e-8
-        )
-
-    def test_repeated_frames(self, faces):
-        result, other = run(faces, 3), run(np.tile(faces, (2, 1)), 3)
-        assert_same_basis(other.basis, result.basis, atol=1e-6)
-        assert_allclose(other.mode_covariance, result.mode_covariance, atol=1e-8)
 
 
 class Recorder(BaseEstimator):
@@ -290,112 +228,7 @@ class TestStrategies:
         turned = random_rotation(3) @ candidates
         assert_allclose(isa.criterion_(turned), values)
 
-    def test_components_are_made_orthogonal(self, faces):
-        result = run(faces, 3, Recorder())
-        f = factorise(faces, 3)
-        assert_allclose(
-            np.trace(result.mode_covariance) * 120,
-            np.sum(f.motion**2) * 40,
-            rtol=1e-13,
-        )
-
     def test_strategy_that_takes_only_signals(self, faces):
         result = run(faces, 3, Plain())
         f = factorise(faces, 3)
         assert_allclose(result.mode_covariance, f.motion.T @ f.motion / 3, atol=1e-10)
-
-    def test_components_of_the_wrong_shape(self, faces):
-        class Fewer(Plain):
-            def fit(self, signals, y=None):
-                self.components_ = np.eye(signals.shape[1])[:6]
-                return self
-
-        with pytest.raises(
-            ValueError,
-            match=r"isa must give components_ of shape \(9, 9\); got \(6, 9\)",
-        ):
-            run(faces, 3, Fewer())
-
-    def test_fitted_strategy_is_the_one_given(self, faces):
-        isa = FastISA(n_init=1, random_state=0)
-        run(faces, 3, isa)
-        assert isa.components_.shape == (9, 9)
-
-
-@pytest.mark.filterwarnings("ignore:FastICA did not converge")
-class TestDegenerate:
-    """Finite results without warnings, which the test run turns into errors."""
-
-    def check(self, W, K, **options):
-        result = run(W, K, **options)
-        assert result.basis.shape == (K, W.shape[1], 3)
-        assert result.mode_covariance.shape == (3 * K, 3 * K)
-        for array in (result.mean_shape, result.basis, result.mode_covariance):
-            assert np.isfinite(array).all()
-        floor = leading_triplets(W, 3 * K + 3).rest_share
-        assert inverse_snr(W, result) >= floor - 1e-12
-        return result
-
-    @pytest.mark.parametrize("K", [1, 2, 4])
-    @pytest.mark.parametrize("method", BLOCK_RECOVERIES)
-    @pytest.mark.parametrize("refinement", ["alternating", None])
-    def test_pure_rigid_motion(self, K, method, refinement):
-        rng = np.random.default_rng(0)
-        B = rng.normal(size=(3, 20))
-        W = rng.normal(size=(60, 3)) @ (B - B.mean(axis=1, keepdims=True))
-        result = self.check(W, K, block_recovery=method, refinement=refinement)
-        assert_array_equal(result.basis, 0)
-        assert_array_equal(result.mode_covariance, 0)
-        assert inverse_snr(W, result) < 1e-25
-
-    @pytest.mark.parametrize("rank", [1, 2])
-    def test_flat_and_straight_objects(self, rank):
-        rng = np.random.default_rng(0)
-        B = rng.normal(size=(rank, 20))
-        W = rng.normal(size=(60, rank)) @ (B - B.mean(axis=1, keepdims=True))
-        result = self.check(W, 2)
-        assert_array_equal(result.basis, 0)
-        assert inverse_snr(W, result) < 1e-25
-
-    @pytest.mark.parametrize("method", BLOCK_RECOVERIES)
-    def test_flat_object_that_deforms_in_its_plane(self, method):
-        rng = np.random.default_rng(0)
-        B, D = rng.normal(size=(2, 20)), rng.laplace(size=(2, 20))
-        frames = [
-            rng.normal(size=(2, 2)) @ (B + 0.1 * a * D) for a in rng.normal(size=30)
-        ]
-        W = np.vstack(frames)
-        self.check(W - W.mean(axis=1, keepdims=True), 1, block_recovery=method)
-
-    @pytest.mark.parametrize("n_extra", range(1, 7))
-    def test_more_basis_shapes_than_the_data_have(self, n_extra):
-        rng = np.random.default_rng(n_extra)
-        B = rng.laplace(size=(3 + n_extra, 30))
-        W = rng.normal(size=(80, 3 + n_extra)) @ (B - B.mean(axis=1, keepdims=True))
-        result = self.check(W, 4)
-        used = -(-n_extra // 3)
-        assert_array_equal(result.basis[used:], 0)
-        assert np.all(np.abs(result.basis[:used]).max(axis=(1, 2)) > 0)
-        assert_array_equal(result.mode_covariance[3 * used :], 0)
-
-    @pytest.mark.parametrize("K", [1, 2, 4])
-    @pytest.mark.parametrize("method", BLOCK_RECOVERIES)
-    def test_shark(self, load_data, K, method):
-        # One subspace of rank two, whatever K.
-        W = measurements(load_data("shark_torresani")["W2d"])
-        result = self.check(W, K, block_recovery=method)
-        assert_array_equal(result.basis[1:], 0)
-        assert_allclose(inverse_snr(W, result), 0.00203, atol=2e-5)
-
-    @pytest.mark.parametrize("K", [1, 3])
-    def test_shark_without_refinement(self, load_data, K):
-        # D is singular, and so is E = D^+, which must not blow up.
-        W = measurements(load_data("shark_torresani")["W2d"])
-        result = self.check(W, K, refinement=None)
-        assert inverse_snr(W, result) < 0.004
-        assert np.linalg.matrix_rank(result.basis[0], tol=1e-6) == 2
-
-    def test_as_few_points_and_frames_as_possible(self):
-        rng = np.random.default_rng(0)
-        W = rng.normal(size=(10, 7))
-        self.check(W - W.mean(axis=1, keepdims=True), 1)

@@ -78,12 +78,6 @@ class TestWeights:
         )
         assert efficiency == pytest.approx(0.95, abs=1e-4)
 
-    @pytest.mark.parametrize("loss", LOSSES)
-    def test_have_any_shape(self, loss):
-        distance = np.random.default_rng(0).exponential(size=(3, 4))
-        weights = WEIGHTS[loss](distance)
-        assert_array_equal(weights.ravel(), WEIGHTS[loss](distance.ravel()))
-
 
 class TestFrameWeights:
     def test_each_loss_has_weights(self):
@@ -144,12 +138,6 @@ class TestSpatialMedian:
     def test_of_points_in_one_place_is_there(self):
         assert_allclose(spatial_median(np.full((2, 5, 2), 3.0)), 3.0)
 
-    def test_single_points_hardly_change_it(self):
-        tracks = np.random.default_rng(0).normal(size=(20, 31, 2))
-        spoilt = tracks.copy()
-        spoilt[:, 5] = 1e3
-        assert_allclose(spatial_median(spoilt), spatial_median(tracks), atol=0.2)
-
     @pytest.mark.parametrize("n_points", [5, 7, 31])
     def test_a_point_at_any_distance_costs_no_digits_of_the_others(self, n_points):
         tracks = np.random.default_rng(0).normal(size=(20, n_points, 2))
@@ -163,13 +151,6 @@ class TestSpatialMedian:
             middle = centred.mean(axis=1, keepdims=True)
             assert_allclose(centred - middle, expected, rtol=0, atol=1e-14)
             assert np.abs(middle).max() < 3
-
-    def test_points_at_several_distances(self):
-        tracks = np.random.default_rng(0).normal(size=(20, 31, 2))
-        spoilt = tracks.copy()
-        for j, far in enumerate([1e3, 1e9, -1e30, 1e120]):
-            spoilt[:, j] = far
-        assert_allclose(spatial_median(spoilt), spatial_median(tracks), atol=0.4)
 
     def test_of_most_points_in_one_place_is_there(self):
         tracks = np.random.default_rng(0).normal(size=(2, 9, 2))
@@ -200,28 +181,12 @@ class TestSizes:
             square = np.sum((points - middle) ** 2, axis=1)
             assert size == pytest.approx(np.sqrt(np.median(square) / 2))
 
-    def test_place_and_unit(self):
-        tracks = self.random_tracks()
-        expected = 10 * robust_sizes(tracks)
-        assert_allclose(robust_sizes(10 * tracks + 3.0), expected)
-
-    def test_single_points_hardly_change_them(self):
-        tracks = self.random_tracks()
-        spoilt = tracks.copy()
-        spoilt[:, 5] = 1e6
-        assert_allclose(robust_sizes(spoilt), robust_sizes(tracks), rtol=0.25)
-
     def test_where_most_points_are_in_one_place(self):
         tracks = self.random_tracks()
         tracks[2, :20] = 1.0
         square = np.sum((tracks[2] - 1.0) ** 2, axis=1)
         size = robust_sizes(tracks)[2]
         assert size == pytest.approx(np.sqrt(np.mean(square) / 2))
-
-    def test_do_not_depend_on_the_rotation_of_the_image(self):
-        tracks = self.random_tracks()
-        angle = np.linspace(0, np.pi, len(tracks))
-        assert_allclose(robust_sizes(turned(tracks, angle)), robust_sizes(tracks))
 
 
 class TestDistantPoints:
@@ -235,15 +200,6 @@ class TestDistantPoints:
         expected[5, 2] = expected[6, 3] = True
         assert_array_equal(distant_points(tracks), expected)
         assert_array_equal(distant_points(0.1 * tracks + 5.0), expected)
-
-    def test_distance_is_measured_in_sizes_from_the_median(self):
-        points = np.random.default_rng(0).normal(size=(101, 2))
-        for distance in np.linspace(5.0, 8.0, 7):
-            points[100] = [0.6 * distance, 0.8 * distance]
-            size = robust_sizes(points[None])[0]
-            from_median = np.linalg.norm(points[100] - spatial_median(points[None])[0])
-            expected = from_median > DISTANT * size
-            assert distant_points(points[None])[0, 100] == expected
 
 
 LARGEST_SHARE = 0.4  # of the points of a frame that may be outliers
@@ -287,14 +243,6 @@ class TestGrossOutliers:
         assert where.sum() > 20
         assert found[where].mean() > 0.8
         assert found[~where].mean() < 0.02
-
-    @pytest.mark.parametrize("distance", [5.0, 100.0])
-    def test_a_single_one(self, distance):
-        tracks = rigid_tracks()
-        tracks[3, 7, 0] += distance
-        expected = np.zeros(tracks.shape[:2], dtype=bool)
-        expected[3, 7] = True
-        assert_array_equal(gross_outliers(tracks), expected)
 
     def test_a_point_that_is_anywhere_belongs_there(self):
         tracks = rigid_tracks()
@@ -349,12 +297,6 @@ class TestGrossOutliers:
         moved = 10 * tracks + rng.normal(size=(len(tracks), 1, 2))
         got = gross_outliers(moved[frames][:, points])
         assert_array_equal(got, expected[frames][:, points])
-
-    def test_rotation_of_single_frames(self):
-        tracks, _ = spoilt(rigid_tracks(), 2.0)
-        angle = np.random.default_rng(2).uniform(0, 2 * np.pi, len(tracks))
-        expected = gross_outliers(tracks)
-        assert_array_equal(gross_outliers(turned(tracks, angle)), expected)
 
     def test_of_exact_rigid_tables_there_are_none(self):
         assert not gross_outliers(rigid_tracks(noise=0.0)).any()

@@ -10,7 +10,6 @@ from isa_nrsfm._prepare import layout_check
 from isa_nrsfm._prepare.checks import (
     check_names,
     check_points,
-    check_size,
     clean_tracks,
     largest_n_components,
     smallest_n_frames,
@@ -53,10 +52,6 @@ class TestHalfPoints:
         assert_array_equal(clean[seen], tracks[seen])
         assert np.isnan(clean[~seen]).all()
         assert clean.dtype == tracks.dtype
-
-    def test_single_precision_stays(self, rng):
-        with pytest.warns(UserWarning, match="3 in all"):
-            assert clean_tracks(self.half(rng).astype(np.float32)).dtype == np.float32
 
     @pytest.mark.parametrize(
         ("layout", "columns"), [("interleaved", "c14, c15"), ("planar", "c7, c16")]
@@ -150,33 +145,6 @@ class TestSize:
         K = largest_n_components(n_points)
         assert 3 * K + 3 <= n_points - 1 < 3 * (K + 1) + 3
 
-    def test_the_smallest_table_passes(self):
-        for K in range(1, 10):
-            check_size(smallest_n_frames(K), 3 * K + 4, K)
-
-    def test_too_few_points(self):
-        with pytest.raises(
-            ValueError,
-            match=r"n_components=3 needs at least 13 points, X has 12; with 12 points "
-            r"the largest possible n_components is 2",
-        ):
-            check_size(100, 12, 3)
-
-    def test_too_few_points_for_any_number(self):
-        with pytest.raises(
-            ValueError,
-            match=r"n_components=2 needs at least 10 points, X has 6; at least 7 "
-            r"points are needed for n_components=1",
-        ):
-            check_size(100, 6, 2)
-
-    def test_too_few_frames(self):
-        with pytest.raises(
-            ValueError,
-            match=r"n_components=3 needs at least 8 frames \(rows\), X has n_samples=7",
-        ):
-            check_size(7, 68, 3)
-
 
 class TestNames:
     @pytest.mark.parametrize("layout", ["interleaved", "planar"])
@@ -259,12 +227,6 @@ class TestOtherLayout:
         warn_if_other_layout(
             unit * tracks_to_table(faces, layout), layout, scale_frames
         )
-
-    def test_single_precision(self, faces):
-        X = tracks_to_table(faces).astype(np.float32)
-        warn_if_other_layout(X, "interleaved", True)
-        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
-            warn_if_other_layout(X, "planar", True)
 
     def test_long_tables_are_sampled_evenly(self, faces):
         X = tracks_to_table(np.tile(faces, (100, 1, 1)))
