@@ -231,17 +231,6 @@ def test_every_attribute_is_documented(model):
     assert documented - fitted == set()
 
 
-def test_defaults_are_the_documented_ones():
-    model = AffineNRSfM(n_components=2, random_state=0).fit(TABLE)
-    assert isinstance(model.isa_, PooledFastICA)
-    assert model.refinement == "joint"
-    assert model.independence == "shapes"
-    assert model.loss == "linear"
-    assert model.camera == "affine"
-    assert model.layout == "interleaved"
-    assert model.scale_frames is True
-
-
 def test_inputs_of_other_types_are_fitted_in_double_precision():
     table = np.round(TABLE).astype(np.int32)
     model = estimator().fit(table)
@@ -431,32 +420,6 @@ def test_rigid_cameras_and_linear_least_squares_of_the_paper(variant, which):
         rest = (centred - model.mean_shape_ @ M.T).ravel()
         best = np.linalg.lstsq(design, rest)[0]
         assert_allclose(alpha[i], best, atol=1e-8 * np.abs(best).max())
-
-
-# Of others cameras are not those of least squares, or points have weights.
-@only(refinement=["joint"], loss=["linear"], camera=["affine"])
-@pytest.mark.parametrize("which", ["fitted", "new"])
-def test_cameras_of_the_joint_refinement_are_best_for_the_coefficients(variant, which):
-    # They are the least squares fit to the shape of the frame, position included.
-    model, table, new = variant
-    table = table if which == "fitted" else new
-    motion, translation, *_ = model.decompose(table)
-    tracks, shapes = tracks_of(table, model.layout), model.reconstruct(table)
-    for points, shape, M, t in zip(tracks, shapes, motion, translation, strict=True):
-        design = np.column_stack([shape, np.ones(N_POINTS)])
-        best = np.linalg.lstsq(design, points)[0]
-        size = np.abs(M).max()
-        assert_allclose(M, best[:3].T, atol=1e-6 * size)
-        assert_allclose(t, best[3], atol=1e-6 * size)
-
-
-def test_frames_are_fitted_by_themselves(variant):
-    model, _, new = variant
-    together = model.decompose(new)
-    for i in range(0, len(new), 5):
-        alone = model.decompose(new[i : i + 1])
-        for one, all_ in zip(alone, together, strict=True):
-            assert_allclose(one[0], all_[i], rtol=1e-9, atol=1e-10)
 
 
 def test_table_that_the_model_has_made_is_taken_apart_again():
@@ -681,31 +644,6 @@ def test_bad_new_tables_are_refused(model, method, table, message):
         getattr(model, method)(table)
 
 
-def test_smallest_tables_are_fitted_and_smaller_ones_are_not():
-    rng = np.random.default_rng(0)
-    for n_components, n_frames in [(1, 5), (2, 7), (3, 8), (4, 10), (9, 18)]:
-        n_points = 3 * n_components + 4
-        table = rng.normal(size=(n_frames, 2 * n_points))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            # Tables of noise alone take many steps that say no more.
-            model = estimator(n_components, max_iter=20).fit(table)
-        assert np.isfinite(model.alpha_).all()
-        assert model.rank_floor_ < 1e-25
-        with pytest.raises(ValueError, match=f"at least {n_points} points"):
-            estimator(n_components).fit(table[:, 2:])
-        with pytest.raises(ValueError, match=f"at least {n_frames} frames"):
-            estimator(n_components).fit(table[1:])
-
-
-@may_not_converge
-def test_k_is_never_changed():
-    faces = make_face_tracks(60, n_components=2, noise=0, random_state=0)
-    model = estimator(6, max_iter=20).fit(faces.data)
-    assert model.n_components == 6
-    assert len(model.basis_) == 6
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -724,6 +662,10 @@ def test_k_is_never_changed():
             (np.zeros((4, 3)), None, np.zeros((1, 2))),
             r"translation must have shape \(4, 2\) or \(2,\); got \(1, 2\)",
         ),
+        ((np.zeros((4, 3)), np.full((2, 3), np.nan)), "motion contains NaN"),
+        ((np.zeros((4, 3)), np.full((2, 3), np.inf)), "motion contains infinity"),
+        ((np.zeros((4, 3)), None, [np.nan, 0.0]), "translation contains NaN"),
+        ((np.zeros((4, 3)), None, [np.inf, 0.0]), "translation contains infinity"),
     ],
 )
 def test_bad_arguments_of_inverse_transform_are_refused(model, arguments, message):
@@ -731,24 +673,11 @@ def test_bad_arguments_of_inverse_transform_are_refused(model, arguments, messag
         model.inverse_transform(*arguments)
 
 
-@pytest.mark.parametrize("broken", [np.nan, np.inf])
-@pytest.mark.parametrize("argument", ["motion", "translation"])
-def test_cameras_that_are_not_finite_numbers_are_refused(model, argument, broken):
-    value = np.zeros({"motion": (2, 3), "translation": (2,)}[argument])
-    value[..., 0] = broken
-    with pytest.raises(ValueError, match=argument):
-        model.inverse_transform(model.alpha_, **{argument: value})
-
-
 @pytest.mark.parametrize("library", ["pandas", "polars"])
-@pytest.mark.parametrize("others", [["likelihood"], ["frame", "person"]])
-def test_columns_that_are_no_points_are_refused(library, others):
+def test_columns_that_are_no_points_are_refused(library):
     table = pd.DataFrame(TABLE, columns=FACES.feature_names)
-    if others == ["likelihood"]:
-        for j in range(68):
-            table.insert(3 * j + 2, f"likelihood_{j}", 0.9)
-    else:
-        table = pd.concat([pd.DataFrame(1.0, table.index, others), table], axis=1)
+    for j in range(68):
+        table.insert(3 * j + 2, f"likelihood_{j}", 0.9)
     given = table
     if library == "polars":
         given = pl.DataFrame(dict(table.items()))
@@ -763,45 +692,16 @@ def test_columns_that_are_no_points_are_refused(library, others):
 def test_names_that_contradict_the_layout_are_refused():
     interleaved = pd.DataFrame(TABLE, columns=FACES.feature_names)
     order = list(interleaved)[0::2] + list(interleaved)[1::2]
-    planar_table = interleaved[order]
-    with pytest.raises(
-        ValueError,
-        match=r"layout='planar' contradicts the column names \(x_0, y_0, x_1, y_1, "
-        r"...\), whose order is interleaved",
-    ):
+    with pytest.raises(ValueError, match=r"layout='planar' .* order is interleaved"):
         estimator(layout="planar").fit(interleaved)
     with pytest.raises(ValueError, match=r"layout='interleaved' .* order is planar"):
-        estimator().fit(planar_table)
-    shuffled = interleaved[order[1:] + order[:1]]
-    for layout in ("interleaved", "planar"):
-        with pytest.raises(ValueError, match="neither interleaved nor planar"):
-            estimator(layout=layout).fit(shuffled)
-    assert_allclose(
-        estimator(layout="planar").fit(planar_table).alpha_,
-        estimator().fit(interleaved).alpha_,
-        atol=1e-9,
-    )
+        estimator().fit(interleaved[order])
 
 
 def test_names_that_say_nothing_are_not_read():
     names = [f"column {j}" for j in range(2 * N_POINTS)]
     model = estimator().fit(pd.DataFrame(TABLE, columns=names))
     assert model.feature_names_in_.tolist() == names
-
-
-def test_methods_need_a_fitted_model():
-    for method in (
-        "transform",
-        "decompose",
-        "reconstruct",
-        "reproject",
-        "score",
-        "inverse_transform",
-    ):
-        with pytest.raises(NotFittedError):
-            getattr(estimator(), method)(TABLE)
-    with pytest.raises(NotFittedError):
-        estimator().get_feature_names_out()
 
 
 @pytest.mark.parametrize(
@@ -847,14 +747,6 @@ def test_too_few_basis_shapes_are_better_than_none(n_components):
     rigid = np.repeat(FACES.shapes.mean(axis=0)[None], N_FRAMES, axis=0)
     error = affine_shape_error(FACES.shapes, model.reconstruct(TABLE))
     assert error < 1.05 * affine_shape_error(FACES.shapes, rigid)
-
-
-@may_not_converge
-@pytest.mark.parametrize("n_components", [1, 3])
-def test_too_few_basis_shapes_do_not_depend_on_rounding(n_components):
-    model = fitted(n_components)
-    moved = estimator(n_components, isa=None).fit(TABLE + 300.0)
-    assert_allclose(moved.alpha_, model.alpha_, atol=1e-5)
 
 
 # --- parameters ---------------------------------------------------------------------
@@ -909,15 +801,6 @@ def test_options_that_need_the_joint_refinement(refinement, option):
     model = AffineNRSfM(refinement=refinement, **option)
     with pytest.raises(ValueError, match=message):
         model.fit(TABLE)
-    with pytest.raises(NotFittedError):
-        model.transform(TABLE)
-
-
-def test_a_fit_that_fails_leaves_nothing_of_the_one_before():
-    model = estimator().fit(TABLE)
-    with pytest.raises(ValueError, match="infinity"):
-        model.fit(np.full_like(TABLE, np.inf))
-    assert not [name for name in vars(model) if name.endswith("_")]
     with pytest.raises(NotFittedError):
         model.transform(TABLE)
 
@@ -1179,16 +1062,6 @@ def test_copies_give_the_same_to_the_bit(way, copied, tmp_path):
     assert str(loaded.get_params()) == str(model.get_params())
 
 
-def test_clone_is_unfitted_and_has_the_parameters(model):
-    copied = clone(model)
-    assert not [name for name in vars(copied) if name.endswith("_")]
-    assert copied.get_params(deep=False).keys() == model.get_params(deep=False).keys()
-    assert copied.isa is not model.isa
-    assert copied.isa.n_init == 3
-    copied.set_params(isa__n_init=5, n_components=1)
-    assert (copied.isa.n_init, model.isa.n_init) == (5, 3)
-
-
 @pytest.mark.parametrize(("library", "frame"), [("pandas", pd), ("polars", pl)])
 def test_output_in_dataframes(library, frame):
     table = frame.DataFrame(
@@ -1204,11 +1077,6 @@ def test_output_in_dataframes(library, frame):
     assert isinstance(model.decompose(table).alpha, np.ndarray)
     assert isinstance(model.reproject(table), np.ndarray)
     assert_allclose(model.inverse_transform(model.transform(table)).shape, TABLE.shape)
-
-
-def test_names_of_the_output(model):
-    names = ["alpha_1", "alpha_2", "alpha_3"]
-    assert model.get_feature_names_out().tolist() == names
 
 
 def test_another_refinement_leaves_nothing_of_the_joint_one():
@@ -1356,11 +1224,6 @@ def test_intervals_of_coefficients_hold(loss, camera):
         found = model.decompose(noisy(0.02))
         inside.append(np.abs(found.alpha - expected) < 1.96 * found.alpha_std)
     assert 0.92 < np.mean(inside) < 0.98
-
-
-def test_the_number_of_components_is_found_by_the_joint_refinement_only():
-    with pytest.raises(ValueError, match="'auto' needs refinement='joint'; got"):
-        estimator("auto", refinement=None).fit(TABLE)
 
 
 @pytest.mark.parametrize(

@@ -132,16 +132,6 @@ def test_shark_with_all_methods(load_data, block_recovery, refinement):
         assert_allclose(model.inverse_snr_, fitted(tracks, 2).inverse_snr_, rtol=1e-6)
 
 
-def test_basis_shape_of_rounding_errors_is_zero(load_data):
-    # Without refinement "eigen" may pick the direction in which the block of the
-    # shark does not move. What is left of it is not to be blown up to unit variance.
-    tracks = real_tracks(load_data, "shark_torresani")
-    model = fitted(tracks, 1, block_recovery="eigen", refinement=None)
-    if np.linalg.norm(model.basis_[0]) < 1e-9 * np.linalg.norm(model.mean_shape_):
-        assert np.all(model.basis_ == 0)
-        assert np.all(model.alpha_ == 0)
-
-
 def cameras(rng, n_frames):
     return rng.normal(size=(n_frames, 2, 3))
 
@@ -390,12 +380,6 @@ def test_joint_refinement_of_duplicated_points_and_frames():
     assert_allclose(frames.inverse_snr_, once.inverse_snr_, rtol=1e-2)
 
 
-def test_joint_refinement_of_few_points_seen_many_times():
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    model = jointly(np.tile(tracks[:, ::10], (1, 5, 1)), 4)
-    assert model.inverse_snr_ < 1e-4
-
-
 @pytest.mark.parametrize(
     ("n_components", "n_cameras", "noise"),
     slow_after(
@@ -435,16 +419,6 @@ def test_joint_refinement_of_smallest_tables(n_components, dtype):
     deviation = model.alpha_.std(axis=0)
     if dtype == np.float64:
         assert_allclose(deviation[model.basis_.any(axis=(1, 2))], 1, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("n_frames", "n_components"),
-    slow_after(1, [(200, 4), (60, 7), (400, 4)], together=True),
-)
-def test_joint_refinement_of_real_tables(load_data, n_frames, n_components):
-    tracks = real_tracks(load_data, "muct_68")
-    model = jointly(tracks[:: len(tracks) // n_frames], n_components)
-    assert_allclose(model.alpha_.std(axis=0), 1, rtol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -195,17 +195,6 @@ class TestFit:
         got = estimator(working_memory=0.1, **params).fit(memmap(X, tmp_path))
         assert_same_model(got, estimator(**params).fit(X))
 
-    def test_single_precision_is_kept(self, tmp_path):
-        X = table().astype(np.float32)
-        got = estimator(working_memory=0.1).fit(memmap(X, tmp_path))
-        assert got.basis_.dtype == got.alpha_.dtype == np.float32
-        assert_allclose(got.alpha_, estimator().fit(X).alpha_, atol=1e-5)
-
-    def test_whole_numbers(self, tmp_path):
-        X = np.round(1000 * table()).astype(np.int16)
-        got = estimator(working_memory=0.1).fit(memmap(X, tmp_path))
-        assert_same_model(got, estimator().fit(X))
-
 
 class TestNewTables:
     def test_all_methods_read_blocks(self, tmp_path):
@@ -261,11 +250,6 @@ class TestKeepFrames:
             model.diagnostics()
         with pytest.raises(ValueError, match=NEEDED):
             model.reconstruct(X, "orthographic")
-
-    def test_another_fit_forgets_them(self):
-        model = estimator().fit(table())
-        model.set_params(keep_frames=False).fit(table())
-        assert not hasattr(model, "alpha_")
 
 
 class TestErrors:
