@@ -25,6 +25,7 @@ REAL_TABLES = [
     "shark_torresani",
 ]
 FAST = FastISA(n_init=2)
+FACES = make_face_tracks(60, n_components=2, random_state=0).tracks
 
 
 def real_tracks(load_data, name):
@@ -94,6 +95,23 @@ def fitted(tracks, n_components, **params):
     return model
 
 
+def jointly(tracks, n_components, repeat=False, **params):
+    """Return the default model of tracks; it is finite, and the same if repeated.
+
+    The table may determine little, then the refinement may not converge and say so;
+    other warnings are errors.
+    """
+    params = {"refinement": "joint", "isa": None} | params
+    model = fitted(tracks, n_components, **params)
+    assert_array_equal(model.transform(table_of(tracks)), model.alpha_)
+    if not repeat:
+        return model
+    again = fitted(tracks, n_components, **params)
+    assert_array_equal(again.alpha_, model.alpha_)
+    assert_array_equal(again.basis_, model.basis_)
+    return model
+
+
 def assert_zero_from(model, first):
     """Assert that the basis shapes from `first` on have no motion."""
     assert np.all(model.basis_[first:] == 0)
@@ -142,12 +160,29 @@ def seen(shapes, motion, rng):
     return shapes @ motion.transpose(0, 2, 1) + position
 
 
-@pytest.mark.parametrize("n_components", [1, 2, 5])
-@pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
-def test_rigid_objects_have_no_basis_shapes(flat, n_components):
+def rigid_tracks(flat=(1, 1, 1)):
+    """Return the tracks of a rigid object."""
     rng = np.random.default_rng(0)
-    shape = rng.normal(size=(20, 3)) * flat
-    tracks = seen(shape, cameras(rng, 40), rng)
+    return seen(rng.normal(size=(20, 3)) * flat, cameras(rng, 40), rng)
+
+
+def bending_tracks(motion=None, flat=(1, 1, 1), noise=0.0):
+    """Return the tracks of an object with one basis shape."""
+    rng = np.random.default_rng(0)
+    shape, basis = rng.normal(size=(2, 20, 3)) * flat
+    alpha = rng.normal(size=(40, 1, 1))
+    motion = cameras(rng, 40) if motion is None else motion
+    tracks = seen(shape + 0.2 * alpha * basis, motion, rng)
+    return tracks + noise * rng.normal(size=tracks.shape)
+
+
+FLAT = pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
+
+
+@pytest.mark.parametrize("n_components", [1, 2, 5])
+@FLAT
+def test_rigid_objects_have_no_basis_shapes(flat, n_components):
+    tracks = rigid_tracks(flat)
     model = fitted(tracks, n_components)
     assert model.inverse_snr_ < 1e-25
     assert_zero_from(model, 0)
@@ -156,12 +191,36 @@ def test_rigid_objects_have_no_basis_shapes(flat, n_components):
     assert_allclose(second, [0] * (3 - rank) + [1] * rank, atol=1e-12)
 
 
+@pytest.mark.parametrize("n_components", [1, 2])
+@FLAT
+@pytest.mark.parametrize(
+    "independence", slow_after(1, ["shapes", "coefficients", None])
+)
+def test_joint_refinement_of_rigid_objects(flat, n_components, independence):
+    model = jointly(rigid_tracks(flat), n_components, independence=independence)
+    assert model.inverse_snr_ < 1e-18
+    assert_zero_from(model, 0)
+
+
+def test_joint_refinement_of_a_rigid_object_with_noise():
+    # What is found is noise, and the deviations say so.
+    tracks = rigid_tracks()
+    noise = np.random.default_rng(1).normal(size=tracks.shape)
+    model = jointly(tracks + 0.02 * noise, 1)
+    assert model.inverse_snr_ < 1e-3
+    assert np.linalg.norm(model.basis_) < 0.02 * np.linalg.norm(model.mean_shape_)
+
+
+@pytest.mark.parametrize("loss", LOSSES[1:])
+def test_robust_fit_of_a_rigid_object(loss):
+    model = jointly(rigid_tracks(), 1, loss=loss)
+    assert model.inverse_snr_ < 1e-10
+    assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_flat_objects_that_deform_in_their_plane(dtype):
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(2, 20, 3)) * [1, 1, 0]
-    alpha = rng.normal(size=(40, 1, 1))
-    tracks = seen(shape + 0.2 * alpha * basis, cameras(rng, 40), rng).astype(dtype)
+    tracks = bending_tracks(flat=(1, 1, 0)).astype(dtype)
     for n_components in (1, 3):
         model = fitted(tracks, n_components)
         assert model.inverse_snr_ < 0.02
@@ -184,7 +243,7 @@ def test_repeated_frames(n_different, n_components):
 
 
 def test_repeated_points_change_nothing_but_their_number():
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    tracks = FACES
     once = fitted(tracks, 2)
     twice = fitted(np.concatenate([tracks, tracks[:, ::-1]], axis=1), 2)
     assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-4)
@@ -197,7 +256,7 @@ def test_repeated_points_change_nothing_but_their_number():
 
 
 def test_frames_repeated_as_often_as_others_change_nothing():
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+    tracks = FACES
     once, twice = fitted(tracks, 2), fitted(np.tile(tracks, (2, 1, 1)), 2)
     assert_allclose(twice.alpha_, np.tile(once.alpha_, (2, 1)), atol=1e-6)
     assert_allclose(twice.inverse_snr_, once.inverse_snr_, rtol=1e-6)
@@ -229,30 +288,26 @@ def test_smallest_tables(n_components, isa, dtype):
 
 def test_cameras_that_never_turn():
     # Depth is not seen at all: the rigid part is filled up with deformation.
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(2, 20, 3))
-    alpha = rng.normal(size=(40, 1, 1))
-    motion = np.broadcast_to(np.eye(2, 3), (40, 2, 3))
+    tracks = bending_tracks(np.broadcast_to(np.eye(2, 3), (40, 2, 3)))
     for n_components in (1, 3):
-        model = fitted(seen(shape + 0.2 * alpha * basis, motion, rng), n_components)
+        model = fitted(tracks, n_components)
         assert model.inverse_snr_ < 1e-3
 
 
-def test_frames_that_are_lines_or_tiny():
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
+def lines_and_tiny_frames():
+    """Return tracks of which three frames hardly show anything."""
+    tracks = FACES.copy()
     tracks[3] *= [1, 0]
     tracks[5] = tracks[5].mean(axis=0) + 1e-7 * tracks[5]
     tracks[7] = tracks[7, :1]
     tracks[7, 0] += 1.0
+    return tracks
+
+
+def test_frames_that_are_lines_or_tiny():
+    tracks = lines_and_tiny_frames()
     for scale_frames in (True, False):
         fitted(tracks, 2, scale_frames=scale_frames)
-
-
-@pytest.mark.parametrize("scale", [1e-136, 1e-30, 1e30, 1e136])
-def test_any_unit_is_fitted(scale):
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    model = fitted(tracks * scale, 2)
-    assert_allclose(model.inverse_snr_, fitted(tracks, 2).inverse_snr_, rtol=1e-6)
 
 
 def test_two_places_only():
@@ -265,26 +320,6 @@ def test_two_places_only():
     assert fitted(diagonal, 1).inverse_snr_ < 1e-25
 
 
-# --- degenerate tables, joint refinement ---------------------------------------------
-
-
-def jointly(tracks, n_components, repeat=False, **params):
-    """Return the default model of tracks; it is finite, and the same if repeated.
-
-    The table may determine little, then the refinement may not converge and say so;
-    other warnings are errors.
-    """
-    params = {"refinement": "joint", "isa": None} | params
-    model = fitted(tracks, n_components, **params)
-    assert_array_equal(model.transform(table_of(tracks)), model.alpha_)
-    if not repeat:
-        return model
-    again = fitted(tracks, n_components, **params)
-    assert_array_equal(again.alpha_, model.alpha_)
-    assert_array_equal(again.basis_, model.basis_)
-    return model
-
-
 @pytest.mark.parametrize("n_components", slow_after(1, [1, 2, 3, 6]))
 def test_joint_refinement_of_the_shark(load_data, n_components):
     # The refinement has hardly an end where the table determines so little.
@@ -292,38 +327,6 @@ def test_joint_refinement_of_the_shark(load_data, n_components):
     model = jointly(tracks, n_components, repeat=n_components == 1, max_iter=100)
     paper = fitted(tracks, n_components)
     assert model.inverse_snr_ < paper.inverse_snr_
-
-
-@pytest.mark.parametrize("n_components", [1, 2])
-@pytest.mark.parametrize("flat", [[1, 1, 1], [1, 1, 0], [1, 0, 0]], ids=str)
-@pytest.mark.parametrize(
-    "independence", slow_after(1, ["shapes", "coefficients", None])
-)
-def test_joint_refinement_of_rigid_objects(flat, n_components, independence):
-    rng = np.random.default_rng(0)
-    shape = rng.normal(size=(20, 3)) * flat
-    tracks = seen(shape, cameras(rng, 40), rng)
-    model = jointly(tracks, n_components, independence=independence)
-    assert model.inverse_snr_ < 1e-18
-    assert_zero_from(model, 0)
-
-
-def test_joint_refinement_of_a_rigid_object_with_noise():
-    # What is found is noise, and the deviations say so.
-    rng = np.random.default_rng(0)
-    tracks = seen(rng.normal(size=(20, 3)), cameras(rng, 40), rng)
-    model = jointly(tracks + 0.02 * rng.normal(size=tracks.shape), 1)
-    assert model.inverse_snr_ < 1e-3
-    assert np.linalg.norm(model.basis_) < 0.02 * np.linalg.norm(model.mean_shape_)
-
-
-@pytest.mark.parametrize("loss", LOSSES[1:])
-def test_robust_fit_of_a_rigid_object(loss):
-    rng = np.random.default_rng(0)
-    tracks = seen(rng.normal(size=(20, 3)), cameras(rng, 40), rng)
-    model = jointly(tracks, 1, loss=loss)
-    assert model.inverse_snr_ < 1e-10
-    assert np.linalg.norm(model.basis_) < 1e-6 * np.linalg.norm(model.mean_shape_)
 
 
 @pytest.mark.slow
@@ -340,11 +343,7 @@ def test_robust_fit_of_the_shark(load_data, loss):
     slow_after(1, [(1, 0.01), (3, 0.0), (3, 0.01)], together=True),
 )
 def test_joint_refinement_of_flat_objects(n_components, noise):
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(2, 20, 3)) * [1, 1, 0]
-    alpha = rng.normal(size=(40, 1, 1))
-    tracks = seen(shape + 0.2 * alpha * basis, cameras(rng, 40), rng)
-    tracks += noise * rng.normal(size=tracks.shape)
+    tracks = bending_tracks(flat=(1, 1, 0), noise=noise)
     model = jointly(tracks, n_components)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
@@ -397,12 +396,8 @@ def test_joint_refinement_of_duplicated_points_and_frames():
 )
 def test_joint_refinement_of_cameras_that_hardly_turn(n_components, n_cameras, noise):
     # All frames from one place, or from two: depth is seen in part or not at all.
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(2, 20, 3))
-    alpha = rng.normal(size=(40, 1, 1))
-    motion = np.repeat(cameras(rng, n_cameras), 40 // n_cameras, axis=0)
-    tracks = seen(shape + 0.2 * alpha * basis, motion, rng)
-    tracks += noise * rng.normal(size=tracks.shape)
+    motion = cameras(np.random.default_rng(1), n_cameras)
+    tracks = bending_tracks(np.repeat(motion, 40 // n_cameras, axis=0), noise=noise)
     model = jointly(tracks, n_components)
     assert model.inverse_snr_ < 1e-9 + 2 * noise**2
 
@@ -424,7 +419,7 @@ def test_joint_refinement_of_smallest_tables(n_components, dtype):
 @pytest.fixture(scope="module")
 def joint_faces():
     """Return the default model of the faces of the tests below."""
-    return jointly(make_face_tracks(60, n_components=2, random_state=0).tracks, 2)
+    return jointly(FACES, 2)
 
 
 @pytest.mark.parametrize(
@@ -436,11 +431,7 @@ def joint_faces():
 def test_joint_refinement_of_frames_that_are_lines_or_tiny(
     joint_faces, loss, scale_frames
 ):
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    tracks[3] *= [1, 0]
-    tracks[5] = tracks[5].mean(axis=0) + 1e-7 * tracks[5]
-    tracks[7] = tracks[7, :1]
-    tracks[7, 0] += 1.0
+    tracks = lines_and_tiny_frames()
     model = jointly(tracks, 2, loss=loss, scale_frames=scale_frames)
     others = np.setdiff1d(np.arange(60), [3, 5, 7])
     errors = [
@@ -451,11 +442,12 @@ def test_joint_refinement_of_frames_that_are_lines_or_tiny(
 
 
 @pytest.mark.parametrize("scale", slow_after(2, [1e-136, 1e136, 1e-30, 1e30]))
-def test_joint_refinement_of_any_unit(joint_faces, scale):
-    tracks = make_face_tracks(60, n_components=2, random_state=0).tracks
-    model = jointly(tracks * scale, 2)
-    assert_allclose(model.alpha_, joint_faces.alpha_, atol=1e-6)
-    assert_allclose(model.inverse_snr_, joint_faces.inverse_snr_, rtol=1e-6)
+@pytest.mark.parametrize("refinement", ["joint", "alternating"])
+def test_any_unit_is_fitted(scale, refinement):
+    fit = {"joint": jointly, "alternating": fitted}[refinement]
+    once, scaled = (fit(unit * FACES, 2) for unit in (1.0, scale))
+    assert_allclose(scaled.alpha_, once.alpha_, atol=1e-6)
+    assert_allclose(scaled.inverse_snr_, once.inverse_snr_, rtol=1e-6)
 
 
 def test_joint_refinement_of_points_in_two_places():
