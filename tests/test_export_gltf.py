@@ -7,6 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from isa_nrsfm.export import _gltf, write_glb
 from isa_nrsfm.export._drawing import (
     choose_drawing,
+    edges_of,
     frontal_triangles,
     vertex_normals,
 )
@@ -109,7 +110,7 @@ def test_edges_are_lines_triangles_surfaces_and_none_is_points(written):
     triangles = [[0, 36, 31], [2, 1, 0]]
     read = written(face_model(), edges=triangles)
     assert_array_equal(read.array(read.primitive(4)["indices"]), np.ravel(triangles))
-    edges = choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4).edges
+    edges = edges_of(choose_drawing([[0, 1, 2], [2, 1, 3]], None, 4)[0])
     assert edges.tolist() == [[0, 1], [0, 2], [1, 2], [1, 3], [2, 3]]
 
 

@@ -1,6 +1,6 @@
 """Turn a shape upright and frontal."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -113,10 +113,14 @@ def canonical_pose(
             f"{points.shape} with {np.sum(~np.isfinite(points))} entries that are not"
         )
     if scheme is not None:
-        pairs = _scheme_pairs(scheme, len(points))
-        left_right = pairs["left_right"] if left_right is None else left_right
-        up = pairs["up"] if up is None else up
-        front = pairs["front"] if front is None else front
+        layout = checked_skeleton(scheme, len(points))
+        if not layout.up:
+            raise ValueError(f"scheme={layout.name!r} does not define which way is up")
+        up = layout.up if up is None else up
+        if left_right is None and len(layout.left_right):
+            left_right = layout.left_right
+        if front is None and layout.front:
+            front = layout.front
         if left_right is None and front is None:
             front = (0.0, 0.0, -1.0)  # to the viewer
     right = None if left_right is None else _principal_direction(points, left_right)
@@ -206,16 +210,3 @@ def _differences(name: str, points: NDArray, pairs: ArrayLike) -> NDArray:
     if not index.size:
         raise ValueError(f"{name} must name a pair of points; got none")
     return points[index[:, 1]] - points[index[:, 0]]
-
-
-def _scheme_pairs(scheme: Any, n_points: int) -> dict[str, Any]:
-    """Return the pairs of points of a layout, None if undefined."""
-    scheme = checked_skeleton(scheme, n_points)
-    if not scheme.up:
-        raise ValueError(f"scheme={scheme.name!r} does not define which way is up")
-    pairs = {
-        "left_right": scheme.left_right,
-        "up": np.array(scheme.up),
-        "front": np.array(scheme.front),
-    }
-    return {name: index if len(index) else None for name, index in pairs.items()}

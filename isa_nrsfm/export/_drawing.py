@@ -1,6 +1,6 @@
 """The parts of a shape that are drawn: triangles, edges or only points."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,45 +8,34 @@ from scipy.spatial import Delaunay, QhullError
 
 from isa_nrsfm.skeletons import Skeleton
 from isa_nrsfm.skeletons._recognition import checked_links
-from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
 # "auto" or the name of a layout, the layout, pairs of points, or triangles.
 Links = ArrayLike | Skeleton | str | None
 
 
-class Drawing(NamedTuple):
-    """Pairs of points or triangles to draw, and the side (n_points,) of each point."""
+def choose_drawing(
+    edges: Any, layout: Skeleton | None, n_points: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return pairs of points or triangles to draw, and the side (n_points,) of points.
 
-    links: NDArray[np.intp]
-    sides: NDArray[np.intp]
-
-    @property
-    def edges(self) -> NDArray[np.intp]:
-        """Return pairs of points: those given, or the sides of triangles, once."""
-        if self.links.shape[1] == 2:
-            return self.links
-        sides = self.links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        return np.unique(np.sort(sides, axis=1), axis=0)
-
-    @property
-    def edges_of_sides(self) -> list[NDArray[np.intp]]:
-        """Return the pairs of points in the middle, on the left and on the right."""
-        edges = self.edges
-        of_edges = sides_of_edges(self.sides, edges)
-        return [edges[of_edges == side] for side in (MIDDLE, LEFT, RIGHT)]
-
-
-def choose_drawing(edges: Any, layout: Skeleton | None, n_points: int) -> Drawing:
-    """Return the lines or triangles of `edges`, otherwise those of the layout."""
+    They are those of `edges`, otherwise those of the layout.
+    """
     links = np.empty((0, 2), dtype=np.intp)
-    sides = np.zeros(n_points, dtype=np.intp)
-    if edges is None:
-        return Drawing(links, sides)
-    if not isinstance(edges, str | Skeleton):
+    if edges is None or layout is None:
+        sides = np.zeros(n_points, dtype=np.intp)
+    else:
+        links, sides = layout.edges, layout.sides
+    if edges is not None and not isinstance(edges, str | Skeleton):
         links = checked_links("edges", edges, n_points, triangles=True)
-    elif layout is not None:
-        links = layout.edges
-    return Drawing(links, sides if layout is None else layout.sides)
+    return links, sides
+
+
+def edges_of(links: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return pairs of points as they are, and the sides of triangles, once."""
+    if links.shape[1] == 2:
+        return links
+    sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    return np.unique(np.sort(sides, axis=1), axis=0)
 
 
 def frontal_triangles(shape: NDArray) -> NDArray[np.intp]:

@@ -13,7 +13,6 @@ from isa_nrsfm import __version__
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.export._drawing import (
-    Drawing,
     Links,
     choose_drawing,
     frontal_triangles,
@@ -23,6 +22,7 @@ from isa_nrsfm.export._names import names_of_components, suffix_of
 from isa_nrsfm.export._upright import Camera, upright_basis, upright_space
 from isa_nrsfm.plotting._axes import is_dense
 from isa_nrsfm.plotting._edges import UPSIDE_DOWN, Origin
+from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 
 # Numbers of the specification: types of components, uses of bytes, kinds of primitives.
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
@@ -30,7 +30,7 @@ VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
 # Matt materials, seen from both sides: those of points and edges in the middle, on the
 # left and on the right, and that of surfaces.
-PLAIN, LEFT, RIGHT, SURFACE = range(4)
+SURFACE = 3
 MATERIALS = [
     {
         "name": name,
@@ -129,19 +129,18 @@ def write_glb(
     mean = (mean - mean.mean(axis=0)) @ UPSIDE_DOWN
     factor = 1 / np.ptp(mean, axis=0).max()
     mean, basis = factor * mean, factor * (basis @ UPSIDE_DOWN)
-    drawing = choose_drawing(edges, space.layout, len(mean))
+    links, sides = choose_drawing(edges, space.layout, len(mean))
     surface = None
-    if drawing.links.shape[1] == 3:
-        surface, drawing = (
-            drawing.links,
-            drawing._replace(links=np.empty((0, 2), np.intp)),
-        )
+    if links.shape[1] == 3:
+        surface, links = links, np.empty((0, 2), np.intp)
     elif isinstance(edges, str) and edges == "auto":
         if space.layout is None or space.layout.kind == "face":
             surface = frontal_triangles(mean)
+    of_links = sides_of_edges(sides, links)
+    drawn_edges = [links[of_links == side] for side in (MIDDLE, LEFT, RIGHT)]
 
     file = Binary()
-    primitives = _primitives(file, mean, basis, surface, drawing)
+    primitives = _primitives(file, mean, basis, surface, drawn_edges)
     used = sorted({part["material"] for part in primitives})
     for part in primitives:
         part["material"] = used.index(part["material"])
@@ -251,51 +250,44 @@ def _primitives(
     mean: NDArray,
     basis: NDArray,
     surface: NDArray | None,
-    drawing: Drawing,
+    drawn_edges: list[NDArray],
 ) -> list[dict[str, Any]]:
     """Return a surface, the points, unless there are many on it, and the edges."""
-    position = file.add(mean, VERTICES, bounds=True)
-    drifts = [file.add(drift, VERTICES, bounds=True) for drift in basis]
+    position, *drifts = (file.add(x, VERTICES, bounds=True) for x in (mean, *basis))
     bare: dict[str, Any] = {
         "attributes": {"POSITION": position},
         "targets": [{"POSITION": drift} for drift in drifts],
-        "material": PLAIN,
+        "material": MIDDLE,
     }
     primitives = []
     if surface is not None:
-        primitives.append(_surface(file, mean, basis, surface, bare))
+        indices = file.add(surface.ravel(), INDICES)
+        normals = vertex_normals(mean, surface)
+        # Normals add up with the weights; what one standard deviation does to them.
+        turns = [vertex_normals(mean + drift, surface) - normals for drift in basis]
+        parts = [
+            part | {"NORMAL": file.add(normal, VERTICES)}
+            for part, normal in zip(
+                [bare["attributes"], *bare["targets"]], [normals, *turns], strict=True
+            )
+        ]
+        primitives.append(
+            {
+                "attributes": parts[0],
+                "targets": parts[1:],
+                "material": SURFACE,
+                "mode": TRIANGLES,
+                "indices": indices,
+            }
+        )
     if surface is None or not is_dense(mean):
         primitives.append(bare | {"mode": POINTS})
-    for side, edges in enumerate(drawing.edges_of_sides):
+    for side, edges in enumerate(drawn_edges):
         if len(edges):
             indices = file.add(edges.ravel(), INDICES)
-            lines = {"mode": LINES, "indices": indices, "material": PLAIN + side}
+            lines = {"mode": LINES, "indices": indices, "material": side}
             primitives.append(bare | lines)
     return primitives
-
-
-def _surface(
-    file: Binary,
-    mean: NDArray,
-    basis: NDArray,
-    triangles: NDArray,
-    bare: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the triangles of a surface, with normals."""
-    indices = file.add(triangles.ravel(), INDICES)
-    normals = vertex_normals(mean, triangles)
-    # Normals add up with the weights; what one standard deviation does to them.
-    turns = [vertex_normals(mean + drift, triangles) - normals for drift in basis]
-    return {
-        "attributes": bare["attributes"] | {"NORMAL": file.add(normals, VERTICES)},
-        "targets": [
-            target | {"NORMAL": file.add(turn, VERTICES)}
-            for target, turn in zip(bare["targets"], turns, strict=True)
-        ],
-        "material": SURFACE,
-        "mode": TRIANGLES,
-        "indices": indices,
-    }
 
 
 def _swings(n_components: int) -> tuple[NDArray, NDArray]:

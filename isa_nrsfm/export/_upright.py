@@ -33,7 +33,11 @@ from isa_nrsfm.plotting._edges import (
     choose_origin,
     upright_turn,
 )
-from isa_nrsfm.plotting._views import euclidean_axes, front_axes, viewing_transform
+from isa_nrsfm.plotting._views import (
+    euclidean_axes,
+    viewing_rotation,
+    viewing_transform,
+)
 from isa_nrsfm.skeletons import Skeleton
 
 Camera = Literal["weak_perspective"] | None
@@ -91,12 +95,11 @@ def upright_space(
         metric = deformation_metric(model.motion_, model.alpha_)
         to_metric = np.linalg.inv(metric.Q)
         cameras, usable = usable_cameras(model.motion_)
-        axes = front_axes(
+        transform = viewing_rotation(
             unit_cameras(cameras[usable] @ metric.Q),
             model.reference_motion_ @ metric.Q,
             to_metric @ to_metric.T,
         )
-        transform = np.vstack([axes, np.cross(*axes)])
         shape = model.mean_shape_ @ (transform @ to_metric).T
 
     image_axes = np.eye(3)

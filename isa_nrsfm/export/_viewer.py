@@ -17,7 +17,7 @@ from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._tables.frame_columns import checked_times
 from isa_nrsfm._transformer import frames_of
-from isa_nrsfm.export._drawing import Links, choose_drawing
+from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
 from isa_nrsfm.export._upright import (
     Camera,
@@ -145,7 +145,7 @@ def write_viewer(
     seconds = np.empty(0) if times is None else _seconds(times, n_rows)[rows]
 
     mean, basis = upright_basis(space, model)
-    drawing = choose_drawing(edges, space.layout, len(mean))
+    links, sides = choose_drawing(edges, space.layout, len(mean))
     centre = mean.mean(axis=0)
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
     shapes /= np.linalg.norm(shapes[0], axis=1).max()
@@ -164,8 +164,8 @@ def write_viewer(
         "labels": codes[rows].tolist() if categories else [],
         "count": _count(n_rows, len(seen), len(rows)),
         "shapes": _encoded(shapes, "<f4"),
-        "edges": _encoded(drawing.edges, "<u4"),
-        "sides": drawing.sides.tolist() if drawing.sides.any() else [],
+        "edges": _encoded(edges_of(links), "<u4"),
+        "sides": sides.tolist() if sides.any() else [],
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
         "times": _encoded(seconds - seconds[:1], "<f8"),

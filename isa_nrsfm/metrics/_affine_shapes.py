@@ -171,14 +171,14 @@ def basis_similarity(
             truth = without_mean_shape(truth, rigid_true)
             shapes = without_mean_shape(shapes, rigid)
         affinity = np.linalg.lstsq(rigid, rigid_true)[0]
-        matched = match_basis(truth, shapes, affinity)
+        rows, columns, cosines = match_basis(truth, shapes, affinity)
     elif modulo_mean_shape:
         raise ValueError("modulo_mean_shape=True needs mean_shape_true and mean_shape")
     else:
-        matched = match_basis_up_to_affinity(truth, shapes)
+        rows, columns, cosines = match_basis_up_to_affinity(truth, shapes)
 
     similarity = np.zeros(len(truth))
     matching = np.full(len(truth), -1)
-    similarity[matched.rows] = matched.cosines
-    matching[matched.rows] = matched.columns
+    similarity[rows] = cosines
+    matching[rows] = columns
     return (similarity, matching) if return_matching else similarity

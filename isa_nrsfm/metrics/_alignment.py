@@ -4,8 +4,6 @@ Shapes are (n, n_points, 3), one point a row; an affinity is a 3x3 matrix that i
 multiplied from the right.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -29,49 +27,34 @@ def normalise(shapes: NDArray, smallest: float) -> NDArray[np.float64]:
     return np.divide(shapes, norms, out=np.zeros_like(shapes), where=norms > smallest)
 
 
-class MatchedBases(NamedTuple):
-    """Matched pairs of true basis shapes (rows) and estimated ones (columns)."""
-
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    cosines: NDArray[np.float64]  # absolute values
-
-    @property
-    def pairs(self) -> tuple[tuple[int, int], ...]:
-        """The pairs in the order of the rows."""
-        return tuple(zip(self.rows.tolist(), self.columns.tolist(), strict=True))
-
-    @property
-    def quality(self) -> float:
-        """Sum of the squared cosines."""
-        return float(np.sum(self.cosines**2))
+# Places of matched true and estimated basis shapes, and absolute cosines of the pairs.
+Matched = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]
 
 
-def match_basis(truth: NDArray, shapes: NDArray, affinity: NDArray) -> MatchedBases:
+def match_basis(truth: NDArray, shapes: NDArray, affinity: NDArray) -> Matched:
     """Match unit shapes, the second ones after an affinity, by squared cosines."""
     n_true = len(truth)
     images = normalise(shapes @ affinity, OF_STEPS * float(np.linalg.norm(affinity)))
     inner = truth.reshape(n_true, -1) @ images.reshape(len(images), -1).T
     cosines = np.minimum(np.abs(inner), 1.0)  # rounding may lead beyond 1
     rows, columns = linear_sum_assignment(cosines**2, maximize=True)
-    return MatchedBases(rows, columns, cosines[rows, columns])
+    return rows, columns, cosines[rows, columns]
 
 
-def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> MatchedBases:
+def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> Matched:
     """Match unit shapes under the best affinity for all of them together."""
     starts = [np.eye(3)]
     starts += [np.linalg.lstsq(x, s)[0] for s in truth for x in shapes]
-    best = match_basis(truth, shapes, starts[0])
-    tried = set()
+    best, tried = match_basis(truth, shapes, starts[0]), set()
     for start in starts:
-        matched = match_basis(truth, shapes, start)
+        rows, columns, cosines = match_basis(truth, shapes, start)
         # What follows depends on the pairs only, so none is worth a second visit.
-        while (pairs := matched.pairs) not in tried:
+        while (pairs := (rows.tobytes(), columns.tobytes())) not in tried:
             tried.add(pairs)
-            affinity = best_affinity(truth[matched.rows], shapes[matched.columns])
-            matched = match_basis(truth, shapes, affinity)
-            if matched.quality > best.quality:
-                best = matched
+            affinity = best_affinity(truth[rows], shapes[columns])
+            rows, columns, cosines = match_basis(truth, shapes, affinity)
+            if np.sum(cosines**2) > np.sum(best[2] ** 2):
+                best = rows, columns, cosines
     return best
 
 

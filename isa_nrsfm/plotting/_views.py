@@ -22,22 +22,25 @@ from isa_nrsfm.plotting._edges import Origin, choose_lines
 from isa_nrsfm.skeletons import Skeleton
 
 
-def front_axes(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
-    """Return the directions of space (2, 3) that the front view shows right and down.
+def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
+    """Return the directions of space (3, 3) that are right, down and away in the view.
 
-    They are nearest to the reference camera (2, 3). Unit cameras (n_frames, 2, 3) that
-    go round the object have one direction of their axis in the images: it is kept, and
-    the object, with the covariance `spread` of its points, shown at its broadest.
+    Right and down are nearest to the reference camera (2, 3). Unit cameras (n_frames,
+    2, 3) that go round the object have one direction of their axis in the images: it is
+    kept, and the object, with the covariance `spread` of its points, shown at its
+    broadest.
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
-    if not shared[1] < 0.2 * row <= shared[0]:  # as in `mean_view`
+    if shared[1] < 0.2 * row <= shared[0]:  # as in `mean_view`
+        across = np.eye(3) - np.outer(right[0], right[0])
+        broadest = np.linalg.eigh(across @ spread @ across)[1][:, -1]
+        axis, turned = np.outer(left[:, 0], right[0]), np.outer(left[:, 1], broadest)
+        axes = axis + turned * (1 if np.sum(turned * reference) >= 0 else -1)
+    else:
         left, _, right = np.linalg.svd(reference, full_matrices=False)
-        return left @ right
-    across = np.eye(3) - np.outer(right[0], right[0])
-    broadest = np.linalg.eigh(across @ spread @ across)[1][:, -1]
-    axis, turned = np.outer(left[:, 0], right[0]), np.outer(left[:, 1], broadest)
-    return axis + turned * (1 if np.sum(turned * reference) >= 0 else -1)
+        axes = left @ right
+    return np.vstack([axes, np.cross(*axes)])
 
 
 def view_of(estimator: Any) -> NDArray:
@@ -62,12 +65,11 @@ def view_and_layout(
 def euclidean_axes(estimator: Any) -> NDArray:
     """Return the viewing axes (3, 3) of a model with calibrated cameras."""
     shape = estimator.mean_shape_
-    axes = front_axes(
+    return viewing_rotation(
         unit_cameras(np.asarray(estimator.motion_)),
         estimator.reference_motion_,
         shape.T @ shape / len(shape),
     )
-    return np.vstack([axes, np.cross(*axes)])
 
 
 def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
@@ -76,7 +78,7 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
     There, ``shape @ T.T``, the cameras (n_frames, 2, 3) are most nearly scaled rows of
     a rotation, and the median camera has rows of length one. If `metric_quadric` finds
     nothing, the mean of ``M_i^T M_i`` over the unit cameras is made isotropic. The x
-    and y axes are `front_axes`; T has a non-negative determinant.
+    and y axes are those of `viewing_rotation`; T has a non-negative determinant.
     """
     G = metric_quadric(motion)
     if G is None:
@@ -84,11 +86,11 @@ def viewing_transform(motion: NDArray, reference_motion: NDArray) -> NDArray:
     else:
         metric = symmetric_power(G, -0.5)
     from_metric = np.linalg.pinv(metric)
-    axes = front_axes(
+    rotation = viewing_rotation(
         unit_cameras(motion @ from_metric),
         reference_motion @ from_metric,
         metric @ metric.T,
     )
-    transform = np.vstack([axes, np.cross(*axes)]) @ metric
+    transform = rotation @ metric
     size = np.linalg.norm(motion @ np.linalg.pinv(transform), axis=(1, 2)) / np.sqrt(2)
     return transform * np.median(size[np.isfinite(size) & (size > 0)])
