@@ -7,9 +7,6 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, OneToOneFeatureMixin, TransformerMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-# The search for the mean ends when it changes by less than this, relative to its size.
-MAX_ROUNDS, SETTLED = 100, 1e-10
-
 
 class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     """
@@ -33,9 +30,6 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         Number of columns.
     """
 
-    mean_: NDArray
-    n_features_in_: int
-
     def __init__(self, turn: bool = True):
         self.turn = turn
 
@@ -57,12 +51,12 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         """
         points = _unit_points(validate_data(self, X, dtype=np.float64))
         mean = points[0]
-        for _ in range(MAX_ROUNDS if self.turn else 0):
+        for _ in range(100 if self.turn else 0):
             turned = _nearest_turns(points, mean).mean(axis=0)
             turned /= np.sqrt(np.mean(np.abs(turned) ** 2))
             change = np.abs(turned - mean).max()
             mean = turned
-            if change < SETTLED:
+            if change < 1e-10:  # of its size
                 break
         self.mean_ = mean
         return self

@@ -31,9 +31,6 @@ from isa_nrsfm.analysis._permutations import (
 if TYPE_CHECKING:
     import pandas as pd
 
-# Weights of the ridge regression of numbers on standardised coefficients.
-RIDGES = np.logspace(-3, 3, 13)
-
 
 class Association(NamedTuple):
     """
@@ -235,7 +232,8 @@ def predictability(
         ("number", True): KFold,
         ("number", False): GroupKFold,
     }[found, numbers is None]
-    model = LinearDiscriminantAnalysis() if found == "classes" else RidgeCV(RIDGES)
+    ridge = RidgeCV(np.logspace(-3, 3, 13))
+    model = LinearDiscriminantAnalysis() if found == "classes" else ridge
     return np.asarray(
         cross_val_score(
             make_pipeline(StandardScaler(), model),

@@ -46,10 +46,6 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
            [ 0.,  1.]])
     """
 
-    groups_: NDArray
-    means_: NDArray
-    n_features_in_: int
-
     def fit(
         self, X: Any, y: Any = None, *, groups: Any = None, neutral: Any = None
     ) -> Self:

@@ -41,9 +41,6 @@ from isa_nrsfm.baselines._shape_sequence import (
     shape_signs,
 )
 
-# Least variance of the noise, relative to the mean square of the coordinates.
-LEAST_NOISE = 1e-12
-
 
 class ShapeSequenceNRSfM(
     ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator
@@ -67,17 +64,6 @@ class ShapeSequenceNRSfM(
         each frame has the sign that turns the camera least from the frame before.
         If False, signs are chosen to make the shapes similar.
     """
-
-    mean_shape_: NDArray
-    basis_: NDArray
-    shapes_: NDArray
-    alpha_: NDArray
-    motion_: NDArray
-    translation_: NDArray
-    inverse_snr_: float
-    noise_variance_: float
-    n_features_in_: int
-    feature_names_in_: NDArray
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "n_components": [Interval(Integral, 1, None, closed="left")],
@@ -169,7 +155,8 @@ class ShapeSequenceNRSfM(
         self.shapes_ = (self._unit * shapes).astype(dtype)
         self.motion_ = (scales * cameras).astype(dtype)
         self.translation_ = table.translation.astype(dtype)
-        self.noise_variance_ = self._unit**2 * max(float(noise), LEAST_NOISE)
+        # At least a share of the mean square of the coordinates.
+        self.noise_variance_ = self._unit**2 * max(float(noise), 1e-12)
         self.alpha_ = self._decompose(X).alpha
         self._n_features_out = self.n_components
         return self

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 # Growth of the penalty in each step; with 1.02 the end is far from stationary.
 GROWTH = 1.001
-# Fewest frames for an atom and its metric.
-FEWEST_FRAMES = 3
 
 
 def shrink_blocks(blocks: NDArray, threshold: float) -> NDArray:
@@ -172,7 +170,8 @@ def update_atoms(
     for atom in range(len(atoms)):
         users = np.flatnonzero(active[:, atom])
         rest = residuals[users] + blocks[users, atom] @ atoms[atom]
-        if replace and len(users) < FEWEST_FRAMES:
+        # An atom and its metric need three frames.
+        if replace and len(users) < 3:
             active[users, atom], blocks[users, atom] = False, 0.0
             residuals[users] = rest
             worst = np.argsort(-np.sum(residuals**2, axis=(1, 2)), kind="stable")

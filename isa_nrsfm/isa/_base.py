@@ -27,12 +27,6 @@ class BaseSubspaceAnalysis(
 ):
     """Validation, whitening and projection. A strategy adds `_unmix`."""
 
-    components_: NDArray
-    mean_: NDArray
-    n_iter_: int
-    n_features_in_: int
-    feature_names_in_: NDArray
-
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "subspace_size": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
@@ -40,8 +34,6 @@ class BaseSubspaceAnalysis(
         "tol": [Interval(Real, 0, None, closed="neither")],
         "random_state": ["random_state"],
     }
-
-    subspace_size: int
 
     # Threads cost more than they give on matrices of this size.
     @one_blas_thread

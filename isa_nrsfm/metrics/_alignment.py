@@ -10,8 +10,6 @@ from scipy.optimize import linear_sum_assignment
 
 from isa_nrsfm._linalg.rounding import OF_STEPS
 
-MAX_NEWTON_STEPS = 100
-
 
 def unit_shapes(shapes: NDArray) -> NDArray[np.float64]:
     """Return shapes centred over the points and of unit norm; zero if all are equal."""
@@ -101,7 +99,7 @@ def _climb(
     """Maximise ``sum <a, cross_i>^2 / <a, scatter_i a>`` over unit vectors a."""
     a = start / np.linalg.norm(start)
     value, gradient, hessian = _squared_cosines(a, cross, scatter)
-    for _ in range(MAX_NEWTON_STEPS):
+    for _ in range(100):
         # The function does not change along a: that direction is barred.
         tangent = np.eye(len(a)) - np.outer(a, a)
         values, axes = np.linalg.eigh(tangent @ hessian @ tangent - np.outer(a, a))

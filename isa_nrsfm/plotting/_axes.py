@@ -57,13 +57,6 @@ def side_colours(sides: NDArray, middle: str) -> list[str]:
     return [colours[side] for side in sides]
 
 
-def side_entries(skeleton: Any) -> list[tuple[str, str]]:
-    """Return name and colour of the sides of a skeleton, if it has any."""
-    if skeleton is None or not skeleton.left:
-        return []
-    return [("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)]
-
-
 def percent(fraction: float) -> str:
     """Write a fraction as percent with two digits, three from 100 % on."""
     value = 100.0 * fraction

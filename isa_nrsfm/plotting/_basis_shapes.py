@@ -21,7 +21,6 @@ from isa_nrsfm.plotting._axes import (
     is_dense,
     percent,
     side_colours,
-    side_entries,
     wrap_title,
 )
 from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines, upright_turn
@@ -391,13 +390,11 @@ class BasisShapeDisplay:
         style: dict[str, Any] = {"linewidth": 1.5}
         if self.edges is None:
             style = {"marker": "o", "linestyle": "none", "markersize": 3}
-        add_legend(
-            self.figure_,
-            [
-                Line2D([], [], color=colour, label=label, **style)
-                for label, colour in [*entries, *side_entries(self.skeleton)]
-            ],
-        )
+        handles = [
+            Line2D([], [], color=colour, label=label, **style)
+            for label, colour in entries
+        ]
+        add_legend(self.figure_, handles, self.skeleton)
 
 
 def drift_labels(amplitudes: NDArray) -> tuple[str, str]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm.plotting._axes import LEFT_COLOUR, RIGHT_COLOUR
 
 # The two coordinates that the front view and the side view show.
 VIEWS = ([0, 1], [2, 1])
@@ -82,8 +83,16 @@ def show_view(axis: Any, view: list[int], limits: NDArray, origin: str) -> None:
     axis.yaxis.set_inverted(origin == "upper")
 
 
-def add_legend(figure: Any, entries: Any, **options: Any) -> None:
-    """Add a legend below a figure."""
+def add_legend(figure: Any, entries: list[Any], skeleton: Any, **options: Any) -> None:
+    """Add a legend below a figure, with the sides of a skeleton if it has any."""
+    from matplotlib.lines import Line2D
+
+    if skeleton is not None and skeleton.left:
+        sides = (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR))
+        entries = entries + [
+            Line2D([], [], color=colour, label=side, linewidth=1.5)
+            for side, colour in sides
+        ]
     style = {"loc": "outside lower center", "frameon": False, "fontsize": "small"}
     figure.legend(handles=entries, ncols=len(entries), **(style | options))
 

@@ -25,7 +25,6 @@ from isa_nrsfm.plotting._axes import (
     is_dense,
     percent,
     side_colours,
-    side_entries,
 )
 from isa_nrsfm.plotting._edges import Edges, Origin, choose_lines
 from isa_nrsfm.plotting._page import LEGEND_HEIGHT, add_legend, chosen_numbers, grid
@@ -299,15 +298,10 @@ class ReprojectionDisplay:
                 axes, i, observed_kw or {}, reprojected_kw or {}, edge_kw or {}
             )
         if new_figure:
-            from matplotlib.lines import Line2D
-
-            sides = [
-                Line2D([], [], color=colour, label=side, lw=1.5)
-                for side, colour in side_entries(self.skeleton)
-            ]
             add_legend(
                 self.figure_,
-                [self.observed_[0], self.reprojected_[0], *sides],
+                [self.observed_[0], self.reprojected_[0]],
+                self.skeleton,
                 markerscale=4.0 if is_dense(self.observed[0]) else 1.0,
             )
         return self
