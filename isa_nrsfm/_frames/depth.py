@@ -58,7 +58,7 @@ class DepthCertainty(NamedTuple):
             "out of the image plane, and these rotations have a standard deviation of "
             f"{deviation:.2g} degrees. Fit a table in which the objects turn further, "
             "and transform this one with that model; or use affine cameras "
-            '(camera="affine"). See "How sure is the depth?" in the documentation'
+            '(camera="affine"). See "How reliable is the depth?" in the documentation'
         )
 
 
