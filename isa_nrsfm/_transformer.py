@@ -15,7 +15,6 @@ from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
-from isa_nrsfm._dynamics import smoothed_posterior
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
@@ -32,6 +31,7 @@ from isa_nrsfm._tables.sources import (
     is_read_later,
     unmasked,
 )
+from isa_nrsfm.analysis._dynamics import smoothed_posterior
 
 
 class SmoothedCoefficients(NamedTuple):

@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._dynamics import (
+from isa_nrsfm.analysis._dynamics import (
     Dynamics,
     Observations,
     estimated_dynamics,

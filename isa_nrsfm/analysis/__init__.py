@@ -1,4 +1,4 @@
-"""Relate coefficients to labels and people, and compare frames."""
+"""Relate coefficients to labels, people and time, and compare frames."""
 
 from isa_nrsfm.analysis._aligned_frames import AlignedFrames
 from isa_nrsfm.analysis._association import Association, association, predictability

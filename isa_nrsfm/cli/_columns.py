@@ -11,7 +11,6 @@ from sklearn.decomposition import PCA
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._dynamics import sequences_of
 from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 from isa_nrsfm.analysis import (
     AlignedFrames,
@@ -20,6 +19,7 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
+from isa_nrsfm.analysis._dynamics import sequences_of
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, column_named
