@@ -1,6 +1,5 @@
 """A headless browser for tests, driven through a pipe by the DevTools protocol."""
 
-import base64
 import contextlib
 import fcntl
 import json
@@ -154,11 +153,6 @@ class Browser:
                 code=key,
                 windowsVirtualKeyCode=code,
             )
-
-    def picture(self, path):
-        """Write what the window shows."""
-        data = self.call("Page.captureScreenshot", format="png")["data"]
-        path.write_bytes(base64.b64decode(data))
 
     def complaints(self):
         """Return what errors and warnings came up since the page was opened."""

@@ -222,18 +222,6 @@ class TestRandomTables:
 
 
 class TestFace:
-    def test_every_point_is_given_and_mirrored(self):
-        neutral, mirror = neutral_shape(), mirror_points()
-        middle = [8, 27, 28, 29, 30, 33, 51, 57, 62, 66]
-        assert_array_equal(mirror[mirror], np.arange(68))
-        assert_array_equal(neutral[mirror] * (-1, 1, 1), neutral)
-        # No point was left at zero, and points on the axis are their own images.
-        assert np.abs(neutral).sum(axis=1).min() > 5
-        assert_array_equal(np.flatnonzero(neutral[:, 0] == 0), middle)
-        assert_array_equal(np.flatnonzero(mirror == np.arange(68)), middle)
-        spread = np.linalg.norm(neutral[:, None] - neutral, axis=2)
-        assert spread[~np.eye(68, dtype=bool)].min() > 2
-
     def test_anatomy_in_image_coordinates(self):
         x, y, z = make_face_tracks(random_state=0).neutral_shape.T
         assert z.argmin() == 30  # tip of the nose in front

@@ -228,11 +228,6 @@ class TestEveryFetcher:
         with pytest.raises(ValueError, match="'download_if_missing' parameter"):
             fetch(download_if_missing="no")
 
-    def test_says_what_is_missing(self, fetch, tmp_path):
-        name = {fetch_shark: "jaws.mat", fetch_muct: "muct76-opencv.csv"}[fetch]
-        with pytest.raises(OSError, match=f"^{name} is not in the folder"):
-            fetch(data_home=tmp_path, download_if_missing=False)
-
     def test_describes_the_data(self, fetch, tmp_path, shark_file, muct_file):
         for file in (shark_file, muct_file):
             put(tmp_path, file.remote, file.content)

@@ -97,14 +97,6 @@ class TestSmoother:
             values.append((smoothed(data, dynamics).log_likelihood, dense / 2))
         assert_allclose(*np.transpose(values))
 
-    def test_frames_without_a_fit_tell_nothing(self):
-        rng = np.random.default_rng(2)
-        mean, covariance = observed(rng.normal(size=(5, K)), rng)
-        mean[2], covariance[2] = np.nan, np.nan
-        data = observations(mean, covariance)
-        assert_array_equal(data.precision[2], 0)
-        assert_array_equal(data.information[2], 0)
-
 
 class TestEstimation:
     def test_finds_the_autoregression(self):

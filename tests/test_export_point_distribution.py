@@ -1,5 +1,3 @@
-import io
-
 import numpy as np
 import pytest
 from export_models import (
@@ -36,36 +34,16 @@ def on_tangent_space(shapes, mean):
 
 
 def read_as_openface_does(path):
-    """Read a text as PDM::Read of OpenFace: from one place in the stream on."""
-    stream = io.BytesIO(path.read_bytes())
-
-    def peek():
-        here = stream.tell()
-        character = stream.read(1)
-        stream.seek(here)
-        return character
-
-    def skip_comments():
-        while peek() in (b"#", b"\n", b" ", b"\r"):
-            stream.readline()
-
-    def word():
-        while peek() and peek() in b" \t\r\n":
-            stream.read(1)
-        letters = b""
-        while peek() and peek() not in b" \t\r\n":
-            letters += stream.read(1)
-        return letters
-
+    """Read a text as PDM::Read of OpenFace: after comments, sizes, type and numbers."""
+    lines = path.read_text().splitlines()
+    words = iter(" ".join(line for line in lines if not line.startswith("#")).split())
     matrices = []
     for _ in range(3):
-        skip_comments()
-        n_rows, n_columns, kind = (int(word()) for _ in range(3))
+        n_rows, n_columns, kind = (int(next(words)) for _ in range(3))
         assert kind == 6  # CV_64FC1, doubles
-        numbers = [float(word()) for _ in range(n_rows * n_columns)]
-        matrices.append(np.array(numbers).reshape(n_rows, n_columns))
-    skip_comments()
-    assert not stream.read()
+        numbers = [float(next(words)) for _ in range(n_rows * n_columns)]
+        matrices.append(np.reshape(numbers, (n_rows, n_columns)))
+    assert not [*words]
     return matrices
 
 

@@ -89,14 +89,6 @@ def test_basis_shapes_are_the_least_squares_fit_to_the_frames():
         assert_allclose(found, best, atol=1e-9 * np.abs(best).max())
 
 
-def test_affine_shapes_are_an_affinity_of_the_model():
-    model = face_model()
-    space = space_of(model, camera=None)
-    mean, basis = upright_basis(space, model)
-    assert_allclose(mean, model.mean_shape_ @ space.transform.T)
-    assert_allclose(basis, model.basis_ @ space.transform.T)
-
-
 @pytest.mark.parametrize("asked", ["weak_perspective", None])
 @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 class TestCalibratedCameras:

@@ -58,13 +58,6 @@ def test_named_points_keep_the_order_of_the_table(template, pattern):
     assert found.points == tuple(points)
 
 
-def test_fingers_are_one_set_of_named_points():
-    points = [f"{f}_{j}" for f in ("thumb", "index") for j in (10, 9, 8, 7)]
-    found = find_landmark_columns(named("{p}_{a}", points=points))
-    assert found.pattern == "*_x,*_y"
-    assert found.points == tuple(points)
-
-
 def test_third_coordinate_is_set_aside_and_reported():
     names = named("{a}_{p}", axes="xyz")
     found = find_landmark_columns(names)
@@ -221,12 +214,6 @@ def test_point_names_fall_back_to_columns_where_they_would_collide():
 )
 def test_names_layout(names, layout):
     assert names_layout(names) == layout
-
-
-def test_layout_of_what_is_found_is_interleaved():
-    found = find_landmark_columns(openface_names(), columns="eye_lmk_x_#,eye_lmk_y_#")
-    assert names_layout(found.interleaved) == "interleaved"
-    assert names_layout(found.x + found.y) == "planar"
 
 
 @pytest.mark.parametrize("columns", [None, "*_x,*_y"])
