@@ -6,24 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from isolated_runs import MEGABYTE, misbehave, use_memory
+from layers import slow_after
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
 from benchmarks import (
     _fits,
-    accuracy,
     questions,
     sensitivity,
 )
-from benchmarks._agreement import compare
-from benchmarks._isolated import run_isolated
 from benchmarks._markdown import cell, value
 from benchmarks._methods import METHODS, Found
 from benchmarks._results import Record, Results
 from benchmarks._sections import SECTIONS
 from benchmarks._sets import SETS, Set
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._fit import Limits as FitLimits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
@@ -56,39 +52,6 @@ def record(**changes):
     return plain._replace(**changes)
 
 
-# Processes
-
-
-@pytest.mark.subprocess
-def test_seconds_and_memory_are_those_of_what_is_measured():
-    outcome = run_isolated(
-        use_memory, {"n_before": 400, "n_inside": 150}, time_limit=600
-    )
-    assert outcome.status == "ok"
-    assert outcome.values["total"] == 150 * MEGABYTE / 8
-    assert outcome.values["inside"] <= outcome.seconds <= outcome.values["outside"]
-    assert 145 < outcome.memory < 250
-
-
-@pytest.mark.subprocess
-@pytest.mark.parametrize(
-    ("how", "status", "message"),
-    [
-        ("raise", "error", "ValueError: expected this; got that"),
-        ("die", "error", "the process ended with exit code 3"),
-        ("hang", "over time", "over 0.5 s"),
-    ],
-)
-def test_what_a_method_does_wrong_is_reported(how, status, message):
-    outcome = run_isolated(misbehave, {"how": how}, time_limit=0.5)
-    assert (outcome.status, outcome.message) == (status, message)
-    assert outcome.values is None
-    assert outcome.seconds is None
-
-
-# Results and tables
-
-
 def test_cells_say_median_range_and_failures():
     ok = [record(seed=i, values={"error": e}) for i, e in enumerate((0.1, 0.3, 0.2))]
     slow = record(seed=3, status="over time", message="over 60 s", values={})
@@ -101,9 +64,6 @@ def test_cells_say_median_range_and_failures():
     assert cell([wrong], error) == "error"
     assert cell([], error) == ""
     assert cell(ok, value("another")) == ""
-
-
-# Sets and methods
 
 
 @pytest.fixture(scope="module")
@@ -136,20 +96,6 @@ def test_true_shapes_and_cameras_have_no_error(tracks, camera):
     np.testing.assert_allclose(list(errors.values()), 0.0, atol=1e-10)
 
 
-@pytest.mark.parametrize("mirror", [1.0, -1.0])
-def test_a_common_rotation_and_the_mirror_image_are_no_error(mirror):
-    truth = np.array([random_rotation(i) for i in range(5)])
-    depth = np.diag([1.0, 1.0, mirror])
-    turned = depth @ truth @ random_rotation(9) @ depth
-    np.testing.assert_allclose(accuracy.turn_errors(truth, turned), 0.0, atol=1e-5)
-    # A turn of one frame by 60 degrees.
-    half, root = 0.5, np.sqrt(0.75)
-    turned[2] = [[half, -root, 0], [root, half, 0], [0, 0, 1]] @ turned[2]
-    angles = accuracy.turn_errors(truth, turned)
-    assert angles.argmax() == 2
-    assert 45 < angles.max() < 61
-
-
 def test_all_limits_of_a_fit_can_be_varied():
     known = set(sensitivity.STAGES) - {"fit"}
     stages = {
@@ -160,7 +106,7 @@ def test_all_limits_of_a_fit_can_be_varied():
     assert known == stages
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_after(4, METHODS))
 def test_what_methods_find_explains_the_table(tracks, method):
     kind = METHODS[method]
     model = kind.make(2, True, False, 0).fit(tracks.data)
@@ -183,9 +129,6 @@ def test_what_methods_find_explains_the_table(tracks, method):
     np.testing.assert_allclose(eye, np.broadcast_to(np.eye(3), eye.shape), atol=1e-8)
 
 
-# Features and agreement
-
-
 def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image():
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(5, 20, 3))
@@ -197,18 +140,6 @@ def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image():
     assert questions.turned_error(mirrored, truth) > 0.02
     centred = truth - truth.mean(axis=1, keepdims=True)
     assert questions.turned_error(1.1 * centred, truth) == pytest.approx(0.1)
-
-
-def test_equal_fits_agree(tracks):
-    model = AffineNRSfM(2, random_state=0).fit(tracks.data)
-    same = compare(model, model, tracks.data)
-    assert same["subspaces"] == pytest.approx(0.0, abs=1e-7)
-    assert same["shapes"] == pytest.approx(0.0, abs=1e-7)
-    assert same["basis"] == pytest.approx(1.0)
-    assert same["mean_basis"] == pytest.approx(1.0)
-
-
-# The command
 
 
 @pytest.mark.subprocess

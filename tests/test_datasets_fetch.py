@@ -321,18 +321,13 @@ class TestMuct:
         # The frame splits again into points and labels.
         points, other = landmark_table(faces.frame)
         pd.testing.assert_frame_equal(points, faces.data)
-        assert list(other) == [
-            "name", "tag", "subject", "lighting", "camera", "sex", "glasses", "mirrored"
-        ]  # fmt: skip
-        for label in ("lighting", "camera", "sex", "glasses", "mirrored"):
-            assert other[label].tolist() == plain[label].tolist()
-        assert other["name"].tolist() == PHOTOS
-        assert other["tag"].tolist() == TAGS
-        assert other["subject"].tolist() == plain.subjects.tolist()
-
-        X, y = fetch_muct(
-            data_home=folder, mirrored=True, return_X_y=True, as_frame=True
-        )
+        labels = "name tag subject lighting camera sex glasses mirrored".split()
+        assert list(other) == labels
+        keys = ["names", "tags", "subjects", *labels[3:]]
+        for label, key in zip(labels, keys, strict=True):
+            assert other[label].tolist() == plain[key].tolist()
+        options = {"mirrored": True, "return_X_y": True, "as_frame": True}
+        X, y = fetch_muct(data_home=folder, **options)
         pd.testing.assert_frame_equal(X, faces.data)
         pd.testing.assert_series_equal(y, faces.target)
 

@@ -338,6 +338,10 @@ class TestRunsThatAreMixed:
         for absent in ("alpha.csv", "report.json"):
             (folder / absent).unlink()
             assert self.warned(run, folder, landmarks) == ""
+        # Reports of something else
+        for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
+            (folder / "report.json").write_text(text)
+            assert self.warned(run, folder, landmarks) == ""
 
     def test_files_of_two_runs(self, run, folder, landmarks, tmp_path):
         assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
@@ -350,10 +354,3 @@ class TestRunsThatAreMixed:
         shutil.copy(folder / "model.npz", folder / "copy.npz")
         (folder / "model.npz").write_bytes(OLD)
         assert self.warned(run, folder, landmarks, "copy.npz") == ""
-
-    @pytest.mark.parametrize(
-        "text", ["", "[]", "{", '{"sha256": 3}', '{"sha256": {"../a": "b"}}']
-    )
-    def test_reports_of_something_else(self, run, folder, landmarks, text):
-        (folder / "report.json").write_text(text)
-        assert self.warned(run, folder, landmarks) == ""

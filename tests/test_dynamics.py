@@ -155,21 +155,6 @@ class TestPeople:
 
 
 class TestSequences:
-    def test_rows_of_groups_in_any_order(self):
-        groups = np.array([0, 1, 0, 1, 1])
-        found, unit = sequences_of(np.array([0.0, 5, 1, 6, 8]), groups, 10)
-        assert unit == 1.0
-        assert [rows.tolist() for rows, _ in found] == [[0, 2], [1, 3, 4]]
-        assert [steps.tolist() for _, steps in found] == [[0, 1], [0, 1, 3]]
-
-    def test_long_gaps_begin_a_new_sequence(self):
-        time = np.array([0.0, 0.1, 0.2, 1.0, 1.1])
-        found, unit = sequences_of(time, np.zeros(5, int), 5)
-        assert unit == pytest.approx(0.1)
-        assert [rows.tolist() for rows, _ in found] == [[0, 1, 2], [3, 4]]
-        ((_, steps),), _ = sequences_of(time, np.zeros(5, int), 8)
-        assert steps.tolist() == [0, 1, 2, 10, 11]
-
     def test_uneven_times_are_rounded_but_stay_apart(self):
         time = np.array([0.0, 0.9, 2.0, 2.2, 4.3])
         ((_, steps),), _ = sequences_of(time, np.zeros(5, int), 10)

@@ -100,24 +100,6 @@ class TestGains:
         for assignment in random_assignments(0, 4):
             self.check(gains, objective, assignment)
 
-    def test_only_changed_subspaces_are_valued_again(self):
-        n_asked = []
-
-        def value(groups):
-            n_asked.append(len(groups))
-            return np.zeros(len(groups))
-
-        gains = value_gains(value, 12)
-        assignment = np.arange(12) // 3
-        gains(assignment)
-        assert sum(n_asked) == 12 * 10  # the others, and the signal itself
-        n_asked.clear()
-        gains(assignment)
-        assert sum(n_asked) == 0
-        assignment[[0, 3]] = assignment[[3, 0]]
-        gains(assignment)
-        assert sum(n_asked) == 6 * 10
-
 
 class TestSwaps:
     @pytest.mark.parametrize("seed", range(5))

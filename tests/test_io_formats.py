@@ -66,20 +66,14 @@ def test_files_read_back_as_they_were_written(name, tmp_path):
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.filterwarnings("default")  # tables of HDF5 files stay open
-def test_truncated_files_and_those_of_other_formats_are_refused(name, tmp_path):
+def test_files_of_other_formats_are_refused(name, tmp_path):
     path, format = WRITERS[name](tmp_path), name.partition("-")[0]
     if path.is_dir():
         path /= "image_000.pts"
-    content = path.read_bytes()
     for wrong in {*FORMATS} - {format}:
         if not {format, wrong} & {"mediapipe", "table"}:
             with pytest.raises(ValueError, match=str(path)):
                 read_landmarks(path, wrong)
-    for length in np.linspace(0, len(content) // 3, 6).astype(int):
-        path.write_bytes(content[:length])
-        if length < len(content) // 4:
-            with pytest.raises(ValueError, match=str(path)):
-                read_landmarks(path, format)
 
 
 def test_every_format_is_written_here_and_described():
@@ -711,12 +705,6 @@ class TestSkeletons:
             assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
             assert found.point_names == tuple(nodes)
 
-    @pytest.mark.parametrize("edges", [[], None])
-    def test_sleap_without_edges(self, tmp_path, edges):
-        path = tmp_path / "a.h5"
-        files.write_sleap(path, TRACKS[:, None], names=["a"], edges=edges)
-        assert read_landmarks(path).skeleton is None
-
     @pytest.mark.parametrize("edges", [[["tree", "root"]], [["a", "b", "c"]], ["a"]])
     def test_bad_edges_of_sleap(self, tmp_path, edges):
         path = tmp_path / "a.h5"
@@ -725,6 +713,14 @@ class TestSkeletons:
             read_landmarks(path)
 
     def test_what_the_readers_tell(self, tmp_path):
+        assert read_landmarks(WRITERS["sleap"](tmp_path)).skeleton is None
+        hand = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
+        results = [SimpleNamespace(hand_landmarks=[hand])]
+        assert from_mediapipe(results, (640, 480)).skeleton.name == "hand-21"
+        coco = get_skeleton("coco-17")
+        content = files.coco_annotations(files.scene(3, 17), names=coco.point_names)
+        path = files.write_json(tmp_path / "a.json", content)
+        assert read_landmarks(path).skeleton == coco
         faces = files.scene(4, 68)
         path = files.write_openface(tmp_path / "a.csv", faces)
         assert read_landmarks(path).skeleton.name == "ibug-68"
@@ -733,14 +729,3 @@ class TestSkeletons:
         )
         table.to_csv(tmp_path / "b.csv", index=False)
         assert read_landmarks(tmp_path / "b.csv", "table").skeleton is None
-
-    def test_what_mediapipe_tells(self):
-        hand = [SimpleNamespace(x=0.1 * j, y=0.2) for j in range(21)]
-        results = [SimpleNamespace(hand_landmarks=[hand])]
-        assert from_mediapipe(results, (640, 480)).skeleton.name == "hand-21"
-
-    def test_names_of_coco_tell(self, tmp_path):
-        names = get_skeleton("coco-17").point_names
-        content = files.coco_annotations(files.scene(3, 17), names=names)
-        path = files.write_json(tmp_path / "a.json", content)
-        assert read_landmarks(path).skeleton == get_skeleton("coco-17")

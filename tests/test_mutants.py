@@ -33,21 +33,3 @@ def test_each_place_is_changed_in_each_way():
         (9, "2.0", "4.0"),
         (10, "min(é, ( x))", "max(é, x)"),
     }
-
-
-def test_a_mutant_is_the_module_with_one_change():
-    for mutant in mutants("module.py", TEXT):
-        start = TEXT.index(mutant.before.split("( ")[0])
-        assert mutant.text[:start] == TEXT[:start]
-        assert f"({mutant.after})" in mutant.text
-        assert len(mutant.text.splitlines()) == 11 - (mutant.line == 10)
-
-
-def test_lines_are_those_of_the_statement():
-    places = {m.line: (m.lines, m.in_function) for m in mutants("module.py", TEXT)}
-    assert places == {
-        3: ((3, 3), False),
-        7: ((7, 7), True),
-        9: ((9, 9), True),
-        10: ((10, 11), True),
-    }

@@ -19,7 +19,6 @@ from isa_nrsfm.plotting import (
     ReprojectionDisplay,
 )
 from isa_nrsfm.plotting._axes import (
-    draw_points,
     percent,
 )
 from isa_nrsfm.plotting._edges import (
@@ -229,14 +228,6 @@ def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
 )
 def test_percent(fraction, text):
     assert percent(fraction) == text
-
-
-def test_many_points_are_small_and_rasterized():
-    _, ax = plt.subplots()
-    few, many = (draw_points(ax, np.zeros((n_points, 2))) for n_points in (400, 401))
-    assert not few.get_rasterized()
-    assert many.get_rasterized()
-    assert many.get_sizes()[0] < few.get_sizes()[0]
 
 
 def test_shapes_are_inside_limits_of_one_scale():
