@@ -15,10 +15,9 @@ from isa_nrsfm.baselines import CompressibleNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
     code_frames,
     group_sparse_factors,
-    shrink_blocks,
     update_atoms,
 )
-from isa_nrsfm.baselines._block_matrix import nuclear_norm_shapes, shrink
+from isa_nrsfm.baselines._block_matrix import nuclear_norm_shapes
 from isa_nrsfm.baselines._compressible import (
     FEWEST_SHARED,
     align_blocks,
@@ -143,16 +142,6 @@ class TestNuclearNorm:
     def errors(self, W, shapes):
         return W.reshape(20, 2, -1) - self.cameras @ shapes.swapaxes(1, 2)
 
-    @tall_and_wide
-    def test_shrinking_takes_off_singular_values(self, n_frames):
-        shapes = rng_of(0).normal(size=(n_frames, 6, 3))
-        U, S, Vt = np.linalg.svd(shapes.reshape(n_frames, -1), full_matrices=False)
-        expected = ((U * np.maximum(S - S[4], 0)) @ Vt).reshape(shapes.shape)
-        assert_allclose(shrink(shapes, S[4]), expected, atol=1e-12)
-        assert_allclose(shrink(shapes, 0.0), shapes, atol=1e-13)
-        assert not shrink(shapes, 1e3).any()
-        assert not shrink(0 * shapes, 1.0).any()
-
     @pytest.mark.parametrize("accelerated", [True, False])
     @pytest.mark.parametrize("price", [0.05, 2.0])
     def test_optimality(self, W, accelerated, price):
@@ -236,21 +225,6 @@ def norms(blocks):
 
 
 class TestBlockDictionary:
-    def test_shrunk_blocks_minimise_their_cost(self):
-        rng = rng_of(0)
-        blocks = rng.normal(size=(50, 2, 3))
-        blocks[0] = 0.0
-        Z = shrink_blocks(blocks, 2.0)
-
-        def cost(Z):
-            return 2.0 * norms(Z) + 0.5 * np.sum((Z - blocks) ** 2, axis=(1, 2))
-
-        assert 1 < np.sum(~Z.any(axis=(1, 2))) < 50
-        for size in (1e-3, 0.1, 1.0):
-            assert (cost(Z) < cost(Z + size * rng.normal(size=Z.shape))).all()
-        assert_allclose(norms(Z), np.maximum(norms(blocks) - 2.0, 0), atol=1e-15)
-        assert_array_equal(shrink_blocks(blocks, 0.0), blocks)
-
     @pytest.mark.parametrize("seed", [1, 2])
     def test_relaxed_problem_is_solved(self, seed):
         frames, penalty = sparse_scene(seed).frames, 0.06

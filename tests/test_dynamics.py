@@ -105,7 +105,7 @@ class TestEstimation:
             observations(*observed(simulated(true, 400, rng), rng, 0.5))
             for _ in range(3)
         ]
-        found = estimated_dynamics(data, 60, 1e-4, False)
+        found = estimated_dynamics(data, 30, 1e-4, False)
         assert_allclose(found.transition, true.transition, atol=0.06)
         assert_allclose(found.innovation, true.innovation, atol=0.06)
 

@@ -1,13 +1,12 @@
 import numpy as np
 import pytest
+from export_models import N_FRAMES, calibrated_model, face_model, faces
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._tables.layout import weighting_sizes
 from isa_nrsfm.calibration import angle_deviations, view_angles
-from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import frame_poses, point_distances
 
 EYES, MOUTH = (36, 45), (48, 54)
@@ -16,11 +15,7 @@ EYES, MOUTH = (36, 45), (48, 54)
 @pytest.fixture(scope="module", params=["weak_perspective", "affine"])
 def fitted(request):
     """Return faces with their true rotations, and a model of them."""
-    faces = make_face_tracks(
-        160, n_components=3, camera="weak_perspective", noise=0.01, random_state=0
-    )
-    model = AffineNRSfM(3, camera=request.param, random_state=0).fit(faces.data)
-    return faces, model
+    return faces(), face_model() if request.param == "affine" else calibrated_model()
 
 
 def rotations_of(poses):
@@ -38,9 +33,9 @@ def common_turn(found, true):
 
 class TestFramePoses:
     def test_true_up_to_a_common_rotation(self, fitted):
-        faces, model = fitted
-        found = rotations_of(frame_poses(model, faces.data))
-        true = Rotation.from_matrix(full_rotations(faces.motion)[0])
+        truth, model = fitted
+        found = rotations_of(frame_poses(model, truth.data))
+        true = Rotation.from_matrix(full_rotations(truth.motion)[0])
         common = common_turn(found, true)
         off = np.degrees((found * common * true.inv()).magnitude())
         assert np.median(off) < 2
@@ -48,18 +43,21 @@ class TestFramePoses:
         assert np.degrees(common.magnitude()) < 5
 
     def test_deviations_are_those_of_the_errors(self, fitted):
-        faces, model = fitted
+        truth, model = fitted
         if model.camera == "affine":
-            assert np.isnan(frame_poses(model, faces.data).yaw_std).all()
+            assert np.isnan(frame_poses(model, truth.data).yaw_std).all()
             return
         # Frames of the model itself, with its noise
         clean = model.inverse_transform(
             model.alpha_, model.motion_, model.translation_
-        ).reshape(160, 68, 2)
+        ).reshape(N_FRAMES, 68, 2)
         sizes = weighting_sizes(clean - clean.mean(axis=1, keepdims=True), True)
         noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
         noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
-        wanted, found = frame_poses(model), frame_poses(model, noisy.reshape(160, -1))
+        wanted, found = (
+            frame_poses(model),
+            frame_poses(model, noisy.reshape(N_FRAMES, -1)),
+        )
         for name in ("yaw", "pitch", "roll"):
             off = getattr(found, name) - getattr(wanted, name)
             ratio = np.sqrt(np.mean((off / getattr(found, f"{name}_std")) ** 2))
@@ -67,9 +65,9 @@ class TestFramePoses:
             assert ratio < 1.25
 
     def test_of_the_fitted_table(self, fitted):
-        faces, model = fitted
+        truth, model = fitted
         assert_allclose(
-            frame_poses(model)[:4], frame_poses(model, faces.data)[:4], atol=1e-4
+            frame_poses(model)[:4], frame_poses(model, truth.data)[:4], atol=1e-4
         )
         assert np.isnan(frame_poses(model).yaw_std).all()
 
@@ -91,32 +89,32 @@ class TestAngleDeviations:
 
 class TestPointDistances:
     def test_true_in_units_of_the_eyes(self, fitted):
-        faces, model = fitted
+        truth, model = fitted
         found = point_distances(model, [MOUTH, EYES])
-        true = np.linalg.norm(faces.shapes[:, 48] - faces.shapes[:, 54], axis=1)
-        mean = faces.shapes.mean(axis=0)
+        true = np.linalg.norm(truth.shapes[:, 48] - truth.shapes[:, 54], axis=1)
+        mean = truth.shapes.mean(axis=0)
         true /= np.linalg.norm(mean[36] - mean[45])
         assert np.corrcoef(found[:, 0], true)[0, 1] > 0.98
         assert_allclose(found[:, 0].mean(), true.mean(), rtol=0.03)
         assert found[:, 1].mean() == pytest.approx(1.0, abs=0.01)
 
     def test_units(self, fitted):
-        faces, model = fitted
+        truth, model = fitted
         eyes = point_distances(model, [MOUTH])
         mouth = point_distances(model, [MOUTH], unit=MOUTH, length=50.0)
         ratio = mouth / eyes
         assert_allclose(ratio, ratio[0, 0])
         assert mouth.mean() == pytest.approx(50.0, rel=0.01)
-        some = point_distances(model, [MOUTH], faces.data[:5])
-        assert_allclose(some, eyes[:5], atol=2e-3)
+        again = point_distances(model, [MOUTH], truth.data)
+        assert_allclose(again, eyes, atol=2e-3)
 
 
 def test_uncertainty_needs_calibrated_cameras(fitted):
-    faces, model = fitted
+    truth, model = fitted
     if model.camera == "affine":
         with pytest.raises(ValueError, match="needs a model with calibrated cameras"):
-            model.rotation_covariance(faces.data)
+            model.rotation_covariance(truth.data)
     else:
-        covariance = model.rotation_covariance(faces.data)
-        assert covariance.shape == (160, 3, 3)
+        covariance = model.rotation_covariance(truth.data)
+        assert covariance.shape == (N_FRAMES, 3, 3)
         assert (np.linalg.eigvalsh(covariance) > 0).all()

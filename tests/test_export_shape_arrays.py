@@ -5,8 +5,11 @@ from export_models import N_COMPONENTS, N_FRAMES, face_model, faces
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.export import ShapeArrays, shape_arrays, write_shapes
+
+QUICK = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
 
 def test_arrays_are_the_attributes_of_the_model():
@@ -33,19 +36,19 @@ def test_points_are_named_as_the_columns(layout):
     table = pd.DataFrame(faces().data, columns=names)
     if layout == "planar":
         table = table[names[::2] + names[1::2]]
-    model = AffineNRSfM(1, layout=layout, random_state=0).fit(table)
+    model = AffineNRSfM(1, layout=layout, **QUICK).fit(table)
     named = [str(name) for name in shape_arrays(model).point_names]
     assert named == [f"p{j}" for j in range(68)]
 
 
 def test_columns_that_are_no_coordinates_name_points_in_full():
     table = pd.DataFrame(faces().data, columns=[f"column {i}" for i in range(136)])
-    model = AffineNRSfM(1, random_state=0).fit(table)
+    model = AffineNRSfM(1, **QUICK).fit(table)
     assert shape_arrays(model).point_names[1] == "column 2"
 
 
 def test_models_without_frames_have_arrays_of_no_frames():
-    model = AffineNRSfM(2, random_state=0, keep_frames=False).fit(faces().data[:40])
+    model = AffineNRSfM(2, keep_frames=False, **QUICK).fit(faces().data[:40])
     arrays = shape_arrays(model)
     shapes = arrays.alpha.shape, arrays.motion.shape, arrays.translation.shape
     assert shapes == ((0, 2), (0, 2, 3), (0, 2))
