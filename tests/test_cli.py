@@ -375,9 +375,7 @@ def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
     assert code == 0
     zeros, few = report_of(tmp_path)["warnings"]
     assert "".join(f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)) == err
-    assert zeros.startswith(
-        "points at exactly (0, 0) were found in 2 of 60 rows, 2 in all."
-    )
+    assert zeros.startswith("in 2 of 60 rows points are at exactly (0, 0) (2 in all).")
     assert "--zeros-missing" in zeros
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 

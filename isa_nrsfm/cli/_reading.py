@@ -25,7 +25,7 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
-from isa_nrsfm.io._tables import as_numbers
+from isa_nrsfm.io._tables import tracks_in
 from isa_nrsfm.skeletons import (
     SKELETONS,
     Skeleton,
@@ -172,8 +172,8 @@ def _frames(
     if at_origin.any():
         n_points, n_rows = at_origin.sum(), at_origin.any(axis=1).sum()
         warn_caller(
-            f"points at exactly (0, 0) were found in {n_rows} of {len(at_origin)} "
-            f"rows, {n_points} in all. If these points are missing, use --zeros-missing"
+            f"in {n_rows} of {len(at_origin)} rows points are at exactly (0, 0) "
+            f"({n_points} in all). If these points are missing, use --zeros-missing"
         )
     # A format knows which of its columns are landmarks.
     not_used = {} if failed is not None else _sets_not_used(table, columns)
@@ -213,12 +213,8 @@ def _tracks(
     kept: NDArray,
 ) -> NDArray:
     """Return the points of all rows of the table, NaN where missing or not kept."""
-    cells = table.loc[kept, columns.interleaved]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    values = np.stack([as_numbers(cells[name]) for name in cells], axis=1)
-    tracks[kept] = values.reshape(-1, *tracks.shape[1:])
-    if args.zeros_missing:
-        tracks[(tracks == 0).all(axis=2)] = np.nan
+    tracks[kept] = tracks_in(table[kept], columns.interleaved, args.zeros_missing)
     return tracks
 
 

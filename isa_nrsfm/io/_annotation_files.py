@@ -20,11 +20,8 @@ _WFLW_ATTRIBUTES = (
     *("pose", "expression", "illumination"),
     *("make_up", "occlusion", "blur"),
 )
-# Points and the image, without and with the box and the attributes.
-_WFLW_LENGTHS = (
-    2 * _N_WFLW + 1,
-    2 * _N_WFLW + len(_WFLW_BOX) + len(_WFLW_ATTRIBUTES) + 1,
-)
+# Fields of a line: points and image, without and with the box and the attributes.
+_WFLW_LENGTHS = (197, 207)
 
 
 def is_pts(path: Path) -> bool:
@@ -64,13 +61,11 @@ def read_pts(path: Path) -> Landmarks:
 def is_wflw(path: Path) -> bool:
     """Return whether the first line has the fields of a WFLW list."""
     fields = "".join(first_lines(path, 1)).split()
-    if len(fields) not in _WFLW_LENGTHS:
-        return False
     try:
         _floats(fields[: 2 * _N_WFLW])
     except ValueError:
         return False
-    return True
+    return len(fields) in _WFLW_LENGTHS
 
 
 def read_wflw(path: Path) -> Landmarks:
@@ -101,11 +96,9 @@ def read_wflw(path: Path) -> Landmarks:
             images.append(fields[-1])
     if not rows:
         raise ValueError("there are no lines in it")
-    values = np.stack(rows)
     frames: dict[str, object] = {"image": images}
-    points, rest = values[:, : 2 * _N_WFLW], values[:, 2 * _N_WFLW :]
+    points, box, attributes = np.split(np.stack(rows), [196, 200], axis=1)
     if n_fields == _WFLW_LENGTHS[1]:
-        box, attributes = rest[:, : len(_WFLW_BOX)], rest[:, len(_WFLW_BOX) :]
         if not np.isin(attributes, (0, 1)).all():
             raise ValueError("the six attributes before the image must be 0 or 1")
         frames |= zip(_WFLW_BOX, box.T, strict=True)

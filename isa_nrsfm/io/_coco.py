@@ -151,12 +151,11 @@ def _keypoints(
                 f"{what} {number} (counted from 0) should have keypoints, a list of "
                 f"numbers; got {str(numbers)[:40]}"
             )
-        if n_points is None:
-            n_points = len(numbers) // 3
-        if len(numbers) != 3 * n_points or n_points == 0:
+        n_points = n_points or len(numbers) // 3
+        if len(numbers) != max(3 * n_points, 3):
             raise ValueError(
-                f"{what} {number} (counted from 0) should have {n_points} keypoints of "
-                f"3 numbers; got {len(numbers)} numbers"
+                f"{what} {number} (counted from 0) should have x, y and a third number "
+                f"for each keypoint, {max(3 * n_points, 3)} in all; got {len(numbers)}"
             )
     try:
         values = np.array([entry["keypoints"] for entry in entries], dtype=np.float64)

@@ -41,8 +41,8 @@ def read_deeplabcut(path: Path) -> Landmarks:
     if len(scorers) > 1:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
     places = _places(table.columns)
-    individuals, bodyparts = _common_bodyparts(places)
-    where = np.array([[places[i, b] for b in bodyparts] for i in individuals])
+    individuals, (first, *_) = list(places), places.values()
+    where = np.array([[parts[name] for name in first] for parts in places.values()])
     # A column of NaN stands for likelihoods that are not there.
     values = np.column_stack([table.values, np.full(len(table.values), np.nan)])
     found = values[:, where]
@@ -53,7 +53,7 @@ def read_deeplabcut(path: Path) -> Landmarks:
     return assemble_individuals(
         found[..., :2],
         individuals if len(table.columns[0]) == len(_LEVELS_OF_MANY) else None,
-        bodyparts,
+        list(first),
         frames,
         format="deeplabcut",
         confidence=found[..., 2] if (where[..., 2] >= 0).any() else None,
@@ -116,12 +116,16 @@ def _levels_of(header: Sequence[Sequence[str]]) -> list[str] | None:
 
 def _places(
     columns: Sequence[tuple[str, ...]],
-) -> dict[tuple[str, str], tuple[int, int, int]]:
-    """Return the places of x, y, likelihood (or -1) by individual and bodypart."""
-    places: dict[tuple[str, str], dict[str, int]] = {}
+) -> dict[str, dict[str, tuple[int, int, int]]]:
+    """Return the places of x, y, likelihood (or -1) by individual and bodypart.
+
+    All individuals have the same bodyparts; one of others, for points of no animal, is
+    left out.
+    """
+    points: dict[tuple[str, str], dict[str, int]] = {}
     for number, column in enumerate(columns):
         *individual, bodypart, coord = column[1:]
-        of_point = places.setdefault(("".join(individual), bodypart), {})
+        of_point = points.setdefault(("".join(individual), bodypart), {})
         if coord == "z":
             raise ValueError(
                 f"{bodypart!r} has a z: these are points in space, not in an image"
@@ -129,34 +133,24 @@ def _places(
         if coord in of_point:
             raise ValueError(f"there is more than one column {coord!r} of {bodypart!r}")
         of_point[coord] = number
-    if not places:
+    if not points:
         raise ValueError("it has no columns x and y")
-    for (_, bodypart), of_point in places.items():
+    places: dict[str, dict[str, tuple[int, int, int]]] = {}
+    for (name, bodypart), of_point in points.items():
         if not {"x", "y"}.issubset(of_point):
             raise ValueError(f"{bodypart!r} has no x or no y")
-    return {
-        point: (of_point["x"], of_point["y"], of_point.get("likelihood", -1))
-        for point, of_point in places.items()
-    }
-
-
-def _common_bodyparts(
-    places: dict[tuple[str, str], tuple[int, int, int]],
-) -> tuple[list[str], list[str]]:
-    """Return the individuals and the bodyparts that all have; leave unique ones out."""
-    parts: dict[str, list[str]] = {}
-    for individual, bodypart in places:
-        parts.setdefault(individual, []).append(bodypart)
-    others = [name for name in parts if name != _UNIQUE]
-    if others and _UNIQUE in parts and set(parts[_UNIQUE]) != set(parts[others[0]]):
+        place = of_point["x"], of_point["y"], of_point.get("likelihood", -1)
+        places.setdefault(name, {})[bodypart] = place
+    others = [name for name in places if name != _UNIQUE]
+    if others and _UNIQUE in places and {*places[_UNIQUE]} != {*places[others[0]]}:
         warn_caller(
-            f"the points {', '.join(parts.pop(_UNIQUE))} belong to no animal "
+            f"the points {', '.join(places.pop(_UNIQUE))} belong to no animal "
             f"(individual {_UNIQUE!r}) and are left out"
         )
-    first, *rest = parts
+    first, *rest = places
     for name in rest:
-        if set(parts[name]) != set(parts[first]):
+        if {*places[name]} != {*places[first]}:
             raise ValueError(
                 f"the individuals {first!r} and {name!r} have different bodyparts"
             )
-    return list(parts), parts[first]
+    return places

@@ -57,13 +57,12 @@ def read_openface(path: Path) -> Landmarks:
     table = read_columns(
         path, leave_out=_OPENFACE_NOT_READ, numbers=[*found.interleaved, *scores]
     )
-    failed = None
     if of_video:
         if not table["success"].isin((0, 1)).all():
             raise ValueError("the column success must hold 0 and 1 only")
         table["success"] = table["success"].astype(int)
-        failed = table["success"].to_numpy() == 0
-    return _assembled(table, found, "openface", score="confidence", failed=failed)
+        table.loc[table["success"] == 0, found.interleaved] = np.nan
+    return _assembled(table, found, "openface", score="confidence")
 
 
 def is_pyfeat(path: Path) -> bool:
@@ -82,14 +81,12 @@ def read_pyfeat(path: Path) -> Landmarks:
     names = header_names(path)
     _need(names, _PYFEAT_BOX)
     found = find_landmark_columns(names, "x_#,y_#")
-    score = "FaceScore" if "FaceScore" in names else None
+    scores = [name for name in names if name == "FaceScore"]
+    numbers = [*found.interleaved, *scores]
     table = read_columns(
-        path,
-        leave_out=_PYFEAT_NOT_READ,
-        numbers=[*found.interleaved, *([score] if score else [])],
-        text=("input",),
+        path, leave_out=_PYFEAT_NOT_READ, numbers=numbers, text=("input",)
     )
-    return _assembled(table, found, "pyfeat", score=score)
+    return _assembled(table, found, "pyfeat", score=scores[0] if scores else None)
 
 
 def is_mediapipe(path: Path) -> bool:
@@ -112,13 +109,9 @@ def read_mediapipe(
     names = header_names(path)
     found = find_landmark_columns(names)
     sizes = [name for name in ("image_width", "image_height") if name in names]
-    landmarks = {*found.interleaved, *found.z, *sizes}
-    table = read_columns(
-        path,
-        leave_out=set(found.z),
-        numbers=[*found.interleaved, *sizes],
-        text=[name for name in names if name not in landmarks],
-    )
+    numbers = [*found.interleaved, *sizes]
+    text = {*names}.difference(numbers, found.z)
+    table = read_columns(path, leave_out={*found.z}, numbers=numbers, text=text)
     tracks = points_of(table, found.interleaved)
     known = np.abs(tracks[~np.isnan(tracks)])
     # Pixels of a face reach beyond this, and shares of the image's size do not.
@@ -156,13 +149,11 @@ def _assembled(
     *,
     tracks: NDArray[np.float64] | None = None,
     score: str | None = None,
-    failed: NDArray[np.bool_] | None = None,
 ) -> Landmarks:
     """Return points under the names of their columns, with the score of their frame."""
     confidence = None
     if score is not None:
-        of_frames = table[score].to_numpy(dtype=np.float64)
-        confidence = np.tile(of_frames[:, None], (1, len(found.points)))
+        confidence = table[[score] * len(found.points)].to_numpy(dtype=np.float64)
     return assemble(
         points_of(table, found.interleaved) if tracks is None else tracks,
         found.points,
@@ -170,7 +161,6 @@ def _assembled(
         format=format,
         columns=found.interleaved,
         confidence=confidence,
-        failed=failed,
     )
 
 

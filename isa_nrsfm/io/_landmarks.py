@@ -95,7 +95,6 @@ def assemble(
     format: str,
     columns: Sequence[str] | None = None,
     confidence: NDArray[np.float64] | None = None,
-    failed: NDArray[np.bool_] | None = None,
     skeleton: Skeleton | None = None,
 ) -> Landmarks:
     """Put landmarks together in the one form that all readers return, and check them.
@@ -103,8 +102,8 @@ def assemble(
     `tracks` (n_frames, n_points, 2) are NaN where points are missing. Points whose
     names are None have numbers from 0 and columns ``x_0, y_0``, ...; other columns are
     by default the names with ``_x`` and ``_y``. `frames` has further columns of each
-    frame. Frames without points are added to those that `failed`. The skeleton is by
-    default that of the layout that the format or the names of the points determine.
+    frame. The skeleton is by default that of the layout that the format or the names of
+    the points determine.
     """
     pd = import_optional("pandas", extra="io")
     n_frames, n_points, _ = tracks.shape
@@ -115,10 +114,6 @@ def assemble(
         columns = [f"{axis}_{j}" for j in point_names for axis in "xy"]
     elif columns is None:
         columns = [f"{name}_{axis}" for name in point_names for axis in "xy"]
-    lost = np.asarray(np.isnan(tracks).all(axis=(1, 2)))
-    if failed is not None:
-        lost |= failed
-        tracks = np.where(lost[:, None, None], np.nan, tracks)
     infinite = np.isinf(tracks)
     if infinite.any():
         frame, point, axis = (int(i) for i in np.argwhere(infinite)[0])
@@ -138,7 +133,7 @@ def assemble(
         confidence=None
         if confidence is None
         else pd.DataFrame(confidence, columns=list(point_names)),
-        failed=lost,
+        failed=np.asarray(np.isnan(tracks).all(axis=(1, 2))),
         format=format,
         point_names=tuple(point_names),
         skeleton=skeleton,

@@ -1,6 +1,7 @@
 """Read the analysis files of SLEAP, h5 and csv."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,17 +77,19 @@ def _read_h5(path: Path) -> Landmarks:
             raise ValueError(f"it has no dataset {', '.join(sorted(absent))}")
         nodes = _texts(content_of(file, "node_names"))
         names = _texts(content_of(file, "track_names"))
-        stored, dims = _stored(file, len(nodes))
-        tracks = stored.transpose([dims.index(dim) for dim in _DIMS])
-        scores = _scores(file, "point_scores", dims, tracks.shape[:3])
+        tracks, dims = _array(file, "tracks", {"xy": 2, "node": len(nodes)}, _ORDERS)
+        lengths = dict(zip(_DIMS, tracks.shape, strict=True))
+        scores = {}
+        for name, n_dims in (("point_scores", 3), ("instance_scores", 2)):
+            if name in file:
+                order = [dim for dim in dims if dim in _DIMS[:n_dims]]
+                scores[name], _ = _array(file, name, lengths, [order])
         skeleton = _skeleton(file, nodes)
-        of_instances = _scores(file, "instance_scores", dims, tracks.shape[:2])
     n_tracks = tracks.shape[1]
     if names and len(names) != n_tracks:
         raise ValueError(f"tracks holds {n_tracks} tracks, track_names {len(names)}")
-    scored = {}
-    if of_instances is not None and not np.isnan(of_instances).all():
-        scored["instance_score"] = of_instances
+    of_instances = scores.pop("instance_scores", np.array(np.nan))
+    scored = {} if np.isnan(of_instances).all() else {"instance_score": of_instances}
     return assemble_individuals(
         tracks,
         names or (range(n_tracks) if n_tracks > 1 else None),
@@ -94,61 +97,41 @@ def _read_h5(path: Path) -> Landmarks:
         {"frame": range(len(tracks))},
         of_instances=scored,
         format="sleap",
-        confidence=scores,
+        confidence=scores.get("point_scores"),
         skeleton=skeleton,
     )
 
 
-def _stored(file: Any, n_nodes: int) -> tuple[NDArray, tuple[str, ...]]:
-    """Return the points as they are stored, and the names of their axes."""
-    stored, dims = numbers_of(file, "tracks"), _named_dims(file["tracks"])
-    if dims is not None and sorted(dims) != sorted(_DIMS):
-        raise ValueError(
-            f"the axes of tracks should be {', '.join(_DIMS)} in some order; got "
-            f"{', '.join(dims)}"
-        )
-    orders = _ORDERS if dims is None else (dims,)
-    for order in orders:
-        lengths = dict(zip(order, stored.shape, strict=False))
-        if (
-            stored.ndim == len(_DIMS)
-            and lengths["xy"] == 2
-            and lengths["node"] == n_nodes
-        ):
-            return stored, order
+def _array(
+    file: Any, name: str, lengths: dict[str, int], orders: Sequence[Sequence[str]]
+) -> tuple[NDArray[np.float64], Sequence[str]]:
+    """Return numbers with the axes in the order of `_DIMS`, and in the order stored.
+
+    Without the attribute ``dims`` this is one of `orders`.
+    """
+    stored, named = numbers_of(file, name), _named_dims(file[name])
+    wanted = [dim for dim in _DIMS if dim in orders[0]]
+    known = {dim: length for dim, length in lengths.items() if dim in wanted}
+    for dims in orders if named is None else [named]:
+        sizes = dict(zip(dims, stored.shape, strict=False))
+        fits = all(sizes.get(dim) == length for dim, length in known.items())
+        if sorted(dims) == sorted(wanted) and stored.ndim == len(dims) and fits:
+            return stored.transpose([dims.index(dim) for dim in wanted]), dims
     raise ValueError(
-        f"tracks should have the axes {', '.join(orders[0])}, with 2 and {n_nodes} for "
-        f"xy and node; got the shape {stored.shape}"
+        f"{name} should have the axes {', '.join(named or orders[0])}, with "
+        f"{' and '.join(map(str, known.values()))} for {' and '.join(known)}; got the "
+        f"shape {stored.shape}"
     )
 
 
-def _named_dims(dataset: Any) -> tuple[str, ...] | None:
+def _named_dims(dataset: Any) -> list[str] | None:
     """Return the names of the axes in the attributes of a dataset, or None."""
     if "dims" not in dataset.attrs:
         return None
     named = json.loads(dataset.attrs["dims"])
     if not isinstance(named, list) or not all(isinstance(dim, str) for dim in named):
         raise ValueError(f"its attribute dims should be a list of names; got {named}")
-    return tuple(named)
-
-
-def _scores(
-    file: Any, name: str, dims_of_tracks: tuple[str, ...], shape: tuple[int, ...]
-) -> NDArray[np.float64] | None:
-    """Return scores by frame, track and, of points, node; None without a dataset."""
-    if name not in file:
-        return None
-    stored = numbers_of(file, name)
-    wanted = _DIMS[: len(shape)]
-    dims = _named_dims(file[name]) or tuple(d for d in dims_of_tracks if d in wanted)
-    if sorted(dims) == sorted(wanted) and stored.ndim == len(shape):
-        scores = stored.transpose([dims.index(dim) for dim in wanted])
-        if scores.shape == shape:
-            return scores
-    raise ValueError(
-        f"{name} should have the axes {', '.join(dims)} of tracks; got the shape "
-        f"{stored.shape}"
-    )
+    return named
 
 
 def _skeleton(file: Any, nodes: list[str]) -> Skeleton | None:

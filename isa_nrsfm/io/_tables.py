@@ -191,14 +191,22 @@ def landmark_table(
     found = find_landmark_columns(frame.columns, columns)
     names = found.interleaved
     refuse_same_names([str(name) for name in frame.columns])
-    values = np.column_stack([as_numbers(frame[name]) for name in names])
-    points = values.reshape(len(frame), len(names) // 2, 2)
-    if missing == "zeros":
-        points[(points == 0).all(axis=2)] = np.nan
+    values = tracks_in(frame, names, missing == "zeros").reshape(len(frame), len(names))
     return LandmarkTable(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
     )
+
+
+def tracks_in(
+    frame: "pd.DataFrame", names: Sequence[str], zeros_missing: bool
+) -> NDArray[np.float64]:
+    """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ...."""
+    values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
+    tracks = values.reshape(len(frame), len(names) // 2, 2)
+    if zeros_missing:
+        tracks[(tracks == 0).all(axis=2)] = np.nan
+    return tracks
 
 
 def is_named_columns(_path: Path) -> bool:
@@ -294,7 +302,7 @@ def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
         return None
 
 
-def as_numbers(column: "pd.Series") -> NDArray[np.float64]:
+def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
     pd = import_optional("pandas", extra="io")
     types = pd.api.types
