@@ -39,7 +39,7 @@ from isa_nrsfm._joint import fit as joint_fit
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
-from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
+from isa_nrsfm._tables.tracks import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 

@@ -23,7 +23,7 @@ from benchmarks._data import (
 from benchmarks.accuracy import common_rotation, hidden_at_random, with_noise
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
-from isa_nrsfm._tables.layout import centred_tracks
+from isa_nrsfm._tables.tracks import centred_tracks
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,

@@ -28,7 +28,7 @@ from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_ta
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._frames.posterior import fit_tracks, frame_search
 from isa_nrsfm._paper.factors import factorise
-from isa_nrsfm._tables.layout import (
+from isa_nrsfm._tables.tracks import (
     centred_tracks,
     measurement_matrix,
     table_to_tracks,

@@ -23,9 +23,10 @@ from isa_nrsfm._parameters.choices import (
     REFINEMENTS,
 )
 from isa_nrsfm._prepare.checks import check_names
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.kept_arrays import kept_arrays
-from isa_nrsfm._tables.layout import LAYOUTS, Layout
-from isa_nrsfm._tables.sources import StoredTable, Table, is_on_dask
+from isa_nrsfm._tables.sources import StoredTable, is_on_dask
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout
 from isa_nrsfm._transformer import TableTransformer
 from isa_nrsfm.isa import PooledFastICA
 
@@ -359,7 +360,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             frames = fit_table(fitted, source, progress)
             if self.keep_frames:
                 kept = keep(frames._asdict())
-                fitted._set_frames(*map(source.blocks.as_collected, kept.values()))
+                fitted._set_frames(*map(source.as_collected, kept.values()))
             certainty = fitted._model.frames.certainty
             if not certainty.determined:
                 warn_caller(certainty.advice)
@@ -386,7 +387,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         self.fit(X)
         return self.alpha_.copy() if self.keep_frames else self.transform(X)
 
-    def _checked(self, X: Any) -> Table:
+    def _checked(self, X: Any) -> FrameBlocks:
         """Check parameters and a table, and set the attributes that a fit needs."""
         only_joint = {
             "n_components": self.n_components == "auto",
@@ -434,10 +435,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         found = ("_model", "_frame_sizes", "_n_features_out")
         left = [name for name in vars(self) if not name.endswith("_")]
         self.__dict__ = {name: vars(self)[name] for name in left if name not in found}
-
-    def __sklearn_is_fitted__(self) -> bool:
-        """Return whether a fit has ended."""
-        return hasattr(self, "_model")
 
     def _set_frames(self, *frames: NDArray) -> None:
         """Set the attributes of the frames, in the order of `Decomposition`."""

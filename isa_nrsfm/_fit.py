@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.callbacks import FitProgress, NoProgress
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera import reference_camera
@@ -65,7 +65,7 @@ from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
-from isa_nrsfm._tables.sources import Table
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._transformer import TableTransformer
 
 # Reported only with the joint refinement.
@@ -101,7 +101,7 @@ class Limits(NamedTuple):
 
 
 def fit_table(
-    estimator: TableTransformer, source: Table, progress: FitProgress
+    estimator: TableTransformer, source: FrameBlocks, progress: FitProgress
 ) -> Decomposition:
     """Fit a table, and set the attributes of an estimator whose parameters are checked.
 
@@ -196,7 +196,7 @@ def _estimate_errors(estimator: TableTransformer, table: ScaledTable) -> None:
 
 
 @one_blas_thread
-def _count_components(estimator: TableTransformer, source: Table) -> int:
+def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
     """Return the number of basis shapes that a table supports, of at most twelve."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
@@ -227,7 +227,7 @@ def _count_components(estimator: TableTransformer, source: Table) -> int:
 
 @one_blas_thread
 def ready_table(
-    estimator: TableTransformer, source: Table, n_components: int
+    estimator: TableTransformer, source: FrameBlocks, n_components: int
 ) -> ScaledTable:
     """Return a table centred, scaled and checked for fits of at most K basis shapes."""
     return scaled_table(
@@ -327,7 +327,6 @@ def _paper_frames(
     if estimator.camera != "affine":
         scaled = estimator.camera == "weak_perspective"
         shapes = table.sizes[0] * rigid_start(factors, shapes, scaled)[1]
-    source = table.source._replace(dtype=np.float64)
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
         frames = RigidFrames(mean_shape, basis, estimator.camera)
@@ -338,7 +337,9 @@ def _paper_frames(
         shapes[0].T,
         shapes[1:].transpose(0, 2, 1),
         table.sizes,
-        lambda mean_shape, basis: fitted(mean_shape, basis).decompose(source),
+        lambda mean_shape, basis: table.source.joined(
+            partial(fitted(mean_shape, basis).decompose, dtype=np.float64)
+        ),
         camera=estimator.camera,
         dtype=table.dtype,
     )

@@ -1,30 +1,32 @@
 """The fitted model as a function of the rows of a table, one block at a time."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
-from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
-from isa_nrsfm._tables.layout import Layout, table_to_tracks, tracks_to_table
-from isa_nrsfm._tables.sources import Table
-from isa_nrsfm._tables.visibility import centred_frames, seen_points
+from isa_nrsfm._tables.tracks import (
+    Layout,
+    centred_frames,
+    clean_tracks,
+    seen_points,
+    table_to_tracks,
+    tracks_to_table,
+)
 
 
 class TableModel(NamedTuple):
     """Model of a frame, shapes and layout: all that the fit of a new table depends on.
 
-    Methods whose names begin with an underscore take some rows (n, 2 * n_points) of a
-    table. Results are NaN for rows with too few points. The mean shape (J, 3) and the
-    basis (K, J, 3) are in the gauge. `names` (2J,) are those of the columns. `unit` is
-    the one size of all frames of a table; None where each has its own.
+    Methods take some rows (n, 2 * n_points) of a table. Results are NaN for rows with
+    too few points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
+    `names` (2J,) are those of the columns. `unit` is the one size of all frames of a
+    table; None where each has its own.
     """
 
     frames: RigidFrames | PosteriorFrames
@@ -34,54 +36,69 @@ class TableModel(NamedTuple):
     names: NDArray | None
     unit: float | None
 
-    @one_blas_thread
-    def decompose(self, table: Table, deviations: bool = True) -> Decomposition:
-        """Return cameras, positions and coefficients of the frames of a table."""
-        K = len(self.basis)
-        fit = partial(self._fit_rows, dtype=table.dtype, deviations=deviations)
-        found = table.blocks.collect(fit, ((2, 3), (2,), (K,), (K,)), table.dtype)
-        return Decomposition(*found)
+    def decompose(
+        self, rows: NDArray, deviations: bool = True, dtype: Any = None
+    ) -> Decomposition:
+        """Return cameras, positions and coefficients, as numbers of the rows' type."""
+        usable, centred, translation, sizes = self._ready(self._tracks(rows))
+        fit = self.frames.fit(centred, sizes, deviations)
+        fit = fit._replace(translation=fit.translation + translation)
+        dtype = rows.dtype if dtype is None else dtype
+        return Decomposition(*(_of_all(each, usable).astype(dtype) for each in fit))
 
-    @one_blas_thread
-    def posterior(self, table: Table) -> FramePosterior:
+    def posterior(self, rows: NDArray) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
-        found = table.blocks.map(self._posterior)
-        return FramePosterior(*map(np.concatenate, zip(*found, strict=True)))
+        assert isinstance(self.frames, PosteriorFrames)
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        whole = FramePosterior.unknown(len(rows), len(self.basis))
+        whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
+        return whole
 
-    @one_blas_thread
     def reconstruct(
-        self, table: Table, metric: DeformationMetric | None, scaled: bool
+        self,
+        rows: NDArray,
+        metric: DeformationMetric | None = None,
+        scaled: bool = False,
     ) -> NDArray:
-        """Return the shapes (n_frames, n_points, 3) of the frames of a table.
+        """Return the shapes (n, n_points, 3) of frames.
 
         A metric of space makes them Euclidean; `scaled` gives them the sizes that an
         orthographic camera shows.
         """
-        shapes = partial(self._shapes, metric=metric, scaled=scaled, dtype=table.dtype)
-        return table.blocks.collect(shapes, (self.mean_shape.shape,), table.dtype)[0]
+        motion, _, alpha, _ = self.decompose(rows, deviations=False)
+        if metric is None:
+            return compose(self.mean_shape, self.basis, alpha)
+        found = euclidean_frames(metric, motion, alpha, self.mean_shape, self.basis)
+        sizes = found.scales[:, None, None] if scaled else 1.0
+        return (sizes * found.shapes).astype(rows.dtype, copy=False)
 
-    @one_blas_thread
-    def depth_deviations(self, table: Table) -> NDArray:
-        """Return standard deviations of the depths of points (n_frames, n_points)."""
-        found = partial(self._depth_deviations, dtype=table.dtype)
-        return table.blocks.collect(found, (self.mean_shape.shape[:1],), table.dtype)[0]
+    def depth_deviations(self, rows: NDArray) -> NDArray:
+        """Return standard deviations of the depths of points (n, n_points)."""
+        assert isinstance(self.frames, PosteriorFrames)
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        found = self.frames.depth_deviations(centred, sizes)
+        return _of_all(found, usable).astype(rows.dtype, copy=False)
 
-    @one_blas_thread
-    def reproject(self, table: Table) -> NDArray:
+    def reproject(self, rows: NDArray) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
-        images = partial(self._images, dtype=table.dtype)
-        return table.blocks.collect(images, ((table.n_columns,),), table.dtype)[0]
+        motion, translation, alpha, _ = self.decompose(rows, deviations=False)
+        shapes = compose(self.mean_shape, self.basis, alpha)
+        return tracks_to_table(project(shapes, motion, translation), self.layout)
 
-    @one_blas_thread
-    def distances(self, table: Table) -> NDArray:
-        """Return lengths of residuals (n_frames, n_points) of frames of size one."""
-        return table.blocks.joined(self._distances)
+    def distances(self, rows: NDArray) -> NDArray:
+        """Return lengths of residuals (n, n_points) of frames of size one."""
+        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        fit = self.frames.fit(centred, sizes, False)
+        shapes = compose(self.mean_shape, self.basis, fit.alpha)
+        off = centred - project(shapes, fit.motion, fit.translation)
+        return _of_all(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
 
-    @one_blas_thread
-    def held_out_error(self, table: Table) -> float:
-        """Return the inverse SNR of points held out of the fit of their frame."""
-        noise, signal = np.sum(list(table.blocks.map(self._held_out)), axis=0)
-        return float(noise / signal) if signal > 0 else float("nan")
+    def held_out(self, rows: NDArray) -> NDArray:
+        """Return the energies (1, 2) of `held_out_energies`."""
+        tracks = self._tracks(rows)
+        usable, _, _, sizes = self._ready(tracks)
+        given = self.frames, self.mean_shape, self.basis, tracks[usable], sizes
+        return np.array([held_out_energies(*given)])
 
     def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
@@ -103,63 +120,6 @@ class TableModel(NamedTuple):
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes
-
-    def _fit_rows(
-        self, rows: NDArray, dtype: Any, deviations: bool = False
-    ) -> Decomposition:
-        """Return the fit of some rows."""
-        usable, centred, translation, sizes = self._ready(self._tracks(rows))
-        fit = self.frames.fit(centred, sizes, deviations)
-        fit = fit._replace(translation=fit.translation + translation)
-        return Decomposition(*(_of_all(each, usable).astype(dtype) for each in fit))
-
-    def _posterior(self, rows: NDArray) -> FramePosterior:
-        """Return the fit of some rows, of size one and before the gauge."""
-        assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
-        whole = FramePosterior.unknown(len(rows), len(self.basis))
-        whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
-        return whole
-
-    def _shapes(
-        self, rows: NDArray, metric: DeformationMetric | None, scaled: bool, dtype: Any
-    ) -> tuple[NDArray]:
-        """Return the shapes (n, n_points, 3) of some rows."""
-        motion, _, alpha, _ = self._fit_rows(rows, dtype)
-        if metric is None:
-            return (compose(self.mean_shape, self.basis, alpha),)
-        found = euclidean_frames(metric, motion, alpha, self.mean_shape, self.basis)
-        sizes = found.scales[:, None, None] if scaled else 1.0
-        return ((sizes * found.shapes).astype(dtype, copy=False),)
-
-    def _depth_deviations(self, rows: NDArray, dtype: Any) -> tuple[NDArray]:
-        """Return standard deviations of depths (n, n_points) in some rows."""
-        assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
-        found = self.frames.depth_deviations(centred, sizes)
-        return (_of_all(found, usable).astype(dtype, copy=False),)
-
-    def _images(self, rows: NDArray, dtype: Any) -> tuple[NDArray]:
-        """Return the images (n, 2 * n_points) of the fitted shapes of some rows."""
-        motion, translation, alpha, _ = self._fit_rows(rows, dtype)
-        shapes = compose(self.mean_shape, self.basis, alpha)
-        return (tracks_to_table(project(shapes, motion, translation), self.layout),)
-
-    def _distances(self, rows: NDArray) -> NDArray:
-        """Return the lengths of the residuals (n, n_points) of some rows."""
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
-        fit = self.frames.fit(centred, sizes, False)
-        shapes = compose(self.mean_shape, self.basis, fit.alpha)
-        off = centred - project(shapes, fit.motion, fit.translation)
-        return _of_all(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
-
-    def _held_out(self, rows: NDArray) -> tuple[float, float]:
-        """Return the energies of `held_out_energies` for some rows."""
-        tracks = self._tracks(rows)
-        usable, _, _, sizes = self._ready(tracks)
-        return held_out_energies(
-            self.frames, self.mean_shape, self.basis, tracks[usable], sizes
-        )
 
 
 def _of_all(values: NDArray, usable: NDArray) -> NDArray:

@@ -1,6 +1,7 @@
 """A fitted model as a transformer of tables: all methods but `fit`."""
 
 import copy
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -22,15 +23,16 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
 from isa_nrsfm._summary import summary_html
-from isa_nrsfm._tables.layout import Layout, tracks_to_table
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
     CHECKS,
-    Table,
     checked_range,
     column_sample,
     is_read_later,
+    open_table,
     unmasked,
 )
+from isa_nrsfm._tables.tracks import Layout, tracks_to_table
 from isa_nrsfm.analysis._dynamics import smoothed_posterior
 
 
@@ -135,6 +137,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         tags.input_tags.allow_nan = True
         return tags
 
+    def __sklearn_is_fitted__(self) -> bool:
+        """Return whether a fit has ended."""
+        return hasattr(self, "_model")
+
     def _html_repr(self) -> str:
         """Return scikit-learn's diagram for notebooks, and a summary."""
         picture = estimator_html_repr(self)
@@ -158,7 +164,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             too little is seen.
         """
         table = self._opened(X)
-        return self._model.decompose(table, deviations=False).alpha
+        found = table.collect(partial(self._model.decompose, deviations=False))
+        return found.alpha
 
     def decompose(self, X: Any) -> Decomposition:
         """
@@ -175,8 +182,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
             alpha_std (n_frames, n_components).
         """
-        table = self._opened(X)
-        return self._model.decompose(table)
+        return self._opened(X).collect(self._model.decompose)
 
     def smooth(
         self,
@@ -241,7 +247,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         check_scalar(tol, "tol", Real, min_val=0.0)
         table = self._opened(X)
         frames = self._jointly_fitted("smooth")
-        alone = self._model.posterior(table)
+        alone = table.joined(self._model.posterior)
         mean, covariance, time_scales = smoothed_posterior(
             alone.alpha,
             alone.covariance,
@@ -252,7 +258,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             tol=tol,
         )
         alpha, deviation, _ = frames.gauge.coefficients(mean, covariance)
-        dtype = table.dtype
+        dtype = table.empty.dtype
         return SmoothedCoefficients(
             alpha.astype(dtype), deviation.astype(dtype), time_scales
         )
@@ -282,12 +288,12 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         table = self._opened(X)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.space, frames.certainty
-        found = self._model.posterior(table)
+        found = table.joined(self._model.posterior)
         covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:
             R, _ = full_rotations(found.motion @ space.T)
             covariance = covariance + R.transpose(0, 2, 1) @ certainty.turns @ R
-        return np.asarray(covariance).astype(table.dtype, copy=False)
+        return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
     def reconstruct(
         self, X: Any, camera: str | None = None, *, return_std: bool = False
@@ -364,11 +370,13 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled = metric is not None and camera == "orthographic"
-        shapes = self._model.reconstruct(table, metric, scaled)
+        shapes = table.collect(
+            partial(self._model.reconstruct, metric=metric, scaled=scaled)
+        )
         if not return_std:
             return shapes
-        _, scales = full_rotations(np.asarray(self._model.decompose(table).motion))
-        return shapes, self._model.depth_deviations(table) / scales[:, None]
+        _, scales = full_rotations(table.joined(self._model.decompose).motion)
+        return shapes, table.collect(self._model.depth_deviations) / scales[:, None]
 
     def mirrored(self) -> Self:
         """
@@ -426,8 +434,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             Points of the fitted shapes in the fitted cameras. NaN for rows with too
             few visible points.
         """
-        table = self._opened(X)
-        return self._model.reproject(table)
+        return self._opened(X).collect(self._model.reproject)
 
     def inverse_transform(
         self, alpha: Any, motion: Any = None, translation: Any = None
@@ -493,8 +500,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             the camera of the others places them with more than twice the noise
             variance.
         """
-        table = self._opened(X)
-        return -self._model.held_out_error(table)
+        noise, signal = self._opened(X).joined(self._model.held_out).sum(axis=0)
+        return -float(noise / signal) if signal > 0 else float("nan")
 
     def diagnostics(self, X: Any = None) -> Diagnostics:
         """
@@ -523,7 +530,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         check_is_fitted(self)
         self._jointly_fitted("diagnostics")
         check_frames_kept(self, "diagnostics")
-        distance = None if X is None else self._model.distances(self._opened(X))
+        distance = None
+        if X is not None:
+            distance = self._opened(X).joined(self._model.distances)
         rows = X.index if hasattr(X, "iloc") else range(len(self._frame_sizes))
         return diagnose(self, distance, rows)
 
@@ -541,17 +550,17 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             )
         return frames
 
-    def _opened(self, X: Any, reset: bool = False) -> Table:
+    def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
         """Return a table in checked blocks; unless `reset`, it must match the fit."""
         if not reset:
             check_is_fitted(self)
         if is_read_later(X):
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
-            return Table.read_later(X, self.working_memory)
-        least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-        X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
-        checked_range(X)
-        return Table.in_memory(X, self.n_jobs)
+        else:
+            least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
+            X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
+            checked_range(X)
+        return open_table(X, self.n_jobs, self.working_memory)
 
 
 def frames_of(estimator: TableTransformer) -> Any:

@@ -23,7 +23,7 @@ from sklearn.utils import estimator_checks
 from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
+from isa_nrsfm._tables.tracks import table_to_tracks, tracks_to_table
 from isa_nrsfm.baselines import (
     BlockMatrixNRSfM,
     CompressibleNRSfM,

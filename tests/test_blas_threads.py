@@ -6,7 +6,7 @@ from numpy.testing import assert_array_equal
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 

@@ -15,7 +15,7 @@ from isa_nrsfm._prepare.completion import (
     completion_model,
     filled_in,
 )
-from isa_nrsfm._tables.layout import centred_tracks, weighting_sizes
+from isa_nrsfm._tables.tracks import centred_tracks, weighting_sizes
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 

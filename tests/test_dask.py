@@ -13,7 +13,7 @@ from sklearn.model_selection import GridSearchCV
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
-from isa_nrsfm._tables.dask_blocks import DaskBlocks
+from isa_nrsfm._tables.blocks import DaskBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 array = pytest.importorskip("dask.array")

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from isa_nrsfm._tables.column_names import names_layout
-from isa_nrsfm._tables.layout import table_to_tracks
+from isa_nrsfm._tables.tracks import table_to_tracks
 from isa_nrsfm.datasets import (
     make_body_tracks,
     make_face_tracks,

@@ -9,7 +9,7 @@ from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._tables.layout import tracks_to_table
+from isa_nrsfm._tables.tracks import tracks_to_table
 from isa_nrsfm.calibration import (
     deformation_metric,
     euclidean_frames,

@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._tables.layout import weighting_sizes
+from isa_nrsfm._tables.tracks import weighting_sizes
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export import frame_poses, point_distances
 

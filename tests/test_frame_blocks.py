@@ -1,12 +1,20 @@
 """Blocks of frames: any way of splitting and computing them gives the same."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.sources import open_table
 
 N_FRAMES = 23
+
+
+class Pair(NamedTuple):
+    first: np.ndarray
+    second: np.ndarray
 
 
 def blocks_of(kind, array, length):
@@ -65,9 +73,10 @@ class TestBlocks:
 
     def test_gather_concatenates_each_of_several_results(self, kind, array, length):
         blocks = blocks_of(kind, array, length)
-        first, second = blocks.collect(lambda b: (b, b[:, 0]), ((4,), ()), float)
-        assert_array_equal(first, array)
-        assert_array_equal(second, array[:, 0])
+        found = blocks.collect(lambda b: Pair(b, b[:, 0]))
+        assert isinstance(found, Pair)
+        assert_array_equal(found.first, array)
+        assert_array_equal(found.second, array[:, 0])
 
 
 def test_stored_blocks_are_computed_when_they_are_needed(array):
@@ -118,7 +127,7 @@ def test_an_error_in_a_thread_is_raised(array):
 
 
 def test_no_frames():
-    blocks = FrameBlocks.of_array(np.empty((0, 4)), 5)
-    (got,) = blocks.collect(lambda b: (b,), ((4,),), np.float32)
+    blocks = open_table(np.empty((0, 4), np.float32))
+    got = blocks.collect(lambda block: 2 * block)
     assert got.shape == (0, 4)
     assert got.dtype == np.float32

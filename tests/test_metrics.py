@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import minimize
 from scipy.stats import ortho_group
 
-from isa_nrsfm._tables.layout import tracks_to_table
+from isa_nrsfm._tables.tracks import tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import (
     affine_shape_error,

@@ -14,7 +14,7 @@ from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormality_residuals,
     principal_columns,
 )
-from isa_nrsfm._tables.layout import centred_tracks, measurement_matrix
+from isa_nrsfm._tables.tracks import centred_tracks, measurement_matrix
 from isa_nrsfm.calibration import orthonormal_cameras
 from isa_nrsfm.calibration._orthonormal_cameras import NOISE_PRICE
 from isa_nrsfm.datasets import make_nonrigid_tracks

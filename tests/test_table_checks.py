@@ -10,13 +10,12 @@ from isa_nrsfm._prepare import layout_check
 from isa_nrsfm._prepare.checks import (
     check_names,
     check_points,
-    clean_tracks,
     largest_n_components,
     smallest_n_frames,
     visible_points,
 )
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import LAYOUTS, tracks_to_table
+from isa_nrsfm._tables.tracks import LAYOUTS, clean_tracks, tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
 

@@ -7,20 +7,18 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
-from isa_nrsfm._prepare.checks import clean_tracks
-from isa_nrsfm._tables.layout import (
+from isa_nrsfm._tables.tracks import (
+    FEWEST_POINTS,
     LAYOUTS,
+    centred_frames,
     centred_tracks,
+    check_frames,
+    clean_tracks,
     measurement_matrix,
+    seen_points,
     table_to_tracks,
     tracks_to_table,
     weighting_sizes,
-)
-from isa_nrsfm._tables.visibility import (
-    FEWEST_POINTS,
-    centred_frames,
-    check_frames,
-    seen_points,
 )
 
 UNITS = [1e-9, 1.0, 1e9]

@@ -24,13 +24,13 @@ from isa_nrsfm._paper.sample import sample_frames
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.layout import (
+from isa_nrsfm._tables.sources import open_table
+from isa_nrsfm._tables.tracks import (
     centred_tracks,
     table_to_tracks,
     tracks_to_table,
     weighting_sizes,
 )
-from isa_nrsfm._tables.sources import Table as Source
 from isa_nrsfm.metrics import basis_similarity, inverse_snr
 
 # Share of the points that are missing where some are.
@@ -89,7 +89,7 @@ def prepared(name):
 def scaled(X, K):
     """Return a table as the stages after the first one take it."""
     return scaled_table(
-        Source.in_memory(X),
+        open_table(X),
         K,
         layout="interleaved",
         names=None,

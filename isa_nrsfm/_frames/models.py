@@ -22,8 +22,7 @@ from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
-from isa_nrsfm._tables.layout import measurement_matrix
-from isa_nrsfm._tables.visibility import seen_points
+from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
 
 # Factors of the coordinates of a mirror image in depth.
 MIRROR = np.array([1.0, 1.0, -1.0])

@@ -16,7 +16,7 @@ from isa_nrsfm._frames.point_sums import (
 )
 from isa_nrsfm._frames.search import MAX_STEPS, FramePosterior, FrameSearch
 from isa_nrsfm._linalg.vectors import in_lanes
-from isa_nrsfm._tables.visibility import seen_points
+from isa_nrsfm._tables.tracks import seen_points
 
 # Objectives that differ by less than this share are equal.
 EQUAL = 1e-10

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
 from isa_nrsfm._linalg.vectors import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.visibility import seen_points
+from isa_nrsfm._tables.tracks import seen_points
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048

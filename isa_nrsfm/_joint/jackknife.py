@@ -29,7 +29,7 @@ from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.visibility import FEWEST_POINTS
+from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
 # Groups of equal size: those of k-means overstate the errors by half.
 N_GROUPS = 5

@@ -3,47 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
-from isa_nrsfm._tables.layout import Layout, table_to_tracks
-from isa_nrsfm._tables.visibility import seen_points
-
-
-def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Hide points with one coordinate. Return tracks (I, J, 2), counts, first ones."""
-    none = np.zeros(len(tracks), dtype=int)
-    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
-        return tracks, none, none
-    missing = np.isnan(tracks)
-    half = missing[..., 0] != missing[..., 1]
-    if not half.any():
-        return tracks, none, none
-    tracks = np.where(half[..., None], tracks.dtype.type(np.nan), tracks)
-    return tracks, half.sum(axis=1), half.argmax(axis=1)
-
-
-def warn_of_half_points(
-    n_half: NDArray, first: NDArray, layout: Layout, names: NDArray | None
-) -> None:
-    """Warn of points with one coordinate, as found by `without_half_points`."""
-    if not n_half.any():
-        return
-    row = int((n_half > 0).argmax())
-    warn_caller(
-        f"in {np.count_nonzero(n_half)} of {len(n_half)} rows points have only one of "
-        f"their two coordinates ({n_half.sum()} in all; first: "
-        f"{_describe_point(int(first[row]), layout, names)} in row {row}). They count "
-        "as missing"
-    )
-
-
-def clean_tracks(
-    tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
-) -> NDArray:
-    """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
-    tracks, n_half, first = without_half_points(tracks)
-    warn_of_half_points(n_half, first, layout, names)
-    return tracks
+from isa_nrsfm._tables.tracks import Layout, describe_point, seen_points
 
 
 def check_names(names: NDArray | None, layout: Layout) -> None:
@@ -151,7 +112,7 @@ def check_points(
         raise ValueError(
             f"n_components={n_components} needs every point in at least {least} "
             f"frames; fewer show {few.sum()} of {n_points} points (first: "
-            f"{_describe_point(point, layout, names)}, in {n_frames[point]} of "
+            f"{describe_point(point, layout, names)}, in {n_frames[point]} of "
             f"{counts.sum()} frames). Leave out these points, or take fewer basis "
             "shapes"
         )
@@ -168,8 +129,8 @@ def check_points(
         raise ValueError(
             f"the points fall into {group.max() + 1} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
-            f"{_describe_point(int(group.argmax()), layout, names)} is never visible "
-            f"with {_describe_point(0, layout, names)} and its group). Add frames that "
+            f"{describe_point(int(group.argmax()), layout, names)} is never visible "
+            f"with {describe_point(0, layout, names)} and its group). Add frames that "
             "show points of both, or fit each group by itself"
         )
 
@@ -186,11 +147,3 @@ def _groups(seen: NDArray) -> NDArray:
             reached = reached | seen[(seen & reached).any(axis=1)].any(axis=0)
         group[reached] = number
     return group
-
-
-def _describe_point(point: int, layout: Layout, names: NDArray | None) -> str:
-    """Return the number of a point, with the names of its columns where known."""
-    if names is None:
-        return f"point {point}"
-    x, y = table_to_tracks(np.asarray(names)[None], layout)[0, point]
-    return f"point {point} ({x}, {y})"

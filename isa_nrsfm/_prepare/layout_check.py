@@ -7,8 +7,14 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import LAYOUTS, Layout, table_to_tracks
-from isa_nrsfm._tables.visibility import FEWEST_POINTS, centred_frames, seen_points
+from isa_nrsfm._tables.tracks import (
+    FEWEST_POINTS,
+    LAYOUTS,
+    Layout,
+    centred_frames,
+    seen_points,
+    table_to_tracks,
+)
 
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_COMPARED = 10

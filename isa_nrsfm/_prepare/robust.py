@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames
-from isa_nrsfm._tables.visibility import seen_points
+from isa_nrsfm._tables.tracks import seen_points
 
 # Tuning constants c of the losses, in standard deviations of a coordinate. With these,
 # the estimate of a location in the plane has 95 percent of the efficiency of least

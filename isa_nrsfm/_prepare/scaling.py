@@ -7,19 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._prepare.checks import (
-    check_points,
-    check_size,
-    visible_points,
-    warn_of_half_points,
-    without_half_points,
-)
+from isa_nrsfm._prepare.checks import check_points, check_size, visible_points
 from isa_nrsfm._prepare.layout_check import warn_if_other_layout
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.layout import Layout, refuse_odd, table_to_tracks
-from isa_nrsfm._tables.sources import Table
-from isa_nrsfm._tables.visibility import FrameReport, centred_frames, check_frames
+from isa_nrsfm._tables.tracks import (
+    FrameReport,
+    Layout,
+    centred_frames,
+    check_frames,
+    refuse_odd,
+    table_to_tracks,
+    warn_of_half_points,
+    without_half_points,
+)
 
 
 class ScaledTable(NamedTuple):
@@ -35,7 +36,7 @@ class ScaledTable(NamedTuple):
     """
 
     shown: NDArray
-    source: Table
+    source: FrameBlocks
     rows: FrameBlocks
     sizes: NDArray
     translation: NDArray
@@ -62,7 +63,7 @@ class ScaledTable(NamedTuple):
         kept = rows[self.shown]
         return self._replace(
             shown=self.shown[rows],
-            source=self.source._replace(blocks=self.source.blocks.subset(kept)),
+            source=self.source.subset(kept),
             rows=self.rows.subset(kept),
             sizes=self.sizes[kept],
             translation=self.translation[kept],
@@ -71,7 +72,7 @@ class ScaledTable(NamedTuple):
 
 
 def scaled_table(
-    table: Table,
+    blocks: FrameBlocks,
     n_components: int,
     *,
     layout: Layout,
@@ -80,7 +81,7 @@ def scaled_table(
     robust: bool,
 ) -> ScaledTable:
     """Check a table, centre and scale its frames, robustly if `robust`."""
-    blocks, n_columns, dtype = table
+    n_columns, dtype = blocks.empty.shape[1], blocks.empty.dtype
     n_points = n_columns // 2
     refuse_odd(n_columns)
     check_size(blocks.n_frames, n_points, n_components)
@@ -124,7 +125,7 @@ def scaled_table(
     spacing = np.finfo(dtype).eps * largest.astype(np.float64)
     return ScaledTable(
         shown,
-        table._replace(blocks=blocks),
+        blocks,
         blocks.derive(unit_rows, translation, size),
         size,
         translation,

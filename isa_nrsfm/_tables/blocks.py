@@ -5,6 +5,7 @@ functions of a block of frames.
 """
 
 import mmap
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -12,6 +13,9 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.scikit_learn import one_blas_thread
 
 
 class FrameBlocks:
@@ -21,8 +25,10 @@ class FrameBlocks:
     that a function given to `derive` has returned. `read` returns a block, given its
     number; `lengths` are their numbers of frames. Derived blocks are computed at once
     and kept if `cached`, or anew at each reading; `n_threads` work on blocks at the
-    same time.
+    same time. `empty` is a block without frames, known for tables as they were given.
     """
+
+    empty: NDArray
 
     def __init__(
         self,
@@ -71,21 +77,24 @@ class FrameBlocks:
         return sum(self.lengths)
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
-        """Yield results of a function of each block and its rows of arrays."""
-        run = self._reader(function, by_frame)
-        numbers = range(len(self.lengths))
-        if min(self.n_threads, len(numbers)) < 2:
-            yield from map(run, numbers)
-            return
+        """Return the results of a function of each block and its rows of arrays."""
+        blocks = map(self.read, range(len(self.lengths)))
+        rows = [map(array.__getitem__, self.slices) for array in by_frame]
+        if min(self.n_threads, len(self.lengths)) < 2:
+            return map(function, blocks, *rows)
         with ThreadPoolExecutor(self.n_threads) as pool:
-            yield from pool.map(run, numbers)
+            return pool.map(function, blocks, *rows)
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return new blocks, the results of a function of each of these (see `map`)."""
         if self.cached:
             blocks = list(self.map(function, *by_frame))
             return self.of_blocks(blocks, self.lengths, self.n_threads)
-        read = self._reader(function, by_frame)
+
+        def read(number: int) -> Any:
+            rows = (array[self.slices[number]] for array in by_frame)
+            return function(self.read(number), *rows)
+
         return type(self)(read, self.lengths, False)
 
     def subset(self, frames: NDArray) -> Self:
@@ -107,37 +116,28 @@ class FrameBlocks:
 
         return self._read_later(rows, int(before[-1]), length)
 
-    def joined(self, function: Callable[..., NDArray], *by_frame: NDArray) -> NDArray:
-        """Return the arrays that a function makes of the blocks, concatenated."""
-        return np.concatenate(list(self.map(function, *by_frame)))
+    @one_blas_thread
+    def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
+        """Return arrays that a function makes of blocks, or a named tuple of them."""
+        parts = list(self.map(function, *by_frame)) or [function(self.empty)]
+        if isinstance(parts[0], tuple):
+            return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+        return np.concatenate(parts)
+
+    # On dask the result stays on the workers.
+    collect = joined
 
     def take(self, frames: NDArray) -> NDArray:
         """Return different frames (n_chosen,) in any order. Blocks are arrays."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
         order = np.argsort(np.argsort(frames))
-        return self.joined(chosen_rows, chosen)[order]
+        found: NDArray = self.joined(chosen_rows, chosen)[order]
+        return found
 
     def whole(self) -> NDArray:
         """Return all frames. Blocks are arrays."""
         return self.joined(lambda block: block)
-
-    def collect(
-        self,
-        function: Callable[..., Any],
-        shapes: tuple[tuple[int, ...], ...],
-        dtype: Any,
-    ) -> tuple[Any, ...]:
-        """Return arrays of all frames that a function makes of the blocks.
-
-        Shapes of rows and dtype serve if there are no blocks, or none is computed yet.
-        """
-        parts = list(self.map(function))
-        if len(parts) == 1:
-            return tuple(parts[0])
-        if not parts:
-            return tuple(np.empty((0, *shape), dtype=dtype) for shape in shapes)
-        return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
     def as_collected(self, values: NDArray) -> Any:
         """Return an array (n_frames, ...) as one of the kind that `collect` returns."""
@@ -157,16 +157,75 @@ class FrameBlocks:
         lengths = [sum(self.lengths[number] for number in group) for group in groups]
         return self.of_blocks(blocks, lengths, self.n_threads)
 
-    def _reader(
-        self, function: Callable[..., Any], by_frame: tuple[NDArray, ...]
-    ) -> Callable[[int], Any]:
-        """Return a function of the number of a block: the result for that block."""
 
-        def read(number: int) -> Any:
-            part = self.slices[number]
-            return function(self.read(number), *(array[part] for array in by_frame))
+class DaskBlocks(FrameBlocks):
+    """Blocks, a sequence of Delayed, on the workers of the active dask scheduler.
 
-        return read
+    Derived blocks stay on the workers, or are computed again if one is lost. Only `map`
+    brings results back. Blocks without frames are left out.
+    """
+
+    def __init__(self, blocks: Sequence[Any], lengths: Sequence[int]):
+        filled = np.flatnonzero(lengths).tolist()
+        self.blocks = [blocks[number] for number in filled]
+        super().__init__(self.blocks.__getitem__, [lengths[k] for k in filled], False)
+
+    @classmethod
+    def of_chunks(cls, table: Any) -> Self:
+        """Return the chunks of a dask array (n_frames, 2 * n_points)."""
+        if np.isnan(table.shape[0]):
+            table = table.compute_chunk_sizes()
+        table = table.rechunk({1: -1})
+        return cls(table.to_delayed().ravel(), table.chunks[0])
+
+    def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
+        """Return the results of a function of each block, in order."""
+        return iter(self._run("compute", self._tasks(function, *by_frame)))
+
+    def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
+        """Return new blocks, the results of a function of each of these."""
+        tasks = self._tasks(function, *by_frame)
+        return type(self)(self._run("persist", tasks), self.lengths)
+
+    def subset(self, frames: NDArray) -> Self:
+        """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
+        lengths = [int(frames[rows].sum()) for rows in self.slices]
+        return type(self)(self.derive(chosen_rows, frames).blocks, lengths)
+
+    def collect(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
+        """Return dask arrays, or a named tuple of them, that are not computed yet."""
+        array = import_optional("dask.array", extra="dask")
+        tasks, like = self._tasks(function, *by_frame), function(self.empty)
+
+        def joined(like: NDArray, tasks: list[Any]) -> Any:
+            shapes = [(length, *like.shape[1:]) for length in self.lengths]
+            parts = map(array.from_delayed, tasks, shapes, [like.dtype] * len(tasks))
+            return array.concatenate(list(parts))
+
+        if not isinstance(like, tuple):
+            return joined(like, tasks)
+        return type(like)(
+            *(joined(each, [task[i] for task in tasks]) for i, each in enumerate(like))
+        )
+
+    def as_collected(self, values: NDArray) -> Any:
+        """Return an array (n_frames, ...) as a dask array with these blocks' chunks."""
+        array = import_optional("dask.array", extra="dask")
+        return array.from_array(values, (tuple(self.lengths), *values.shape[1:]))
+
+    def _tasks(self, function: Callable[..., Any], *by_frame: NDArray) -> list[Any]:
+        """Return the tasks that compute a function of each block."""
+        dask = import_optional("dask", extra="dask")
+        run = dask.delayed(function, pure=False, traverse=False)
+        rows = [map(array.__getitem__, self.slices) for array in by_frame]
+        return list(map(run, self.blocks, *rows))
+
+    def _run(self, how: str, tasks: list[Any]) -> Any:
+        """Call dask.compute or dask.persist, without a warning of the tasks' size."""
+        with warnings.catch_warnings():
+            # Cameras and coefficients of the frames of a block go with each task.
+            warnings.filterwarnings("ignore", "Sending large graph")
+            return getattr(import_optional("dask", extra="dask"), how)(*tasks)
 
 
 def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:

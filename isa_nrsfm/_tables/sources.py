@@ -1,7 +1,7 @@
 """Sources of a table: an array, or an object that is read block by block."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from joblib import effective_n_jobs
@@ -10,8 +10,7 @@ from sklearn import get_config
 from sklearn.utils import check_array
 
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.dask_blocks import DaskBlocks
+from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
 
 # Range of the coordinates of a frame. Squares of larger and of smaller ones leave the
 # range of double precision; fits at both ends agree with those of sizes about one.
@@ -23,43 +22,36 @@ CHECKS: dict[str, Any] = {
 }
 
 
-class Table(NamedTuple):
-    """A table in blocks (n_frames, 2 * n_points) of float32 or float64 rows."""
+def open_table(
+    X: Any, n_jobs: int | None = 1, working_memory: float | None = None
+) -> FrameBlocks:
+    """Return a table (n_frames, 2 * n_points) in blocks of float32 or float64 rows.
 
-    blocks: FrameBlocks
-    n_columns: int
-    dtype: Any
-
-    @classmethod
-    def in_memory(cls, X: NDArray, n_jobs: int | None = 1) -> "Table":
-        """Return the table of an array (n_frames, 2 * n_points) in memory."""
+    Arrays in memory are checked already and shared by `n_jobs` threads, chunks of dask
+    stay on its workers, blocks of other tables use `working_memory` megabytes.
+    """
+    if X.ndim != 2:
+        raise ValueError(
+            f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
+            "a frame and two columns a point"
+        )
+    n_columns = max(X.shape[1], 1)
+    if is_on_dask(X):
+        blocks: FrameBlocks = DaskBlocks.of_chunks(X).derive(checked_rows)
+    elif is_read_later(X):
+        if working_memory is None:
+            working_memory = get_config()["working_memory"]
+        # A block needs at most eight times its own memory, copies included.
+        numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
+        blocks = FrameBlocks.of_stored(X, max(int(numbers // n_columns), 1))
+        blocks = blocks.derive(checked_rows)
+    else:
         # Blocks large enough that products of matrices are fast.
-        length = min(max(2**21 // max(X.shape[1], 1), 1), 2048)
+        length = min(max(2**21 // n_columns, 1), 2048)
         blocks = FrameBlocks.of_array(X, length, effective_n_jobs(n_jobs))
-        return cls(blocks, X.shape[1], X.dtype)
-
-    @classmethod
-    def read_later(cls, X: Any, working_memory: float | None) -> "Table":
-        """Return the table of a dask array, or one that is read in blocks.
-
-        Chunks of dask stay on its workers; blocks use `working_memory` megabytes.
-        """
-        if X.ndim != 2:
-            raise ValueError(
-                f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
-                "a frame and two columns a point"
-            )
-        if is_on_dask(X):
-            blocks: FrameBlocks = DaskBlocks.of_chunks(X)
-        else:
-            if working_memory is None:
-                working_memory = get_config()["working_memory"]
-            # A block needs at most eight times its own memory, copies included.
-            numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
-            length = max(int(numbers // max(X.shape[1], 1)), 1)
-            blocks = FrameBlocks.of_stored(X, length)
-        dtype = np.dtype(np.float32 if X.dtype == np.float32 else np.float64)
-        return cls(blocks.derive(checked_rows), X.shape[1], dtype)
+    dtype = np.float32 if X.dtype == np.float32 else np.float64
+    blocks.empty = np.empty((0, X.shape[1]), dtype)
+    return blocks
 
 
 def is_read_later(X: Any) -> bool:

@@ -17,15 +17,20 @@ from sklearn.base import (
 )
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
+from isa_nrsfm._compat.scikit_learn import (
+    Interval,
+    StrOptions,
+    fit_context,
+    one_blas_thread,
+)
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._frames.posterior import fit_tracks, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.layout import (
+from isa_nrsfm._tables.sources import checked_range, open_table, unmasked
+from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
     centred_tracks,
@@ -34,7 +39,6 @@ from isa_nrsfm._tables.layout import (
     tracks_to_table,
     weighting_sizes,
 )
-from isa_nrsfm._tables.sources import Table, checked_range, unmasked
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
     principal_shapes,
@@ -123,7 +127,7 @@ class ShapeSequenceNRSfM(
         names = getattr(self, "feature_names_in_", None)
         check_names(names, self.layout)
         table = scaled_table(
-            Table.in_memory(X),
+            open_table(X),
             self.n_components,
             layout=self.layout,
             names=names,

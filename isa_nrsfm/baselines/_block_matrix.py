@@ -9,7 +9,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import Interval
-from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._pseudo_inverse import (
     least_norm_shapes,

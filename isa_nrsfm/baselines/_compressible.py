@@ -20,7 +20,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
     conformal_equations,
     strain_basis,
 )
-from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.baselines._base import ShapeSequenceNRSfM
 from isa_nrsfm.baselines._block_dictionary import block_ksvd, group_sparse_factors
 

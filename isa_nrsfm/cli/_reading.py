@@ -13,10 +13,14 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
-from isa_nrsfm._prepare.checks import clean_tracks
 from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
-from isa_nrsfm._tables.layout import tracks_to_table
-from isa_nrsfm._tables.visibility import FEWEST_POINTS, FrameReport, centred_frames
+from isa_nrsfm._tables.tracks import (
+    FEWEST_POINTS,
+    FrameReport,
+    centred_frames,
+    clean_tracks,
+    tracks_to_table,
+)
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
 from isa_nrsfm.io._formats import TABLE

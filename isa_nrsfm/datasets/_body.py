@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.datasets._performers import film, perform, wander
 from isa_nrsfm.datasets._scene import PARAMETERS, Camera, observe
 from isa_nrsfm.skeletons import get_skeleton

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
-from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.datasets._face_model import (
     COMPONENT_NAMES,
     SIGNED_COMPONENTS,

@@ -28,7 +28,7 @@ from sklearn.utils import Bunch
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import checked_parameters
-from isa_nrsfm._tables.layout import table_to_tracks
+from isa_nrsfm._tables.tracks import table_to_tracks
 from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
 
 MUCT = RemoteFile(

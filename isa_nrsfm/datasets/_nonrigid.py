@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sklearn.utils import Bunch, check_random_state
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, checked_parameters
-from isa_nrsfm._tables.layout import Layout
+from isa_nrsfm._tables.tracks import Layout
 from isa_nrsfm.datasets._scene import (
     PARAMETERS,
     Camera,

@@ -8,7 +8,7 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.scikit_learn import Interval, StrOptions
-from isa_nrsfm._tables.layout import LAYOUTS, Layout, tracks_to_table
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout, tracks_to_table
 
 Camera = Literal["weak_perspective", "affine", "orthographic"]
 CAMERAS: tuple[Camera, ...] = ("weak_perspective", "affine", "orthographic")

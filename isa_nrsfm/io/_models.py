@@ -25,7 +25,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm._tables.layout import LAYOUTS
+from isa_nrsfm._tables.tracks import LAYOUTS
 from isa_nrsfm.io._packed_values import (
     Arrays,
     check_names,

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._tables.layout import LAYOUTS, Layout, table_to_tracks
 from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.tracks import LAYOUTS, Layout, table_to_tracks
 from isa_nrsfm.metrics._checks import check_same_shape
 
 

@@ -12,8 +12,8 @@ from sklearn.utils.validation import check_is_fitted
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables.column_names import checked_names
-from isa_nrsfm._tables.layout import table_to_tracks, tracks_to_table
 from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.tracks import table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
     OBSERVED_COLOUR,

@@ -1,16 +1,97 @@
-"""Which points the frames of a table show, and which frames show enough."""
+"""Tables of landmarks, the tracks in them, and which points their frames show.
 
-from typing import NamedTuple, Self
+A *table* has one row a frame and two columns a point, shape ``(n_frames,
+2 * n_points)``, in either layout of the columns. *Tracks* are the same numbers as
+``(n_frames, n_points, 2)``. A point that is not seen in a frame is NaN.
+"""
+
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
+
+# Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
+Layout = Literal["interleaved", "planar"]
+LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
 # Least number of points that a frame must show. Each point gives two equations; an
 # affine camera with its translation has eight unknowns. Coefficients need no further
 # points: their prior determines what the points do not.
 FEWEST_POINTS = 4
 # Coordinates count as equal up to this many units in the last place of the largest one.
 EQUAL = 4
+
+
+def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
+    """Return the tracks (n_frames, n_points, 2) of a table."""
+    n_frames, n_columns = X.shape
+    refuse_odd(n_columns)
+    if layout == "planar":
+        return X.reshape(n_frames, 2, n_columns // 2).transpose(0, 2, 1)
+    return X.reshape(n_frames, n_columns // 2, 2)
+
+
+def refuse_odd(n_columns: int) -> None:
+    """Refuse a number of columns that is odd."""
+    if n_columns % 2:
+        raise ValueError(
+            "X must have two columns per point (x and y), an even number; "
+            f"got n_features={n_columns}"
+        )
+
+
+def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
+    """Return tracks as a table, the inverse of `table_to_tracks`."""
+    n_frames, n_points, _ = tracks.shape
+    if layout == "planar":
+        tracks = tracks.transpose(0, 2, 1)
+    return tracks.reshape(n_frames, 2 * n_points)
+
+
+def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Hide points with one coordinate. Return tracks (I, J, 2), counts, first ones."""
+    none = np.zeros(len(tracks), dtype=int)
+    if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
+        return tracks, none, none
+    missing = np.isnan(tracks)
+    half = missing[..., 0] != missing[..., 1]
+    if not half.any():
+        return tracks, none, none
+    tracks = np.where(half[..., None], tracks.dtype.type(np.nan), tracks)
+    return tracks, half.sum(axis=1), half.argmax(axis=1)
+
+
+def warn_of_half_points(
+    n_half: NDArray, first: NDArray, layout: Layout, names: NDArray | None
+) -> None:
+    """Warn of points with one coordinate, as found by `without_half_points`."""
+    if not n_half.any():
+        return
+    row = int((n_half > 0).argmax())
+    warn_caller(
+        f"in {np.count_nonzero(n_half)} of {len(n_half)} rows points have only one of "
+        f"their two coordinates ({n_half.sum()} in all; first: "
+        f"{describe_point(int(first[row]), layout, names)} in row {row}). They count "
+        "as missing"
+    )
+
+
+def clean_tracks(
+    tracks: NDArray, layout: Layout = "interleaved", names: NDArray | None = None
+) -> NDArray:
+    """Return tracks (I, J, 2) without points that have one coordinate; warn of them."""
+    tracks, n_half, first = without_half_points(tracks)
+    warn_of_half_points(n_half, first, layout, names)
+    return tracks
+
+
+def describe_point(point: int, layout: Layout, names: NDArray | None) -> str:
+    """Return the number of a point, with the names of its columns where known."""
+    if names is None:
+        return f"point {point}"
+    x, y = table_to_tracks(np.asarray(names)[None], layout)[0, point]
+    return f"point {point} ({x}, {y})"
 
 
 class FrameReport(NamedTuple):
@@ -128,3 +209,28 @@ def refuse_one_place(report: FrameReport, n_points: int) -> None:
             f"all {which} are equal in {one.sum()} of {len(one)} frames (first: row "
             f"{one.argmax()}), so that they show no shape. Leave out these rows"
         )
+
+
+def centred_tracks(tracks: NDArray) -> tuple[NDArray, NDArray]:
+    """Return tracks (I, J, 2) centred over their visible points, and centroids."""
+    centred, report = centred_frames(tracks)
+    refuse_one_place(report, tracks.shape[1])
+    return centred, report.translation
+
+
+def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
+    """Return the sizes (I,) by which centred tracks (I, J, 2) are divided.
+
+    The RMS of the visible coordinates of each frame, or of all if not `scale_frames`.
+    """
+    known = ~np.isnan(centred)
+    seen = np.where(known, centred, 0.0)
+    square = np.einsum("ijc,ijc->i", seen, seen) / known.sum(axis=(1, 2))
+    return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
+
+
+def measurement_matrix(centred: NDArray) -> NDArray:
+    """Return W (2 * n_frames, n_points): for each frame the row of x, then of y."""
+    return np.ascontiguousarray(centred.transpose(0, 2, 1)).reshape(
+        -1, centred.shape[1]
+    )
