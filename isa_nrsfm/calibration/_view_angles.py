@@ -133,8 +133,10 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
     deviations = np.full((3, n_frames), np.nan)
     known = np.isfinite(angles.yaw) & np.isfinite(C).all(axis=(1, 2))
     if known.any():
-        Y = _turns([0.0, 1.0, 0.0], -angles.yaw[known])
-        X = _turns([1.0, 0.0, 0.0], -angles.pitch[known])
+        Y = Rotation.from_euler("y", -angles.yaw[known, None], degrees=True).as_matrix()
+        X = Rotation.from_euler(
+            "x", -angles.pitch[known, None], degrees=True
+        ).as_matrix()
         along_x, along_z = Y.swapaxes(1, 2)[:, :, 0], (X @ Y)[:, 2]
         along_y = np.broadcast_to([0.0, 1.0, 0.0], along_x.shape)
         # w = slope (dy, dx, d roll)
@@ -143,10 +145,3 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
         variance = np.einsum("nab,nbc,nac->an", inverse, C[known], inverse)
         deviations[:, known] = np.degrees(np.sqrt(variance))
     return ViewAngles(*deviations)
-
-
-def _turns(axis: list[float], degrees: NDArray) -> NDArray:
-    """Return rotations (n, 3, 3) about an axis by angles (n,)."""
-    return np.asarray(
-        Rotation.from_rotvec(np.outer(degrees, axis), degrees=True).as_matrix()
-    )

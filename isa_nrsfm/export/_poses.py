@@ -13,7 +13,6 @@ from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
     Camera,
-    UprightSpace,
     upright_frames,
     upright_space,
 )
@@ -113,13 +112,7 @@ def frame_poses(
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
     space = upright_space(model, camera, origin, mirrored, edges)
-    return poses_in(space, model, *frames_of_table(model, X), X)
-
-
-def poses_in(
-    space: UprightSpace, model: Any, motion: NDArray, alpha: NDArray, X: Any
-) -> FramePoses:
-    """Return the poses of frames in an upright space; deviations need their table X."""
+    motion, alpha = frames_of_table(model, X)
     _, rotations, scales = upright_frames(space, model, motion, alpha)
     # The fitted table must determine the depth.
     determined = frames_of(model).certainty.determined

@@ -312,7 +312,10 @@ class BasisShapeDisplay:
         self.axes_ = self.axes_.reshape(-1, 2)
         self.figure_ = self.axes_[0, 0].figure
 
-        below, above = drift_labels(amplitudes)
+        below, above = "negative end of the drift", "positive end of the drift"
+        if not amplitudes.ndim:
+            size = f"{amplitudes:g} standard deviations"
+            below, above = f"\N{MINUS SIGN}{size}", f"+{size}"
         points, edges = point_kw or {}, edge_kw or {}
         arrow_kw = ARROW_STYLE | (arrow_kw or {})
         self.mean_: list[Any] = []
@@ -395,11 +398,3 @@ class BasisShapeDisplay:
             for label, colour in entries
         ]
         add_legend(self.figure_, handles, self.skeleton)
-
-
-def drift_labels(amplitudes: NDArray) -> tuple[str, str]:
-    """Return the names of the two ends of the drift, for the legend."""
-    if amplitudes.ndim:
-        return "negative end of the drift", "positive end of the drift"
-    size = f"{amplitudes:g} standard deviations"
-    return f"\N{MINUS SIGN}{size}", f"+{size}"

@@ -43,21 +43,18 @@ def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> N
     return np.vstack([axes, np.cross(*axes)])
 
 
-def view_of(estimator: Any) -> NDArray:
-    """Return the transform (3, 3) from the space of a model to the viewing frame.
-
-    With calibrated cameras it is a rotation times the median scale of the cameras.
-    """
-    if not hasattr(estimator, "rotations_"):
-        return viewing_transform(estimator.motion_, estimator.reference_motion_)
-    return np.nanmedian(np.asarray(estimator.scales_)) * euclidean_axes(estimator)
-
-
 def view_and_layout(
     estimator: Any, edges: Any = "auto", origin: Origin = "auto"
 ) -> tuple[NDArray, Skeleton | None, Skeleton | None, Literal["upper", "lower"]]:
-    """Return the view of a fitted model, its layout, the lines to draw, the origin."""
-    view = view_of(estimator)
+    """Return the view of a fitted model, its layout, the lines to draw, the origin.
+
+    The view is the transform (3, 3) from the space of the model. With calibrated
+    cameras it is a rotation times the median scale of the cameras.
+    """
+    if hasattr(estimator, "rotations_"):
+        view = np.nanmedian(np.asarray(estimator.scales_)) * euclidean_axes(estimator)
+    else:
+        view = viewing_transform(estimator.motion_, estimator.reference_motion_)
     shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
     return view, *choose_lines(edges, origin, shape, names)
 
