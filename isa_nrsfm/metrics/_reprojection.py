@@ -5,7 +5,13 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
 from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm._tables.tracks import LAYOUTS, Layout, table_to_tracks
+from isa_nrsfm._tables.tracks import (
+    LAYOUTS,
+    Layout,
+    centred_frames,
+    seen_points,
+    table_to_tracks,
+)
 from isa_nrsfm.metrics._checks import check_same_shape
 
 
@@ -95,8 +101,8 @@ def frame_energies(
     ]
     check_same_shape("X", tables[0], "X_hat", tables[1])
     truth, fitted = (table_to_tracks(table, layout) for table in tables)
-    seen = ~np.isnan(truth).any(axis=2)
-    lost = seen & np.isnan(fitted).any(axis=2)
+    seen = seen_points(truth)
+    lost = seen & ~seen_points(fitted)
     if lost.any():
         rows = np.flatnonzero(lost.any(axis=1))
         raise ValueError(
@@ -104,14 +110,7 @@ def frame_energies(
             f"{len(lost)} frames (first: row {rows[0]}). Fill them in, or make them "
             "NaN in X"
         )
-    truth, fitted = (_centre_seen(tracks, seen) for tracks in (truth, fitted))
-    energy = np.sum(truth**2, axis=(1, 2))
-    return energy, np.sum((truth - fitted) ** 2, axis=(1, 2)), seen
-
-
-def _centre_seen(tracks: NDArray, seen: NDArray) -> NDArray:
-    """Return frames centred over their seen points; the others are zero."""
-    tracks = np.where(seen[..., None], tracks, 0.0)
-    n_seen = np.maximum(seen.sum(axis=1), 1)
-    centroids = tracks.sum(axis=1) / n_seen[:, None]
-    return (tracks - centroids[:, None]) * seen[..., None]
+    fitted = np.where(seen[..., None], fitted, np.nan)
+    truth, fitted = (centred_frames(tracks)[0] for tracks in (truth, fitted))
+    energy = np.nansum(truth**2, axis=(1, 2))
+    return energy, np.nansum((truth - fitted) ** 2, axis=(1, 2)), seen

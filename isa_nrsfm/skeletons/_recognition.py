@@ -39,7 +39,6 @@ LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 # and 0.17 to 0.23 in the mean, hands 0.32 to 0.68 and 0.5, bodies 0.35 to 0.5; points
 # in any order have about 1.
 LONGEST = {"face": 0.4}
-LONGEST_OF_OTHERS = 0.7
 # Of two layouts of faces with short edges that one is taken whose edges are so many
 # times shorter: mean faces of 68 points have edges 1.28 to 1.55 times as long in the
 # wrong order as in their own. Bodies of 17 points in the order of COCO have short edges
@@ -177,7 +176,9 @@ def find_skeleton(
         return _named(fitting, [str(name) for name in names])
     if reader is not None and reader in LAYOUTS_OF_READERS:
         fitting = [s for s in fitting if s.name in LAYOUTS_OF_READERS[reader]]
-    return _only(fitting) if points is None else _shortest(fitting, points)
+    if points is not None:
+        return _shortest(fitting, points)
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def edge_length(shape: NDArray, edges: NDArray) -> float:
@@ -194,24 +195,16 @@ def edge_length(shape: NDArray, edges: NDArray) -> float:
     return float(lengths.mean() / distances.mean())
 
 
-def _only(skeletons: Sequence[Skeleton]) -> Skeleton | None:
-    """Return the single one of some layouts, or None."""
-    return skeletons[0] if len(skeletons) == 1 else None
-
-
 def _shortest(skeletons: Sequence[Skeleton], shape: NDArray) -> Skeleton | None:
     """Return the layout whose edges are short, and clearly shorter than others'."""
-    lengths = {s.name: edge_length(shape, s.edges) for s in skeletons}
-    fitting = [
-        s
-        for s in sorted(skeletons, key=lambda s: lengths[s.name])
-        if lengths[s.name] <= LONGEST.get(s.kind, LONGEST_OF_OTHERS)
-    ]
-    if len(fitting) > 1:
-        best, second, *_ = (lengths[s.name] for s in fitting)
-        clearly = second >= CLEARLY.get(fitting[0].kind, np.inf) * best
-        fitting = fitting[:1] if clearly else []
-    return _only(fitting)
+    lengths = [(edge_length(shape, s.edges), s) for s in skeletons]
+    lengths.sort(key=lambda found: found[0])
+    short = [(size, s) for size, s in lengths if size <= LONGEST.get(s.kind, 0.7)]
+    if not short:
+        return None
+    (best, first), *others = short
+    clearly = CLEARLY.get(first.kind, np.inf) * best
+    return None if others and others[0][0] < clearly else first
 
 
 def _named(skeletons: Sequence[Skeleton], names: Sequence[str]) -> Skeleton | None:
