@@ -71,15 +71,11 @@ COCO_17 = _body(
     "coco-17",
     _COCO_NAMES,
     curves=(
-        (3, 1, 0, 2, 4),  # ears, eyes and nose
-        (1, 2),
-        (3, 5),
-        (4, 6),
+        *((3, 1, 0, 2, 4), (1, 2)),  # ears, eyes and nose
+        *((3, 5), (4, 6)),  # ears to shoulders
         (5, 6, 12, 11, 5),  # trunk
-        (5, 7, 9),  # arms
-        (6, 8, 10),
-        (11, 13, 15),  # legs
-        (12, 14, 16),
+        *((5, 7, 9), (6, 8, 10)),  # arms
+        *((11, 13, 15), (12, 14, 16)),  # legs
     ),
     source=(
         "T.-Y. Lin et al., Microsoft COCO: Common Objects in Context, ECCV 2014; "
@@ -101,10 +97,8 @@ H36M_17 = _body(
     _H36M_NAMES,
     curves=(
         (0, 7, 8, 9, 10),  # spine and head
-        (0, 1, 2, 3),  # legs
-        (0, 4, 5, 6),
-        (8, 11, 12, 13),  # arms
-        (8, 14, 15, 16),
+        *((0, 1, 2, 3), (0, 4, 5, 6)),  # legs
+        *((8, 11, 12, 13), (8, 14, 15, 16)),  # arms
     ),
     source=(
         "C. Ionescu et al., Human3.6M, IEEE Transactions on Pattern Analysis and "
@@ -129,12 +123,9 @@ BODY_25 = _body(
     curves=(
         (17, 15, 0, 16, 18),  # ears, eyes and nose
         (0, 1, 8),  # neck and trunk
-        (1, 2, 3, 4),  # arms
-        (1, 5, 6, 7),
-        (8, 9, 10, 11, 22, 23),  # legs and feet
-        (11, 24),
-        (8, 12, 13, 14, 19, 20),
-        (14, 21),
+        *((1, 2, 3, 4), (1, 5, 6, 7)),  # arms
+        *((8, 9, 10, 11, 22, 23), (11, 24)),  # right leg and foot
+        *((8, 12, 13, 14, 19, 20), (14, 21)),  # left leg and foot
     ),
     source=(
         "Z. Cao et al., OpenPose, IEEE Transactions on Pattern Analysis and Machine "
@@ -159,10 +150,8 @@ POSE_33 = _body(
         (7, 3, 2, 1, 0, 4, 5, 6, 8),  # ears, eyes and nose
         (9, 10),  # mouth
         (11, 12, 24, 23, 11),  # trunk
-        (11, 13, 15, 17, 19, 15, 21),  # arms and hands
-        (12, 14, 16, 18, 20, 16, 22),
-        (23, 25, 27, 29, 31, 27),  # legs and feet
-        (24, 26, 28, 30, 32, 28),
+        *((11, 13, 15, 17, 19, 15, 21), (12, 14, 16, 18, 20, 16, 22)),  # arms, hands
+        *((23, 25, 27, 29, 31, 27), (24, 26, 28, 30, 32, 28)),  # legs and feet
     ),
     source=(
         "V. Bazarevsky et al., BlazePose: On-device Real-time Body Pose Tracking, "
@@ -197,13 +186,11 @@ WHOLE_BODY_133 = replace(
     n_points=133,
     curves=(
         *COCO_17.curves,
-        (19, 15, 17, 18),  # feet
-        (22, 16, 20, 21),
+        *((19, 15, 17, 18), (22, 16, 20, 21)),  # feet
         *map(_shifted, IBUG_68.curves),
         *(_shifted(curve, _LEFT_HAND) for curve in HAND_21.curves),
         *(_shifted(curve, _RIGHT_HAND) for curve in HAND_21.curves),
-        (9, _LEFT_HAND),
-        (10, _RIGHT_HAND),
+        *((9, _LEFT_HAND), (10, _RIGHT_HAND)),  # wrists
     ),
     source=(
         "S. Jin et al., Whole-Body Human Pose Estimation in the Wild, ECCV 2020; "

@@ -17,14 +17,11 @@ IBUG_68 = Skeleton(
     n_points=68,
     curves=(
         run(0, 16),  # jaw
-        run(17, 21),  # brows
-        run(22, 26),
+        *(run(17, 21), run(22, 26)),  # brows
         run(27, 30),  # bridge of the nose
         run(31, 35),  # nostrils
-        run(36, 41, closed=True),  # eyes
-        run(42, 47, closed=True),
-        run(48, 59, closed=True),  # outer and inner lips
-        run(60, 67, closed=True),
+        *(run(36, 41, closed=True), run(42, 47, closed=True)),  # eyes
+        *(run(48, 59, closed=True), run(60, 67, closed=True)),  # outer and inner lips
     ),
     source=(
         "C. Sagonas et al., 300 Faces in-the-Wild Challenge, ICCV Workshops 2013; "
@@ -59,13 +56,11 @@ XM2VTS_68 = Skeleton(
     n_points=68,
     curves=(
         run(0, 14),  # jaw
-        run(15, 20, closed=True),  # brows
-        run(21, 26, closed=True),
+        *(run(15, 20, closed=True), run(21, 26, closed=True)),  # brows
         *_XM2VTS_EYES,
         run(37, 45),  # nose
         run(48, 59, closed=True),  # outer lips
-        (48, *run(60, 62), 54),  # inner edge of the lower and of the upper lip
-        (54, *run(63, 65), 48),
+        *((48, *run(60, 62), 54), (54, *run(63, 65), 48)),  # inner edges of the lips
     ),
     source=(
         "K. Messer et al., XM2VTSDB: The Extended M2VTS Database, AVBPA 1999; "
@@ -111,14 +106,11 @@ WFLW_98 = Skeleton(
     n_points=98,
     curves=(
         run(0, 32),  # jaw
-        run(33, 41, closed=True),  # brows
-        run(42, 50, closed=True),
+        *(run(33, 41, closed=True), run(42, 50, closed=True)),  # brows
         run(51, 54),  # bridge of the nose
         run(55, 59),  # nostrils
-        run(60, 67, closed=True),  # eyes
-        run(68, 75, closed=True),
-        run(76, 87, closed=True),  # outer and inner lips
-        run(88, 95, closed=True),
+        *(run(60, 67, closed=True), run(68, 75, closed=True)),  # eyes
+        *(run(76, 87, closed=True), run(88, 95, closed=True)),  # outer and inner lips
     ),
     source=(
         "W. Wu et al., Look at Boundary: A Boundary-Aware Face Alignment Algorithm, "
@@ -206,8 +198,7 @@ MESH_478 = replace(
     n_points=478,
     curves=(
         *MESH_468.curves,
-        run(469, 472, closed=True),
-        run(474, 477, closed=True),
+        *(run(469, 472, closed=True), run(474, 477, closed=True)),
     ),
     right=(*MESH_468.right, 468),
     left=(*MESH_468.left, 473),
