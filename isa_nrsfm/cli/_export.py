@@ -6,11 +6,11 @@ from typing import Any
 
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
-from isa_nrsfm.cli._outputs import refuse_overwriting, warn_of_mixed_runs
+from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
 from isa_nrsfm.cli._reading import (
     as_fitted,
-    chosen_edges,
     column_named,
+    drawing,
     drawing_files,
     read_frames,
 )
@@ -23,7 +23,6 @@ from isa_nrsfm.export import (
     write_shapes,
     write_viewer,
 )
-from isa_nrsfm.io import load_model
 
 # The options of each content, besides those of the table.
 _POSE = ("camera", "origin", "mirrored")
@@ -41,8 +40,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     output = Path(args.output)
     content = _content(output, args.content)
     options = _given(args, content)
-    estimator = load_model(args.model)
-    warn_of_mixed_runs(args.model)
+    estimator = read_model(args.model)
     sources = filter(None, (args.model, args.table, *drawing_files(args)))
     refuse_overwriting(sources, [output])
     sections: dict[str, Any] = {"Model": [args.model]}
@@ -57,9 +55,8 @@ def run(args: Namespace, warned: list[str]) -> str:
             labels = column_named(frames.other, args.label, "--label")
             options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
-        options["edges"] = chosen_edges(
-            args, names_of_points(estimator), stored, surfaces=content == "glb"
-        )
+        names = names_of_points(estimator)
+        options |= drawing(args, names, stored, surfaces=content == "glb")
     if options.get("camera") == NONE:
         options["camera"] = None
 

@@ -29,17 +29,16 @@ from isa_nrsfm.cli._options import AUTO, NONE
 from isa_nrsfm.cli._outputs import (
     REPORT,
     RESULTS,
+    digests_of,
     entry_of_report,
-    is_of_run,
     refuse_overwriting,
     write_alpha,
-    write_report,
     write_results,
 )
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import chosen_edges, drawing_files, read_frames
+from isa_nrsfm.cli._reading import drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
-from isa_nrsfm.cli._sections import fit_text, write_page
+from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
 
@@ -80,8 +79,7 @@ def fit_table(
         raise ValueError(f"{args.table} has no row that can be fitted: {out}")
     asked = asked_columns(args, frames)
     figures = {} if args.no_figures else figures_of(args, asked)
-    edges = chosen_edges(args, frames.columns.points, frames.skeleton)
-    drawn: dict[str, Any] = {"edges": edges, "origin": args.origin or "auto"}
+    drawn = drawing(args, frames.columns.points, frames.skeleton)
     results, inputs = RESULTS, drawing_files(args)
     if table is None:
         inputs.append(args.table)
@@ -111,25 +109,29 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args.table, args.format, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, X, edges),
+                "model": model_report(estimator, X, drawn["edges"]),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,
                 "versions": versions(),
             }
-            report = _written(new, report, results, clock, "write")
+            clock["write"] = time.perf_counter()
+            report |= {"seconds": _seconds(clock), "files": results}
+            report = write_report(new, report)
         if not figures:
             return report
         # A figure that fails, or takes long, costs no results: they are in place.
         with files_together(folder) as new:
-            if not is_of_run(folder, report):
+            if digests_of(folder, report["sha256"]) != report["sha256"]:
                 raise ValueError(
                     f"another run has written to {folder} in the meantime: the folder "
                     "has its files, and no figures of this run"
                 )
             fit = Fit(estimator, X, search, smooth, drawn)
             captions = write_figures(new, figures, fit)
-            report = _written(new, report, results | captions, clock, "figures")
+            clock["figures"] = time.perf_counter()
+            report |= {"seconds": _seconds(clock), "files": results | captions}
+            report = write_report(new, report)
     return report
 
 
@@ -145,20 +147,10 @@ def _check_options(args: Namespace) -> None:
             )
 
 
-def _written(
-    folder: Path,
-    report: dict[str, Any],
-    files: dict[str, str],
-    clock: dict[str, float],
-    stage: str,
-) -> dict[str, Any]:
-    """Write a report, with the seconds up to now, and return it."""
-    clock[stage] = time.perf_counter()
+def _seconds(clock: dict[str, float]) -> dict[str, float]:
+    """Return the seconds of each stage by the times of their ends."""
     of_stages = np.diff([*clock.values()]).round(3)
-    seconds = dict(zip([*clock][1:], of_stages, strict=True))
-    report = report | {"seconds": seconds, "files": files}
-    write_page(folder, report)
-    return write_report(folder, report)
+    return dict(zip([*clock][1:], of_stages, strict=True))
 
 
 def _fitted(

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.texts import as_utf8
-from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
-from isa_nrsfm.io import save_model, write_table
+from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
 
 if TYPE_CHECKING:
@@ -143,49 +141,19 @@ def fitted_table(estimator: AffineNRSfM) -> NDArray:
     )
 
 
-def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
-    """Write the report and digests of its files as JSON, NaN as null; return it."""
-    digests = report.get("sha256", {}) | _digests(folder, report["files"])
-    report = report | {"sha256": digests}
-    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
-    write_whole(folder / REPORT, f"{text}\n".encode())
-    return report
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON can hold it."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if value is None or isinstance(value, int):
-        return value
-    return as_utf8(value if isinstance(value, str) else repr(value))
-
-
-def is_of_run(folder: Path, report: dict[str, Any]) -> bool:
-    """Return whether the files in a folder are those that a report has digests of."""
-    return _digests(folder, report["sha256"]) == report["sha256"]
-
-
-def warn_of_mixed_runs(model: str) -> None:
-    """Warn if files beside a model are not of the run that the report is of."""
-    folder, name = Path(model).parent, Path(model).name
+def read_model(path: str) -> AffineNRSfM:
+    """Load a model; warn if files beside it are not of the run of the report there."""
+    estimator, folder = load_model(path), Path(path).parent
     recorded = entry_of_report(folder, "sha256")
-    # A report that does not know the model is of something else.
-    if name not in recorded:
-        return
-    beside = _digests(folder, (name for name in recorded if Path(name).name == name))
+    beside = digests_of(folder, [name for name in recorded if Path(name).name == name])
     differing = [name for name in beside if beside[name] != recorded[name]]
-    if differing:
+    # A report that does not know the model is of something else.
+    if differing and Path(path).name in recorded:
         warn_caller(
             f"{folder / REPORT} is of another run than {', '.join(differing)} beside "
             "it, or these were changed since"
         )
+    return estimator
 
 
 def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
@@ -197,7 +165,7 @@ def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
         return {}
 
 
-def _digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
     """Return the digests of those of the files that are in a folder."""
     found = {}
     for name in names:

@@ -379,12 +379,19 @@ def drawing_files(args: Namespace) -> list[str]:
     return [each for each in named if each not in (None, NONE, *SKELETON_NAMES)]
 
 
-def chosen_edges(
+def drawing(
     args: Namespace,
     names: Sequence[str],
-    stored: Skeleton | None = None,
-    *,
+    stored: Skeleton | None,
     surfaces: bool = False,
+) -> dict[str, Any]:
+    """Return the options of displays: lines or surfaces to draw, where y is zero."""
+    edges = _edges(args, names, stored, surfaces)
+    return {"edges": edges, "origin": args.origin or "auto"}
+
+
+def _edges(
+    args: Namespace, names: Sequence[str], stored: Skeleton | None, surfaces: bool
 ) -> Any:
     """Return the lines to draw: an option, or the skeleton stored in the table.
 

@@ -1,9 +1,10 @@
-"""The sections of a report, and how they become text and a page.
+"""The sections of a report, and how the report becomes text, JSON and a page.
 
 A section has paragraphs (texts) and tables (`Cells`).
 """
 
 import base64
+import json
 import math
 import shlex
 import textwrap
@@ -15,10 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from isa_nrsfm._compat.texts import as_utf8
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
-from isa_nrsfm.cli._outputs import PAGE
+from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
@@ -145,7 +147,32 @@ def fit_text(report: dict[str, Any], folder: Path) -> str:
     return text_of(fit_title(report), fit_sections(report) | {"Files": listed})
 
 
-def write_page(folder: Path, report: dict[str, Any]) -> None:
+def write_report(folder: Path, report: dict[str, Any]) -> dict[str, Any]:
+    """Write the report of a fit as a page and as JSON; return it with digests."""
+    _write_page(folder, report)
+    digests = report.get("sha256", {}) | digests_of(folder, report["files"])
+    report = report | {"sha256": digests}
+    text = json.dumps(_plain(report), indent=2, ensure_ascii=False, allow_nan=False)
+    write_whole(folder / REPORT, f"{text}\n".encode())
+    return report
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it, NaN as null."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if value is None or isinstance(value, int):
+        return value
+    return as_utf8(value if isinstance(value, str) else repr(value))
+
+
+def _write_page(folder: Path, report: dict[str, Any]) -> None:
     """Write the report of a fit as a page, with the figures of the folder in it."""
     title = escape(fit_title(report))
     about = escape(f"{report['table']['path']}, {report['finished']}")

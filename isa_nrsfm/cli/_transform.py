@@ -10,17 +10,16 @@ import numpy as np
 from isa_nrsfm import export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm.cli._outputs import refuse_overwriting, warn_of_mixed_runs, write_alpha
+from isa_nrsfm.cli._outputs import read_model, refuse_overwriting, write_alpha
 from isa_nrsfm.cli._reading import (
     as_fitted,
-    chosen_edges,
+    drawing,
     drawing_files,
     drawing_options,
     read_frames,
 )
 from isa_nrsfm.cli._report import quality_report, table_report
 from isa_nrsfm.cli._sections import quality_section, table_section, text_of
-from isa_nrsfm.io import load_model
 from isa_nrsfm.io._tables import table_suffix
 
 
@@ -28,8 +27,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     """Write the coefficients of a table's rows, and return the report."""
     output = Path(args.output)
     table_suffix(output)
-    estimator = load_model(args.model)
-    warn_of_mixed_runs(args.model)
+    estimator = read_model(args.model)
     if args.std and not hasattr(estimator, "noise_variance_"):
         raise ValueError(
             f"--std: {args.model} was fitted with refinement={estimator.refinement!r}, "
@@ -38,7 +36,7 @@ def run(args: Namespace, warned: list[str]) -> str:
     if args.viewer is None and drawing_options(args):
         raise ValueError("--edges, --skeleton and --origin need --viewer")
     frames = read_frames(args, estimator)
-    edges = chosen_edges(args, names_of_points(estimator), frames.skeleton)
+    drawn = drawing(args, names_of_points(estimator), frames.skeleton)
     outputs = [Path(path) for path in (output, args.viewer) if path is not None]
     refuse_overwriting([args.table, args.model, *drawing_files(args)], outputs)
     X, n_components = as_fitted(estimator, frames.X), len(estimator.basis_)
@@ -50,7 +48,6 @@ def run(args: Namespace, warned: list[str]) -> str:
         quality = quality_section(quality_report(estimator, X, explained))
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
-        drawn = {"edges": edges, "origin": args.origin or "auto"}
         _write_viewer(outputs[1], estimator, X=X, **drawn)
     table = table_report(args.table, args.format, frames)
     sections = {

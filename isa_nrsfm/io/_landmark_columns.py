@@ -193,30 +193,31 @@ def _warn_of_left_out(
     names: Sequence[Hashable], chosen: Sequence[str], pattern: str
 ) -> None:
     """Warn if patterns match only a part of a set of x and y columns."""
-    coordinates = {name: parse_coordinate(name) for name in names}
-    sets = {c.memberships[0][0] for name in chosen if (c := coordinates[name])}
+    sets = {point[0] for _, _, point in _coordinates(chosen)}
+    used = {*chosen}
     left = [
         name
-        for name in coordinates.keys() - chosen
-        if (c := coordinates[name]) and c.axis < 2 and c.memberships[0][0] in sets
+        for name, axis, point in _coordinates(names)
+        if name not in used and axis < 2 and point[0] in sets
     ]
     if left:
         warn_caller(
             f"the patterns {pattern!r} match {len(chosen)} columns and leave out "
-            f"{len(left)} that are named alike; the first is "
-            f"{next(name for name in names if name in left)!r}"
+            f"{len(left)} that are named alike; the first is {left[0]!r}"
         )
 
 
 def _z_of(names: Sequence[Hashable], x_columns: Iterable[str]) -> tuple[str, ...]:
     """Return the columns with the third coordinate of the points of x columns."""
-    found = [c.memberships[0] for name in x_columns if (c := parse_coordinate(name))]
-    points = set(found)
-    return tuple(
-        str(name)
-        for name in names
-        if (c := parse_coordinate(name)) and c.axis == 2 and c.memberships[0] in points
-    )
+    points = {point for _, _, point in _coordinates(x_columns)}
+    found = _coordinates(names)
+    return tuple(name for name, axis, point in found if axis == 2 and point in points)
+
+
+def _coordinates(names: Iterable[Hashable]) -> list[tuple[str, int, tuple]]:
+    """Return the coordinates among columns: name, axis, set and key of the point."""
+    found = [(str(name), parse_coordinate(name)) for name in names]
+    return [(name, c.axis, c.memberships[0]) for name, c in found if c is not None]
 
 
 def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str:
@@ -235,7 +236,5 @@ def _several_found(names: Sequence[Hashable], candidates: dict[str, int]) -> str
 
 def _first_columns(names: Sequence[Hashable]) -> str:
     """List the first columns of a table."""
-    listed = ", ".join(repr(name) for name in names[:4])
-    return f"the table's {len(names)} columns are {listed}" + (
-        ", ..." if len(names) > 4 else ""
-    )
+    listed = ", ".join(map(repr, names[:4])) + ", ..." * (len(names) > 4)
+    return f"the table's {len(names)} columns are {listed}"
