@@ -192,15 +192,12 @@ class Binary:
 
         The use of the bytes is VERTICES or INDICES; bounds add minimum and maximum.
         """
+        kind, dtype = FLOATS, "<f4"
         if array.dtype.kind in "iu":
             # Shorts have no index 65535: it means something else.
-            kind, array = SHORTS, array.astype("<u4")
-            if array.size and array.max() > 65534:
-                kind = INTEGERS
-            else:
-                array = array.astype("<u2")
-        else:
-            kind, array = FLOATS, array.astype("<f4")
+            short = array.max(initial=0) < 65535
+            kind, dtype = (SHORTS, "<u2") if short else (INTEGERS, "<u4")
+        array = array.astype(dtype)
         accessor = {
             "bufferView": len(self.views),
             "componentType": kind,

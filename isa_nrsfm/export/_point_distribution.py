@@ -15,7 +15,7 @@ from sklearn.decomposition import PCA
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
 from isa_nrsfm._compat.stored_arrays import array_in
-from isa_nrsfm._compat.whole_files import whole_file, write_whole
+from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._names import suffix_of
 from isa_nrsfm.export._upright import Camera, upright_frames, upright_space
@@ -205,23 +205,20 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     suffix = suffix_of(path, SUFFIXES)
     mean, modes, eigenvalues = map(np.asarray, pdm)
     _check_shapes(PointDistributionModel(mean, modes, eigenvalues))
-    n_modes = len(eigenvalues)
-    if suffix == ".npz":
-        with whole_file(path) as file:
-            np.savez(file, mean=mean, modes=modes, eigenvalues=eigenvalues)
-        return
     M = mean.T.reshape(-1, 1)
-    V = modes.transpose(2, 1, 0).reshape(-1, n_modes)
-    if suffix == ".mat":
-        with whole_file(path) as file:
+    V = modes.transpose(2, 1, 0).reshape(mean.size, len(eigenvalues))
+    with whole_file(path) as file:
+        if suffix == ".npz":
+            np.savez(file, mean=mean, modes=modes, eigenvalues=eigenvalues)
+        elif suffix == ".mat":
             savemat(file, {"M": M, "V": V, "E": eigenvalues[:, None]})
-        return
-    lines = []
-    # OpenCV calls matrices of doubles 6.
-    for comment, matrix in zip(COMMENTS, (M, V, eigenvalues[None]), strict=True):
-        lines += [f"# {comment}", *map(str, (*matrix.shape, 6))]
-        lines += [" ".join(format(x, ".17g") for x in row) for row in matrix]
-    write_whole(path, ("\n".join(lines) + "\n").encode("ascii"))
+        else:
+            matrices = (M, V, eigenvalues[None])
+            for comment, matrix in zip(COMMENTS, matrices, strict=True):
+                n_rows, n_columns = matrix.shape
+                # OpenCV calls matrices of doubles 6.
+                file.write(f"# {comment}\n{n_rows}\n{n_columns}\n6\n".encode())
+                np.savetxt(file, matrix, fmt="%.17g")
 
 
 def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:

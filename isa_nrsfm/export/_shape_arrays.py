@@ -129,12 +129,10 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
     """
     suffix = suffix_of(path, [".npz", ".mat"])
     arrays = shape_arrays(model)._asdict()
-    if suffix == ".npz":
-        with whole_file(path) as file:
-            np.savez(file, **arrays)
-        return
-    for name, array in arrays.items():
-        if array.dtype.kind == "U":
-            arrays[name] = array.astype(object)
     with whole_file(path) as file:
-        savemat(file, arrays, oned_as="column")
+        if suffix == ".npz":
+            np.savez(file, **arrays)
+        else:
+            for name in ("point_names", "component_names"):
+                arrays[name] = arrays[name].astype(object)
+            savemat(file, arrays, oned_as="column")
