@@ -282,7 +282,9 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
         read_skeleton(config, ["a", "b"])
     for damaged in (b"a: [", b"skeleton:\n- [a, b\xe9]\n"):
         config.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"config.yaml is not YAML"):
+        with pytest.raises(
+            ValueError, match=r"config.yaml cannot be read as a configuration"
+        ):
             read_skeleton(config, ["a", "b"])
 
 

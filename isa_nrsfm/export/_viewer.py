@@ -232,5 +232,4 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
             f"labels must have at most {MOST_LABELS} different values; got "
             f"{len(categories)}"
         )
-    code = {text: i for i, text in enumerate(categories)}
-    return np.array([code[text] for text in texts], dtype=np.intp), categories
+    return np.array([*map(categories.index, texts)], dtype=np.intp), categories

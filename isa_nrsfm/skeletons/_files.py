@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
+from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm.skeletons._skeleton import Skeleton, sides_of_names
 
@@ -103,25 +104,17 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
     --------
     find_skeleton : A layout that is known.
     """
-    written = Path(path).read_bytes()  # YAML tells UTF-8 and UTF-16 apart itself
     yaml = import_optional("yaml", extra="yaml")
-    try:
-        content = yaml.safe_load(written)
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path} is not YAML: {error}") from error
-    edges = content.get("skeleton") if isinstance(content, dict) else None
-    if not isinstance(edges, list) or not all(isinstance(edge, list) for edge in edges):
-        raise ValueError(
-            f"{path} has no list of pairs of bodyparts that is called skeleton, as the "
-            "config.yaml of DeepLabCut has"
-        )
-    # A curve may be written as more than two bodyparts in turn.
-    try:
+    with reading(path, "a configuration of DeepLabCut"):
+        # YAML tells UTF-8 and UTF-16 apart itself.
+        content = yaml.safe_load(Path(path).read_bytes())
+        edges = content.get("skeleton") if isinstance(content, dict) else None
+        if not isinstance(edges, list) or not all(isinstance(e, list) for e in edges):
+            raise ValueError("it has no list of pairs of bodyparts called skeleton")
+        # A curve may be written as more than two bodyparts in turn.
         return skeleton_of_names(
             [pair for edge in edges for pair in pairwise(edge)],
             point_names,
             name=Path(path).name,
             source=f"DeepLabCut, {Path(path).name}",
         )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
