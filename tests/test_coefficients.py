@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import scenes
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
@@ -15,16 +16,17 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
 )
 from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
-from isa_nrsfm._linalg.vectors import frames_first
+from isa_nrsfm._linalg.vectors import frames_first, frames_last
 
 NOISE = 0.05
 
 
-class Scene(NamedTuple):
-    tracks: NDArray  # (n_frames, n_points, 2)
-    shapes: NDArray  # (n_components + 1, 3, n_points)
-    M: NDArray  # (2, 3, n_frames)
-    weights: NDArray | None
+class Scene(scenes.Scene):
+    """Tracks that the shapes do not explain, and cameras."""
+
+    @property
+    def M(self):
+        return frames_last(self.motion)
 
     def posterior(self, noise=NOISE, **options):
         products = frame_sums(
@@ -33,18 +35,8 @@ class Scene(NamedTuple):
         return coefficient_posterior(products, self.M, noise, **options)
 
 
-def random_scene(kind="complete", seed=0, n_frames=6, n_points=11, n_components=3):
-    """Return tracks that the shapes do not explain, and cameras of any size."""
-    rng = np.random.default_rng(seed)
-    tracks = rng.normal(size=(n_frames, n_points, 2)) + rng.normal(size=2)
-    shapes = rng.normal(size=(n_components + 1, 3, n_points))
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    weights = None
-    if kind != "complete":
-        weights = rng.uniform(0.1, 2.0, tracks.shape[:2])
-        weights[rng.random(weights.shape) < 0.2] = 0.0
-        tracks[weights == 0] = np.nan
-    return Scene(tracks, shapes, rng.normal(size=(2, 3, n_frames)), weights)
+def random_scene(kind="complete", n_components=3):
+    return Scene(*scenes.random_scene(0, 6, 11, n_components, noise=1.0, kind=kind))
 
 
 class Frame(NamedTuple):
@@ -72,7 +64,7 @@ def frames_of(scene):
         yield Frame((np.sqrt(w) * points.T).ravel(), columns[0], columns[1:].T)
 
 
-KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
+KINDS = pytest.mark.parametrize("kind", ["complete", "missing"])
 
 
 class TestPosterior:
@@ -194,7 +186,7 @@ class TestNoise:
         shapes[2] = shapes[1] + 1e-4 * shapes[2]
         alpha = np.random.default_rng(1).normal(size=(6, 3))
         frames = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-        tracks = (frames_first(scene.M) @ frames).swapaxes(1, 2)
+        tracks = (scene.motion @ frames).swapaxes(1, 2)
         scene = scene._replace(tracks=tracks, shapes=shapes)
         noise = 1e-14
 
@@ -230,14 +222,14 @@ class TestDegenerate:
 
     def test_cameras_of_zero_leave_the_prior(self):
         scene = random_scene()
-        got = scene._replace(M=np.zeros((2, 3, 6))).posterior()
+        got = scene._replace(motion=np.zeros((6, 2, 3))).posterior()
         assert_array_equal(got.alpha, 0.0)
         energy = [np.sum(frame.y**2) for frame in frames_of(scene)]
         assert_allclose(got.objective, energy)
 
     def test_exact_frames_have_no_negative_objective(self):
         scene = random_scene()
-        images = (frames_first(scene.M) @ scene.shapes[0]).swapaxes(1, 2)
+        images = (scene.motion @ scene.shapes[0]).swapaxes(1, 2)
         got = scene._replace(tracks=images).posterior(1e-20, refined=True)
         assert (got.objective >= 0).all()
         assert_allclose(got.objective, 0.0, atol=1e-12)

@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import scenes
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scenes import likelihood_of
 
-from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
+from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointState, refine_joint
 from isa_nrsfm._linalg.vectors import frames_first, frames_last
@@ -25,25 +26,14 @@ class Scene(NamedTuple):
     truth: JointState
 
 
-def random_scene(
-    seed=0, noise=DEVIATION, kind="complete", n_frames=40, n_points=25, n_components=2
-):
+def random_scene(seed=0, noise=DEVIATION, kind="complete", camera="affine"):
     """Return a table that follows the model, and what made it."""
-    rng = np.random.default_rng(seed)
-    shapes = rng.normal(size=(n_components + 1, 3, n_points))
-    shapes[1:] *= 0.25
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    motion = frames_first(rng.normal(size=(2, 3, n_frames)))
-    c = np.vstack([np.ones(n_frames), rng.normal(size=(n_components, n_frames))])
-    tracks = np.einsum("ira,kaj,ki->ijr", motion, shapes, c)
-    tracks += noise * rng.normal(size=tracks.shape)
-    weights = None
-    if kind != "complete":
-        weights = rng.choice([0.0, 0.5, 1.0], size=tracks.shape[:2], p=[0.1, 0.3, 0.6])
-        tracks[weights == 0] = np.nan
-    else:
-        tracks -= tracks.mean(axis=1, keepdims=True)
-    return Scene(tracks, weights, JointState(shapes, motion, max(noise, 1e-3) ** 2))
+    kind = {"complete": "complete", "weighted": "missing"}[kind]
+    options = {"noise": noise, "kind": kind, "camera": camera, "deformation": 0.25}
+    scene = scenes.random_scene(seed, 40, 25, 2, **options)
+    truth = JointState(scene.shapes, scene.motion, max(noise, 1e-3) ** 2)
+    tracks = scene.centred if scene.weights is None else scene.tracks
+    return Scene(tracks, scene.weights, truth)
 
 
 def disturbed(state, seed=1, size=0.1):
@@ -248,22 +238,6 @@ class TestTolerance:
         assert len(again.history) < 10
 
 
-def calibrated_scene(camera, seed=0, noise=DEVIATION, kind="complete"):
-    """Return a table of calibrated cameras, and what made it."""
-    rng = np.random.default_rng(seed)
-    scene = random_scene(seed, noise, kind)
-    motion, scales = nearest_calibrated(scene.truth.motion)
-    if camera == "weak_perspective":
-        motion = scales[:, None, None] * motion
-    c = np.vstack([np.ones(40), rng.normal(size=(2, 40))])
-    tracks = np.einsum("ira,kaj,ki->ijr", motion, scene.truth.shapes, c)
-    tracks += noise * rng.normal(size=tracks.shape)
-    tracks[np.isnan(scene.tracks)] = np.nan
-    if kind == "complete":
-        tracks -= tracks.mean(axis=1, keepdims=True)
-    return Scene(tracks, scene.weights, scene.truth._replace(motion=motion))
-
-
 def moved(cameras, motion, step):
     """Return cameras (n_frames, 2, 3) after steps (n_parameters, n_frames)."""
     return frames_first(cameras.moved(frames_last(motion), step))
@@ -279,7 +253,7 @@ def disturbed_by(cameras, state, seed=1, size=0.1):
 @cache
 def calibrated_optimum(camera, kind="complete"):
     """Return a minimum of the objective with calibrated cameras, and its table."""
-    scene, cameras = calibrated_scene(camera, kind=kind), CAMERAS[camera]
+    scene, cameras = random_scene(kind=kind, camera=camera), CAMERAS[camera]
     likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
     start = disturbed_by(cameras, scene.truth)
     result = refine_joint(likelihood, start, cameras, max_iter=5000, tol=1e-10)
@@ -330,7 +304,7 @@ class TestCalibratedCameras:
 
     @CALIBRATED
     def test_gradient_norm_by_its_definition(self, camera):
-        scene, cameras = calibrated_scene(camera), CAMERAS[camera]
+        scene, cameras = random_scene(camera=camera), CAMERAS[camera]
         likelihood = likelihood_of(scene.tracks, None, 0.0)
         start = disturbed_by(cameras, scene.truth)
         result = refine_joint(likelihood, start, cameras, max_iter=3, tol=1e-3)
@@ -352,7 +326,8 @@ class TestCalibratedCameras:
     @CALIBRATED
     @KINDS
     def test_tables_without_noise_are_fitted_to_the_floor(self, camera, kind):
-        scene, cameras = calibrated_scene(camera, noise=0.0, kind=kind), CAMERAS[camera]
+        scene = random_scene(noise=0.0, kind=kind, camera=camera)
+        cameras = CAMERAS[camera]
         likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
         start = disturbed_by(cameras, scene.truth)
         result = refine_joint(likelihood, start, cameras, max_iter=1000, tol=1e-3)
@@ -386,7 +361,7 @@ class TestHeldCameras:
 class TestLeastNoise:
     @pytest.mark.parametrize("camera", CAMERAS)
     def test_noise_stays_above(self, camera):
-        scene, cameras = calibrated_scene(camera), CAMERAS[camera]
+        scene, cameras = random_scene(camera=camera), CAMERAS[camera]
         likelihood = likelihood_of(scene.tracks, None, 0.0)
         mean_square = likelihood.square / likelihood.n_seen
         least = 10 * DEVIATION**2 / mean_square
