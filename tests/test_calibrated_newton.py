@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scenes
-from frame_parts import camera_and_alpha, fit_posterior
+from frame_parts import fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from scenes import images, with_gaps
+from scenes import with_gaps
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -165,26 +165,6 @@ class TestMinimum:
             square = frame.square(fits.alpha[i], NOISE**2)
             assert fits.objective[i] == pytest.approx(square, rel=1e-9)
 
-    @BOTH
-    @pytest.mark.parametrize("depth", slow_after(2, [0.1, 0.0, 0.03, 0.01]))
-    @pytest.mark.parametrize("deviation", slow_after(1, [0.02, 0.005]))
-    def test_of_thin_objects_is_no_higher_than_from_the_truth(
-        self, camera, depth, deviation
-    ):
-        # Their depth tells the affine camera little or nothing of its third column.
-        scene = random_scene(camera, noise=deviation, n_frames=12, depth=depth)
-        noise = deviation**2
-        fits = fitted(scene, camera, noise)
-        n = CAMERAS[camera].n_parameters
-        for i, start in enumerate(scene.motion):
-            end = minimize(
-                lambda step, i=i, start=start: value(
-                    scene, i, moved(start, step), noise
-                ),
-                np.zeros(n),
-            )
-            assert value(scene, i, fits.motion[i], noise) <= end.fun + 0.01
-
 
 class TestDerivatives:
     """Away from the minimum, where the gradient is not zero."""
@@ -301,20 +281,6 @@ class TestCovariance:
             expected = np.linalg.inv(hessian / (2 * noise))[n:, n:]
             size = np.abs(expected).max()
             assert_allclose(fits.covariance[i], expected, atol=1e-3 * size)
-
-
-class TestExact:
-    @BOTH
-    def test_few_points_are_enough(self, camera):
-        # Six unknowns of the pose at most and three coefficients: five points.
-        scene = random_scene(camera, noise=0.0, n_frames=40)
-        shapes = scene.shapes.copy()
-        shapes[1:] *= 0.2
-        tracks = images(shapes, *camera_and_alpha(scene))
-        tracks[:, 6:] = np.nan
-        given = scene._replace(tracks=tracks, shapes=shapes)
-        fits = fitted(given, camera, 0.0)
-        assert_allclose(fits.objective, 0.0, atol=1e-6)
 
 
 class TestReversal:

@@ -1,8 +1,6 @@
 """AffineNRSfM: attributes, the model's formula, methods, input and parameters."""
 
-import copy
 import inspect
-import pickle
 import warnings
 from functools import cache
 
@@ -19,14 +17,13 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.linear_model import LogisticRegression
 from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
-from threadpoolctl import threadpool_info, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import robust_sizes
 from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
-from isa_nrsfm.io import landmark_table, load_model, save_model
+from isa_nrsfm.io import landmark_table
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 
 N_FRAMES, N_POINTS, K = 90, 68, 3
@@ -564,19 +561,6 @@ def test_planar_tables_equal_interleaved_ones():
     )
 
 
-@pytest.mark.parametrize("frame", [pd.DataFrame, pl.DataFrame])
-def test_names_of_dataframes_are_kept_and_compared(frame):
-    names = list(FACES.feature_names)
-    table = frame({name: TABLE[:, j] for j, name in enumerate(names)})
-    model = estimator().fit(table)
-    assert model.feature_names_in_.tolist() == names
-    assert_allclose(model.transform(table), model.alpha_, atol=1e-10)
-    with pytest.raises(ValueError, match="feature names should match"):
-        model.transform(table[names[2:4] + names[:2] + names[4:]])
-    with pytest.warns(UserWarning, match="does not have valid feature names"):
-        model.transform(TABLE)
-
-
 # --- errors -------------------------------------------------------------------------
 
 
@@ -696,12 +680,6 @@ def test_names_that_contradict_the_layout_are_refused():
         estimator(layout="planar").fit(interleaved)
     with pytest.raises(ValueError, match=r"layout='interleaved' .* order is planar"):
         estimator().fit(interleaved[order])
-
-
-def test_names_that_say_nothing_are_not_read():
-    names = [f"column {j}" for j in range(2 * N_POINTS)]
-    model = estimator().fit(pd.DataFrame(TABLE, columns=names))
-    assert model.feature_names_in_.tolist() == names
 
 
 @pytest.mark.parametrize(
@@ -883,39 +861,12 @@ def test_same_seed_gives_the_same_result_to_the_bit(isa):
     assert_array_equal(from_instance.fit(TABLE).alpha_, first.alpha_)
 
 
-def test_fitting_again_forgets_the_first_table(model):
-    again = estimator().fit(make_face_tracks(40, n_components=2, random_state=9).data)
-    again.fit(TABLE)
-    assert_array_equal(again.alpha_, model.alpha_)
-
-
 @may_not_converge
 @pytest.mark.parametrize("isa", slow_after(1, [None, FastISA(n_init=18)]))
 def test_results_do_not_depend_on_n_jobs(isa):
     first, second = (estimator(isa=isa, n_jobs=n).fit(TABLE) for n in (1, 2))
     assert_array_equal(first.alpha_, second.alpha_)
     assert_array_equal(first.basis_, second.basis_)
-
-
-@may_not_converge
-@pytest.mark.parametrize(
-    ("refinement", "precision"),
-    # A minimum that is found by its value is known to the root of the rounding errors.
-    [(None, 1e-8), ("joint", 10 * np.sqrt(np.finfo(float).eps))],
-)
-@pytest.mark.parametrize("isa", slow_after(1, [None, FastISA(n_init=3)]))
-def test_results_do_not_depend_on_the_threads_of_blas(isa, refinement, precision):
-    table = make_face_tracks(2000, n_components=4, random_state=0).data
-    models = []
-    for n_threads in (1, 2):
-        with threadpool_limits(n_threads, user_api="blas"):
-            used = {p["num_threads"] for p in threadpool_info() if "blas" in p.values()}
-            models.append(estimator(4, isa=isa, refinement=refinement).fit(table))
-        if used != {n_threads}:
-            pytest.skip(f"BLAS uses {used} threads instead of {n_threads}")
-    for name in ("alpha_", "basis_"):
-        first, second = (getattr(model, name) for model in models)
-        assert np.abs(first - second).max() <= precision * np.abs(first).max()
 
 
 def test_strategy_gets_what_it_leaves_open():
@@ -1012,71 +963,6 @@ def test_grid_search_over_own_and_nested_parameters():
     assert search.best_estimator_.isa_.n_init == search.best_params_["isa__n_init"]
     assert search.best_estimator_.basis_.shape == (3, N_POINTS, 3)
     assert search.score(TABLE) == search.best_estimator_.score(TABLE)
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.FitFailedWarning")
-@pytest.mark.filterwarnings("ignore:One or more of the test scores:UserWarning")
-def test_grid_search_leaves_out_what_is_impossible():
-    search = GridSearchCV(estimator(), {"n_components": [1, 2, 5]}, cv=2)
-    search.fit(TABLE[:, :24])
-    assert np.isnan(search.cv_results_["mean_test_score"]).tolist() == [
-        False,
-        False,
-        True,
-    ]
-    assert search.best_params_["n_components"] in (1, 2)
-
-
-COPIES = {
-    "pickle": lambda model, path: pickle.loads(pickle.dumps(model)),
-    "deepcopy": lambda model, path: copy.deepcopy(model),
-    "joblib": lambda model, path: joblib.load(joblib.dump(model, path)[0]),
-    "model file": lambda model, path: (save_model(model, path), load_model(path))[1],
-}
-
-
-@pytest.fixture(
-    scope="module",
-    params=[
-        {"isa": PooledFastICA(n_init=2)},
-        {"isa": FastISA(n_init=2), "refinement": "alternating"},
-    ],
-    ids=str,
-)
-def copied(request):
-    """Return a model that is copied."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return estimator(**request.param).fit(TABLE)
-
-
-@may_not_converge
-@pytest.mark.parametrize("way", COPIES)
-def test_copies_give_the_same_to_the_bit(way, copied, tmp_path):
-    model = copied
-    loaded = COPIES[way](model, tmp_path / "model")
-    assert_array_equal(loaded.transform(TABLE), model.transform(TABLE))
-    assert_array_equal(loaded.reproject(TABLE), model.reproject(TABLE))
-    assert_array_equal(loaded.basis_, model.basis_)
-    assert loaded.score(TABLE) == model.score(TABLE)
-    assert str(loaded.get_params()) == str(model.get_params())
-
-
-@pytest.mark.parametrize(("library", "frame"), [("pandas", pd), ("polars", pl)])
-def test_output_in_dataframes(library, frame):
-    table = frame.DataFrame(
-        {name: TABLE[:, j] for j, name in enumerate(FACES.feature_names)}
-    )
-    model = estimator().set_output(transform=library)
-    for alpha in (model.fit_transform(table), model.transform(table)):
-        assert isinstance(alpha, frame.DataFrame)
-        assert list(alpha.columns) == ["alpha_1", "alpha_2", "alpha_3"]
-        assert_allclose(alpha.to_numpy(), model.alpha_, atol=1e-10)
-    assert isinstance(model.alpha_, np.ndarray)
-    # What is not the coefficients stays an array.
-    assert isinstance(model.decompose(table).alpha, np.ndarray)
-    assert isinstance(model.reproject(table), np.ndarray)
-    assert_allclose(model.inverse_transform(model.transform(table)).shape, TABLE.shape)
 
 
 def test_another_refinement_leaves_nothing_of_the_joint_one():

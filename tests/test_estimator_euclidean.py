@@ -140,17 +140,6 @@ class TestContract:
         some = model.reconstruct(new.data[7:9], camera=camera)
         assert_allclose(some, shapes[7:9], rtol=1e-6)
 
-    @both_cameras
-    def test_frames_of_which_too_little_is_seen_are_nan(self, faces, model, camera):
-        table = faces.data[:4].copy()
-        table[1] = np.nan
-        table[2, :20] = np.nan
-        shapes = model.reconstruct(table, camera=camera)
-        assert np.isnan(shapes[1]).all()
-        assert np.isfinite(shapes[[0, 2, 3]]).all()
-        whole = model.reconstruct(faces.data[:4], camera=camera)
-        assert_allclose(shapes[[0, 3]], whole[[0, 3]], rtol=1e-6)
-
     @pytest.mark.parametrize("refinement", ["joint", "alternating", None])
     def test_every_refinement(self, faces, refinement):
         model = AffineNRSfM(n_components=2, refinement=refinement, random_state=0)

@@ -444,62 +444,6 @@ def test_noise_variance(seed, scale_frames, missing):
     assert_allclose(fitted.noise_variance_, variance, rtol=0.05)
 
 
-def aligned(true, found, deviation):
-    """
-    Return true coefficients in the basis of the found ones.
-
-    Bases that explain a table equally well have (1, alpha) that differ by one linear
-    map for all frames, up to a factor for each: alpha' = G (1, alpha) / (g (1, alpha)).
-    The map is fitted, weighted by the deviations: 8 numbers of 2 * I.
-    """
-    n_frames, n = true.shape
-    one = np.column_stack([np.ones(n_frames), true])
-    scale = np.ones(n_frames)
-    for _ in range(10):
-        design = np.zeros((n, n_frames, n + n * (n + 1)))
-        weights = 1 / (deviation * scale[:, None])
-        for k in range(n):
-            design[k, :, :n] = -found[:, [k]] * true
-            design[k, :, n + k * (n + 1) : n + (k + 1) * (n + 1)] = one
-            design[k] *= weights[:, [k]]
-        target = (found * weights).T.ravel()
-        solution = np.linalg.lstsq(design.reshape(n * n_frames, -1), target)[0]
-        scale = 1 + true @ solution[:n]
-    return one @ solution[n:].reshape(n, n + 1).T / scale[:, None]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("missing", [0.0, 0.3])
-@pytest.mark.parametrize("independence", ["shapes", "coefficients"])
-def test_deviations_of_the_coefficients_cover_the_truth(independence, missing):
-    z = []
-    for seed in range(3):
-        made = scene(seed, n_frames=300, n_points=40, missing=missing)
-        fitted = estimator(independence=independence).fit(made.data)
-        true = aligned(made.alpha, fitted.alpha_, fitted.alpha_std_)
-        z.append((fitted.alpha_ - true) / fitted.alpha_std_)
-    # 1800 numbers: the share is known to half a percent.
-    covered = np.mean(np.abs(np.concatenate(z)) < 1.96)
-    assert 0.93 < covered < 0.97
-
-
-def test_deviations_are_those_of_repeated_noise():
-    # Frames of one fit, with other noise again and again: no alignment is needed.
-    made = scene(0, camera="orthographic", n_frames=90, n_points=40)
-    fitted = estimator(scale_frames=False).fit(made.data)
-    rng = np.random.default_rng(0)
-    X = made.clean.reshape(90, -1)[:10]
-    draws = np.stack(
-        [
-            fitted.transform(
-                X + np.sqrt(made.noise_variance) * rng.normal(size=X.shape)
-            )
-            for _ in range(400)
-        ]
-    )
-    assert_allclose(draws.std(axis=0), fitted.alpha_std_[:10], rtol=0.2)
-
-
 def test_frames_that_show_less_are_known_less_well():
     tracks = COMPLETE.tracks.copy()
     tracks[:45, ::2] = np.nan

@@ -85,18 +85,6 @@ class TestProducts:
             assert_array_equal(each[..., 1], 0)
             assert np.isfinite(each).all()
 
-    def test_memory_order_changes_nothing(self):
-        tracks, shapes, weights = random_problem(0)
-        for w in (None, weights):
-            columns = None if w is None else np.asfortranarray(w)
-            got = frame_sums(
-                frame_tracks(np.asfortranarray(tracks), columns),
-                ShapeProducts(np.asfortranarray(shapes)),
-            )
-            expected = frame_sums(frame_tracks(tracks, w), ShapeProducts(shapes))
-            assert_array_equal(got.cross, expected.cross)
-            assert_array_equal(got.gram.pairs, expected.gram.pairs)
-
     @pytest.mark.parametrize("weighted", [False, True])
     def test_take(self, weighted):
         tracks, shapes, weights = random_problem(0)

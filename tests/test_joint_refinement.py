@@ -114,49 +114,6 @@ class TestHistory:
 
 class TestOptimum:
     @KINDS
-    @pytest.mark.parametrize("penalty", [0.0, 10.0])
-    def test_objective_rises_in_every_direction(self, kind, penalty):
-        scene, result = optimum(kind, penalty)
-        assert result.converged
-        assert result.gradient_norm < 5e-6
-        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-        rng = np.random.default_rng(2)
-        shapes, motion, noise = result.state
-        for _ in range(10):
-            change = [rng.normal(size=each.shape) for each in (shapes, motion)]
-            rises = []
-            for size in (-1e-3, 1e-3):
-                moved = likelihood(
-                    shapes + size * change[0],
-                    motion + size * change[1],
-                    noise * np.exp(size),
-                )
-                rises.append(moved.value - result.history[-1])
-            assert min(rises) > 0
-            # Equal on both sides: the slope is zero, not only small.
-            assert_allclose(rises[0], rises[1], rtol=0.1)
-
-    @KINDS
-    def test_gradient_norm_by_its_definition(self, kind):
-        # The gradient in the metric of the curvature, in units of the coordinates.
-        scene = random_scene(kind=kind)
-        result = refined(scene, max_iter=3)
-        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
-        passed = likelihood(*result.state)
-        noise = result.state.noise
-        square = passed.noise_gradient**2 / likelihood.n_seen
-        points = passed.shape_gradient.reshape(-1, scene.tracks.shape[1]).T
-        for j, g in enumerate(points):
-            N = passed.shape_curvature[j if kind == "weighted" else 0]
-            square += noise / 2 * g @ np.linalg.solve(N, g)
-        for i, g in enumerate(frames_first(passed.motion_gradient)):
-            xx, xy, xz, yy, yz, zz = passed.motion_curvature[:, i]
-            A = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-            square += noise / 2 * np.trace(g @ np.linalg.solve(A, g.T))
-        expected = np.sqrt(square / likelihood.n_seen)
-        assert result.gradient_norm == pytest.approx(expected, rel=1e-6)
-
-    @KINDS
     @pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
@@ -251,8 +208,8 @@ def disturbed_by(cameras, state, seed=1, size=0.1):
 
 
 @cache
-def calibrated_optimum(camera, kind="complete"):
-    """Return a minimum of the objective with calibrated cameras, and its table."""
+def optimum_of(camera, kind="complete"):
+    """Return a minimum of the objective with cameras of a model, and its table."""
     scene, cameras = random_scene(kind=kind, camera=camera), CAMERAS[camera]
     likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
     start = disturbed_by(cameras, scene.truth)
@@ -260,18 +217,20 @@ def calibrated_optimum(camera, kind="complete"):
     return scene, likelihood, start, result
 
 
-CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+EACH = pytest.mark.parametrize("camera", CAMERAS)
 
 
-class TestCalibratedCameras:
-    @CALIBRATED
+class TestCameras:
+    @EACH
     @KINDS
-    def test_history_falls_and_cameras_stay_calibrated(self, camera, kind):
-        _, likelihood, start, result = calibrated_optimum(camera, kind)
+    def test_history_falls_and_cameras_stay_of_their_model(self, camera, kind):
+        _, likelihood, start, result = optimum_of(camera, kind)
         assert result.converged
         assert (np.diff(result.history) < 0).all()
         assert result.history[0] == likelihood(*start).value
         assert result.history[-1] == likelihood(*result.state).value
+        if camera == "affine":
+            return
         motion = result.state.motion
         gram = motion @ motion.swapaxes(1, 2)
         scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
@@ -280,10 +239,10 @@ class TestCalibratedCameras:
         if camera == "orthographic":
             assert_allclose(scale, 1.0, rtol=1e-11)
 
-    @CALIBRATED
+    @EACH
     @KINDS
     def test_objective_rises_in_every_direction(self, camera, kind):
-        _, likelihood, _, result = calibrated_optimum(camera, kind)
+        _, likelihood, _, result = optimum_of(camera, kind)
         cameras = CAMERAS[camera]
         assert result.gradient_norm < 5e-6
         rng = np.random.default_rng(2)
@@ -302,17 +261,20 @@ class TestCalibratedCameras:
             assert min(rises) > 0
             assert_allclose(rises[0], rises[1], rtol=0.1)
 
-    @CALIBRATED
-    def test_gradient_norm_by_its_definition(self, camera):
-        scene, cameras = random_scene(camera=camera), CAMERAS[camera]
-        likelihood = likelihood_of(scene.tracks, None, 0.0)
+    @EACH
+    @KINDS
+    def test_gradient_norm_by_its_definition(self, camera, kind):
+        # The gradient in the metric of the curvature, in units of the coordinates.
+        scene, cameras = random_scene(kind=kind, camera=camera), CAMERAS[camera]
+        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
         start = disturbed_by(cameras, scene.truth)
         result = refine_joint(likelihood, start, cameras, max_iter=3, tol=1e-3)
         passed = likelihood(*result.state)
         noise, motion = result.state.noise, result.state.motion
         square = passed.noise_gradient**2 / likelihood.n_seen
-        for g in passed.shape_gradient.reshape(9, -1).T:
-            square += noise / 2 * g @ np.linalg.solve(passed.shape_curvature[0], g)
+        for j, g in enumerate(passed.shape_gradient.reshape(9, -1).T):
+            N = passed.shape_curvature[j if kind == "weighted" else 0]
+            square += noise / 2 * g @ np.linalg.solve(N, g)
         D = cameras.tangents(frames_last(motion))
         slope = np.einsum("crai,rai->ci", D, passed.motion_gradient)
         for i, g in enumerate(slope.T):
@@ -323,7 +285,7 @@ class TestCalibratedCameras:
         expected = np.sqrt(square / likelihood.n_seen)
         assert result.gradient_norm == pytest.approx(expected, rel=1e-6)
 
-    @CALIBRATED
+    @EACH
     @KINDS
     def test_tables_without_noise_are_fitted_to_the_floor(self, camera, kind):
         scene = random_scene(noise=0.0, kind=kind, camera=camera)
@@ -335,7 +297,8 @@ class TestCalibratedCameras:
         assert (np.diff(result.history) <= 0).all()
         floor = NOISE_FLOOR * likelihood.square / likelihood.n_seen
         assert result.state.noise == pytest.approx(floor, rel=1e-6)
-        assert likelihood(*result.state).residual < 1e-12 * likelihood.square
+        left = 1e-9 if camera == "affine" else 1e-12
+        assert likelihood(*result.state).residual < left * likelihood.square
 
 
 class TestHeldCameras:
@@ -387,18 +350,6 @@ class TestLeastNoise:
 
 
 class TestWithoutNoise:
-    @KINDS
-    @pytest.mark.parametrize("penalty", [0.0, 10.0])
-    def test_reaches_the_floor_and_the_true_images(self, kind, penalty):
-        scene = random_scene(noise=0.0, kind=kind)
-        result = refined(scene, penalty=penalty)
-        likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
-        floor = NOISE_FLOOR * likelihood.square / likelihood.n_seen
-        assert result.converged
-        assert (np.diff(result.history) <= 0).all()
-        assert result.state.noise == pytest.approx(floor, rel=1e-6)
-        assert likelihood(*result.state).residual < 1e-9 * likelihood.square
-
     def test_starts_at_the_floor_where_the_start_has_no_noise(self):
         scene = random_scene()
         start = disturbed(scene.truth)._replace(noise=0.0)

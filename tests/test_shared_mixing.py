@@ -123,18 +123,6 @@ class TestRecovery:
         mixed = np.concatenate([truth[:3] + truth[3:], truth[:3] - truth[3:]])
         assert cosines(truth, unmix(mixed)).min() > 0.99
 
-    def test_coefficients_with_labels(self, load_data):
-        data = load_data("ict_bu3dfe_like_68")
-        shapes = data["S3d"].reshape(len(data["S3d"]), -1)
-        U, S, _ = np.linalg.svd(shapes - shapes.mean(axis=0), full_matrices=False)
-        alpha = U[:, :9] * S[:9]
-        found = alpha @ independent_coefficients(alpha).T
-        label = data["labels"][:, None] == np.unique(data["labels"])
-        means = label.T @ found / label.sum(axis=0)[:, None]
-        share = label.sum(axis=0) @ means**2 / len(found)  # the variance is 1
-        assert np.sum(share > 0.5) >= 3
-        assert np.sum(share < 0.05) >= 4
-
 
 class TestReturned:
     @pytest.mark.parametrize("size", [1, 3])
