@@ -61,13 +61,17 @@ def error_of_depths(model, X, points):
 @pytest.fixture(scope="module")
 def frontal():
     X, *_ = faces_turned_by(2)
-    return X, fitted(X)
+    model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    with pytest.warns(UserWarning, match="transform this one with that model"):
+        return X, model.fit(X)
 
 
 @pytest.fixture(scope="module")
 def turned():
+    """Return faces of which the fit does not warn."""
     X, points, rotations = faces_turned_by(20)
-    return X, points, rotations, fitted(X)
+    model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    return X, points, rotations, model.fit(X)
 
 
 class TestExtents:
@@ -110,11 +114,6 @@ class TestFrontalFaces:
         extents = np.linalg.svd(model.mean_shape_, compute_uv=False)
         assert extents[0] < 4 * extents[-1]
 
-    def test_fit_warns_with_the_way_out(self, frontal):
-        X, _ = frontal
-        with pytest.warns(UserWarning, match="transform this one with that model"):
-            AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(X)
-
     def test_depths_are_uncertain(self, frontal):
         assert frontal[1].depth_uncertainty_ > 0.2
         found = frontal[1].diagnostics()
@@ -151,10 +150,6 @@ class TestFrontalFaces:
 
 
 class TestTurnedFaces:
-    def test_fit_does_not_warn(self, turned):
-        X, *_ = turned
-        AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(X)
-
     def test_depth_uncertainty_is_the_error(self, turned):
         X, points, _, model = turned
         _, error = error_of_depths(model, X, points)

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from layers import slow_after
 from numpy.testing import assert_allclose
 from scipy.linalg import eigvals
 from scipy.spatial.transform import Rotation
@@ -69,7 +70,7 @@ class TestReliabilities:
 
     @pytest.mark.parametrize(
         ("n_frames", "n_points", "n_components"),
-        [(100, 68, 4), (300, 68, 1), (60, 478, 2)],
+        slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)], together=True),
     )
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
     def test_noise_of_rigid_objects_has_none(
@@ -211,7 +212,7 @@ class TestPoseShare:
         assert -0.1 < share[0] <= 0
         assert np.isnan(share[1])
 
-    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+    @pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "affine"]))
     def test_a_contour_that_slides_is_named(self, camera):
         faces = make_face_tracks(
             300, n_components=2, camera="weak_perspective", noise=0.01, random_state=0
