@@ -2,22 +2,22 @@
 Which camera
 ============
 
-`AffineNRSfM` has three models of a camera.
+`AffineNRSfM` has three camera models:
 
-- ``camera="affine"``, the default, assumes nothing: take it for images that may be
-  stretched, and where coefficients matter more than proportions.
-- ``camera="weak_perspective"`` takes cameras for rotations with a scale for each frame:
-  take it for photos and videos with square pixels of things that are far away for their
-  size, and always where a thing moves much, as bodies do.
-- ``camera="orthographic"`` has one scale for all frames: take it for one camera whose
-  distance and focal length do not change, and for motion capture.
+- ``camera="affine"``, the default, makes no assumption. Use it for stretched images, or
+  if coefficients matter more than proportions.
+- ``camera="weak_perspective"`` has a rotation and a scale for each frame. Use it for
+  photos and videos with square pixels whose distance is large compared with the object,
+  and for objects that deform much, such as bodies.
+- ``camera="orthographic"`` has one scale for all frames. Use it for motion capture, or
+  for one camera with constant distance and focal length.
 
-With the last two shapes have true proportions. Whether a table agrees with them is
-said by ``camera_noise_ratio_``: the variance of the noise that the fit with calibrated
-cameras leaves, divided by that of affine ones. Any fit has it, whatever its `camera`.
+The last two are called *calibrated*; their shapes have true proportions.
+``camera_noise_ratio_`` measures whether a table agrees with calibrated cameras. It is
+the noise variance of the fit with calibrated cameras divided by that of the fit with
+affine cameras. Every joint fit computes it.
 """
 
-import warnings
 from textwrap import fill
 
 import matplotlib.pyplot as plt
@@ -29,10 +29,10 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 # %%
-# A table of an object of two parts, one of which turns on a hinge. It takes two basis
-# shapes: the sine and the cosine of the angle. The cameras are weak-perspective ones.
-# In a second table each image is stretched besides, by up to a half in any direction:
-# the cameras are affine then.
+# The object has two parts that are joined by a hinge. Its shape depends linearly on the
+# sine and the cosine of the angle, so it has two basis shapes. In the first table the
+# cameras are weak-perspective. In the second table they are affine: each image is
+# stretched by up to a half in any direction.
 
 rng = np.random.RandomState(0)
 shapes = np.tile(rng.normal(size=(40, 3)), (200, 1, 1))
@@ -48,34 +48,31 @@ for camera in ("weak_perspective", "affine"):
     tables[camera] = (tracks + noise).reshape(200, -1)
 
 # %%
-# What the noise says
-# -------------------
+# Interpretation of the ratio
+# ---------------------------
 #
-# - Near one (below 1.3): calibrated cameras explain the table as well. Take them.
-# - Above ten: the cameras are not calibrated ones, if K is large enough.
-# - Between: often too few basis shapes. What is missing of the deformation is explained
-#   by cameras that are free, and wrongly so. Try a larger K before anything else.
-#   Perspective, of things that are near, leads there as well, and so do stretched
-#   images where basis shapes can take over a part of the stretching.
+# - Near one (below 1.3): calibrated cameras explain the table as well as affine
+#   cameras. Use calibrated cameras.
+# - Above ten: if K is large enough, the cameras are not calibrated.
+# - Between: often there are too few basis shapes, and affine cameras explain the rest
+#   of the deformation. Try a larger K first. Other reasons are near objects in
+#   perspective, or slightly stretched images.
 #
-# `AffineNRSfM.diagnostics` says it in a sentence, and so does the report of the command
-# line. The last of these has too few basis shapes.
+# `AffineNRSfM.diagnostics` and the report of the command line describe the ratio in a
+# sentence. The last of these fits has too few basis shapes.
 
 for camera, K in [("weak_perspective", 2), ("affine", 2), ("weak_perspective", 1)]:
     model = AffineNRSfM(K, random_state=0).fit(tables[camera])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of other things than the cameras
-        meaning = model.diagnostics().camera_meaning
     print(f"{camera} cameras, K={K}: {model.camera_noise_ratio_:.2f}")
-    print(fill(meaning, 80))
+    print(fill(model.diagnostics().camera_meaning, 80))
 
 # %%
 # How many basis shapes
 # ---------------------
 #
-# Too few basis shapes are worse for calibrated cameras than for affine cameras, which
-# absorb the missing ones. With enough basis shapes the opposite holds. ``"auto"`` uses
-# as many as the table determines.
+# If there are too few basis shapes, the 3D error is larger with calibrated cameras than
+# with affine cameras, which absorb part of the missing deformation. With enough basis
+# shapes it is smaller. ``"auto"`` uses as many as the table determines.
 
 X = tables["weak_perspective"]
 numbers, errors = [1, 2, 3, 4], {"affine": [], "weak_perspective": []}
@@ -95,13 +92,13 @@ axis.set(ylabel="3D error, %", xlabel="n_components", xticks=numbers, ylim=0)
 axis.legend()
 
 # %%
-# What shapes are
-# ---------------
+# Euclidean shapes
+# ----------------
 #
-# With affine cameras the shapes of a model are known up to an affinity of space;
-# ``reconstruct(X, camera="weak_perspective")`` finds the metric afterwards. With
-# calibrated ones they are Euclidean as they are, `reconstruct` needs no further word,
-# and each frame has a rotation and a scale.
+# With affine cameras the shapes are determined up to an affinity of space;
+# ``reconstruct(X, camera="weak_perspective")`` estimates the Euclidean metric
+# afterwards. With calibrated cameras the shapes are Euclidean, and each frame has a
+# rotation and a scale.
 
 shape = auto.mean_shape_ + np.tensordot(auto.alpha_[0], auto.basis_, 1)
 image = auto.scales_[0] * shape @ auto.rotations_[0, :2].T + auto.translation_[0]
@@ -109,5 +106,5 @@ off = np.std(image - X[0].reshape(-1, 2)) / auto.scales_[0]
 print(f"image of frame 0: off by {off:.3f} of the size of the object")
 
 # %%
-# An object and its mirror image in depth have the same images: `AffineNRSfM.mirrored`
-# selects the other one. Units and conventions are in :doc:`/conventions`.
+# An object and its mirror image in depth have the same images; `AffineNRSfM.mirrored`
+# returns the other one. See :doc:`/conventions` for units and ambiguities.

@@ -3,13 +3,13 @@ Choosing the number of basis shapes
 ===================================
 
 More basis shapes always reduce the reprojection error of the fitted points, but not the
-error of held-out points. `AffineNRSfM.score` measures the latter: the points are
-divided into five parts, and each is predicted from the others, frame by frame. The
-score is minus the error relative to the energy of the points. `AffineNRSfMCV` also
-holds out frames, so shapes are evaluated on frames that they were not fitted to.
+error of held-out points. `AffineNRSfM.score` measures the latter. The points are
+divided into five parts, and each part of a frame is predicted from the other four. The
+score is minus the energy of the error relative to that of the points. `AffineNRSfMCV`
+also holds out frames, so that shapes are evaluated on frames to which they were not
+fitted.
 """
 
-import warnings
 from textwrap import fill
 
 import numpy as np
@@ -27,8 +27,8 @@ search.fit(tracks.data)
 print("chosen:", search.n_components_)
 
 # %%
-# The table was made with three. The error of the points that were fitted goes on
-# falling behind that; the held-out error does not.
+# The true number is three. The error of the fitted points (inverse SNR) decreases
+# further with more basis shapes; the held-out error does not.
 
 K = search.cv_results_["param_n_components"]
 models = {k: AffineNRSfM(k, random_state=0).fit(tracks.data) for k in K.tolist()}
@@ -40,14 +40,14 @@ display.ax_.legend(frameon=False)
 print("held-out errors, %:", -100 * search.cv_results_["mean_test_score"].round(6))
 
 # %%
-# ``best_estimator_`` is the fit of all frames with the chosen number, the same as that
-# of `AffineNRSfM` alone, and `transform`, `reconstruct` and others use it. With
-# ``select="one_standard_error"`` the fewest basis shapes are taken that are not clearly
-# worse than the best ones: at most by one standard error.
+# ``best_estimator_`` is `AffineNRSfM` with the selected number, fitted to all frames.
+# `transform`, `reconstruct` and other methods use it. ``select="one_standard_error"``
+# selects the fewest basis shapes whose error is within one standard error of the
+# lowest.
 #
-# Where rows belong to persons, and new persons are what matters, all rows of a person
-# are held out together. By default blocks of a third of the rows are, for neighbours in
-# a video are alike.
+# By default the rows are held out in three blocks, because neighbouring frames of a
+# video are similar. If the model is to be used for new people, hold out all rows of a
+# person together:
 
 person = np.arange(200) // 4
 by_person = AffineNRSfMCV(range(2, 5), cv=GroupKFold(5))
@@ -57,24 +57,25 @@ print(by_person.fit(tracks.data, groups=person).n_components_)
 # The search follows a path. Each fit starts from earlier fits: from the fit with fewer
 # basis shapes and the leading direction of its residual, and for a part of the frames
 # also from the fit of all frames. All fits run to convergence, and the start with the
-# best fit to the training frames is used. Held-out frames can only provide a start. If
-# fits have one minimum, the errors agree with `GridSearchCV` within half a percent. If
-# there are several, as for motion capture with affine cameras, both searches may find
-# different ones, and errors differ by several percent in either direction.
-# ``python -m benchmarks.choice`` prints costs, choices and differences.
+# best fit to the training frames is used. Held-out frames therefore affect only the
+# start of a fit. If the objective has one minimum, the errors agree with those of
+# `GridSearchCV` within half a percent. If it has several, as for motion capture with
+# affine cameras, both searches may find different minima, and errors differ by several
+# percent in either direction. ``python -m benchmarks.choice`` prints costs, selected
+# numbers and differences.
 #
 # On the command line
 # -------------------
 #
-# ``isa-nrsfm fit faces.csv -k 1-8 --output out`` does the same, and fits the table with
-# the best. If this is the largest number tried, it prints the cost of the next ones.
+# ``isa-nrsfm fit faces.csv -k 1-8 --output out`` selects K in the same way. If this is
+# the largest number tried, it prints the expected time of the next three.
 #
 # Without a search
 # ----------------
 #
 # ``n_components="auto"`` fits twelve basis shapes, or as many as the table allows, and
-# takes those that the table determines: a few fits less, and it does not need frames to
-# be held out.
+# uses the number that the table determines. It requires fewer fits, and no frames are
+# held out.
 
 auto = AffineNRSfM("auto", random_state=0).fit(tracks.data)
 print('"auto" finds', len(auto.basis_))
@@ -83,32 +84,30 @@ print('"auto" finds', len(auto.basis_))
 # Diagnostics
 # -----------
 #
-# `AffineNRSfM.diagnostics` measures how well the table determines a fit, and warns if
-# it does not. With five basis shapes, two directions of the coefficients may well be
-# noise: their reliability, the share of their variance that is neither uncertainty nor
-# noise that the shapes have followed, is zero.
+# `AffineNRSfM.diagnostics` measures how well the table determines a fit; `messages`
+# describe problems. Reliability is the squared correlation of estimated and true
+# coefficients, along uncorrelated directions. With five basis shapes, two directions of
+# the coefficients are noise, with a reliability of zero.
 
 for k in (3, 5):
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        diagnostics = models[k].diagnostics()
+    diagnostics = models[k].diagnostics()
     print(f"K={k}: reliability {diagnostics.reliability.round(2)}")
-    for warning in told:
-        print(fill(str(warning.message), 80))
+    for message in diagnostics.messages:
+        print(fill(message, 80))
 
 # %%
-# The other figures of the named tuple:
+# Other fields of the named tuple:
 #
-# - ``camera_singular_values``: how much the images show of each direction of space. A
-#   last value near zero says that all frames see the object from one side: depth is
-#   hardly determined.
-# - ``deformation_amplitude``: deformation relative to the mean shape. The larger it is,
-#   the more of it affine cameras can take for motion of their own.
-# - ``effective_frames``: how many frames speak for each basis shape. One of a few
-#   frames may be an outlier, such as a single bad detection.
+# - ``camera_singular_values``: RMS of the cameras along the principal directions of
+#   space. If the last value is near zero, all frames show the object from the same
+#   side, and the depth is hardly determined.
+# - ``deformation_amplitude``: RMS of the deformation relative to the mean shape. The
+#   larger it is, the more of the deformation affine cameras can absorb.
+# - ``effective_frames``: effective number of frames that determine each basis shape. If
+#   it is small, the basis shape may model outliers, such as a wrong detection.
 # - ``weak_deviations``: standard deviations of those parts of the basis shapes that
 #   cameras can absorb.
-# - ``camera_noise_ratio`` and ``camera_meaning``: whether the table agrees with
+# - ``camera_noise_ratio`` and ``camera_meaning``: agreement of the table with
 #   calibrated cameras (:doc:`plot_cameras`).
 
 for name, figures in models[3].diagnostics()._asdict().items():
@@ -119,12 +118,11 @@ for name, figures in models[3].diagnostics()._asdict().items():
 # Real faces
 # ----------
 #
-# Faces of many people have more small deformations than a table determines. The
-# held-out error then falls slowly up to a large K (:doc:`/benchmarks/held_out` has the
-# curve of a table of 2500 rendered faces, where it still falls at 13), and there is no
-# true number. Choose K for the purpose: few basis shapes that can be interpreted, or as
-# many as improve a classifier, cross-validated with the classifier as in
-# :ref:`sphx_glr_gallery_problems_plot_expressions.py`.
+# Faces of many people have more small deformations than a table determines. There is no
+# true number, and the held-out error decreases slowly up to a large K. For 2500
+# rendered faces it still decreases at 13 (:doc:`/benchmarks/held_out`). Choose K for
+# the purpose. To interpret the basis shapes, use few. For a classifier, select K
+# together with it, as in :ref:`sphx_glr_gallery_problems_plot_expressions.py`.
 #
-# K needs ``3 K + 4`` points and ``ceil(8 (K + 2) / 5)`` frames at least: a hand of 21
-# points can have at most five. Many more frames than that are better.
+# K basis shapes need at least ``3 K + 4`` points and ``ceil(8 (K + 2) / 5)`` frames:
+# for a hand of 21 points, K is at most five. Many more frames are better.

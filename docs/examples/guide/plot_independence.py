@@ -2,12 +2,12 @@
 Which basis shapes: independence
 ================================
 
-The joint fit finds the span of the basis shapes. Any mixing of them fits equally well:
-images do not distinguish a smile and an open mouth from their sum and difference. The
-parameter `independence` of `AffineNRSfM` selects a mixing:
+Images determine only the span of the basis shapes: for example, they do not distinguish
+a smile and an open mouth from their sum and difference. The parameter `independence` of
+`AffineNRSfM` selects a basis of the span:
 
-- ``"shapes"``, the default: the basis shapes are independent over the points. That is
-  the assumption of the paper.
+- ``"shapes"``, the default: the basis shapes are independent over the points, as the
+  paper assumes.
 - ``"coefficients"``: the coefficients are independent over the frames. Use it if the
   deformations occur independently of each other.
 - ``None``: the principal axes of the deformation.
@@ -35,14 +35,13 @@ names = [faces.component_names[np.abs(c).argmax()] for c in correlation.T]
 BasisShapeDisplay.from_estimator(model, component_names=names, n_columns=3)
 
 # %%
-# Printed is the largest correlation of each true expression with a coefficient. With
-# independent coefficients each expression is one of its own. These are its basis
-# shapes, from the front and from the side. Affine cameras leave one affinity of space
-# open; for figures the cameras are taken for photos from afar, which chooses it.
+# The output lists the largest correlation of each true expression with a coefficient.
+# With independent coefficients, each expression corresponds to one coefficient. The
+# figure shows their basis shapes from the front and from the side. Affine cameras
+# determine shapes up to an affinity of space; for the figure, weak-perspective cameras
+# are assumed.
 #
-# The points of these faces are fixed on the surface, so that the coefficients do not
-# depend on the viewpoint. Each is the strength of an
-# expression:
+# Each coefficient measures the strength of one expression:
 
 _, axes = plt.subplots(2, 3, figsize=(9, 5), layout="constrained")
 for k, axis in enumerate(axes.flat):
@@ -51,5 +50,5 @@ for k, axis in enumerate(axes.flat):
     axis.set(xlabel=f"true {faces.component_names[k]}", ylabel=f"alpha_[:, {found}]")
 
 # %%
-# In real faces nothing is fully independent. Labels and people show which choice gives
-# meaningful coefficients: :doc:`/questions`.
+# In real faces nothing is completely independent. :doc:`/questions` compares both
+# choices by means of labels and people.

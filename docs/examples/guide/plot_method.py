@@ -2,15 +2,14 @@
 The method in pictures
 ======================
 
-From a table of 2D landmarks to basis shapes, stage by stage, on artificial faces of
-which everything is known. :doc:`/method` says the same in words and formulas.
+This page shows the stages from a table of 2D landmarks to basis shapes, on artificial
+faces with known truth. :doc:`/method` describes them in detail.
 
 The table
 ---------
 
-One row a frame, two columns a point. The frames have no order, the heads are turned,
-and photos differ in size. Nothing else goes into the method: no calibration, no 3D
-shapes, no labels.
+The table has one row per frame and two columns per point. Frames are in any order, with
+heads in different poses and sizes. The method uses no other data.
 """
 
 # sphinx_gallery_thumbnail_number = 3
@@ -32,16 +31,17 @@ for i, axis in enumerate(axes):
     axis.invert_yaxis()
 
 # %%
-# The measurement matrix, and what is rigid in it
-# -----------------------------------------------
+# Measurement matrix and rigid part
+# ---------------------------------
 #
-# Centred over the points, each frame gives two rows of the measurement matrix W, one
-# of x and one of y. Images of a rigid object in affine cameras have rank three (Tomasi
-# and Kanade, 1992), and each basis shape adds three more. Here are the singular values:
-# three large ones, 3 K of the deformation, then noise.
+# Each frame, centred over its points, provides two rows of the measurement matrix W,
+# one of x and one of y. For images of a rigid object in affine cameras, W has rank
+# three (Tomasi and Kanade, 1992). Each basis shape increases the rank by three. The
+# figure shows the singular values: three large ones, 3 K of the deformation, then
+# noise.
 #
 # The first three are the *rigid part*: a shape, and a camera for each frame. It
-# explains most, but its mouth does not open.
+# explains most of the energy, but none of the deformation.
 
 tracks = faces.tracks - faces.tracks.mean(axis=1, keepdims=True)
 tracks /= np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
@@ -59,14 +59,14 @@ axis.legend()
 # Independent subspaces
 # ---------------------
 #
-# What is left, the next 3 K singular triplets, mixes all deformations. Its 3 K rows
-# over the points are taken for signals. The paper assumes that the basis shapes are
-# independent of each other; the three coordinates of one are not. So the signals fall
-# into K groups of three, *independent subspaces*.
+# The next 3 K singular triplets contain all deformations. Their right singular vectors
+# are signals with the points as samples. The paper assumes that the basis shapes are
+# independent of each other, but the three coordinates of a basis shape are not. The
+# signals are therefore transformed into K groups of three, the *independent subspaces*.
 #
-# `PooledFastICA` finds independent components and pools them into groups, by how they
-# move together in the images: their covariance over the images, the *mode covariance
-# matrix*, shall be block-diagonal, as nearly as it can be.
+# `PooledFastICA` estimates independent components and pools them into groups. The
+# groups are chosen such that the covariance of the components over the images, the
+# *mode covariance matrix*, is as block-diagonal as possible.
 
 motion = U[:, 3:12] * S[3:12] / np.sqrt(68)
 covariance = motion.T @ motion * 68 / len(W)
@@ -85,11 +85,11 @@ print(f"{display.off_block_share:.1%} of the squares outside the blocks")
 # Refinement
 # ----------
 #
-# In a subspace, camera and coefficient have to be separated: the motion of subspace k
-# is that of the rigid part times a coefficient, after the right 3x3 transformation. The
-# paper finds it, and refines the basis shapes with the rigid cameras held. But faces
-# also deform along their rigid shape, so the rigid cameras are not the true cameras,
-# and the basis shapes are biased.
+# In each subspace, camera and coefficient must be separated. After a suitable 3x3
+# transformation, the motion of subspace k is that of the rigid part times a
+# coefficient. The paper estimates this transformation, and refines the basis shapes
+# with the rigid cameras. But faces also deform along their rigid shape. Therefore the
+# rigid cameras are not the true cameras, and the basis shapes are biased.
 #
 # The *joint refinement*, the default, optimises cameras, shapes and noise together,
 # with the coefficients integrated out. Its objective never increases. Affine cameras
@@ -108,5 +108,5 @@ for name, options in cases.items():
     print(f"{name:27} {model.inverse_snr_:10.4%} {error:9.2%}")
 
 # %%
-# The joint fit finds the span of the basis shapes. Any mixing of them fits equally
-# well; :doc:`plot_independence` shows how it is selected.
+# The fit determines only the span of the basis shapes; :doc:`plot_independence` shows
+# how a basis is selected.

@@ -2,8 +2,8 @@
 Missing points and outliers
 ===========================
 
-A missing point is NaN in both columns. Rows with missing points are kept, and nothing
-is filled in before the fit: missing points have weight zero.
+A missing point is NaN in both columns. Rows with missing points are used in the fit;
+missing points have weight zero.
 """
 
 import matplotlib.pyplot as plt
@@ -34,37 +34,40 @@ for share in shares:
 print(f"noise: {np.sqrt(faces.noise_variance):.2f} pixels in x and in y")
 
 # %%
-# The errors grow because fewer points determine the coefficients less well;
-# ``alpha_std_`` has their uncertainty. These are the rows with most and fewest points:
+# The errors increase because fewer points determine the coefficients less well.
+# ``alpha_std_`` contains the standard deviations of the coefficients. These are the
+# rows with most and fewest points:
 
 order = np.argsort(faces.visible.sum(axis=1))
 for i in (order[-1], order[0]):
     print(faces.visible[i].sum(), "points, deviations", model.alpha_std_[i].round(3))
 
 # %%
-# What is needed
-# --------------
+# Requirements
+# ------------
 #
-# - Rows without any point, where tracking failed, are left out of the fit with a
-#   warning, and have NaN in ``alpha_``.
-# - Another row needs four points that are not on one line, else its camera is not
-#   determined. `AffineNRSfM.fit` names rows that show less, `AffineNRSfM.transform`
-#   returns NaN for them.
-# - Each point has to be seen in some frames; the error names the first that is not.
-# - A point with only one coordinate counts as not seen, with a warning.
-# - Zeros for points that were not seen, as some programs write them, have to be made
-#   NaN: ``landmark_table(frame, missing="zeros")``, or ``--zeros-missing`` on the
-#   command line.
-# - Points that are *always* missing together with a pose (the far ear of a profile) are
-#   no problem as long as other frames show them.
+# - Rows without any point are left out of the fit with a warning; their ``alpha_`` is
+#   NaN.
+# - Other rows need at least four visible points that determine a camera
+#   (:doc:`/conventions`). Otherwise `AffineNRSfM.fit` raises an error that names the
+#   first such row, and `AffineNRSfM.transform` returns NaN.
+# - Each point must be visible in several frames; the error names the first point that
+#   is not.
+# - A point with only one coordinate counts as missing, with a warning.
+# - Some programs write zeros for missing points. Convert them to NaN with
+#   ``landmark_table(frame, missing="zeros")``, or ``--zeros-missing`` on the command
+#   line.
+# - Points may be missing systematically in some poses (such as the far ear in profile
+#   views) if they are visible in other frames.
 #
 # Outliers
 # --------
 #
-# Detectors sometimes put points far off. ``model.diagnostics(X)`` and the report name
-# rows and points that are. Squares of such errors lead a fit astray;
-# ``loss="huber"`` and ``loss="cauchy"`` count points less the farther they are from the
-# model, the second hardly at all. Here 2 % of the points are anywhere within the face.
+# Detections can be grossly wrong. ``model.diagnostics(X)`` and the report name the rows
+# and points. With a quadratic loss, such outliers distort the shapes. With
+# ``loss="huber"`` and ``loss="cauchy"``, the weight of a point decreases with its
+# residual, with the second to nearly zero. Here 2 % of the points are displaced by up
+# to twice the size of the face.
 
 faces = make_face_tracks(n_frames=200, random_state=0)
 rng = np.random.RandomState(0)
@@ -80,7 +83,7 @@ for loss in ("linear", "huber", "cauchy"):
     print(f"loss={loss!r:9} error of the 3D shapes {results[loss]:.2%}")
 
 # %%
-# The points that do not fit stand out: the distance from the reprojection finds them.
+# The distance from the reprojection separates the wrong points from the others.
 
 distance = np.linalg.norm(model.reproject(X).reshape(tracks.shape) - tracks, axis=-1)
 _, axis = plt.subplots(figsize=(6, 3), layout="constrained")
@@ -91,6 +94,6 @@ axis.set(xscale="log", yscale="log", xlabel="distance from the model, pixels")
 axis.legend()
 
 # %%
-# Rows that are wrong as a whole, of another object or a failed detection, show in the
-# inverse SNR of the frame, which ``cameras.csv`` of the command line has in a column.
-# Leave them out and fit again.
+# If a row is completely wrong, for example because another object was detected, the
+# inverse SNR of the frame is large. It is a column of ``cameras.csv``, which the
+# command line writes. Leave such rows out and fit again.

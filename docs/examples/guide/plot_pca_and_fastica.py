@@ -2,15 +2,15 @@
 Comparison with PCA and FastICA of the table
 ============================================
 
-PCA and FastICA of a table of landmarks are two lines of scikit-learn. They model the
-*images*, linearly. A head that turns moves its points more than a mouth that opens, and
-not linearly, so that their first components are pose, and expressions are spread over
-many. Aligning the frames (removing position, size and rotation in the image) takes out
-what can be taken out in the plane, not yaw and pitch.
+PCA and FastICA of a table of landmarks are linear models of the *images*. A head
+rotation displaces the points more than an opening mouth does, and nonlinearly. The
+first components therefore describe the pose, and expressions are spread over many
+components. Alignment of the frames removes position, size and rotation in the image,
+but not yaw and pitch.
 
-`AffineNRSfM` has a camera for each frame. Its coefficients do not depend on where the
-camera is. All of it is measured here on artificial faces of which pose and expression
-are known.
+`AffineNRSfM` estimates a camera for each frame, so its coefficients do not depend on
+the viewpoint. This page compares the methods on artificial faces with known pose and
+expression.
 """
 
 # sphinx_gallery_thumbnail_number = 2
@@ -38,17 +38,16 @@ features = {
 }
 
 # %%
-# How much of the head pose is in the coefficients?
-# -------------------------------------------------
+# Dependence of the coefficients on the head pose
+# -----------------------------------------------
 #
-# The share of the variance (R squared, cross-validated) that a linear regression
-# predicts from the coefficients: for yaw and pitch it should be zero, for the
-# expressions one. If the first is near zero or below, the coefficients do not predict
-# the pose.
+# A linear regression predicts pose and expressions from the coefficients. The
+# cross-validated R squared should be at most zero for yaw and pitch, and one for the
+# expressions.
 #
-# A regression can combine coefficients. In an interpretable basis, each expression is a
-# single coefficient. The third number measures this: the largest correlation of an
-# expression with a single coefficient, averaged over the expressions.
+# In an interpretable basis, each expression corresponds to a single coefficient. The
+# third number measures this: the largest correlation of an expression with a single
+# coefficient, averaged over the expressions.
 
 truth = {"yaw and pitch": faces.angles[:, :2], "expressions": faces.strength}
 _, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")
@@ -67,11 +66,11 @@ axis.invert_yaxis()
 axis.legend(truth, loc="upper center", bbox_to_anchor=(0.4, 1.2), ncols=2)
 
 # %%
-# What the components show
-# ------------------------
+# Components of PCA
+# -----------------
 #
 # The first four components of PCA, from two standard deviations below the mean (rings)
-# to two above (lines): they turn the head.
+# to two above (lines), are mainly rotations of the head.
 
 pca = PCA(K).fit(images)
 size = 2 * np.sqrt(pca.explained_variance_)[:, None, None]
@@ -83,7 +82,7 @@ for k, axis in enumerate(display.axes_):
     axis.set_title(f"PCA {k + 1}")
 
 # %%
-# The basis shapes move the face:
+# The basis shapes of `AffineNRSfM` deform the face:
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)
 
@@ -91,9 +90,9 @@ BasisShapeDisplay.from_estimator(model, n_columns=3)
 # When PCA is enough
 # ------------------
 #
-# Where all images are frontal there is no pose to be mixed with. And with many
-# components a classifier can undo the mixing: with 3 K + 3 = 30 components of PCA,
-# expressions are classified as well as with 9 coefficients or better
-# (:doc:`/benchmarks/classification`: 82 against 81 % on rendered faces in any pose, 87
-# against 80 % on photos). What PCA does not give are 3D shapes, cameras, coefficients
-# with a meaning of their own, and coefficients that stay the same in another view.
+# If all images are frontal, PCA suffices. With many components, a classifier can
+# separate pose and expression: with 3 K + 3 = 30 components of PCA, expressions are
+# classified as well as with 9 coefficients, or better (82 and 81 % on rendered faces in
+# any pose, 87 and 80 % on photos: :doc:`/benchmarks/classification`). PCA provides no
+# 3D shapes, cameras, interpretable coefficients, or coefficients that are independent
+# of the viewpoint.

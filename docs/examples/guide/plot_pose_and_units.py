@@ -2,21 +2,21 @@
 Units, true proportions and head pose
 =====================================
 
-What are the units of the shapes? Where is the metric size? How is the head turned?
 Images do not determine the size of an object. With affine cameras, they do not
-determine its angles and proportions in depth either: see :doc:`/conventions`. This page
-shows how to obtain them; :doc:`plot_cameras` compares the cameras.
+determine its angles and proportions in depth either (:doc:`/conventions`). This page
+shows how to obtain true proportions, head pose and millimetres; :doc:`plot_cameras`
+compares the cameras.
 
-In short:
+Summary:
 
-- ``motion_`` and ``translation_`` are in the units of the table, pixels for instance.
-- ``mean_shape_`` and ``basis_`` have no unit. With affine cameras the mean shape is
-  white, and only together with the cameras they are images.
-- With cameras taken for weak-perspective ones (photos from afar, square pixels) shapes
-  have true proportions, rotations are poses, and only the unit of length is free.
-- With orthographic cameras, which have one scale, shapes are in the units of the table.
-- One known length, such as the distance of the pupils, gives the unit.
-- What remains is the mirror image in depth.
+- ``motion_`` and ``translation_`` are in the units of the table, such as pixels.
+- ``mean_shape_`` and ``basis_`` are dimensionless. With affine cameras the mean shape
+  is white, and its proportions are not those of the object.
+- With weak-perspective cameras (distant camera, square pixels), shapes have true
+  proportions, and rotations are poses. The unit of length is undetermined.
+- With orthographic cameras, shapes are in the units of the table.
+- One known length, such as the distance of the pupils, determines the unit.
+- The mirror image in depth is undetermined in all cases.
 """
 
 # sphinx_gallery_thumbnail_number = 2
@@ -39,10 +39,9 @@ print(f"noise variance {model.camera_noise_ratio_:.2f} times that of affine came
 # True proportions
 # ----------------
 #
-# A fit with weak-perspective cameras has them, and rotations and scales. A model with
-# affine cameras gets them afterwards: `AffineNRSfM.reconstruct` with
-# ``camera="weak_perspective"`` finds the metric of space in which its cameras are
-# scaled rotations.
+# The shapes of a fit with weak-perspective cameras have true proportions. For a fit
+# with affine cameras, `AffineNRSfM.reconstruct` with ``camera="weak_perspective"``
+# estimates the metric in which the cameras are scaled rotations.
 
 for name, each in (("weak perspective", model), ("affine", affine)):
     shapes = each.reconstruct(faces.data, camera="weak_perspective")
@@ -53,10 +52,10 @@ for name, each in (("weak perspective", model), ("affine", affine)):
 # Upright and frontal
 # -------------------
 #
-# `canonical_pose` turns a shape upright. For :doc:`known layouts </skeletons>` set the
-# scheme; for others give pairs of points, such as ``left_right=[(right_eye, left_eye)],
-# up=[(chin, nose)], front=[(ears, nose)]``. The mean shape of affine cameras is white;
-# the Euclidean one is a face.
+# `canonical_pose` turns a shape upright. For :doc:`known layouts </skeletons>` set
+# `scheme`; for others set pairs of points, such as ``left_right=[(right_eye,
+# left_eye)], up=[(chin, nose)], front=[(ears, nose)]``. The figure compares the white
+# mean shape of affine cameras with the upright Euclidean mean shape.
 
 upright = canonical_pose(model.mean_shape_, scheme="ibug-68").shape
 _, axes = plt.subplots(1, 4, figsize=(9, 3), layout="constrained")
@@ -72,14 +71,12 @@ for k, (shape, what) in enumerate(
 # Head pose
 # ---------
 #
-# `frame_poses` has yaw, pitch and roll in degrees, all zero for a frontal, upright
-# face. Yaw is positive where the face is turned to the viewer's right, pitch where it
-# looks up, roll where it is turned clockwise in the image (:doc:`/conventions`). The
-# true angles are those of the true face, upright by the same definition.
+# `frame_poses` returns yaw, pitch and roll in degrees; :doc:`/conventions` defines
+# their signs. The true angles are those of the true face, made upright in the same way.
 #
-# Bars, which are hardly visible, are two standard deviations. They come from the
-# posterior of the rotation of a frame, for the given shapes; only calibrated cameras
-# have them. :doc:`/questions` has their accuracy on other faces.
+# Bars are two standard deviations. They include the uncertainty of the shapes and
+# require calibrated cameras (:doc:`/depth`). :doc:`/questions` describes the accuracy
+# on other faces.
 
 poses = frame_poses(model, faces.data)
 turn = canonical_pose(faces.mean_shape, scheme="ibug-68").rotation
@@ -98,9 +95,9 @@ for axis, name in zip(axes, ("yaw", "pitch", "roll"), strict=True):
 # Millimetres
 # -----------
 #
-# One known length is enough. `point_distances` measures the shape of each frame, in
-# units of that length: here the outer corners of the eyes, 36 and 45, have their true
-# distance in the mean face, and the opening of the mouth, 62 to 66, is wanted.
+# `point_distances` returns distances in the shape of each frame, scaled by one known
+# length. Here the known length is the distance of the outer eye corners, 36 and 45, in
+# the mean shape. The distance of points 62 and 66 is the opening of the mouth.
 
 known = np.linalg.norm(faces.mean_shape[36] - faces.mean_shape[45])
 found = point_distances(model, [(62, 66)], unit=(36, 45), length=known)[:, 0]
@@ -109,6 +106,6 @@ print("mouth open by, mm:", found[:5].round(1))
 print("in truth:         ", true[:5].round(1))
 
 # %%
-# How large each frame is in the image, ``poses.scale``, over the unit in millimetres is
-# pixels a millimetre. If the focal length is known, it gives the distance of the
-# camera.
+# ``poses.scale`` is the scale of each frame in pixels per unit of the shapes. Divided
+# by the unit in millimetres, it is in pixels per millimetre. If the focal length is
+# known, it determines the distance of the camera.

@@ -2,10 +2,10 @@
 The 3D motion of a body from one camera
 =======================================
 
-Four people walk, reach and squat in front of a camera, and a tracker gives 17 joints in
-each frame. From these 2D tracks alone `AffineNRSfM` finds the bodies in 3D. Bodies move
-so much that affine cameras would take part of their motion for their own; so it is said
-that the camera is a weak-perspective one.
+Four people walk, reach and squat in front of a camera, and a tracker detects 17 joints
+in each frame. `AffineNRSfM` reconstructs the 3D bodies from these 2D tracks. Affine
+cameras would absorb part of the large deformation of bodies; weak-perspective cameras
+do not.
 """
 
 # sphinx_gallery_thumbnail_number = 2
@@ -32,8 +32,9 @@ for axis, i in zip(display.axes_, shown, strict=True):
 # %%
 # The order of the joints is that of Human3.6M, a layout of `isa_nrsfm.skeletons`. It
 # defines the edges, left and right, and the correct mirror image: noses are in front.
-# `canonical_pose` turns the mean body upright. Images do not determine the rotation
-# that accompanies a deformation, so each frame is rotated onto the truth.
+# `canonical_pose` turns the mean body upright. Because images do not determine
+# rotations that are correlated with the deformation, each frame is rotated onto the
+# truth.
 
 pose = canonical_pose(model.mean_shape_, scheme="h36m-17")
 found = model.reconstruct(bodies.data) @ pose.rotation.T
@@ -61,8 +62,7 @@ for name, shapes in (("found", found), ("standing still", still)):
     print(f"{name:15} {error:.1%} of the size of the body")
 
 # %%
-# The actions of the bodies, in coefficients that do not depend on the camera. Each
-# person has 200 frames; colours are actions.
+# The first coefficient over the frames, coloured by action. Each person has 200 frames.
 
 _, axis = plt.subplots(figsize=(8, 2.8), layout="constrained")
 for name in np.unique(bodies.labels):
@@ -72,7 +72,7 @@ axis.set(xlabel="frame", ylabel="alpha 1")
 axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
 
 # %%
-# The basis shapes, from the front and from the side. A page on which the bodies move is
-# one call: ``write_viewer(model, "body.html", edges="h36m-17", labels=bodies.labels)``.
+# The basis shapes, from the front and from the side. ``write_viewer(model, "body.html",
+# edges="h36m-17", labels=bodies.labels)`` writes an interactive page.
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)

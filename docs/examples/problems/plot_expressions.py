@@ -2,11 +2,10 @@
 Classify expressions in any pose
 ================================
 
-A table of landmarks, a column of labels: which expression is it? `AffineNRSfM` is a
-transformer, so it goes into a `Pipeline`, and `GridSearchCV` chooses the number of
-basis shapes together with the classifier.
+`AffineNRSfM` is a transformer: in a `Pipeline` with a classifier it predicts
+expressions, and `GridSearchCV` selects the number of basis shapes.
 
-The faces are artificial, in any pose, labelled by the strongest of their expressions.
+The faces are artificial, in different poses. Their label is the strongest expression.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -37,8 +36,8 @@ for axis, i in zip(display.axes_, shown, strict=True):
     axis.set_title(labels[i])
 
 # %%
-# The whole pipeline is cross-validated: the shapes are fitted within each fold, so the
-# accuracy is that for new rows.
+# The complete pipeline is cross-validated: the shapes are fitted within each fold, so
+# the accuracy applies to new rows.
 
 pipeline = make_pipeline(
     AffineNRSfM(random_state=0), StandardScaler(), LinearDiscriminantAnalysis()
@@ -48,8 +47,8 @@ search.fit(X, labels)
 print(search.best_params_, f"accuracy {search.best_score_:.1%}")
 
 # %%
-# PCA for comparison, with as many components and with as many as the model has. Frames
-# are moved, scaled and turned to be nearest to their mean.
+# For comparison, PCA of aligned frames, with the same number of components, and with
+# the rank 3 K + 3 of the model.
 
 K = search.best_params_["affinenrsfm__n_components"]
 for n_components in (K, 3 * K + 3):
@@ -58,11 +57,11 @@ for n_components in (K, 3 * K + 3):
     print(f"PCA with {n_components} components: accuracy {accuracy:.1%}")
 
 # %%
-# Many components of PCA let the classifier undo the mixing of pose and expression, as
-# far as the poses of the table go:
+# With many components of PCA, the classifier can separate pose and expression within
+# the range of poses of the table:
 # :ref:`sphx_glr_gallery_guide_plot_pca_and_fastica.py`.
 #
-# Which are confused? Rows that no fit has seen, fold by fold.
+# The confusion matrix of the cross-validated predictions:
 
 predicted = cross_val_predict(search.best_estimator_, X, labels, cv=3)
 display = ConfusionMatrixDisplay.from_predictions(
@@ -71,9 +70,9 @@ display = ConfusionMatrixDisplay.from_predictions(
 display.figure_.set_layout_engine("constrained")
 
 # %%
-# Each coefficient belongs to a basis shape that can be inspected. Eta squared is the
-# share of the variance of a coefficient that lies between the expressions. These are
-# the two with the largest, and their basis shapes.
+# Eta squared is the share of the variance of a coefficient that lies between the
+# expressions. The figures show the basis shapes of the two coefficients with the
+# largest values, and their distributions.
 
 model = search.best_estimator_[0]
 eta_squared = association(model.alpha_, labels, random_state=0).statistic

@@ -2,12 +2,12 @@
 Hand gestures from any side
 ===========================
 
-Hand trackers give 21 points: the wrist, and four joints of each finger. A classifier of
-the points learns the hands as they were held when it was trained. The coefficients of
-`AffineNRSfM` do not depend on how the hand is held.
+Hand trackers detect 21 points: the wrist, and four points of each finger. A classifier
+of the points depends on the orientation of the hands in the training set. The
+coefficients of `AffineNRSfM` do not depend on it.
 
-Six people open their hands, close them and point; the classifier is tested on two whom
-it has not seen.
+Six people open their hands, close them and point. The classifier is tested on two
+people who are not in the training set.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -37,8 +37,8 @@ for axis, i in zip(display.axes_, shown, strict=True):
 BasisShapeDisplay.from_estimator(model, n_columns=3)
 
 # %%
-# Test on the other two people, with hands held as in training, and turned in the image
-# by any angle.
+# The hands of the other two people are tested twice: as they are, and rotated in the
+# image by random angles.
 
 angle = np.random.RandomState(1).uniform(-np.pi, np.pi, test.sum())
 turns = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

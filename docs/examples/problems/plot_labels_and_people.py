@@ -2,10 +2,9 @@
 Relate coefficients to gestures and people
 ==========================================
 
-Several people open a hand, close it and point. The coefficients of a fit change from
-gesture to gesture, and from person to person: hands have fingers of different lengths.
-Which coefficient describes what? `isa_nrsfm.analysis` measures it, and
-:doc:`/questions` explains the measures.
+Several people open a hand, close it and point. The coefficients of a fit depend on the
+gesture and on the person, because fingers have different lengths. `isa_nrsfm.analysis`
+tests which coefficient depends on which; :doc:`/questions` explains the statistics.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -33,13 +32,13 @@ for label, y, column in (("gesture", hands.labels, 0), ("person", people, 1)):
     CoefficientsDisplay.from_estimator(model, y=y, label=label, ax=axes[:, column])
 
 # %%
-# In numbers
+# Statistics
 # ----------
 #
 # Eta squared is the share of the variance of a coefficient that lies between the
-# gestures. For the p-values labels are permuted among people, and in blocks of frames
-# within them, because the frames of a video are similar. `between_share` is the share
-# of the variance between people: about zero if they do not differ.
+# gestures. For the p-values, labels are permuted between people, and in blocks of
+# frames within people, because the frames of a video are similar. `between_share` is
+# the share of the variance between people.
 
 found = association(model.alpha_, hands.labels, people, random_state=0)
 share = between_share(model.alpha_, people)
@@ -49,9 +48,8 @@ for k in range(5):
     print(f"{k + 1:5}   {gesture:16} {share.between[k]:.2f}")
 
 # %%
-# Small p-values alone are not informative: with many frames, small effects are
-# significant. The effect sizes show that the first two coefficients describe gestures,
-# and the others mostly people. Their basis shapes:
+# With many frames, small effects are significant, so consider the effect sizes. The
+# first two coefficients describe gestures, the others mostly people. The basis shapes:
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)
 
@@ -59,11 +57,11 @@ BasisShapeDisplay.from_estimator(model, n_columns=3)
 # All coefficients together
 # -------------------------
 #
-# How well do they predict the gestures of new people? The baseline are as many
-# components of PCA of the aligned frames. Coefficients relative to the mean of their
-# person do not contain the appearance of the person. Three gestures are easy to
-# predict for all of them. For seven expressions of faces, both kinds of coefficients
-# are better than PCA (:doc:`/questions`).
+# How well do all coefficients predict the gestures of new people? The baseline is PCA
+# of the aligned frames with the same number of components. `WithinGroups` subtracts the
+# mean coefficients of each person. Three gestures are easy to predict with any of these
+# features. For seven expressions of faces, both kinds of coefficients are better than
+# PCA (:doc:`/questions`).
 
 features = {
     "alpha": model.alpha_,

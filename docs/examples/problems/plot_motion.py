@@ -2,12 +2,12 @@
 Smooth a motion over time
 =========================
 
-Neighbouring frames of a video are similar. The fit does not use this: frames may be in
-any order. `AffineNRSfM.smooth` uses it after the fit, for frames in a known order. A
-frame with few visible points then profits from its neighbours.
+Neighbouring frames of a video are similar. The fit does not use the order of the
+frames; `AffineNRSfM.smooth` uses it after the fit. Frames with few visible points are
+then estimated more accurately.
 
-A person walks, reaches and squats. The tracker is noisy, misses four points in ten, and
-sees nothing for more than a second.
+A person walks, reaches and squats. The tracks are noisy, 40 % of the points are
+missing, and all points are missing for more than a second.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -40,15 +40,15 @@ for left, right in axes:
     right.set_ylim(left.get_ylim())
 
 # %%
-# Bands are one standard deviation. They widen where nothing was seen. The memory of the
-# motion is estimated from the table.
+# Bands are one standard deviation. They widen where no points are visible. The decay
+# times of the motion are estimated from the table.
 
 print("seconds until a motion is forgotten:", smooth.time_scales.round(1))
 
 # %%
-# Does smoothing reduce the error? These are the errors of the 3D shapes of the visible
-# frames, after the best rotation and scale of each. Coefficients of complete frames
-# without noise, with the same basis shapes, give the lower bound for any smoothing.
+# The output lists the 3D errors of the visible frames, after the best rotation and
+# scale of each. The last line is for coefficients of complete frames without noise:
+# approximately the lowest error that is possible with these basis shapes.
 
 clean = model.transform(body.clean.reshape(len(X), -1))
 for name, alpha in {
@@ -61,7 +61,8 @@ for name, alpha in {
     print(f"{name:24} {error:.1%} of the size of the body")
 
 # %%
-# Photos in random order have no dynamics. The method detects this, and nothing changes.
+# Photos in random order have no dynamics. `smooth` detects this and returns the
+# coefficients unchanged.
 
 order = np.random.RandomState(0).permutation(np.flatnonzero(seen))
 shuffled = model.smooth(X[order])

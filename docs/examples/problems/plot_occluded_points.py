@@ -2,9 +2,9 @@
 Fill in occluded landmarks
 ==========================
 
-A hand in front of the mouth, hair over a brow, the far side of a turned head: some
-landmarks were not seen, and not at random. `AffineNRSfM.reproject` returns the table
-with all points as the model has them. Filled in are those that were missing.
+Landmarks are often occluded systematically: by a hand in front of the mouth, by hair,
+or on the far side of a turned head. `AffineNRSfM.reproject` returns the reprojections
+of all points, with which missing points can be filled in.
 """
 
 import numpy as np
@@ -28,14 +28,14 @@ X = np.where(seen[..., None], faces.tracks, np.nan).reshape(faces.data.shape)
 print(f"{np.isnan(X).mean():.0%} of the table is missing")
 
 # %%
-# The model is fitted to the table as it is, with its holes.
+# The model is fitted to the incomplete table.
 
 model = AffineNRSfM(4, random_state=0).fit(X)
 completed = np.where(np.isnan(X), model.reproject(X), X)
 
 # %%
-# The baseline for the completion: the mean shape of the model in the affine camera that
-# fits the points of the frame best.
+# The baseline is the mean shape of the model in the affine camera that fits the visible
+# points of the frame best.
 
 mean_shape = np.c_[model.mean_shape_, np.ones(68)]
 rigid = np.empty_like(faces.tracks)
@@ -51,12 +51,13 @@ for name, found in {"AffineNRSfM": completed, "mean shape": rigid}.items():
         print(f"{name:12} {group:16} {error:5.2f}")
 
 # %%
-# How sure is it?
-# ---------------
+# Uncertainty
+# -----------
 #
-# If only the mouth is hidden, the chin still shows how far it is open. If the jaw is
-# hidden as well, the coefficient tends to its mean, zero, and its standard deviation to
-# one, that over all frames. Check `alpha_std_` before you rely on a completed point.
+# If only the mouth is hidden, the position of the chin determines how far it is open.
+# If mouth and jaw are hidden, the coefficient tends to its mean, zero, and its standard
+# deviation to that over all frames, one. Check `alpha_std_` before you use a completed
+# point.
 
 mouth = np.abs(np.corrcoef(faces.alpha[:, 0], model.alpha_.T)[0, 1:]).argmax()
 print(f"deviation of the coefficient of {faces.component_names[0]!r}")
@@ -65,8 +66,8 @@ for group in [*groups, "nothing"]:
     print(f"  {group + ' hidden':24} {deviation.mean():.2f}")
 
 # %%
-# Four frames with the mouth and four with an eye hidden: what was seen (rings), and the
-# model.
+# Four frames with a hidden mouth and four with a hidden eye: observed points (rings)
+# and the model.
 
 rows = [np.flatnonzero(hidden_group == name)[:4] for name in list(groups)[:2]]
 ReprojectionDisplay.from_estimator(

@@ -1,11 +1,10 @@
 """
-Make a shape model, and a page that shows it
-============================================
+Write a shape model and an interactive page
+===========================================
 
 Trackers such as OpenFace fit a *point distribution model* to images: a mean shape,
-principal axes of the shapes in 3D, and their variances. It is made from a table of
-landmarks, with your own points, in a few lines. So is a page for people who have a
-browser and no Python.
+principal axes of the 3D shapes, and their variances. This example estimates such a
+model from a table of landmarks, and writes an interactive page of the shapes.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -31,16 +30,16 @@ model = AffineNRSfM(4, random_state=0).fit(faces.data)
 
 # %%
 # The modes are not the independent basis shapes. They are the principal axes of the
-# shapes of the frames, in true proportions and aligned to each other: orthogonal,
-# uncorrelated, strongest first.
+# aligned Euclidean shapes of the frames: orthogonal, with uncorrelated scores,
+# strongest first.
 
 pdm = point_distribution_model(model)
 print("mean", pdm.mean.shape, "modes", pdm.modes.shape)
 print("standard deviations", np.sqrt(pdm.eigenvalues).round(3))
 
 # %%
-# Images do not determine the unit of length. One known distance does: that of the outer
-# corners of the eyes, in millimetres.
+# Images do not determine the unit of length. Here it is determined by one known
+# distance, that of the outer eye corners in millimetres.
 
 known = np.linalg.norm(faces.neutral_shape[36] - faces.neutral_shape[45])
 pdm = pdm.scaled(known / np.linalg.norm(pdm.mean[36] - pdm.mean[45]))
@@ -59,11 +58,10 @@ display.plot(n_columns=2)
 # The files
 # ---------
 #
-# ``pdm.txt`` is what OpenFace reads as the shape model of a landmark detector. glTF
-# files (``.glb``) open in any 3D program, each basis shape as a morph target. The page
-# has a slider for each basis shape, and needs nothing but a browser. On the command
-# line: ``isa-nrsfm export model.npz --output pdm.txt``, or ``face.glb``, or
-# ``viewer.html``.
+# OpenFace reads ``pdm.txt`` as the shape model of a landmark detector. In glTF files
+# (``.glb``), which 3D programs open, each basis shape is a morph target. The page has a
+# slider for each basis shape. On the command line, use ``isa-nrsfm export model.npz
+# --output pdm.txt``, ``face.glb`` or ``viewer.html``.
 
 correlation = np.abs(np.corrcoef(faces.alpha.T, model.alpha_.T)[:4, 4:])
 names = [faces.component_names[k] for k in correlation.argmax(axis=0)]
@@ -78,7 +76,7 @@ with TemporaryDirectory() as folder:
 print("the same model again:", np.allclose(again.modes, pdm.modes))
 
 # %%
-# This is the page, in a frame of this one. Drag to turn the face.
+# The page, embedded in this one. Drag to rotate the face.
 
 
 class Framed:

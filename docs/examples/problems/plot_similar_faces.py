@@ -1,13 +1,13 @@
 """
-Find similar faces whatever their pose
-======================================
+Find similar faces in any pose
+==============================
 
-Which other row of the table shows the same face? Distances between landmarks find the
-same *pose*. Distances between coefficients find the same *shape*, because the
+The nearest neighbour of a face by its landmarks is a face in the same *pose*. The
+nearest neighbour by its coefficients is a face of the same *shape*, because the
 coefficients do not depend on the viewpoint.
 
-Here the same 200 artificial faces are seen twice, by different cameras. A query is a
-face of the first half, and its like is one row of the second.
+Here 200 artificial faces are each seen by two cameras. For each image of the first
+camera, the same face is searched among the images of the second.
 """
 
 import numpy as np
@@ -27,16 +27,16 @@ tracks = np.concatenate([first.tracks, again])
 X = tracks.reshape(len(tracks), -1)
 
 # %%
-# Coefficients of unit variance have equal weight in the distance, but a coefficient
-# that the points of a frame hardly determine should have less weight. Division by the
-# mean of `alpha_std_` achieves this.
+# All coefficients have unit variance. In the distance, coefficients with larger
+# standard deviations should have less weight. They are therefore divided by the RMS of
+# `alpha_std_`.
 
 model = AffineNRSfM(K, random_state=0).fit(X)
 alpha = model.alpha_ / np.sqrt(np.mean(model.alpha_std_**2, axis=0))
 
 # %%
-# The baseline is the distance of the landmarks, with frames aligned by the best
-# similarity transform of the image (a single product of complex numbers).
+# The baseline is the distance of the landmarks after the best similarity transform,
+# computed with complex numbers.
 
 z = tracks @ [1, 1j]
 z = z - z.mean(axis=1, keepdims=True)
@@ -52,8 +52,8 @@ for name, values in likeness.items():
     print(f"    and among the nearest five in {five:.0%}")
 
 # %%
-# Faces near rest are similar; their differences are below the noise. The nearest face
-# need not be the same one, but it should look the same from the front.
+# Nearly neutral faces differ by less than the noise. The nearest face may therefore be
+# another one, but it should have the same expression.
 
 strong = np.argsort(first.strength[:, :3].max(axis=1))[-4:]
 nearest = {name: n_faces + values.argmax(axis=1) for name, values in likeness.items()}
@@ -74,8 +74,8 @@ for axis, title in zip(display.axes_, ["query"] * 4 + titles, strict=True):
 # With scikit-learn's neighbours
 # ------------------------------
 #
-# For a large table, an index of the coefficients answers at once. New photos are
-# transformed and looked up.
+# For a large table, use an index of the coefficients. New photos are transformed, and
+# their neighbours are queried.
 
 index = NearestNeighbors(n_neighbors=3).fit(alpha[n_faces:])
 query = model.transform(X[:1]) / np.sqrt(np.mean(model.alpha_std_**2, axis=0))
