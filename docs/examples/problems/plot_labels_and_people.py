@@ -4,7 +4,7 @@ Relate coefficients to gestures and people
 
 Several people open a hand, close it and point. The coefficients of a fit depend on the
 gesture and on the person, because fingers have different lengths. `isa_nrsfm.analysis`
-tests which coefficient depends on which; :doc:`/questions` explains the statistics.
+measures this dependence; :doc:`/questions` explains the statistics.
 """
 
 # sphinx_gallery_thumbnail_number = 1
