@@ -75,14 +75,13 @@ def _content(output: Path, content: str | None) -> str:
     """Return the content to write, and check that the suffix fits."""
     suffix = output.suffix.lower()
     if content is None:
-        found = [name for name, suffixes in SUFFIXES.items() if suffix in suffixes]
-        if not found:
-            known = ", ".join(s for suffixes in SUFFIXES.values() for s in suffixes)
+        known = {each: name for name, own in SUFFIXES.items() for each in own}
+        if suffix not in known:
             raise ValueError(
-                f"--output: expected a file with one of the suffixes {known}; got "
-                f"{output}"
+                "--output: expected a file with one of the suffixes "
+                f"{', '.join(known)}; got {output}"
             )
-        return found[0]
+        return known[suffix]
     suffixes = SUFFIXES[content]
     if content == "pdm":
         suffixes += SUFFIXES["shapes"]

@@ -139,9 +139,9 @@ def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
-    auto = args.n_components[0] == AUTO
-    for option in ["--std"] * args.std + ["--n-components auto"] * auto:
-        if args.refinement != "joint":
+    joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
+    for option, is_given in joint.items():
+        if is_given and args.refinement != "joint":
             raise ValueError(
                 f"{option} needs --refinement joint; got --refinement {args.refinement}"
             )
@@ -275,6 +275,5 @@ def extrapolated(tried: NDArray, seconds: NDArray, following: NDArray) -> NDArra
     if len(tried) > 2:
         tried, seconds = tried[1:], seconds[1:]
     degree = min(len(tried) - 1, 1)
-    # The numbers as they are: one alone has no range to be scaled by.
-    line = np.polynomial.Polynomial.fit(tried, seconds, degree, domain=[])
-    return np.maximum(line(following), seconds[-1])
+    line = np.polyfit(tried, seconds, degree)
+    return np.maximum(np.polyval(line, following), seconds[-1])

@@ -42,14 +42,18 @@ class Cells(NamedTuple):
     rows: Sequence[Sequence[str]]
     title: str = ""
 
-    def aligned(self) -> list[list[tuple[str, bool]]]:
-        """Return the rows, head first, and whether cells are aligned to the right."""
-        numbers = [
+    @property
+    def lines(self) -> Sequence[Sequence[str]]:
+        """The rows, after the head if there is one."""
+        return [self.head, *self.rows] if self.head else self.rows
+
+    @property
+    def numbers(self) -> list[bool]:
+        """Which columns have numbers, and are aligned to the right."""
+        return [
             any(column) and all(cell[:1] in "+-0123456789" for cell in column)
             for column in zip(*self.rows, strict=True)
         ]
-        lines = [self.head, *self.rows] if self.head else self.rows
-        return [list(zip(line, numbers, strict=True)) for line in lines]
 
 
 Section = Sequence[str | Cells]
@@ -206,18 +210,13 @@ def _lines(part: str | Cells) -> list[str]:
     """Return the lines of a part: sentences, which end with a point, are wrapped."""
     if isinstance(part, str):
         return textwrap.wrap(part, 90) if part.endswith(".") else [part]
-    rows = part.aligned()
-    widths = [
-        max(len(cell) for cell, _ in column) for column in zip(*rows, strict=True)
-    ]
-    lines = [part.title] if part.title else []
-    for row in rows:
-        cells = [
-            cell.rjust(width) if right else cell.ljust(width)
-            for (cell, right), width in zip(row, widths, strict=True)
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return lines
+    columns = []
+    cells = zip(*part.lines, strict=True)
+    for column, is_number in zip(cells, part.numbers, strict=True):
+        align, width = ">" if is_number else "<", max(map(len, column))
+        columns.append([f"{cell:{align}{width}}" for cell in column])
+    rows = ["  ".join(row).rstrip() for row in zip(*columns, strict=True)]
+    return [part.title, *rows] if part.title else rows
 
 
 def _markup(name: str, parts: Section) -> list[str]:
@@ -230,11 +229,11 @@ def _markup(name: str, parts: Section) -> list[str]:
         if part.title:
             found.append(f"<h3>{escape(part.title)}</h3>")
         found.append('<div class="wide"><table>')
-        for i, row in enumerate(part.aligned()):
+        for i, row in enumerate(part.lines):
             tag = "th" if part.head and not i else "td"
             cells = (
-                f"<{tag}{' class=number' * right}>{escape(cell)}</{tag}>"
-                for cell, right in row
+                f"<{tag}{' class=number' * is_number}>{escape(cell)}</{tag}>"
+                for cell, is_number in zip(row, part.numbers, strict=True)
             )
             found.append(f"<tr>{''.join(cells)}</tr>")
         found.append("</table></div>")
