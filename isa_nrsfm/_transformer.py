@@ -33,7 +33,6 @@ from isa_nrsfm._tables.sources import (
     unmasked,
 )
 from isa_nrsfm._tables.tracks import Layout, tracks_to_table
-from isa_nrsfm.analysis._dynamics import smoothed_posterior
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -242,6 +241,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         not for photos in any order, the coefficients are those of `transform`. With
         groups, the likelihood is compared with that of groups with intercepts alone.
         """
+        # With it come linear models, for which `transform` need not wait.
+        from isa_nrsfm.analysis._dynamics import smoothed_posterior
+
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
         check_scalar(tol, "tol", Real, min_val=0.0)
