@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
 from isa_nrsfm import AffineNRSfM, FastISA
-from isa_nrsfm._frames.posterior import fit_tracks, frame_search
+from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._tables.tracks import (
     centred_tracks,
@@ -289,7 +289,7 @@ def found_by_search(model, tracks, seed):
     for _ in range(N_STARTS):
         alpha = SPREAD * rng.normal(size=(len(tracks), model.n_components))
         search = frame_search("affine", frames.shapes)
-        other = fit_tracks(tracks, search, frames.noise_variance, initial=alpha)
+        other = search.fit_tracks(tracks, frames.noise_variance, initial=alpha)
         found = np.minimum(found, other.objective)
     return fit / frames.noise_variance, found / frames.noise_variance
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.vectors import polar
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.skeletons import Skeleton, find_skeleton

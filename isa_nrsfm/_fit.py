@@ -27,15 +27,14 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera import reference_camera
-from isa_nrsfm._frames.camera_models import nearest_calibrated
+from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
 from isa_nrsfm._frames.models import (
     Decomposition,
     FrameMap,
     PosteriorFrames,
     RigidFrames,
+    spread_starts,
 )
-from isa_nrsfm._frames.posterior import spread_starts
 from isa_nrsfm._frames.projection import reprojection_error
 from isa_nrsfm._gauge.canonical import (
     image_energies,

@@ -1,6 +1,6 @@
 """The parts of fits of frames, by their names."""
 
-from isa_nrsfm._frames.posterior import fit_tracks, frame_search
+from isa_nrsfm._frames.models import frame_search
 
 # What a fitted model has of each frame.
 ATTRIBUTES_OF_FRAMES = ("motion_", "translation_", "alpha_", "alpha_std_")
@@ -22,4 +22,4 @@ def numbers_of(fits):
 
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
-    return fit_tracks(tracks, frame_search(camera, shapes), noise, **given)
+    return frame_search(camera, shapes).fit_tracks(tracks, noise, **given)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scenes import measurements, random_cameras, random_rotation
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg.vectors import polar
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM
 from isa_nrsfm.baselines._block_dictionary import (

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
-from isa_nrsfm._linalg.packed_symmetric import unpacked
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpacked
 
 NOISE = 0.02
 BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scenes import permute_frames, random_rotation, rotate_frames
 
-from isa_nrsfm._frames.camera import mean_view, reference_camera, rigid_cameras
+from isa_nrsfm._frames.camera_models import mean_view, reference_camera, rigid_cameras
 
 
 @pytest.fixture

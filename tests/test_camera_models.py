@@ -12,8 +12,13 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rotated,
 )
-from isa_nrsfm._linalg.packed_symmetric import COLUMNS, ROWS, unpacked
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import (
+    COLUMNS,
+    ROWS,
+    frames_first,
+    frames_last,
+    unpacked,
+)
 
 N = 7
 CALIBRATED = pytest.mark.parametrize("name", ["weak_perspective", "orthographic"])

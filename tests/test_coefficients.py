@@ -15,8 +15,12 @@ from isa_nrsfm._frames.point_sums import (
     frame_sums,
     frame_tracks,
 )
-from isa_nrsfm._linalg.packed_symmetric import unpack3, unpacked
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import (
+    frames_first,
+    frames_last,
+    unpack3,
+    unpacked,
+)
 
 NOISE = 0.05
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
-from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.svd import block_triplets, leading_triplets
 from isa_nrsfm._tables.blocks import FrameBlocks

@@ -11,7 +11,7 @@ from isa_nrsfm._frames.point_sums import (
     frame_tracks,
     whitened,
 )
-from isa_nrsfm._linalg.packed_symmetric import (
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     ROWS,
     pair_indices,

@@ -7,8 +7,8 @@ from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_rotation, random_scene, with_gaps
 
+from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.point_sums import frame_tracks
-from isa_nrsfm._frames.posterior import fit_frames, frame_search
 
 NOISE = 0.02
 CAMERA = pytest.mark.parametrize(
@@ -67,8 +67,8 @@ class TestExact:
         frames = frame_tracks(scene.tracks, np.isfinite(scene.tracks[..., 0]) * 1.0)
         search = frame_search(camera, scene.shapes)
         expected = fitted(scene, camera)
-        assert_same_fits(fit_frames(frames, search, NOISE**2), expected)
-        rough = fit_frames(frames, search, NOISE**2, rough=True)
+        assert_same_fits(search.fit(frames, NOISE**2), expected)
+        rough = search.fit(frames, NOISE**2, rough=True)
         away = np.abs(rough.motion - expected.motion).max(axis=(1, 2))
         assert np.median(away) < 0.1
 

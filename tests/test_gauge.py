@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, rotate_frames
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.camera import mean_view
+from isa_nrsfm._frames.camera_models import mean_view
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import (
     canonical_gauge,

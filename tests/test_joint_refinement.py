@@ -14,7 +14,7 @@ from scenes import likelihood_of
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointState, refine_joint
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 
 DEVIATION = 0.03
 AFFINE = CAMERAS["affine"]

@@ -6,7 +6,7 @@ import scenes
 from numpy.testing import assert_allclose
 from scenes import likelihood_of
 
-from isa_nrsfm._linalg.vectors import frames_first
+from isa_nrsfm._linalg.small_matrices import frames_first
 
 NOISE = 0.05
 PENALTY = 7.0

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg.vectors import frames_last
+from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._metric_upgrade.quadric import (
     CAMERA_MODELS,
     metric_quadric,

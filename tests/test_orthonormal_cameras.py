@@ -7,7 +7,7 @@ from scenes import random_rotation
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._linalg.vectors import polar
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     _linearised,
     orthonormal_mixture,

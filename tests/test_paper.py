@@ -12,7 +12,7 @@ from scenes import (
 from sklearn.base import BaseEstimator
 
 from isa_nrsfm import FastISA, PooledFastICA
-from isa_nrsfm._frames.camera import rigid_cameras
+from isa_nrsfm._frames.camera_models import rigid_cameras
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.pipeline import run_paper_pipeline
 from isa_nrsfm._paper.svd import leading_triplets

@@ -4,25 +4,23 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm._linalg.packed_symmetric import (
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
+    LANES,
     ROWS,
     diagonal_of,
+    frames_first,
+    frames_last,
+    in_lanes,
     inverse3,
     invert_positive,
+    of_frames,
     packed_products,
     pair_indices,
     solve_positive,
     sweep,
     unpack3,
     unpacked,
-)
-from isa_nrsfm._linalg.vectors import (
-    LANES,
-    frames_first,
-    frames_last,
-    in_lanes,
-    of_frames,
 )
 
 NUMBERS = [3, 98]

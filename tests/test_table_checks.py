@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from isa_nrsfm._prepare import layout_check
+from isa_nrsfm._prepare import checks
 from isa_nrsfm._prepare.checks import (
     check_names,
     check_points,
@@ -202,7 +202,7 @@ def faces():
 
 def warn_if_other_layout(X, layout, scale_frames):
     blocks = FrameBlocks.of_array(X, 17)
-    layout_check.warn_if_other_layout(blocks, X.shape[1], layout, scale_frames)
+    checks.warn_if_other_layout(blocks, X.shape[1], layout, scale_frames)
 
 
 class TestOtherLayout:

@@ -32,7 +32,7 @@ from isa_nrsfm._frames.point_sums import (
     with_one,
 )
 from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
-from isa_nrsfm._linalg.packed_symmetric import (
+from isa_nrsfm._linalg.small_matrices import (
     diagonal_of,
     packed_products,
     solve_positive,

@@ -32,8 +32,13 @@ from isa_nrsfm._frames.point_sums import (
     with_one,
 )
 from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
-from isa_nrsfm._linalg.packed_symmetric import pair_indices, unpack3, unpacked
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import (
+    frames_first,
+    frames_last,
+    pair_indices,
+    unpack3,
+    unpacked,
+)
 
 # Takes cameras, in the axes of the mean shape, to those reversed in depth. The images
 # of a flat object do not change when it is reflected at its plane. Those of other

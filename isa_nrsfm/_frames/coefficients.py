@@ -16,12 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameSums, camera_gram, with_one
-from isa_nrsfm._linalg.packed_symmetric import (
-    diagonal_of,
-    packed_rows,
-    sweep,
-    unpacked,
-)
+from isa_nrsfm._linalg.small_matrices import diagonal_of, packed_rows, sweep, unpacked
 
 
 class CoefficientPosterior(NamedTuple):

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera import rigid_cameras
-from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.affine_newton import AffineSearch
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.camera_models import CAMERAS, rigid_cameras
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty, depth_deviations
 from isa_nrsfm._frames.point_sums import FrameTracks
-from isa_nrsfm._frames.posterior import fit_frames, fit_tracks, frame_search
 from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
-from isa_nrsfm._linalg.vectors import in_lanes
+from isa_nrsfm._linalg.small_matrices import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
 
@@ -176,6 +176,13 @@ class RigidFrames(NamedTuple):
         return motion, translation, alpha
 
 
+def frame_search(camera: str, shapes: NDArray) -> FrameSearch:
+    """Return the search of a camera model for centred shapes with alpha ~ N(0, I)."""
+    if camera == "affine":
+        return AffineSearch(shapes)
+    return CalibratedSearch(shapes, camera == "weak_perspective")
+
+
 @dataclass(frozen=True, eq=False)
 class PosteriorFrames:
     """The joint refinement's model of a frame: its posterior, camera and coefficients.
@@ -239,7 +246,7 @@ class PosteriorFrames:
 
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """Return the fit of prepared frames of size one, before the gauge."""
-        return fit_frames(block, self._search, self.noise_variance, starts=self.starts)
+        return self._search.fit(block, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """Return standard deviations (n, J) of depths with calibrated cameras."""
@@ -263,10 +270,7 @@ class PosteriorFrames:
         # Rounding depends on the strides: the same for all callers.
         tracks = np.ascontiguousarray(tracks)
         fitted = partial(
-            fit_tracks,
-            search=self._search,
-            noise=self.noise_variance,
-            covariances=covariances,
+            self._search.fit_tracks, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
             return fitted(tracks, starts=self.starts)
@@ -303,3 +307,17 @@ class PosteriorFrames:
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
         return fit
+
+
+def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:
+    """Return at most n_starts rows of alpha (n, K) by farthest point sampling."""
+    alpha = alpha[np.isfinite(alpha).all(axis=1)]
+    # Squared distance from zero and from the rows chosen so far
+    distance = np.einsum("ik,ik->i", alpha, alpha)
+    chosen: list[int] = []
+    while len(chosen) < n_starts and distance.max(initial=0.0) > 0:
+        chosen.append(int(np.argmax(distance)))
+        difference = alpha - alpha[chosen[-1]]
+        nearest = np.einsum("ik,ik->i", difference, difference)
+        distance = np.minimum(distance, nearest)
+    return alpha[chosen]

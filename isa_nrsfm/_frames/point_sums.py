@@ -13,23 +13,23 @@ product for all frames.
 """
 
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.packed_symmetric import (
+from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,
     ROWS,
     diagonal_of,
     inverse3,
+    of_frames,
     pair_indices,
     unpack3,
     unpacked,
 )
-from isa_nrsfm._linalg.vectors import of_frames
 
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
@@ -51,6 +51,9 @@ class Gram:
         self._index = unpacked(np.arange(len(pairs)))  # (n_shapes, n_shapes)
         # Pairs with k < l stand for two.
         self._multiplicity = np.bincount(self._index.ravel())[:, None]
+        # Products of matrices (a, b) or (a, b, n) with vectors (b, n)
+        of_each = partial(np.einsum, "abi,bi->ai")
+        self._times = np.matmul if pairs.ndim == 2 else of_each
 
     @cached_property
     def _full(self) -> NDArray:
@@ -61,28 +64,21 @@ class Gram:
 
     def products(self, c: NDArray) -> NDArray:
         """Return packed ``B_k S_i^T + S_i B_k^T`` (n_shapes, 6, n), c (n_shapes, n)."""
-        return _times(self._full, c).reshape(len(c), 6, c.shape[1])
+        return self._times(self._full, c).reshape(len(c), 6, c.shape[1])
 
     def moments(self, C: NDArray) -> NDArray:
         """Return ``sum_kl C_kl G_kl`` (6, n), packed; C (n_pairs, n) is packed."""
-        return _times(self.pairs.swapaxes(0, 1), self._multiplicity * C)
+        return self._times(self.pairs.swapaxes(0, 1), self._multiplicity * C)
 
     def energies(self, Q: NDArray) -> NDArray:
         """Return ``H_kl = <G_kl, Q>`` (n_pairs, n), packed; Q (6, n) is packed."""
-        return _times(self.pairs, TWICE[:, None] * Q)
+        return self._times(self.pairs, TWICE[:, None] * Q)
 
     def take(self, frames: NDArray) -> Self:
         """Return the Gram matrices of some of the frames."""
         if self.pairs.ndim == 2:
             return self
         return type(self)(of_frames(self.pairs, frames))
-
-
-def _times(matrices: NDArray, vectors: NDArray) -> NDArray:
-    """Return the products of matrices (a, b) or (a, b, n) with vectors (b, n)."""
-    if matrices.ndim == 2:
-        return matrices @ vectors
-    return np.einsum("abi,bi->ai", matrices, vectors)
 
 
 class FrameTracks(NamedTuple):
@@ -224,30 +220,17 @@ def _share(weight: NDArray) -> NDArray:
 
 
 class ShapeProducts:
-    """Products of shapes (n_shapes, 3, J), rows centred, computed when first needed."""
+    """Products of shapes (n_shapes, 3, J), rows centred.
+
+    rows (3 n_shapes, J): the shapes; pairs (6 n_pairs, J): the products ``b_kj b_lj^T``
+    of each point; gram: the sums of these.
+    """
 
     def __init__(self, shapes: NDArray):
         self.shapes = np.ascontiguousarray(shapes, dtype=np.float64)
-
-    @property
-    def n_components(self) -> int:
-        """Number of the shapes without the mean shape."""
-        return len(self.shapes) - 1
-
-    @property
-    def rows(self) -> NDArray:
-        """The shapes as rows (3 n_shapes, n_points)."""
-        return self.shapes.reshape(-1, self.shapes.shape[-1])
-
-    @cached_property
-    def gram(self) -> Gram:
-        """The Gram matrix of the shapes."""
-        return Gram(self.pairs.sum(axis=1).reshape(-1, 6))
-
-    @cached_property
-    def pairs(self) -> NDArray:
-        """The products ``b_kj b_lj^T`` of each point, (6 n_pairs, n_points)."""
-        return _pair_products(self.shapes).reshape(-1, self.shapes.shape[-1])
+        self.rows = self.shapes.reshape(-1, shapes.shape[-1])
+        self.pairs = _pair_products(self.shapes).reshape(-1, shapes.shape[-1])
+        self.gram = Gram(self.pairs.sum(axis=1).reshape(-1, 6))
 
 
 def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:

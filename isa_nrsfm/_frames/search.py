@@ -1,23 +1,42 @@
-"""Newton's method for cameras and coefficients of many frames at once.
+"""Most probable camera, position and coefficients of frames, for given shapes.
 
-The frame is the last index of all arrays. Steps are damped where the Hessian is not
-positive definite or a step has raised the objective of a frame, so that it never rises.
+Newton's method for many frames at once, the frame as the last index of all arrays.
+Steps are damped where the Hessian is not positive definite or a step has raised the
+objective of a frame, so that it never rises. Frames start from zero coefficients, badly
+fitted frames again from others.
 """
 
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.point_sums import FrameSums, ShapeProducts
-from isa_nrsfm._linalg.packed_symmetric import invert_positive, solve_positive, unpacked
+from isa_nrsfm._frames.point_sums import (
+    FrameSums,
+    FrameTracks,
+    ShapeProducts,
+    determines_camera,
+    frame_sums,
+    frame_tracks,
+)
 from isa_nrsfm._linalg.rounding import OF_STEPS
-from isa_nrsfm._linalg.vectors import frames_first, in_lanes, of_frames
+from isa_nrsfm._linalg.small_matrices import (
+    frames_first,
+    in_lanes,
+    invert_positive,
+    of_frames,
+    solve_positive,
+    unpacked,
+)
+from isa_nrsfm._tables.tracks import seen_points
 
 # Largest number of steps of a search.
 MAX_STEPS = 60
 # With so much damping a step no longer moves, and the search of the frame ends.
 LARGEST_DAMPING = 1e8
+# Objectives that differ by less than this share are equal.
+EQUAL = 1e-10
 
 
 class FramePosterior(NamedTuple):
@@ -97,13 +116,6 @@ class State(NamedTuple):
         """Return the state of some of the frames."""
         return type(self)(*(of_frames(each, frames) for each in self))
 
-    def newton_step(self, damping: NDArray) -> tuple[NDArray, NDArray]:
-        """Return damped steps (p, n), and where the matrix is positive definite."""
-        matrix = self.hessian
-        if damping.any():
-            matrix = matrix + damping * self.definite
-        return solve_positive(matrix, self.slope)
-
     def inverse(self) -> NDArray:
         """Return inverse Hessians (p, p, n), where indefinite those of `definite`."""
         inverse, positive = invert_positive(self.hessian)
@@ -128,40 +140,143 @@ class FrameSearch:
     def __init__(self, shapes: NDArray, space: NDArray):
         self.shared, self.space = ShapeProducts(shapes), space
 
+    def fit_tracks(
+        self,
+        tracks: NDArray,
+        noise: NDArray | float,
+        *,
+        weights: NDArray | None = None,
+        initial: NDArray | None = None,
+        starts: NDArray | None = None,
+        covariances: bool = True,
+    ) -> FramePosterior:
+        """Fit tracks (I, J, 2), NaN where a point is missing, as `fit` does.
+
+        The noise variance is at least 1e-13 of the energy. Weights (I, J) are 1 by
+        default.
+        """
+        tracks = np.asarray(tracks)
+        n_frames, n_components = len(tracks), len(self.shared.shapes) - 1
+        noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
+        given = 1.0 if weights is None else weights
+        weights = np.where(seen_points(tracks), given, 0.0)
+        complete = (weights == 1.0).all(axis=1)
+        fits = FramePosterior.unknown(n_frames, n_components, covariances)
+        # Complete frames share one Gram matrix.
+        for chosen in np.flatnonzero(complete), np.flatnonzero(~complete):
+            if len(chosen):
+                frames = in_lanes(chosen)
+                own = None if complete[frames[0]] else weights[frames]
+                whole = len(chosen) == len(frames) == n_frames
+                part = tracks if whole else tracks[frames]
+                fit = self.fit(
+                    frame_tracks(part, own),
+                    noise[frames],
+                    initial=None if initial is None else initial[frames],
+                    starts=starts,
+                    covariances=covariances,
+                )
+                fits.put(frames, fit)
+        return fits
+
     def fit(
         self,
-        products: FrameSums,
-        variance: NDArray,
-        initial: NDArray,
-        max_steps: int,
+        frames: FrameTracks,
+        noise: NDArray | float,
+        *,
+        initial: NDArray | None = None,
+        starts: NDArray | None = None,
         covariances: bool = True,
         rough: bool = False,
     ) -> FramePosterior:
-        """Return the minima that frames reach from coefficients initial (n, K).
+        """Return the most probable camera, position and coefficients of each frame.
 
-        The sums are those for the shapes in `shared`, the noise variances (n,). Rough
-        cameras need not be those of the lowest minimum.
+        The shapes are by points or directions, as the frames. `initial` (I, K) is by
+        default zero. Frames whose fit is much worse than the noise explains start again
+        from each of `starts` (n_starts, K). `rough` ends after a few steps.
+
+        Frames are independent, and NaN where points do not determine a camera. If only
+        the mean shape is flat, zero can be a saddle point: further starts help.
         """
-        problem = self.problem(products, variance)
-        start = self.evaluate(problem, self.start(problem, initial.T))
-        position, converged = self.descend(problem, start, max_steps)
-        if not rough:
-            position = self.improved(problem, position, converged, max_steps)
-        M, alpha, objective = self.solution(problem, position)
-        motion, n = frames_first(M), len(objective)
-        spreads = np.empty((n, 0, 0)), np.full((n, 3, 3), np.nan)
-        if covariances:
-            covariance, turns = self.covariances(problem, position)
-            turns = self.space.T @ frames_first(turns) @ self.space
-            spreads = frames_first(covariance), turns
-        return FramePosterior(
-            motion @ self.space,
-            products.positions(motion, alpha.T),
-            alpha.T,
-            *spreads,
-            np.maximum(objective, 0.0),  # less is rounding errors
-            converged,
-        )
+        n_frames, n_components = len(frames.weight), len(self.shared.shapes) - 1
+        noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
+        fit = partial(self._minima, frames, noise, covariances, rough)
+        every = np.arange(n_frames)
+        initial = np.zeros((n_frames, n_components)) if initial is None else initial
+        if rough:
+            return fit(every, initial, self.rough_steps)
+        # First round, block by block
+        fits = fit(every, initial, self.first_steps)
+        # Second round: the few frames that have not converged, from all blocks
+        slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
+        if len(slow):
+            fits.put(slow, fit(slow, fits.alpha[slow], MAX_STEPS))
+        # Further starts for frames that are explained badly, all starts at once. At the
+        # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model:
+        # it is chi-squared distributed, with two degrees of freedom for each point less
+        # the eight of camera and position. Three times its expectation may be another
+        # minimum.
+        freedom = np.maximum(2.0 * frames.weight - 8.0, 1.0)
+        poor = np.flatnonzero(fits.objective > 3.0 * noise * freedom)
+        if starts is not None and len(starts) and len(poor):
+            number = np.repeat(np.arange(len(starts)), len(poor))
+            others = fit(np.tile(poor, len(starts)), starts[number], MAX_STEPS)
+            # Of equal minima the first one is kept.
+            objective = others.objective.reshape(len(starts), -1)
+            best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
+            best = best * len(poor) + np.arange(len(poor))
+            gain = fits.objective[poor] - others.objective[best]
+            better = gain > EQUAL * fits.objective[poor]
+            fits.put(poor[better], others.take(best[better]))
+        return fits
+
+    def _minima(
+        self,
+        frames: FrameTracks,
+        noise: NDArray,
+        covariances: bool,
+        rough: bool,
+        chosen: NDArray,
+        initial: NDArray,
+        max_steps: int,
+    ) -> FramePosterior:
+        """Return the minima that chosen frames reach from coefficients (n_chosen, K).
+
+        Rough cameras need not be those of the lowest minimum.
+        """
+        fits = FramePosterior.unknown(len(chosen), initial.shape[1], covariances)
+        # Enough frames to be worth the calls, few enough for the cache
+        length = 2048 if frames.weights is None else 1024
+        for first in range(0, len(chosen), length):
+            block = in_lanes(np.arange(first, min(first + length, len(chosen))))
+            products = frame_sums(frames.take(chosen[block]), self.shared)
+            if frames.weights is not None:
+                determined = determines_camera(products, self.shared.shapes[0])
+                if not determined.all():
+                    usable = in_lanes(np.flatnonzero(determined))
+                    block, products = block[usable], products.take(usable)
+            problem = self.problem(products, noise[chosen[block]])
+            start = self.evaluate(problem, self.start(problem, initial[block].T))
+            position, converged = self.descend(problem, start, max_steps)
+            if not rough:
+                position = self.improved(problem, position, converged, max_steps)
+            M, alpha, objective = self.solution(problem, position)
+            motion = frames_first(M)
+            spreads = fits.covariance[block], fits.turn_covariance[block]
+            if covariances:
+                covariance, turns = self.covariances(problem, position)
+                turns = self.space.T @ frames_first(turns) @ self.space
+                spreads = frames_first(covariance), turns
+            found = FramePosterior(
+                motion @ self.space,
+                products.positions(motion, alpha.T),
+                alpha.T,
+                *spreads,
+                np.maximum(objective, 0.0),  # less is rounding errors
+                converged,
+            )
+            fits.put(block, found)
+        return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
         """Return frames with noise variances (n,) that are not zero."""
@@ -254,13 +369,16 @@ class FrameSearch:
 
     def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
         """Return Newton steps (p, n) and the damping (n,) that makes them definite."""
-        damping = damping.copy()
-        step, positive = state.newton_step(damping)
+        matrix, damping = state.hessian, damping.copy()
+        if damping.any():
+            matrix = matrix + damping * state.definite
+        step, positive = solve_positive(matrix, state.slope)
         failing = in_lanes(np.flatnonzero(~positive))
         while len(failing):
             damping[failing] = raised(damping[failing])
             part = state.take(failing)
-            step[:, failing], positive = part.newton_step(damping[failing])
+            matrix = part.hessian + damping[failing] * part.definite
+            step[:, failing], positive = solve_positive(matrix, part.slope)
             still = ~positive & (damping[failing] < LARGEST_DAMPING)
             failing = in_lanes(np.unique(failing[still]))
         return self.limited(step), damping

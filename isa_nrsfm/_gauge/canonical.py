@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera import mean_view
+from isa_nrsfm._frames.camera_models import mean_view
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 
 
 class Gauge(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
-from isa_nrsfm._linalg.vectors import energies
+from isa_nrsfm._linalg.small_matrices import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import seen_points
 

@@ -38,8 +38,7 @@ from isa_nrsfm._frames.point_sums import (
 )
 from isa_nrsfm._joint.extents import extent_penalty
 from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
-from isa_nrsfm._linalg.packed_symmetric import diagonal_of, unpack3, unpacked
-from isa_nrsfm._linalg.vectors import frames_last
+from isa_nrsfm._linalg.small_matrices import diagonal_of, frames_last, unpack3, unpacked
 
 
 class LikelihoodTerms(NamedTuple):

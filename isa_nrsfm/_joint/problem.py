@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._frames.posterior import fit_frames, frame_search
 from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
@@ -152,4 +152,4 @@ def _reversed_back(
 
 def _aligned_cameras(block: FrameTracks, search: FrameSearch, noise: float) -> NDArray:
     """Return nearly optimal cameras (n_frames, 2, 3) for the shapes of a search."""
-    return fit_frames(block, search, noise, covariances=False, rough=True).motion
+    return search.fit(block, noise, covariances=False, rough=True).motion

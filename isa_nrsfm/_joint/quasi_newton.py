@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_SUMS
-from isa_nrsfm._linalg.vectors import frames_first, frames_last
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 
 # Lower bound of the noise variance, as a share of the mean square of the tracks. It
 # keeps the objective finite for tables without noise.

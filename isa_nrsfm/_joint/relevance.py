@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._joint.problem import JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState, regular
-from isa_nrsfm._linalg.vectors import frames_last
+from isa_nrsfm._linalg.small_matrices import frames_last
 
 
 def relevant_components(

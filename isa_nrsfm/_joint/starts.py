@@ -13,17 +13,17 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera import rigid_cameras
 from isa_nrsfm._frames.camera_models import (
     AffineCameras,
     CameraModel,
     nearest_calibrated,
+    rigid_cameras,
 )
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
-from isa_nrsfm._linalg.vectors import frames_last
+from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     orthonormal_mixture,
     principal_columns,

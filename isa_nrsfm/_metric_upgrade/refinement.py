@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
-from isa_nrsfm._linalg.vectors import frames_last
+from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._metric_upgrade.quadric import (
     CalibratedCamera,
     mean_gram,

@@ -6,7 +6,7 @@ from scipy import linalg
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.vectors import polar
+from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._metric_upgrade.quadric import (
     CalibratedCamera,
     mean_gram,

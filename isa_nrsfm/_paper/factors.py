@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from isa_nrsfm._linalg.rounding import OF_RANKS
-from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._paper.svd import Triplets, leading_triplets
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
-from isa_nrsfm._linalg.vectors import energies
+from isa_nrsfm._linalg.small_matrices import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES, OF_STEPS
+from isa_nrsfm._linalg.small_matrices import unpacked
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames
 
@@ -137,7 +138,7 @@ def _posterior(frames: _Frames, model: CompletionModel) -> _Posterior:
     sums = patterns @ B.T
     means = sums / patterns.sum(axis=1)[:, None]
     # B_c B_c^T for each pattern. Centring integrates the translation out.
-    gram = _symmetric(patterns @ (B[upper[0]] * B[upper[1]]).T, rank)
+    gram = _symmetric(patterns @ (B[upper[0]] * B[upper[1]]).T)
     gram -= sums[:, :, None] * means[:, None]
     gram[:, range(rank), range(rank)] += model.ridge
     covariance = np.linalg.inv(gram)
@@ -164,13 +165,13 @@ def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, 
     products += seen.T @ (noise * cross[pattern])
     # M step: least squares for each point. One that is seen in fewer rows than the rank
     # needs the ridge. The translation takes the mean of the points.
-    moments = _symmetric(seen.T @ squares, rank)
+    moments = _symmetric(seen.T @ squares)
     moments[:, range(rank), range(rank)] += OF_DIFFERENCES * n_frames
     B = np.linalg.solve(moments, products[..., None])[..., 0].T
     B -= B.mean(axis=1, keepdims=True)
     # Rescale so that the mean of E[z z^T] is I, as in the prior: parameter expansion,
     # which makes EM faster (Liu, Rubin and Wu 1998).
-    mean_square = _symmetric(squares.mean(axis=0)[None] / 2, rank)[0]
+    mean_square = unpacked(squares.mean(axis=0) / 2)
     B = np.linalg.cholesky(mean_square).T @ B
     # Noise variance: residual energy over degrees of freedom. This is the fixed point
     # of EM's own step for the variance (MacKay 1992). A row has as many parameters as
@@ -182,9 +183,6 @@ def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, 
     return CompletionModel(B, variance), energy / n_numbers
 
 
-def _symmetric(packed: NDArray, size: int) -> NDArray:
-    """Return symmetric matrices (n, size, size) from upper triangles (n, n_pairs)."""
-    full = np.empty((len(packed), size, size))
-    first, second = np.triu_indices(size)
-    full[:, first, second] = full[:, second, first] = packed
-    return full
+def _symmetric(packed: NDArray) -> NDArray:
+    """Return symmetric matrices (n, k, k) from upper triangles (n, n_pairs)."""
+    return unpacked(packed.T).transpose(2, 0, 1)

@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._prepare.checks import check_points, check_size, visible_points
-from isa_nrsfm._prepare.layout_check import warn_if_other_layout
+from isa_nrsfm._prepare.checks import (
+    check_points,
+    check_size,
+    visible_points,
+    warn_if_other_layout,
+)
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import (

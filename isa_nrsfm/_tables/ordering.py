@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.vectors import energies
+from isa_nrsfm._linalg.small_matrices import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 
 

@@ -23,8 +23,7 @@ from isa_nrsfm._compat.scikit_learn import (
     fit_context,
     one_blas_thread,
 )
-from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._frames.posterior import fit_tracks, frame_search
+from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import check_names
@@ -299,9 +298,8 @@ class ShapeSequenceNRSfM(
             sizes = weighting_sizes(centred_tracks(tracks)[0], True)
         shapes = np.concatenate([self.mean_shape_[None], self.basis_]) / self._unit
         search = frame_search("orthographic", shapes.transpose(0, 2, 1).astype(float))
-        fits = fit_tracks(
+        fits = search.fit_tracks(
             tracks / sizes[:, None, None],
-            search,
             self.noise_variance_ / self._unit**2,
             covariances=False,
         )

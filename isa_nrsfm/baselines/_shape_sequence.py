@@ -7,7 +7,7 @@ With one shape for each frame the sign of a frame is undetermined: the camera -R
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 
 
 def shape_signs(shapes: NDArray) -> NDArray:

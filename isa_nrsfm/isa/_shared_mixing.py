@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from scipy.special import gammaln
 
 from isa_nrsfm._linalg.rounding import OF_RANKS, OF_STEPS
-from isa_nrsfm._linalg.vectors import orientations
+from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
 
