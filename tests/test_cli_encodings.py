@@ -1,9 +1,9 @@
 """The command line: names that are not UTF-8, encodings of output, interruptions."""
 
 import io
-import re
 import json
 import os
+import re
 import subprocess
 import sys
 
