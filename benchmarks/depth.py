@@ -95,10 +95,10 @@ def main(argv=None):
     cases = [("ICT-68 faces", 3), ("ICT-68 faces", 9)]
     cases += [("generated faces", 3), ("generated faces", 9), ("bodies", 3)]
     print(
-        "| shapes | K | noise | turned by | error of depths | as a share of the fitted "
-        "depths | stated deviation | "
-        "within two deviations | angles given | error of rotations, degrees | "
-        "over its deviation |"
+        "| shapes | K | noise | turned by | error of depths, relative to the true "
+        "depths | relative to the fitted depths | estimated (`depth_uncertainty_`) | "
+        "error below twice the estimate | depth determined | "
+        "error of rotations, degrees | RMS of this error over its standard deviation |"
     )
     print("|---" * 11 + "|")
     for kind, n_components in cases:

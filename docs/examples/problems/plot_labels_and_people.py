@@ -49,7 +49,8 @@ for k in range(5):
 
 # %%
 # With many frames, small effects are significant, so consider the effect sizes. The
-# first two coefficients describe gestures, the others mostly people. The basis shapes:
+# first two coefficients describe gestures; the others depend on the person only. The
+# basis shapes:
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)
 

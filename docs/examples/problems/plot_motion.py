@@ -43,7 +43,7 @@ for left, right in axes:
 # Bands are one standard deviation. They widen where no points are visible. The decay
 # times of the motion are estimated from the table.
 
-print("seconds until a motion is forgotten:", smooth.time_scales.round(1))
+print("decay times, seconds:", smooth.time_scales.round(1))
 
 # %%
 # The output lists the 3D errors of the visible frames, after the best rotation and
@@ -54,7 +54,7 @@ clean = model.transform(body.clean.reshape(len(X), -1))
 for name, alpha in {
     "frames by themselves": alone.alpha,
     "smoothed": smooth.alpha,
-    "without noise and holes": clean,
+    "complete, without noise": clean,
 }.items():
     shapes = model.mean_shape_ + np.tensordot(alpha[seen], model.basis_, 1)
     error = mean_shape_error_3d(body.shapes[seen], shapes, convention="frame")

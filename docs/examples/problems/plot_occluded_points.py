@@ -43,7 +43,7 @@ for i, points in enumerate(seen):
     camera = np.linalg.lstsq(mean_shape[points], faces.tracks[i, points])[0]
     rigid[i] = mean_shape @ camera
 
-print("mean error of the points that were hidden, in pixels")
+print("mean error of the hidden points, pixels")
 for name, found in {"AffineNRSfM": completed, "mean shape": rigid}.items():
     distance = np.linalg.norm(found.reshape(rigid.shape) - faces.clean, axis=-1)
     for group, points in groups.items():
@@ -56,11 +56,12 @@ for name, found in {"AffineNRSfM": completed, "mean shape": rigid}.items():
 #
 # If only the mouth is hidden, the position of the chin determines how far it is open.
 # If mouth and jaw are hidden, the coefficient tends to its mean, zero, and its standard
-# deviation to that over all frames, one. Check `alpha_std_` before you use a completed
-# point.
+# deviation increases towards that over all frames, one. Check `alpha_std_` before you
+# use a completed point.
 
 mouth = np.abs(np.corrcoef(faces.alpha[:, 0], model.alpha_.T)[0, 1:]).argmax()
-print(f"deviation of the coefficient of {faces.component_names[0]!r}")
+opening = faces.component_names[0]
+print(f"standard deviation of the coefficient of {opening!r}")
 for group in [*groups, "nothing"]:
     deviation = model.alpha_std_[hidden_group == group, mouth]
     print(f"  {group + ' hidden':24} {deviation.mean():.2f}")

@@ -48,8 +48,7 @@ likeness = {
 for name, values in likeness.items():
     better = (values > np.diag(values)[:, None]).sum(axis=1)
     first_one, five = np.mean(better == 0), np.mean(better < 5)
-    print(f"{name}: of {n_faces} faces the same one is the nearest in {first_one:.0%},")
-    print(f"    and among the nearest five in {five:.0%}")
+    print(f"{name}: same face nearest {first_one:.0%}, among nearest five {five:.0%}")
 
 # %%
 # Nearly neutral faces differ by less than the noise. The nearest face may therefore be
