@@ -61,12 +61,10 @@ def text(separator):
     return lambda content, rng: damage.damaged_text(content.decode(), rng, separator)
 
 
-# By suffix. Of each four damages one is of bytes.
+# By suffix; other files are text. Of each four damages one is of bytes.
 DAMAGES = {
     ".csv": text(","),
     ".tsv": text("\t"),
-    ".txt": text(" "),
-    ".pts": text(" "),
     ".json": of_tree,
     ".npy": damage.damaged_npy,
     ".npz": damage.damaged_archive,
@@ -81,7 +79,8 @@ def change(path, rng):
     elif path.suffix == ".h5":
         damage.damage_hdf5(path, rng)
     else:
-        path.write_bytes(DAMAGES[path.suffix](path.read_bytes(), rng))
+        damaged = DAMAGES.get(path.suffix, text(" "))
+        path.write_bytes(damaged(path.read_bytes(), rng))
 
 
 # --- promises -----------------------------------------------------------------------

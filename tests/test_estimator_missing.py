@@ -411,7 +411,7 @@ def test_robust_losses_withstand_outliers(loss, seed, size):
     # The influence of outliers is bounded by "huber", but not small.
     *_, expected = gross_scene(seed)
     made, X, _, linear = gross_scene(seed, size)
-    bound = {"huber": 1.4, "cauchy": 1.3}[loss]
+    bound = 1.4 if loss == "huber" else 1.3
     assert error(estimator(loss=loss).fit(X), X, made.shapes) < bound * expected
     assert linear > 2 * expected
 

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from isa_nrsfm import AffineNRSfM, isa as strategies
@@ -109,6 +110,11 @@ class TestStrategies:
         signals[:, 5] = signals[:, 0] - signals[:, 1]
         with pytest.raises(ValueError, match=r"6 linearly independent .* got rank 5"):
             isa.fit(signals)
+
+    def test_not_converged(self, isa):
+        isa = clone(isa).set_params(max_iter=1)
+        with pytest.warns(ConvergenceWarning, match="did not converge in max_iter=1"):
+            isa.fit(spherical_sources(0, 68, 9))
 
     def test_arguments_that_are_not_known(self, isa, signals):
         with pytest.raises(TypeError, match="weights"):

@@ -319,7 +319,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "joint refinement: independent basis shapes, or independent coefficients",
     ),
     "loss": _choice(
-        LOSSES, "joint refinement: huber and cauchy limit the influence of outliers"
+        LOSSES, "joint refinement: all but linear limit the influence of outliers"
     ),
     "no_scale_frames": _flag(
         "weight frames by their size in the image, as orthographic cameras always do"

@@ -194,7 +194,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
             warn_caller(
                 f"FastICA did not converge in max_iter={self.max_iter} steps in the "
                 "run that is kept: its sources may be ill determined; try "
-                "PooledFastICA with another fun or larger n_init or max_iter",
+                f"{type(self).__name__} with another fun or larger n_init or max_iter",
                 ConvergenceWarning,
             )
         return W
