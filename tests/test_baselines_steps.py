@@ -10,7 +10,6 @@ from scenes import measurements, random_cameras, random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.small_matrices import polar
-from isa_nrsfm._metric_upgrade.quadric import LARGEST_STRETCH
 from isa_nrsfm.baselines import CompressibleNRSfM
 from isa_nrsfm.baselines._block_dictionary import (
     code_frames,
@@ -31,7 +30,6 @@ from isa_nrsfm.baselines._pseudo_inverse import (
 )
 from isa_nrsfm.baselines._shape_sequence import (
     camera_signs,
-    principal_shapes,
     shape_signs,
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -66,25 +64,6 @@ class TestShapeSequences:
         found = camera_signs(signs[:, None, None] * cameras)
         assert_array_equal(found, signs * signs[0])
         assert_array_equal(camera_signs(cameras[:1]), [1.0])
-
-    @tall_and_wide
-    def test_principal_shapes(self, n_frames):
-        shapes = rng_of(0).normal(size=(n_frames, 8, 3)) + 1.0
-        mean, basis, c = principal_shapes(shapes, 3)
-        assert_allclose(mean, shapes.mean(axis=0))
-        rows = basis.reshape(3, -1)
-        sizes = np.sum(rows**2, axis=1)
-        assert_allclose(rows @ rows.T, np.diag(sizes), atol=1e-12)
-        assert (np.diff(sizes) < 0).all()
-        assert_allclose(c.mean(axis=0), 0, atol=1e-12)
-        assert_allclose(c.T @ c / n_frames, np.eye(3), atol=1e-12)
-        assert (np.sum(c**3, axis=0) > 0).all()
-        rest = (shapes - mean).reshape(n_frames, -1)
-        beyond = np.linalg.svd(rest, compute_uv=False)[3:]
-        assert np.sum((rest - c @ rows) ** 2) == pytest.approx(np.sum(beyond**2))
-        _, basis, c = principal_shapes(np.repeat(shapes[:1], 5, axis=0), 2)
-        assert not basis.any()
-        assert not c.any()
 
 
 class TestFirstShapes:
@@ -281,19 +260,6 @@ class TestBlockDictionary:
         share = (x + np.sqrt(np.maximum(x**2 - 4 * x * ridge, 0))) / 2 - ridge
         assert_allclose(norms(blocks)[kept, 1] ** 2, share[kept], rtol=0.02)
 
-    def test_end_of_the_reweighting(self):
-        # Blocks of overlapping atoms: D_l E_i^T = ridge * |W_i|^2 P_il^T / |P_il|^2.
-        scene, ridge = sparse_scene(3, n_points=60, n_atoms=6), 1e-4
-        atoms, *_ = true_code(scene)
-        blocks, _ = code_frames(scene.frames, atoms, 2, ridge)
-        rest = scene.frames - images(blocks, atoms)
-        pull = np.einsum("irp,lcp->ilrc", rest, atoms)
-        price = ridge * np.sum(scene.frames**2, axis=(1, 2))[:, None]
-        large = norms(blocks) ** 2 > 100 * price
-        weight = (price / np.where(large, norms(blocks), 1) ** 2)[large]
-        expected = weight[:, None, None] * blocks[large]
-        assert_allclose(pull[large], expected, rtol=1e-2, atol=1e-6)
-
     def test_units_rotations_and_batches_of_frames(self):
         frames = sparse_scene(0).frames
         atoms, *_ = true_code(sparse_scene(0))
@@ -401,17 +367,6 @@ class TestMetricCorrection:
         for same in (1e-6 * blocks, random_rotation(0, 2) @ blocks):
             G = metric_correction(same)
             assert_allclose(G @ G.T, Q, atol=1e-9)
-
-    def test_blocks_that_are_no_cameras(self):
-        stretch = [
-            np.linalg.cond(metric_correction(rng_of(seed).normal(size=(10, 2, 3))))
-            for seed in range(20)
-        ]
-        assert max(stretch) == pytest.approx(LARGEST_STRETCH)  # some are not definite
-        for n_flat in (1, 2, 3):
-            blocks = self.distorted(0, 30)
-            blocks[..., 3 - n_flat :] = 0
-            assert np.isfinite(metric_correction(blocks)).all()
 
 
 class TestAlignment:

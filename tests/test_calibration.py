@@ -120,20 +120,6 @@ class TestMetricUpgrade:
         assert upgrade.residual == pytest.approx(expected, rel=1e-6)
 
     @both_cameras
-    def test_follows_the_affinity_of_space(self, camera):
-        motion, *_ = scene(4, camera)
-        rng = np.random.default_rng(4)
-        motion += 0.1 * rng.standard_normal(motion.shape)
-        other = affinity_of(rng, 0.1, 1, 4)
-        one, two = (
-            metric_upgrade(motion, camera),
-            metric_upgrade(motion @ other, camera),
-        )
-        assert_allclose(other @ two.Q @ two.Q.T @ other.T, one.Q @ one.Q.T, rtol=1e-6)
-        assert two.residual == pytest.approx(one.residual, rel=1e-9)
-        assert two.condition_number == pytest.approx(one.condition_number, rel=1e-6)
-
-    @both_cameras
     def test_leaves_out_frames_without_camera(self, camera):
         motion, *_ = scene(7, camera)
         whole = np.full((23, 2, 3), np.nan)
@@ -204,14 +190,6 @@ class TestEuclideanShapes:
             images = [shapes @ M.T for M in motion]
             assert_allclose([upgraded @ (M @ Q).T for M in motion], images, atol=1e-9)
 
-    def test_shapes_of_exact_cameras_are_true_up_to_rotation_and_mirror_image(self):
-        motion, _, _, affinity = scene(0, "orthographic")
-        shape = np.random.default_rng(0).standard_normal((9, 3))
-        affine = shape @ np.linalg.inv(affinity).T
-        found = euclidean_shapes(affine, metric_upgrade(motion, "orthographic").Q)
-        # In units of the images, where the cameras have the scale 1.7.
-        assert_allclose(found @ found.T, 1.7**2 * shape @ shape.T, atol=1e-8)
-
     @pytest.mark.parametrize(
         ("shapes", "Q", "message"),
         [
@@ -274,17 +252,6 @@ class TestDeformationMetric:
         motion, alpha, _, strain, *_ = strained_scene(2, n_frames=400, noise=0.02)
         assert_allclose(deformation_metric(motion, alpha).strain, strain, atol=0.03)
 
-    def test_follows_the_affinity_of_space(self):
-        motion, alpha, *_ = strained_scene(5, noise=0.05)
-        other = affinity_of(np.random.default_rng(5), 0.3, 1, 2)
-        one = deformation_metric(motion, alpha)
-        two = deformation_metric(motion @ other, alpha)
-        gram = [
-            [metric.Q @ expm(np.tensordot(a, metric.strain, 1)) @ metric.Q.T
-             for a in alpha] for metric in (one, two)
-        ]  # fmt: skip
-        assert_allclose(other @ gram[1] @ other.T, gram[0], rtol=1e-4, atol=1e-6)
-
     def test_leaves_out_frames_without_camera(self):
         motion, alpha, *_ = strained_scene(6)
         more = np.concatenate([motion, np.full((2, 2, 3), np.nan)])
@@ -345,13 +312,6 @@ class TestEuclideanFrames:
         assert mean_shape_error_3d(true, frames.shapes, convention="frame") < 1e-7
         unit = scales / np.sqrt(np.mean(scales**2))
         assert_allclose(frames.scales / unit, frames.scales[0] / unit[0], rtol=1e-7)
-
-    def test_frames_do_not_depend_on_each_other(self, fitted):
-        metric, motion, alpha, mean, basis = fitted
-        frames = euclidean_frames(*fitted)
-        few = euclidean_frames(metric, motion[3:5], alpha[3:5], mean, basis)
-        for whole, part in zip(frames, few, strict=True):
-            assert_allclose(part, whole[3:5], rtol=1e-12)
 
     def test_frames_without_camera_are_nan(self, fitted):
         metric, motion, alpha, mean, basis = fitted

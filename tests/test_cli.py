@@ -5,13 +5,11 @@ import os
 import pty
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
 import warnings
 from argparse import Namespace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -33,7 +31,6 @@ QUICK = ["--n-components", str(N_COMPONENTS), "--isa", "fast", "--n-init", "2"]
 NO_FIGURES = ["--no-figures", *QUICK]
 UNREFINED = [*NO_FIGURES, "--refinement", "none"]
 MODULE = [sys.executable, "-m", "isa_nrsfm"]
-PROGRAM = str(Path(sys.executable).with_name("isa-nrsfm"))
 LANDMARKS = [f"{axis}_{j}" for j in range(68) for axis in "xy"]
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -753,25 +750,3 @@ def test_reader_that_goes_away_is_no_error(fitted, table, tmp_path, monkeypatch,
         argv = ["transform", fitted / MODEL, table, "-o", tmp_path / "a.csv"]
         assert main([str(word) for word in argv]) == 141
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.subprocess
-@pytest.mark.usefixtures("interruptible")
-def test_signal_of_the_keyboard_stops_the_program(table, tmp_path):
-    folder = tmp_path / "results"
-    started = subprocess.Popen(
-        [PROGRAM, "fit", str(table), "-o", str(folder), "--isa=fast", "--n-init=99999"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 60
-    while not folder.exists() and started.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    time.sleep(0.5)
-    started.send_signal(signal.SIGINT)
-    out, err = started.communicate(timeout=60)
-    assert (started.returncode, out) == (130, "")
-    assert err.endswith("isa-nrsfm: interrupted\n")
-    assert "Traceback" not in err

@@ -345,17 +345,6 @@ class TestPeople:
         with pytest.raises(ValueError, match="at least 2 frames for each of 5 people"):
             MAKERS[kind](9, n_people=5)
 
-    def test_the_two_orders_of_bodies_are_of_the_same_bodies(self):
-        joints, labels = [], []
-        for kind in ("coco-17", "h36m-17"):
-            scene = BODIES[kind](50, random_state=0)
-            names = ("left_knee", "right_elbow", "left_wrist")
-            points = [scene.point_names.index(name) for name in names]
-            joints.append(np.diff(scene.shapes[:, points], axis=1))
-            labels.append(scene.labels)
-        assert_array_equal(*labels)
-        assert_allclose(*joints, atol=1e-9)
-
     def test_poses_are_what_they_are_called(self):
         hands = make_hand_tracks(400, random_state=0)
         tips = np.linalg.norm(hands.shapes[:, [8, 12]] - hands.shapes[:, [0]], axis=2)

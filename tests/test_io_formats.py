@@ -116,16 +116,6 @@ def test_openface_keeps_what_it_says_of_frames(tmp_path):
     assert_array_equal(sure.failed, landmarks.failed)
 
 
-def test_several_faces_in_a_frame_keep_their_rows(tmp_path):
-    path = files.write_openface(tmp_path / "a.csv", TRACKS)
-    table = pd.read_csv(path)
-    table["frame"], table["face_id"] = np.arange(12) // 2, np.arange(12) % 2
-    table.to_csv(path, index=False)
-    landmarks = read_landmarks(path)
-    assert_array_equal(tracks_of(landmarks), TRACKS)
-    assert list(landmarks.frames["face_id"]) == [0, 1] * 6
-
-
 def test_openface_without_landmarks_is_refused(tmp_path):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     table = pd.read_csv(path)
@@ -289,15 +279,6 @@ def test_h5_files_run_no_code(tmp_path):
         file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(call)
     with pytest.raises(ValueError, match=r"builtins\.exec is not allowed"):
         read_landmarks(path)
-
-
-@pytest.mark.parametrize("name", ["a.csv", "a.h5"])
-def test_further_columns_of_lightning_pose_are_left_aside(name, tmp_path):
-    frame = FRAME.copy()
-    frame[("DLC_resnet50_mice", "set", "")] = "train"
-    path = files.write_deeplabcut(tmp_path / name, frame)
-    landmarks = read_landmarks(path, min_confidence=0.5)
-    assert_allclose(tracks_of(landmarks), TRACKS)
 
 
 def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):

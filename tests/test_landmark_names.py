@@ -58,24 +58,11 @@ def test_named_points_keep_the_order_of_the_table(template, pattern):
     assert found.points == tuple(points)
 
 
-def test_third_coordinate_is_set_aside_and_reported():
-    names = named("{a}_{p}", axes="xyz")
-    found = find_landmark_columns(names)
-    assert found.interleaved == named("{a}_{p}")
-    assert found.z == tuple(f"z_{j}" for j in range(N_POINTS))
-    assert find_landmark_columns(names, columns="x_#,y_#").z == found.z
-
-
 def test_gaps_in_the_numbers_are_reported_not_refused():
     names = named("{a}{p}", points=[3, 4, 5, 7, 8, 9, 12])
     found = find_landmark_columns(names)
     assert found.gaps == (6, 10, 11)
     assert found.points == ("3", "4", "5", "7", "8", "9", "12")
-
-
-def test_zero_padding_does_not_separate_coordinates():
-    names = [f"x{j:02d}" for j in range(12)] + [f"y{j}" for j in range(12)]
-    assert find_landmark_columns(names).interleaved[2:4] == ["x01", "y1"]
 
 
 def test_case_and_prefix_separate_sets():
@@ -214,15 +201,6 @@ def test_point_names_fall_back_to_columns_where_they_would_collide():
 )
 def test_names_layout(names, layout):
     assert names_layout(names) == layout
-
-
-@pytest.mark.parametrize("columns", [None, "*_x,*_y"])
-def test_names_with_line_breaks_are_points_as_others(columns):
-    points = ["nose", "left\neye", "chin", "brow 1", "tip\r\nof nose", "ear", "lip"]
-    names = ["id", *named("{p}_{a}", points=points)]
-    found = find_landmark_columns(names, columns=columns)
-    assert found.points == tuple(points)
-    assert found.interleaved == names[1:]
 
 
 def test_patterns_that_match_a_part_of_a_set_say_so():
