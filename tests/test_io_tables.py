@@ -202,17 +202,6 @@ def test_other_input_is_refused(frame):
         landmark_table(doubled)
 
 
-def test_table_as_it_is_distributed(data_path):
-    table = read_table(data_path("raw/muct76-opencv.csv"))
-    assert table.shape == (7510, 138)
-    points, other = landmark_table(table, missing="zeros")
-    assert list(points)[-2:] == ["x67", "y67"]
-    assert list(other) == ["name", "tag"]
-    plain = ~other["name"].str.startswith("ir")
-    assert plain.sum() == 3755
-    assert points[plain].isna().any(axis=1).sum() == 840
-
-
 @pytest.mark.skipif(
     not hasattr(os, "getuid") or os.getuid() == 0, reason="needs a user"
 )
