@@ -18,9 +18,7 @@ from isa_nrsfm.plotting import (
     ModeCovarianceDisplay,
     ReprojectionDisplay,
 )
-from isa_nrsfm.plotting._axes import (
-    percent,
-)
+from isa_nrsfm.plotting._axes import percent, row_width
 from isa_nrsfm.plotting._edges import (
     choose_layout,
     choose_lines,
@@ -228,6 +226,21 @@ def test_bad_arguments_of_plot_are_refused(kind, arguments, message):
 )
 def test_percent(fraction, text):
     assert percent(fraction) == text
+
+
+@pytest.mark.parametrize("layout", [None, "constrained"])
+def test_the_width_of_a_row(layout):
+    figure, axes = plt.subplots(2, 4, width_ratios=[1, 3, 1, 3], layout=layout)
+    figure.set_size_inches(8, 3)
+    for ax in figure.axes:
+        ax.set(xticks=[], yticks=[])
+    pair, alone = row_width(axes[0, :2]), row_width(axes[0, 1:2])
+    assert alone < pair <= 4.0
+    figure.canvas.draw()
+    boxes = [ax.get_position() for ax in axes[0, :2]]
+    assert pair == pytest.approx(8 * (boxes[1].x1 - boxes[0].x0), rel=0.1)
+    # One above the other: the width of the first.
+    assert row_width(axes[::-1, 0]) == pytest.approx(row_width(axes[:1, 0]), rel=0.2)
 
 
 def test_shapes_are_inside_limits_of_one_scale():
