@@ -65,6 +65,7 @@ from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import of_all_rows
 from isa_nrsfm._transformer import TableTransformer
 
 # Reported only with the joint refinement.
@@ -177,10 +178,10 @@ def fit_ready_table(
     centre = frames.translation.mean(axis=0)
     estimator.reference_translation_ = centre.astype(table.dtype)
     if estimator.keep_frames:
-        estimator._frame_sizes = table.of_all_rows(table.sizes)
+        estimator._frame_sizes = of_all_rows(table.sizes, table.shown)
     progress("gauge and coefficients")
     return Decomposition(
-        *(table.of_all_rows(each.astype(table.dtype)) for each in frames)
+        *(of_all_rows(each.astype(table.dtype), table.shown) for each in frames)
     )
 
 

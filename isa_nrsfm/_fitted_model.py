@@ -14,6 +14,7 @@ from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
     clean_tracks,
+    of_all_rows,
     seen_points,
     table_to_tracks,
     tracks_to_table,
@@ -44,7 +45,7 @@ class TableModel(NamedTuple):
         fit = self.frames.fit(centred, sizes, deviations)
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
-        return Decomposition(*(_of_all(each, usable).astype(dtype) for each in fit))
+        return Decomposition(*(of_all_rows(each, usable).astype(dtype) for each in fit))
 
     def posterior(self, rows: NDArray) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
@@ -77,7 +78,7 @@ class TableModel(NamedTuple):
         assert isinstance(self.frames, PosteriorFrames)
         usable, centred, _, sizes = self._ready(self._tracks(rows))
         found = self.frames.depth_deviations(centred, sizes)
-        return _of_all(found, usable).astype(rows.dtype, copy=False)
+        return of_all_rows(found, usable).astype(rows.dtype, copy=False)
 
     def reproject(self, rows: NDArray) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
@@ -91,7 +92,7 @@ class TableModel(NamedTuple):
         fit = self.frames.fit(centred, sizes, False)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         off = centred - project(shapes, fit.motion, fit.translation)
-        return _of_all(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
+        return of_all_rows(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
 
     def held_out(self, rows: NDArray) -> NDArray:
         """Return the energies (1, 2) of `held_out_energies`."""
@@ -120,15 +121,6 @@ class TableModel(NamedTuple):
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes
-
-
-def _of_all(values: NDArray, usable: NDArray) -> NDArray:
-    """Return values of the usable frames as values of all frames, NaN for others."""
-    if usable.all():
-        return values
-    whole = np.full((len(usable), *values.shape[1:]), np.nan)
-    whole[usable] = values
-    return whole
 
 
 def held_out_energies(

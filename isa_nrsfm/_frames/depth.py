@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import full_rotations
-
 # Rotations whose standard deviation is a larger share of their spread are not
 # determined. Faces of known shape that turn by 10 degrees have 0.2 to 0.3, by 4 degrees
 # 0.9 to 1.3; bodies that turn by 20 degrees 0.5, by 10 degrees 1.
@@ -63,39 +61,3 @@ class DepthCertainty(NamedTuple):
 
 
 NOT_ESTIMATED = DepthCertainty()
-
-
-def depth_deviations(
-    shapes: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    seen: NDArray,
-    noise: float,
-    certainty: DepthCertainty,
-    free: bool,
-) -> NDArray:
-    """
-    Compute the standard deviations of the depths of the points of frames of size one.
-
-    The variance of a depth is that of the jackknife plus that of its frame,
-    ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
-    depths by rotation vector, logarithm of the scale (if free) and coefficients.
-
-    shapes (n_components + 1, 3, n_points), motion (n_frames, 2, 3), NaN where a frame
-    has no camera, alpha (n_frames, n_components), seen (n_frames, n_points).
-    """
-    deviations = np.full(seen.shape, np.nan)
-    rotations, scales = full_rotations(motion)
-    prior = np.diag([0.0] * (3 + free) + [1.0] * alpha.shape[1])
-    for i in np.flatnonzero(np.isfinite(scales)):
-        centred = shapes - shapes[:, :, seen[i]].mean(axis=2, keepdims=True)
-        shape = centred[0] + np.tensordot(alpha[i], centred[1:], 1)
-        turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
-        changes = np.stack([*turned, *([shape] if free else []), *centred[1:]])
-        changes = scales[i] * rotations[i] @ changes
-        T = changes[:, :2, seen[i]].reshape(len(changes), -1)
-        covariance = np.linalg.pinv(T @ T.T / noise + prior, hermitian=True)
-        Z = changes[:, 2]
-        deviations[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
-    points = 0.0 if certainty.points is None else certainty.points
-    return np.sqrt(deviations + points)

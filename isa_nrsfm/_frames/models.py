@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.affine_newton import AffineSearch
 from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
-from isa_nrsfm._frames.camera_models import CAMERAS, rigid_cameras
-from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty, depth_deviations
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations, rigid_cameras
+from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
@@ -249,17 +249,31 @@ class PosteriorFrames:
         return self._search.fit(block, self.noise_variance, starts=self.starts)
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
-        """Return standard deviations (n, J) of depths with calibrated cameras."""
+        """Compute the standard deviations (n, J) of depths with calibrated cameras.
+
+        The variance of a depth is that of the jackknife plus that of its frame, ``Z
+        (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
+        depths by rotation vector, logarithm of the scale (if free) and coefficients.
+        """
         found = self.posterior(tracks / sizes[:, None, None], covariances=False)
-        return sizes[:, None] * depth_deviations(
-            self.shapes,
-            found.motion,
-            found.alpha,
-            seen_points(tracks),
-            self.noise_variance,
-            self.certainty,
-            CAMERAS[self.camera].scaled,
-        )
+        seen, free = seen_points(tracks), CAMERAS[self.camera].scaled
+        variances = np.full(seen.shape, np.nan)
+        rotations, scales = full_rotations(found.motion)
+        prior = np.diag([0.0] * (3 + free) + [1.0] * found.alpha.shape[1])
+        for i in np.flatnonzero(np.isfinite(scales)):
+            middle = self.shapes[:, :, seen[i]].mean(axis=2, keepdims=True)
+            mean_shape, basis = np.split(self.shapes - middle, [1])
+            shape = mean_shape[0] + np.tensordot(found.alpha[i], basis, 1)
+            turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
+            changes = np.stack([*turned, *([shape] if free else []), *basis])
+            changes = scales[i] * rotations[i] @ changes
+            T = changes[:, :2, seen[i]].reshape(len(changes), -1)
+            information = T @ T.T / self.noise_variance + prior
+            covariance = np.linalg.pinv(information, hermitian=True)
+            Z = changes[:, 2]
+            variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
+        points = 0.0 if self.certainty.points is None else self.certainty.points
+        return sizes[:, None] * np.sqrt(variances + points)
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
         """Return the fit of tracks of frames of size one, before the gauge.

@@ -54,14 +54,6 @@ class ScaledTable(NamedTuple):
         """Whether all points are seen."""
         return bool((self.n_seen == self.n_points).all())
 
-    def of_all_rows(self, values: NDArray) -> NDArray:
-        """Return values (n_frames, ...) as (n_rows, ...), NaN for the other rows."""
-        if self.shown.all():
-            return values
-        all_rows = np.full((len(self.shown), *values.shape[1:]), np.nan, values.dtype)
-        all_rows[self.shown] = values
-        return all_rows
-
     def part(self, rows: NDArray) -> "ScaledTable":
         """Return the table of some rows, by a mask (n_rows,), with the same scaling."""
         kept = rows[self.shown]

@@ -134,6 +134,15 @@ def seen_points(tracks: NDArray) -> NDArray:
     return ~(missing[..., 0] | missing[..., 1])
 
 
+def of_all_rows(values: NDArray, shown: NDArray) -> NDArray:
+    """Return values of the rows that are shown as those of all rows, NaN for others."""
+    if shown.all():
+        return values
+    all_rows = np.full((len(shown), *values.shape[1:]), np.nan, values.dtype)
+    all_rows[shown] = values
+    return all_rows
+
+
 def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
     """Return frames (I, J, 2) centred over their visible points in double precision."""
     eps = EQUAL * np.finfo(tracks.dtype).eps
