@@ -98,8 +98,64 @@ class TableModel(NamedTuple):
         """Return the energies (1, 2) of `held_out_energies`."""
         tracks = self._tracks(rows)
         usable, _, _, sizes = self._ready(tracks)
-        given = self.frames, self.mean_shape, self.basis, tracks[usable], sizes
-        return np.array([held_out_energies(*given)])
+        return np.array([self.held_out_energies(tracks[usable], sizes)])
+
+    def held_out_energies(self, tracks: NDArray, sizes: NDArray) -> tuple[float, float]:
+        """Return the energies of the error and of the signal of held-out points.
+
+        Each of five parts of the points, the same for all tables, is predicted from the
+        others: camera, position and coefficients of each frame are fitted without it.
+        The energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over
+        the points, divided by the squared sizes (I,) of frames.
+
+        Points are left out if the others of the frame do not determine its fit, or if
+        in a frame with missing points the affine camera of the mean shape adds more
+        than twice the noise variance to their prediction: a few such frames would
+        decide. This does not depend on the basis, so that scores of different K are of
+        the same points.
+        """
+        folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
+        seen = seen_points(tracks)
+        # Complete frames are fitted without the points, others with gaps instead.
+        frames = self.frames
+        complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
+        complete = complete and bool(seen.all())
+        noise = signal = 0.0
+        for fold in range(5):
+            held = folds == fold
+            # Fit without the held-out points
+            visible = np.where(held[:, None], np.nan, tracks)
+            enough = centred_frames(visible)[1].usable
+            usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
+            if not len(usable):
+                continue
+            mean, others = self.mean_shape[held], self.basis[:, held]
+            if complete:
+                assert isinstance(frames, PosteriorFrames)
+                kept = frames.of_points(~held)  # their centroid is the origin
+                fit = kept.fit(tracks[usable][:, ~held], sizes[usable], False)
+                mean = mean - self.mean_shape[~held].mean(axis=0)
+                others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
+            else:
+                fit = frames.fit(visible[usable], sizes[usable], False)
+            # Prediction of the held-out points, and its error
+            predicted = project(
+                compose(mean, others, fit.alpha), fit.motion, fit.translation
+            )
+            part = tracks[usable]
+            centre = np.nanmean(part, axis=1, keepdims=True)
+            weight = sizes[usable, None, None] ** -2.0
+            counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
+            some = ~seen[usable].all(axis=1)
+            # In 12 scenes of 120 frames, two frames that show six of 23 points multiply
+            # the error by 1.5 to 52 without a limit, and by 1.0 to 1.8 with this one.
+            # With 20 % of all points missing it changes the error by at most 1.2 %; a
+            # limit of 1 changes it by up to 21 %.
+            leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
+            counted[some] &= leverage[:, held] <= 2.0
+            noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
+            signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
+        return float(noise), float(signal)
 
     def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
@@ -121,68 +177,6 @@ class TableModel(NamedTuple):
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes
-
-
-def held_out_energies(
-    frames: RigidFrames | PosteriorFrames,
-    mean_shape: NDArray,
-    basis: NDArray,
-    tracks: NDArray,
-    sizes: NDArray,
-) -> tuple[float, float]:
-    """Return the energy of the error, and of the signal, of points that are held out.
-
-    Each of five parts of the points, the same for all tables, is predicted from the
-    others: camera, position and coefficients of each frame are fitted without it. The
-    energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over the
-    points, divided by the squared sizes (I,) of frames.
-
-    Points are left out if the others of the frame do not determine its fit, or if in a
-    frame with missing points the affine camera of the mean shape adds more than twice
-    the noise variance to their prediction: a few such frames would decide. This does
-    not depend on the basis, so that scores of different K are of the same points.
-    """
-    folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
-    seen = seen_points(tracks)
-    # Complete frames are fitted without the points, others with gaps in their place.
-    complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
-    complete = complete and bool(seen.all())
-    noise = signal = 0.0
-    for fold in range(5):
-        held = folds == fold
-        # Fit without the held-out points
-        visible = np.where(held[:, None], np.nan, tracks)
-        enough = centred_frames(visible)[1].usable
-        usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
-        if not len(usable):
-            continue
-        mean, others = mean_shape[held], basis[:, held]
-        if complete:
-            assert isinstance(frames, PosteriorFrames)
-            kept = frames.of_points(~held)  # their centroid is the origin
-            fit = kept.fit(tracks[usable][:, ~held], sizes[usable], False)
-            mean = mean - mean_shape[~held].mean(axis=0)
-            others = others - basis[:, ~held].mean(axis=1, keepdims=True)
-        else:
-            fit = frames.fit(visible[usable], sizes[usable], False)
-        # Prediction of the held-out points, and its error
-        predicted = project(
-            compose(mean, others, fit.alpha), fit.motion, fit.translation
-        )
-        part = tracks[usable]
-        centre = np.nanmean(part, axis=1, keepdims=True)
-        weight = sizes[usable, None, None] ** -2.0
-        counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
-        some = ~seen[usable].all(axis=1)
-        # In 12 scenes of 120 frames, two frames that show six of 23 points multiply the
-        # error by 1.5 to 52 without a limit, and by 1.0 to 1.8 with this one. With 20 %
-        # of all points missing it changes the error by at most 1.2 %; a limit of 1
-        # changes it by up to 21 %.
-        leverage = _camera_leverage(mean_shape, seen[usable[some]] & ~held)
-        counted[some] &= leverage[:, held] <= 2.0
-        noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
-        signal += np.sum((weight * (part[:, held] - centre) ** 2)[counted])
-    return float(noise), float(signal)
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:
