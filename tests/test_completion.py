@@ -32,17 +32,6 @@ def random_mask(shape, missing, seed, least=4):
     )
 
 
-def half_mask(tracks, share, seed):
-    """Return a mask that hides the left or the right part of a share of the frames."""
-    rng = np.random.default_rng(seed)
-    x = np.mean(tracks[..., 0] - tracks[..., 0].mean(axis=1, keepdims=True), axis=0)
-    seen = np.ones(tracks.shape[:2], dtype=bool)
-    for i in np.flatnonzero(rng.random(len(tracks)) < share):
-        side = rng.choice([-1.0, 1.0]) * x
-        seen[i] = side <= np.quantile(side, rng.uniform(0.5, 0.8))
-    return seen
-
-
 def unit_rows(centred, sizes):
     """Return tracks as frames (n_frames, 2, n_points) of size one."""
     return (centred / sizes[:, None, None]).transpose(0, 2, 1)
@@ -215,22 +204,6 @@ def test_the_error_is_near_the_noise(noise):
     assert noise**2 < held_out_error(scene.tracks, seen, 3) < 2 * noise**2
 
 
-def test_sides_of_faces():
-    tracks = make_face_tracks(400, random_state=0).tracks
-    assert held_out_error(tracks, half_mask(tracks, 0.7, 0), 4) < 5e-4
-
-
-def test_more_steps_do_not_find_much_better_points():
-    scene = make_face_tracks(300, random_state=0)
-    seen = random_mask(scene.visible.shape, 0.3, 0)
-    stopped = completed(hide(scene.tracks, seen), 4)
-    carried_on = completed(hide(scene.tracks, seen), 4, tol=1e-6, max_iter=500)
-    errors = [
-        np.sum((filled - scene.tracks)[~seen] ** 2) for filled in (stopped, carried_on)
-    ]
-    assert errors[0] < 1.05 * errors[1]
-
-
 # Inverse SNR in percent of hidden points on every fifth frame, a little above what is
 # reached; filling in with the centroid has 100, the mean of the 5 nearest frames 0.7.
 @pytest.mark.parametrize(
@@ -328,9 +301,3 @@ def test_noise_of_a_rigid_object(missing):
     centred, _ = centred_tracks(hide(scene.tracks, random_mask((500, 30), missing, 0)))
     variance = completion_model(unit_rows(centred, np.ones(500)), 3).noise
     assert_allclose(variance, scene.noise_variance, rtol=0.05)
-
-
-def test_a_rigid_object_without_noise():
-    tracks = make_nonrigid_tracks(100, 30, 0, random_state=0).tracks
-    centred, _ = centred_tracks(hide(tracks, random_mask((100, 30), 0.3, 0)))
-    assert completion_model(unit_rows(centred, np.ones(100)), 3).noise < 1e-18

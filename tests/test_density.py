@@ -40,18 +40,6 @@ class TestSqrtDensity:
         assert_allclose(g, -1 / 3)
         assert_allclose(dg, 1 / (4 * 1.5**3))
 
-    def test_keeps_the_shape(self):
-        energy = np.random.default_rng(0).exponential(size=(2, 3, 5))
-        density = SqrtDensity()
-        assert density.log_density(energy).shape == (2, 3, 5)
-        assert all(d.shape == (2, 3, 5) for d in density.derivatives(energy))
-
-    def test_falls_and_is_convex(self):
-        # F' < 0 < F'': heavier tails than those of a normal density.
-        g, dg = SqrtDensity().derivatives(np.array(ENERGIES))
-        assert np.all(g < 0)
-        assert np.all(dg > 0)
-
     @pytest.mark.parametrize("eps", [0.0, -0.5, np.nan])
     def test_eps_must_be_positive(self, eps):
         density = SqrtDensity(eps=eps)

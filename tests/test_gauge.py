@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import random_rotation, rotate_frames
+from scenes import random_rotation
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import mean_view
@@ -100,15 +100,6 @@ class TestSpace:
         assert_allclose(gauge.mean_shape, expected.mean_shape, atol=1e-10)
         assert_allclose(gauge.basis, expected.basis, atol=1e-8)
         assert_allclose(motion, expected_motion, atol=1e-10)
-
-    def test_rotated_images_of_scattered_views(self):
-        # Where no view is common, rotating single images changes nothing.
-        scene = Scene(n_frames=300).scattered()
-        expected, _ = scene.canonical()
-        rows = rotate_frames(scene.motion.reshape(-1, 3), 1)
-        scene.motion = rows.reshape(-1, 2, 3)
-        assert mean_view(scene.canonical()[1]) is None
-        assert_allclose(scene.canonical()[0].basis, expected.basis, atol=1e-10)
 
     @pytest.mark.parametrize("flat", [1, 2])
     @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])

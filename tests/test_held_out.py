@@ -103,19 +103,6 @@ def test_two_frames_of_six_points_do_not_decide(seed):
     assert error < 1.9 * expected  # without a limit up to fifty times
 
 
-def test_frames_that_show_too_little_are_left_out():
-    frames, shapes, tracks = scene()
-    sizes = np.ones(len(tracks))
-    expected = error_of(frames, shapes[0], shapes[1:], tracks[:8], sizes[:8])
-    tracks[8:, 4:] = np.nan  # four points: with one held out too few are left
-    error = error_of(frames, shapes[0], shapes[1:], tracks, sizes)
-    folds = np.random.RandomState(FOLD_SEED).permutation(23) % N_FOLDS
-    if all(
-        np.any(folds[:4] == fold) == (np.sum(folds[:4] == fold) > 0) for fold in folds
-    ):
-        assert_allclose(error, expected, rtol=1e-9)
-
-
 def test_nothing_that_can_be_held_out_has_no_energy():
     frames, shapes, tracks = scene()
     tracks[:, 3:] = np.nan

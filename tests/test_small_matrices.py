@@ -9,8 +9,6 @@ from isa_nrsfm._linalg.small_matrices import (
     LANES,
     ROWS,
     diagonal_of,
-    frames_first,
-    frames_last,
     in_lanes,
     inverse3,
     invert_positive,
@@ -217,21 +215,6 @@ def test_nothing_to_solve(k, n):
     assert x.shape == (k, n)
     assert positive.all()
     assert unpacked(invert_positive(packed(A))[0]).shape == (k, k, n)
-
-
-class TestOrderOfTheFrames:
-    motion = np.arange(24.0).reshape(4, 2, 3)
-
-    def test_last(self):
-        M = frames_last(self.motion)
-        assert M.flags.c_contiguous
-        for i, camera in enumerate(self.motion):
-            assert_array_equal(M[..., i], camera)
-
-    def test_first_and_back_without_a_copy(self):
-        M = frames_last(self.motion)
-        assert_array_equal(frames_first(M), self.motion)
-        assert np.shares_memory(frames_last(frames_first(M)), M)
 
 
 def test_packing_of_3x3_matrices():

@@ -262,29 +262,6 @@ class TestOtherLayout:
             warnings.simplefilter("error")
             warn_if_other_layout(X, "interleaved", scale_frames)
 
-    @pytest.mark.parametrize("scale_frames", [True, False])
-    @pytest.mark.parametrize(("right", "wrong"), [LAYOUTS, LAYOUTS[::-1]])
-    @pytest.mark.parametrize("missing", [0.1, 0.6])
-    @pytest.mark.parametrize(
-        "name",
-        [
-            "akhter_yoga",
-            "expressions_dlib_68",
-            "hands_kazuhito_21",
-            "ict_bu3dfe_like_68",
-            "muct_68",
-            "shark_torresani",
-        ],
-    )
-    def test_real_tables_with_missing_points(
-        self, load_data, name, missing, right, wrong, scale_frames
-    ):
-        tracks, _ = with_missing(load_data(name)["W2d"].astype(float), missing)
-        X = tracks_to_table(tracks, right)
-        warn_if_other_layout(X, right, scale_frames)
-        with pytest.warns(UserWarning, match=f"layout='{right}' explains the table"):
-            warn_if_other_layout(X, wrong, scale_frames)
-
     @pytest.mark.parametrize("seed", range(5))
     def test_generated_faces_with_missing_points(self, seed):
         X = make_face_tracks(60, missing=0.3, random_state=seed).data
@@ -301,9 +278,3 @@ class TestOtherLayout:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 warn_if_other_layout(tracks_to_table(X), layout, True)
-
-    @pytest.mark.parametrize("layout", LAYOUTS)
-    def test_a_rigid_object_with_missing_points(self, rng, layout):
-        tracks = rng.normal(size=(30, 3)) @ rng.normal(size=(40, 3, 2))
-        X = tracks_to_table(with_missing(tracks, 0.3)[0], layout)
-        warn_if_other_layout(X, layout, True)
