@@ -1,5 +1,8 @@
 """The parts of fits of frames, by their names."""
 
+import numpy as np
+from numpy.testing import assert_allclose
+
 from isa_nrsfm._frames.models import frame_search
 
 # What a fitted model has of each frame.
@@ -23,3 +26,19 @@ def numbers_of(fits):
 def fit_posterior(tracks, shapes, noise, camera="affine", **given):
     """Return the fit of frames by a new search."""
     return frame_search(camera, shapes).fit_tracks(tracks, noise, **given)
+
+
+def assert_same_fits(got, expected, atol):
+    """Compare fits of frames."""
+    for name in ("motion", "translation", "alpha", "covariance"):
+        assert_allclose(getattr(got, name), getattr(expected, name), atol=atol)
+    assert_allclose(got.objective, expected.objective, rtol=1e-7, atol=1e-12)
+
+
+def assert_calibrated(motion, camera, atol=1e-12):
+    """Check that cameras are scaled rotations, orthographic ones of scale one."""
+    gram = motion @ motion.swapaxes(1, 2)
+    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
+    assert_allclose(gram / scale, np.broadcast_to(np.eye(2), gram.shape), atol=atol)
+    if camera == "orthographic":
+        assert_allclose(scale, 1.0, rtol=atol)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scenes
-from frame_parts import fit_posterior
+from frame_parts import assert_calibrated, fit_posterior
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -96,15 +96,6 @@ def problem_of(scene, camera, noise):
     products = frame_sums(frame_tracks(scene.tracks, weights), search.shared)
     problem = search.problem(products, np.full(len(scene.tracks), noise))
     return search, problem, frames_last(scene.motion @ search.space.T)
-
-
-def assert_calibrated(motion, camera):
-    """Check that cameras are scaled rotations."""
-    gram = motion @ motion.swapaxes(1, 2)
-    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
-    assert_allclose(gram / scale, np.broadcast_to(np.eye(2), gram.shape), atol=1e-12)
-    if camera == "orthographic":
-        assert_allclose(scale, 1.0, rtol=1e-12)
 
 
 class TestMinimum:

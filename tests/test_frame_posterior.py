@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scenes
-from frame_parts import camera_and_alpha, fit_posterior
+from frame_parts import assert_same_fits, camera_and_alpha, fit_posterior
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_rotation, with_gaps
 
@@ -23,11 +23,10 @@ def random_scene(seed, noise=NOISE, n_frames=30):
     return scene.tracks, scene.shapes, camera_and_alpha(scene)
 
 
-def cost(tracks, shapes, variance, fits, weights=None):
+def cost(tracks, shapes, variance, fits):
     """Return f of each frame by its definition."""
     difference = tracks - images(shapes, fits.motion, fits.translation, fits.alpha)
-    w = np.ones(tracks.shape[:2]) if weights is None else weights
-    squares = np.nansum(w[..., None] * difference**2, axis=(1, 2))
+    squares = np.nansum(difference**2, axis=(1, 2))
     return squares + variance * np.sum(fits.alpha**2, axis=1)
 
 
@@ -35,12 +34,6 @@ def energy_of(tracks):
     """Return the largest energy of a frame; rounding errors are relative to it."""
     centred = tracks - np.nanmean(tracks, axis=1, keepdims=True)
     return np.nansum(centred**2, axis=(1, 2)).max()
-
-
-def assert_same_fits(got, expected, atol=1e-9):
-    for name in ("motion", "translation", "alpha", "covariance"):
-        assert_allclose(getattr(got, name), getattr(expected, name), atol=atol)
-    assert_allclose(got.objective, expected.objective, rtol=1e-7, atol=1e-12)
 
 
 def problem_of(tracks, shapes, variance, weights=None):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from frame_parts import camera_and_alpha, fit_posterior, numbers_of
+from frame_parts import assert_same_fits, camera_and_alpha, fit_posterior, numbers_of
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import images, random_rotation, random_scene, with_gaps
@@ -34,12 +34,6 @@ def fitted(scene, camera, noise=NOISE**2, **given):
     return fit_posterior(scene.tracks, scene.shapes, noise, camera, **given)
 
 
-def assert_same_fits(got, expected, atol=1e-8):
-    for name in ("motion", "translation", "alpha", "covariance"):
-        assert_allclose(getattr(got, name), getattr(expected, name), atol=atol)
-    assert_allclose(got.objective, expected.objective, rtol=1e-7, atol=1e-12)
-
-
 @CAMERA
 class TestExact:
     @GAPS
@@ -67,7 +61,7 @@ class TestExact:
         frames = frame_tracks(scene.tracks, np.isfinite(scene.tracks[..., 0]) * 1.0)
         search = frame_search(camera, scene.shapes)
         expected = fitted(scene, camera)
-        assert_same_fits(search.fit(frames, NOISE**2), expected)
+        assert_same_fits(search.fit(frames, NOISE**2), expected, 1e-8)
         rough = search.fit(frames, NOISE**2, rough=True)
         away = np.abs(rough.motion - expected.motion).max(axis=(1, 2))
         assert np.median(away) < 0.1

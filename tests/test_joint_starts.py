@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from frame_parts import assert_calibrated
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
@@ -66,14 +67,6 @@ def camera_error(motion, truth):
     """Return the largest error of cameras up to a rotation or reflection of space."""
     U, _, Vt = np.linalg.svd(motion.reshape(-1, 3).T @ truth.reshape(-1, 3))
     return np.abs(motion @ (U @ Vt) - truth).max()
-
-
-def assert_calibrated(motion, camera):
-    gram = motion @ motion.swapaxes(1, 2)
-    scale = np.trace(gram, axis1=1, axis2=2)[:, None, None] / 2
-    assert_allclose(gram, scale * np.eye(2), atol=1e-12)
-    if camera == "orthographic":
-        assert_allclose(scale, 1.0, rtol=1e-12)
 
 
 class TestRigidStart:

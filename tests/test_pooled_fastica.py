@@ -76,26 +76,19 @@ class TestCovariance:
         isa.fit(planted[0], covariance=np.zeros((9, 9)))
         assert_array_equal(isa.criteria_, 1)
 
-    def test_wrong_shape(self, planted):
-        with pytest.raises(
-            ValueError, match=r"covariance must have shape \(9, 9\); got \(6, 6\)"
-        ):
-            PooledFastICA().fit(planted[0], covariance=np.eye(6))
-        with pytest.raises(ValueError, match="Expected 2D array, got 1D array"):
-            PooledFastICA().fit(planted[0], covariance=np.ones(9))
-
-    def test_not_symmetric(self, planted):
-        C = planted[2].copy()
-        C[0, 1] += 0.1
-        with pytest.raises(ValueError, match="covariance must be symmetric"):
-            PooledFastICA().fit(planted[0], covariance=C)
-
-    @pytest.mark.parametrize("bad", [np.nan, np.inf])
-    def test_not_finite(self, planted, bad):
-        C = planted[2].copy()
-        C[3, 3] = bad
-        with pytest.raises(ValueError, match="covariance contains"):
-            PooledFastICA().fit(planted[0], covariance=C)
+    @pytest.mark.parametrize(
+        ("covariance", "message"),
+        [
+            (np.eye(6), r"covariance must have shape \(9, 9\); got \(6, 6\)"),
+            (np.ones(9), "Expected 2D array, got 1D array"),
+            (np.eye(9) + 0.1 * np.eye(9, k=1), "covariance must be symmetric"),
+            (np.diag([np.nan, *np.ones(8)]), "covariance contains NaN"),
+            (np.diag([np.inf, *np.ones(8)]), "covariance contains infinity"),
+        ],
+    )
+    def test_bad_covariances_are_refused(self, planted, covariance, message):
+        with pytest.raises(ValueError, match=message):
+            PooledFastICA().fit(planted[0], covariance=covariance)
 
 
 class TestLikelihood:
