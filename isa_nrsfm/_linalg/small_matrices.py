@@ -34,23 +34,19 @@ def inverse3(packed: NDArray) -> NDArray:
     Generalised inverses of singular ones have zeros for dependent coordinates.
     """
     a, d, e, b, f, c = packed
-    # R = L^-1 of the Cholesky factor L
+    # R = L^-1 of the Cholesky factor L, zero where a pivot is rounding error
     R = np.zeros((3, 3, packed.shape[-1]))
-    R[0, 0] = x = _inverse_root(a, a)
+    R[0, 0] = x = 1.0 / np.sqrt(np.where(a > 0, a, np.inf))
     xy, xz = d * x, e * x  # the first column of L
-    R[1, 1] = y = _inverse_root(b - xy * xy, b)
+    left = b - xy * xy
+    R[1, 1] = y = 1.0 / np.sqrt(np.where(left > OF_STEPS * b, left, np.inf))
     yz = (f - xz * xy) * y
-    R[2, 2] = z = _inverse_root(c - xz * xz - yz * yz, c)
+    left = c - xz * xz - yz * yz
+    R[2, 2] = z = 1.0 / np.sqrt(np.where(left > OF_STEPS * c, left, np.inf))
     R[1, 0] = -xy * x * y
     R[2, 0] = -(xz * x + yz * R[1, 0]) * z
     R[2, 1] = -yz * y * z
     return np.einsum("can,cbn->abn", R, R)
-
-
-def _inverse_root(pivot: NDArray, diagonal: NDArray) -> NDArray:
-    """Return ``pivot^(-1/2)`` (n,), zero where the pivot is rounding error."""
-    kept = pivot > OF_STEPS * diagonal
-    return kept / np.sqrt(np.where(kept, pivot, 1.0))
 
 
 @cache
