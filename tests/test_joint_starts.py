@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
-from isa_nrsfm._joint.fit import Start, _continued_fit
+from isa_nrsfm._joint.fit import Start, _calibrated_fit, _continued_fit, _first_fit
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
 from isa_nrsfm._joint.quasi_newton import JointState
@@ -334,3 +334,16 @@ def test_the_better_given_start_is_taken_whatever_the_order():
         for starts in ([good], [good, poor], [poor, good])
     ]
     assert_allclose(ends[1:], ends[0], rtol=1e-4)
+
+
+def test_the_likeliest_fit_of_the_starts_counts():
+    scene = random_scene(amplitude=0.6, noise=0.02)
+    problem, factors = problem_of(scene), scene.factors
+    ends = [
+        _calibrated_fit(problem, state, CAMERAS["orthographic"]).value
+        for state in started(scene, "orthographic", problem)
+    ]
+    table = FactorisedTable(*[None] * 5, Sample(scene.W, []), factors)
+    fit, _ = _first_fit(problem, table, paper_shapes(factors))
+    assert max(ends) > min(ends)
+    assert fit.value == min(ends)
