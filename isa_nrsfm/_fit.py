@@ -422,5 +422,4 @@ def _table_model(
 ) -> TableModel:
     """Return the fitted model as a function of tables."""
     unit = None if estimator.frames_scaled_ else float(table.sizes[0])
-    names = getattr(estimator, "feature_names_in_", None)
-    return TableModel(frames, mean_shape, basis, estimator.layout, names, unit)
+    return TableModel(frames, mean_shape, basis, estimator.layout, unit)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
@@ -13,11 +14,11 @@ from isa_nrsfm._prepare.robust import robust_sizes, robustly_centred
 from isa_nrsfm._tables.tracks import (
     Layout,
     centred_frames,
-    clean_tracks,
     of_all_rows,
     seen_points,
     table_to_tracks,
     tracks_to_table,
+    without_half_points,
 )
 
 
@@ -26,15 +27,13 @@ class TableModel(NamedTuple):
 
     Methods take some rows (n, 2 * n_points) of a table. Results are NaN for rows with
     too few points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
-    `names` (2J,) are those of the columns. `unit` is the one size of all frames of a
-    table; None where each has its own.
+    `unit` is the one size of all frames of a table; None where each has its own.
     """
 
     frames: RigidFrames | PosteriorFrames
     mean_shape: NDArray
     basis: NDArray
     layout: Layout
-    names: NDArray | None
     unit: float | None
 
     def decompose(
@@ -159,8 +158,13 @@ class TableModel(NamedTuple):
 
     def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
-        tracks = table_to_tracks(rows, self.layout)
-        return clean_tracks(tracks, self.layout, self.names)
+        tracks, n_half, _ = without_half_points(table_to_tracks(rows, self.layout))
+        if n_half.any():  # the number of a row in its block would mislead
+            warn_caller(
+                "some points have only one of their two coordinates. They count as "
+                "missing"
+            )
+        return tracks
 
     def _ready(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return which tracks are usable; these centred, their centres and sizes."""

@@ -39,7 +39,7 @@ def scene(seed=0, n_frames=12, n_points=23):
 
 
 def energies_of(frames, mean_shape, basis, tracks, sizes):
-    model = TableModel(frames, mean_shape, basis, "interleaved", None, None)
+    model = TableModel(frames, mean_shape, basis, "interleaved", None)
     return model.held_out_energies(tracks, sizes)
 
 

@@ -40,6 +40,11 @@ MOST_STEPS, TOL = 100, 1e-3
 # Frames and points of the fits. With 100 frames one deviation changed from
 # 12 to 19 %. Points are assigned to groups in cubic time.
 MOST_FRAMES, MOST_POINTS = 200, 200
+# Floor of the noise variance of the fits, as a share of the mean square. In tables
+# without noise surplus basis shapes leave the depth open, and fits stay near their
+# start: errors were 30 times the deviation, with this floor 5 times. It changes no
+# deviation of tables with a noise of 0.1 % by more than a third.
+LEAST_NOISE = 1e-6
 # Residuals that are longer, in standard deviations of a coordinate, are left out of the
 # fits of tables with a robust loss: one of 3,000 points without outliers.
 OUTLYING = 4.0
@@ -121,7 +126,7 @@ class _Refit:
         n_numbers, energy = part.totals
         penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())
-        noise = frames.noise_variance
+        noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         least_noise = min(noise * n_numbers / energy, JOINT_OPTIONS.least_noise)
         state = refine_joint(
             likelihood,

@@ -208,7 +208,6 @@ def _restored(header: dict[str, Any], arrays: Arrays) -> AffineNRSfM:
         estimator.mean_shape_,
         estimator.basis_,
         entries["layout"],
-        getattr(estimator, "feature_names_in_", None),
         entries["unit"],
     )
     estimator._n_features_out = len(estimator.basis_)
