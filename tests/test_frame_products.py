@@ -56,6 +56,17 @@ class TestProducts:
             assert_allclose(products.shape_centroid[..., i], shapes @ w / w.sum())
             assert_allclose(products.gram.pairs[..., i], pairs, atol=1e-13)
 
+    def test_positions_are_weighted_means_of_residuals(self):
+        tracks, shapes, weights = random_problem(0)
+        rng = np.random.default_rng(1)
+        motion, alpha = rng.normal(size=(6, 2, 3)), rng.normal(size=(6, 2))
+        products = frame_sums(frame_tracks(tracks, weights), ShapeProducts(shapes))
+        positions = products.positions(motion, alpha)
+        for i, w in enumerate(weights):
+            shape = shapes[0] + alpha[i, 0] * shapes[1] + alpha[i, 1] * shapes[2]
+            rest = tracks[i] - (motion[i] @ shape).T
+            assert_allclose(positions[i], w @ rest / w.sum())
+
     def test_complete_frames_share_a_gram_matrix(self):
         tracks, shapes, weights = random_problem(0)
         shared = frame_sums(frame_tracks(tracks), ShapeProducts(shapes))
