@@ -14,7 +14,6 @@ from isa_nrsfm._metric_upgrade.quadric import (
     strain_basis,
 )
 from isa_nrsfm._metric_upgrade.refinement import (
-    BLOCK_FRAMES,
     STRETCH_OF_START,
     _linearised,
     _normal_equations,
@@ -24,6 +23,7 @@ from isa_nrsfm._metric_upgrade.refinement import (
     refine_metric,
     safe_start,
 )
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)
 

@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_tracks, joined_frames
 from isa_nrsfm._linalg.small_matrices import energies
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.tracks import seen_points
-
-# Frames that are worked on at a time, so that their small matrices stay in the cache.
-BLOCK_FRAMES = 2048
 
 
 class WeightedRows(NamedTuple):

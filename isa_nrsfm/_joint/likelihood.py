@@ -37,8 +37,9 @@ from isa_nrsfm._frames.point_sums import (
     frame_sums,
 )
 from isa_nrsfm._joint.extents import extent_penalty
-from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
+from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._linalg.small_matrices import diagonal_of, frames_last, unpack3, unpacked
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
 
 class LikelihoodTerms(NamedTuple):

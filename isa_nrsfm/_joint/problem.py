@@ -14,14 +14,14 @@ from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
 from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
-from isa_nrsfm._joint.frames import BLOCK_FRAMES, JointFrames
+from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS, JointOptions
 from isa_nrsfm._joint.quasi_newton import JointFit, JointState, refine_joint
 from isa_nrsfm._paper.factors import Factorisation
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import Triplets
-from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 
 
 class FactorisedTable(NamedTuple):

@@ -18,9 +18,6 @@ from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames
 
-# Numbers of an array of derivatives that is made at a time: 32 MB.
-BLOCK_NUMBERS = 2**22
-
 
 def reweighted(
     problem: JointProblem,
@@ -82,7 +79,8 @@ def _residual_deviations(
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
     deviations = np.empty(weights.shape)
-    length = max(BLOCK_NUMBERS // (2 * n_points * (n_pose + n_components)), 1)
+    # Derivatives of as many frames at a time as fit into 32 MB
+    length = max(2**22 // (2 * n_points * (n_pose + n_components)), 1)
     for first in range(0, n_frames, length):
         part = slice(first, first + length)
         M, w = motion[part], weights[part, None, None]

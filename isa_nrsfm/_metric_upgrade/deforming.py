@@ -23,10 +23,6 @@ from isa_nrsfm._metric_upgrade.rigid import (
     warn_if_degenerate,
 )
 
-# Bound on the eigenvalues of the strain of a frame. Unusual coefficients then stretch
-# no direction by more than exp(1 / 2).
-LARGEST_STRAIN = 1.0
-
 
 class DeformationMetric(NamedTuple):
     """
@@ -224,9 +220,10 @@ def euclidean_frames(
     usable = usable & np.isfinite(weights).all(axis=1)
     cameras, weights = cameras[usable], weights[usable]
 
-    # The metric of each frame.
+    # The metric of each frame. Unusual coefficients stretch no direction by more than
+    # exp(1 / 2).
     stretch, axes = np.linalg.eigh(np.tensordot(weights, metric.strain, 1))
-    stretch = np.clip(stretch, -LARGEST_STRAIN, LARGEST_STRAIN)
+    stretch = np.clip(stretch, -1.0, 1.0)
     strain = (axes * stretch[:, None]) @ axes.transpose(0, 2, 1)
     Q = metric.Q @ exponential(strain / 2)
     shapes = mean + np.tensordot(weights, directions, 1)

@@ -31,9 +31,8 @@ from isa_nrsfm._metric_upgrade.quadric import (
     symmetric_power,
     unit_cameras,
 )
+from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
-# Frames taken at a time, for which all that a step needs stays in the cache.
-BLOCK_FRAMES = 2048
 # Bound on the ratio of stretches of a metric to start from, in the space in which the
 # cameras see all directions alike. Nearly singular metrics are near saddle points.
 STRETCH_OF_START = 3.0

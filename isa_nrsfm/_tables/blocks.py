@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
 
+# Frames that are worked on at a time, so that their small matrices stay in the cache.
+BLOCK_FRAMES = 2048
+
 
 class FrameBlocks:
     """Consecutive blocks of the frames of a table, in memory or read when needed.

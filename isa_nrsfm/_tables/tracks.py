@@ -19,8 +19,6 @@ LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
 # affine camera with its translation has eight unknowns. Coefficients need no further
 # points: their prior determines what the points do not.
 FEWEST_POINTS = 4
-# Coordinates count as equal up to this many units in the last place of the largest one.
-EQUAL = 4
 
 
 def table_to_tracks(X: NDArray, layout: Layout = "interleaved") -> NDArray:
@@ -145,7 +143,8 @@ def of_all_rows(values: NDArray, shown: NDArray) -> NDArray:
 
 def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
     """Return frames (I, J, 2) centred over their visible points in double precision."""
-    eps = EQUAL * np.finfo(tracks.dtype).eps
+    # Coordinates are equal up to four units in the last place of the largest one.
+    eps = 4 * np.finfo(tracks.dtype).eps
     # The same memory order, so that sums are the same to the last bit.
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     seen = seen_points(tracks)
