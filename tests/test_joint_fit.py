@@ -73,7 +73,7 @@ def euclidean_error(model, tracks, truth):
     """Return the error of shapes up to one rotation or reflection, and units."""
     convention = "sequence" if model.camera == "orthographic" else "frame"
     shapes = model.reconstruct(table_of(tracks))
-    return mean_shape_error_3d(truth, shapes, convention=convention)
+    return mean_shape_error_3d(truth, shapes, convention=convention, scale=True)
 
 
 class Fit(NamedTuple):
