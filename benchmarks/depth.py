@@ -93,7 +93,12 @@ def main(argv=None):
     options = parser.parse_args(argv)
     ict = load_arrays(ICT)
     cases = [("ICT-68 faces", 3), ("ICT-68 faces", 9)]
-    cases += [("generated faces", 3), ("generated faces", 9), ("bodies", 3)]
+    cases += [
+        ("generated faces", 3),
+        ("generated faces", 9),
+        ("bodies", 3),
+        ("bodies", 12),
+    ]
     print(
         "| shapes | K | noise | turned by | error of depths, relative to the true "
         "depths | relative to the fitted depths | estimated (`depth_uncertainty_`) | "

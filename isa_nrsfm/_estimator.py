@@ -47,7 +47,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     ----------
     n_components : int or "auto", default=3
         K, the number of basis shapes. K needs at least 3K + 4 points and
-        ``ceil(8 (K + 2) / 5)`` frames. "auto" takes the relevant ones of twelve, or of
+        ``ceil(8 (K + 2) / 5)`` frames. Calibrated cameras allow up to 2J - 7 basis
+        shapes of J points, if there are enough frames (joint refinement only): for 17
+        points 27 instead of 4. "auto" takes the relevant ones of twelve, or of
         as many as the table allows (joint refinement only); ``len(basis_)`` is the
         number found.
     isa : object, default=None
@@ -165,7 +167,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks of the
         visible points, scaled as in the fit.
     rank_floor_ : float
-        Lowest inverse SNR of any model of rank 3K + 3, with missing points filled in.
+        Lowest inverse SNR of any model of rank 3K + 3, with missing points filled in;
+        zero where K exceeds the bound of affine cameras.
     noise_variance_ : float
         Variance of the noise of a coordinate; of frames of size one where frames are
         scaled (joint refinement only, as are the next four).
@@ -188,7 +191,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Covariance over the images of the 3K independent directions, 3x3 blocks in
         the order of `basis_`; after the joint refinement ``(1 / 2I) sum_i (alpha_i
         alpha_i^T) (x) (M_i^T M_i)``. Of frames of size one where frames are scaled.
-    singular_values_ : ndarray of shape (3 * n_components + 3,)
+    singular_values_ : ndarray of shape (min(3 * n_components + 3, n_points - 1),)
         Largest singular values of W, decreasing.
     reference_motion_ : ndarray of shape (2, 3)
         Default camera of `inverse_transform`: the mean view of the table.

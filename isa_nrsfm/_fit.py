@@ -60,7 +60,7 @@ from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import DENSE, block_triplets
-from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
+from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
 from isa_nrsfm._prepare.scaling import ScaledTable, rows_without, scaled_table
@@ -201,8 +201,8 @@ def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
         table = ready_table(estimator, source, 1)
-    largest = largest_n_components(table.n_points), most_for_frames(len(table.sizes))
-    most = min(12, *largest)
+    possible = most_components(len(table.sizes), table.n_points, estimator.camera)
+    most = min(12, possible)
     trial = copy.copy(estimator)
     factorised = _factorised(trial, table, most, NoProgress())
     paper = _paper_result(trial, factorised.factors, most, NoProgress())
@@ -237,7 +237,13 @@ def ready_table(
         names=getattr(estimator, "feature_names_in_", None),
         scale_frames=estimator.frames_scaled_,
         robust=estimator.loss != "linear",
+        camera=joint_camera(estimator),
     )
+
+
+def joint_camera(estimator: TableTransformer) -> str | None:
+    """Return the camera model of the joint refinement, None without it."""
+    return estimator.camera if estimator.refinement == "joint" else None
 
 
 def joint_tol(estimator: TableTransformer) -> float:
@@ -267,6 +273,9 @@ def _factorised(
 ) -> FactorisedTable:
     """Return a table with outliers (robust loss), completed frames and factors."""
     limits, n_points = estimator._limits, table.n_points
+    # Calibrated cameras can have more basis shapes than the factorisation.
+    n_triplets = min(3 * n_components + 3, n_points - 1)
+    n_components = min(n_components, largest_n_components(n_points))
     outliers, completed, complete = None, table.rows, table.complete
     if estimator.loss != "linear":
         outliers = gross_outliers(table.rows, limits.model_frames)
@@ -277,7 +286,7 @@ def _factorised(
         completed = complete_rows(completed, n_points, n_components, most)
     report("table")
     shape = 2 * len(table.sizes), n_points
-    triplets = block_triplets(completed, shape, 3 * n_components + 3, limits.dense)
+    triplets = block_triplets(completed, shape, n_triplets, limits.dense)
     if estimator.refinement == "joint":
         rigid, first = triplets.vectors[:3], limits.sample
         sample = sample_frames(completed, n_points, rigid, first, limits.small_table)

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._parameters.choices import LOSSES
-from isa_nrsfm.datasets import make_face_tracks
+from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
+from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.metrics import mean_shape_error_3d
 
 REAL_TABLES = [
     "akhter_drink",
@@ -494,3 +497,26 @@ def test_one_basis_shape_needs_no_independence(load_data, name):
         for seed in (0, 1)
     ]
     assert_allclose(values, values[0], rtol=1e-5)
+
+
+def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation(tmp_path):
+    # 17 points allow 4 basis shapes with affine cameras. Bodies have many more.
+    bodies = make_body_tracks(200, camera="orthographic", random_state=0)
+    fitted = AffineNRSfM(4, camera="orthographic", random_state=0)
+    few, many = fitted.fit(bodies.data), clone(fitted).set_params(n_components=12)
+    errors = [
+        mean_shape_error_3d(
+            bodies.shapes, model.reconstruct(bodies.data), convention="frame"
+        )
+        for model in (few, many.fit(bodies.data))
+    ]
+    assert errors[1] < 0.6 * errors[0]
+    assert many.basis_.shape == (12, 17, 3)
+    assert many.singular_values_.shape == (16,)
+    assert many.rank_floor_ < 1e-20
+    save_model(many, tmp_path / "model.npz")
+    again = load_model(tmp_path / "model.npz").transform(bodies.data)
+    assert_array_equal(again, many.alpha_)
+    for refused in ({"camera": "affine"}, {"refinement": "alternating"}):
+        with pytest.raises(ValueError, match="with 17 points the largest possible"):
+            clone(many).set_params(**refused).fit(bodies.data)

@@ -64,6 +64,21 @@ class TestDefinitions:
         found = mean_shape_error_3d(*pair, convention="frame")
         assert found == pytest.approx(np.mean(expected), rel=1e-9)
 
+    def test_camera_by_hand(self):
+        flat = np.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+        twist = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
+        S = np.stack([flat, flat + twist])
+        X = S + 0.1 * twist
+        found = mean_shape_error_3d(S, X, convention="camera")
+        assert found == pytest.approx(np.mean([0.2 / np.sqrt(8), 0.2 / np.sqrt(12)]))
+        # One mirror image for all frames: the first frame alone would not choose it.
+        mirrored = mean_shape_error_3d(S, X * [1, 1, -1], convention="camera")
+        assert mirrored == pytest.approx(found)
+        scaled = mean_shape_error_3d(S, 5 * X, convention="camera", scale=True)
+        c = np.vdot(S, X) / np.vdot(X, X)
+        rest = np.linalg.norm(S - c * X, axis=(1, 2)) / np.sqrt([8, 12])
+        assert scaled == pytest.approx(rest.mean())
+
     @staticmethod
     def procrustes(S, X):
         """Return the best rotation and scale, by numerical minimisation."""

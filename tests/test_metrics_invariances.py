@@ -14,6 +14,8 @@ MEASURES = {
     "frame": partial(mean_shape_error_3d, convention="frame"),
     "scaled sequence": partial(mean_shape_error_3d, scale=True),
     "frame, no scale": partial(mean_shape_error_3d, convention="frame", scale=False),
+    "camera": partial(mean_shape_error_3d, convention="camera"),
+    "scaled camera": partial(mean_shape_error_3d, convention="camera", scale=True),
 }
 ALL = set(MEASURES)
 N, J = 6, 15
@@ -31,13 +33,16 @@ AFFINITY = np.array([[1.0, 0.5, 0.2], [0.0, 2.0, -0.3], [0.3, 0.0, 0.4]])
 CHANGES = {
     "places": (lambda S, X: (S + TURNS[:, :1], X + 9 * TURNS[:, 1:2]), ALL),
     "order": (lambda S, X: (S[FRAMES][:, POINTS], X[FRAMES][:, POINTS]), ALL),
-    "common rotation": (lambda S, X: (S, X @ TURNS[1]), ALL),
+    "common rotation": (
+        lambda S, X: (S, X @ TURNS[1]),
+        ALL - {"camera", "scaled camera"},
+    ),
     "common mirror image": (lambda S, X: (S, X @ MIRROR), ALL),
     "small unit": (lambda S, X: (1e-80 * S, 1e-80 * X), ALL),
     "large unit": (lambda S, X: (1e75 * S, 1e75 * X), ALL),
     "common scale": (
         lambda S, X: (S, 3 * X),
-        {"affine", "frame", "scaled sequence"},
+        {"affine", "frame", "scaled sequence", "scaled camera"},
     ),
     "scales of frames": (lambda S, X: (S, SCALES * X), {"affine", "frame"}),
     "points reflected in frames": (

@@ -11,6 +11,7 @@ from isa_nrsfm._prepare.checks import (
     check_names,
     check_points,
     largest_n_components,
+    most_components,
     smallest_n_frames,
     visible_points,
 )
@@ -89,12 +90,13 @@ class TestPoints:
         least = -(-3 * (K + 1) // 2)
         assert 2 * least >= 3 * (K + 1) > 2 * (least - 1)
         # Complete tables that are large enough have it.
-        assert least <= smallest_n_frames(K)
+        assert least <= smallest_n_frames(K, 3 * K + 4)
 
     @pytest.mark.parametrize("K", range(1, 6))
     def test_count_of_all_equations(self, K):
         # The smallest complete table has hardly more equations than unknowns.
-        n_frames, n_points = smallest_n_frames(K), 3 * K + 4
+        n_points = 3 * K + 4
+        n_frames = smallest_n_frames(K, n_points)
         surplus = n_equations_minus_unknowns(n_frames, n_points, K)
         tracks = np.random.default_rng(0).normal(size=(n_frames, n_points, 2))
         checked(tracks, K)
@@ -122,18 +124,20 @@ class TestPoints:
         checked(tracks, 1)
 
 
-def n_equations_minus_unknowns(n_frames, n_points, K):
+def n_equations_minus_unknowns(n_frames, n_points, K, calibrated=False):
     """Count: numbers in the table against cameras, coefficients, shapes and gauge."""
     cameras, coefficients, shapes = 8 * n_frames, K * n_frames, 3 * n_points * (K + 1)
     gauge = (K + 1) ** 2 + 8 + 3 * (K + 1)  # the last: the origin of each shape
+    if calibrated:  # rotation and scale of a frame; rotation of space
+        cameras, gauge = 6 * n_frames, K * (K + 1) + 3 + 3 * (K + 1)
     return 2 * n_points * n_frames - (cameras + coefficients + shapes - gauge)
 
 
 class TestSize:
     @pytest.mark.parametrize("K", range(1, 21))
     def test_counts_of_equations_and_unknowns(self, K):
-        smallest = smallest_n_frames(K)
         fewest_points = 3 * K + 4
+        smallest = smallest_n_frames(K, fewest_points)
         assert n_equations_minus_unknowns(smallest, fewest_points, K) >= 0
         assert n_equations_minus_unknowns(smallest - 1, fewest_points, K) < 0
         assert n_equations_minus_unknowns(smallest, 10 * fewest_points, K) >= 0
@@ -143,6 +147,26 @@ class TestSize:
         # Centred points span n_points - 1 directions, the model needs 3K + 3.
         K = largest_n_components(n_points)
         assert 3 * K + 3 <= n_points - 1 < 3 * (K + 1) + 3
+
+    @pytest.mark.parametrize("n_points", [7, 15, 17])
+    def test_calibrated_cameras(self, n_points):
+        affine = largest_n_components(n_points)
+        largest = largest_n_components(n_points, "orthographic")
+        assert largest > affine
+        frames = []
+        for K in range(affine + 1, largest + 1):
+            frames.append(smallest_n_frames(K, n_points))
+            surplus = n_equations_minus_unknowns(frames[-1], n_points, K, True)
+            assert surplus >= 0
+            few = frames[-1] - 1
+            if few >= smallest_n_frames(affine, n_points):
+                assert most_components(few, n_points, "orthographic") < K
+            assert most_components(frames[-1], n_points, "orthographic") >= K
+        # With one basis shape more, no coordinate of a frame is left for the noise.
+        assert 2 * n_points - 6 - (largest + 1) == 0
+        assert frames == sorted(frames)
+        assert most_components(10**6, n_points) == affine
+        assert most_components(3, n_points, "orthographic") == 0
 
 
 class TestNames:

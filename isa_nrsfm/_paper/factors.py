@@ -40,12 +40,13 @@ def factorise(
     """Return the rigid and the non-rigid factors of centred W (2 * n_frames, n_points).
 
     `precision` is the rounding error of its entries, relative to their RMS. `triplets`
-    are the 3K + 3 leading ones of a larger matrix, by default of W.
+    are at least the 3K + 3 leading ones of a larger matrix, by default of W.
     """
     n_points = W.shape[1]
     S, Vt, _ = triplets or leading_triplets(W, 3 * n_components + 3)
     # Rows of Vt above rounding errors, centred, their signs fixed.
     rank = int(np.sum(S > max(OF_RANKS, precision) * S[0]))
+    rank = min(rank, 3 * n_components + 3)
     Vt = Vt[:rank] - Vt[:rank].mean(axis=1, keepdims=True)
     Vt *= orientations(Vt)[:, None]
     # The first three are the rigid shape, the next ones the signals.

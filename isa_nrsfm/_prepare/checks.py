@@ -53,43 +53,68 @@ def _is_x_or_y(name: str) -> bool:
     return coordinate is not None and coordinate.axis < 2
 
 
-def largest_n_components(n_points: int) -> int:
-    """Return the largest K with 3K + 3 directions in n_points centred points."""
-    return (n_points - 1) // 3 - 1
+def largest_n_components(n_points: int, camera: str | None = None) -> int:
+    """Return the largest K that n_points points allow.
+
+    The factorisation needs 3K + 3 directions in centred points. The joint fit with
+    calibrated cameras needs it for a start only, with fewer basis shapes. A frame has
+    2J - 2 centred coordinates, at most four unknowns of its camera and K coefficients;
+    one coordinate has to be left for the noise. `camera` is None without a joint fit.
+    """
+    largest = (n_points - 1) // 3 - 1
+    calibrated = camera not in (None, "affine")
+    return 2 * n_points - 7 if calibrated and largest > 0 else largest
 
 
-def smallest_n_frames(n_components: int) -> int:
-    """Return the least number of frames that determines the affine factorisation."""
+def smallest_n_frames(n_components: int, n_points: int) -> int:
+    """Return the least number of frames that determines the shapes."""
+    K = n_components
     # However many the points, W = M B leaves an invertible matrix between its factors:
     # 9 (K + 1)^2 unknowns, less the (K + 1)^2 + 8 of the gauge. A frame has 6 (K + 1)
     # entries of M, but 6 numbers of its camera and K coefficients: 5K equations. So
     # 5K I >= 8 (K + 1)^2 - 8 = 8K (K + 2), rounded up.
-    return -(-8 * (n_components + 2) // 5)
+    smallest = -(-8 * (K + 2) // 5)
+    if K <= largest_n_components(n_points):
+        return smallest
+    # Calibrated cameras: 3 (K + 1) (J - 1) unknowns of the shapes, less the K (K + 1) +
+    # 3 of mixing, shift and rotation; a frame has 2J - 6 - K equations.
+    unknowns = 3 * (K + 1) * (n_points - 1) - K * (K + 1) - 3
+    return max(smallest, -(-unknowns // (2 * n_points - 6 - K)))
 
 
-def most_for_frames(n_frames: int) -> int:
-    """Return the largest K that n_frames frames determine, at least 1."""
-    return max(5 * n_frames // 8 - 2, 1)
+def most_components(n_frames: int, n_points: int, camera: str | None = None) -> int:
+    """Return the largest K that a table of this size determines, zero if none."""
+    largest = largest_n_components(n_points, camera)
+    possible = [
+        k for k in range(1, largest + 1) if n_frames >= smallest_n_frames(k, n_points)
+    ]
+    return max(possible, default=0)
 
 
-def check_size(n_frames: int, n_points: int, n_components: int) -> None:
+def check_size(
+    n_frames: int, n_points: int, n_components: int, camera: str | None = None
+) -> None:
     """Refuse a table that is too small for the number of basis shapes."""
-    largest = largest_n_components(n_points)
+    largest = largest_n_components(n_points, camera)
     if n_components > largest:
-        possible = (
-            f"with {n_points} points the largest possible n_components is {largest}"
-            if largest > 0
-            else "at least 7 points are needed for n_components=1"
-        )
+        possible = "at least 7 points are needed for n_components=1"
+        if largest > 0:
+            possible = (
+                f"with {n_points} points the largest possible n_components is {largest}"
+            )
+        if largest > 0 and camera == "affine":
+            most = largest_n_components(n_points, "weak_perspective")
+            possible += f" with affine cameras and {most} with calibrated cameras"
+        of_affine = camera in (None, "affine")
+        needed = 3 * n_components + 4 if of_affine else (n_components + 8) // 2
         raise ValueError(
-            f"n_components={n_components} needs at least {3 * n_components + 4} "
-            f"points, X has {n_points}; {possible}"
+            f"n_components={n_components} needs at least {needed} points, X has "
+            f"{n_points}; {possible}"
         )
-    smallest = smallest_n_frames(n_components)
+    smallest = smallest_n_frames(n_components, n_points)
     if n_frames < smallest:
         possible = ""
-        if n_frames >= smallest_n_frames(1):
-            most = min(most_for_frames(n_frames), largest)
+        if most := most_components(n_frames, n_points, camera):
             possible = f"; the largest possible n_components is {most}"
         raise ValueError(
             f"n_components={n_components} needs at least {smallest} frames (rows), "

@@ -75,12 +75,13 @@ def scaled_table(
     names: NDArray | None,
     scale_frames: bool,
     robust: bool,
+    camera: str | None = None,
 ) -> ScaledTable:
     """Check a table, centre and scale its frames, robustly if `robust`."""
     n_columns, dtype = blocks.empty.shape[1], blocks.empty.dtype
     n_points = n_columns // 2
     refuse_odd(n_columns)
-    check_size(blocks.n_frames, n_points, n_components)
+    check_size(blocks.n_frames, n_points, n_components, camera)
     examined = blocks.map(partial(_examine, layout=layout, robust=robust))
     parts = map(np.concatenate, zip(*examined, strict=True))
     n_half, first, visible, largest, *rest = parts
@@ -99,7 +100,7 @@ def scaled_table(
             f"(first: row {shown.argmin()}). They are left out of the fit, and their "
             "results are NaN"
         )
-        check_size(int(shown.sum()), n_points, n_components)
+        check_size(int(shown.sum()), n_points, n_components, camera)
         blocks, report = blocks.subset(shown), report.of_frames(shown)
         visible, largest = visible[shown], largest[shown]
     check_points(visible, n_points, n_components, layout, names)

@@ -22,7 +22,7 @@ from sklearn.utils.parallel import Parallel, delayed
 from isa_nrsfm._compat.callbacks import NoProgress
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._estimator import AffineNRSfM
-from isa_nrsfm._fit import fit_ready_table, joint_tol, ready_table
+from isa_nrsfm._fit import fit_ready_table, joint_camera, joint_tol, ready_table
 from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.fit import Start
 from isa_nrsfm._joint.starts import extended_shapes
@@ -147,7 +147,7 @@ def _check_part(
 
     def refused(k: int) -> ValueError | None:
         try:
-            check_size(n_frames, part.n_points, k)
+            check_size(n_frames, part.n_points, k, joint_camera(estimator))
             check_points(visible, part.n_points, k, estimator.layout, names)
         except ValueError as error:
             return error

@@ -21,7 +21,8 @@ from isa_nrsfm._compat.whole_files import (
     files_together,
     folder_for_writing,
 )
-from isa_nrsfm._prepare.checks import largest_n_components, most_for_frames
+from isa_nrsfm._fit import joint_camera
+from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection.choice import standard_errors
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
@@ -256,7 +257,8 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
         "chosen": search.n_components_,
     }
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
-    most = min(largest_n_components(X.shape[1] // 2), most_for_frames(fitted))
+    camera = joint_camera(search.best_estimator_)
+    most = most_components(fitted, X.shape[1] // 2, camera)
     following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
     if search.n_components_ == tried[-1] and len(following):
         report["next"] = {

@@ -231,7 +231,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         "mean_shape_": (P, 3),
         "energy_share_": (K,),
         "mode_covariance_": (3 * K, 3 * K),
-        "singular_values_": (3 * K + 3,),
+        "singular_values_": (min(3 * K + 3, P - 1),),
         "reference_motion_": (2, 3),
         "reference_translation_": (2,),
         "reliability_": (K,),

@@ -125,4 +125,5 @@ for name, figures in models[3].diagnostics()._asdict().items():
 # together with it, as in :ref:`sphx_glr_gallery_problems_plot_expressions.py`.
 #
 # K basis shapes need at least ``3 K + 4`` points and ``ceil(8 (K + 2) / 5)`` frames:
-# for a hand of 21 points, K is at most five. Many more frames are better.
+# for a hand of 21 points, K is at most five. With calibrated cameras, ``2 J - 7`` basis
+# shapes of J points are possible: 35 of a hand. Many more frames are better.
