@@ -1,4 +1,4 @@
-"""How far a table determines its fit: figures, and messages for people."""
+"""Diagnostics of a fit: figures, and messages that interpret them."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -13,55 +13,55 @@ from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 
 # Directions of the coefficients with a lower reliability are not supported by the
-# table: noise has zero.
+# table. Pure noise has reliability zero.
 LEAST_RELIABILITY = 0.1
 # Entries of V_k with a larger standard deviation count as not determined.
 LARGEST_DEVIATION = 0.1
-# Bounds on the noise variance with calibrated cameras over that with affine ones. Below
-# the first, cameras are calibrated as far as the table shows. Above the second they
-# hardly are. Measured on artificial tables: 1.02 for weak-perspective cameras, up to
-# 1.2 for perspective ones at 8 to 2.5 radii, 22 to 48 for cameras that stretch the
-# image. Motion capture with too few basis shapes has 1.1 to 4
-# (``python -m benchmarks.accuracy cameras``).
+# Thresholds of the noise variance with calibrated cameras over that with affine ones.
+# Below the first, the table does not contradict calibrated cameras. Above the second,
+# the cameras are probably not calibrated. Measured on artificial tables: 1.02 for
+# weak-perspective cameras, up to 1.2 for perspective ones at 8 to 2.5 radii, 22 to 48
+# for cameras that stretch the image. Motion capture with too few basis shapes has 1.1
+# to 4 (``python -m benchmarks.accuracy cameras``).
 SAME_NOISE, OTHER_CAMERAS = 1.3, 10.0
-# Length of gross residuals in robust standard deviations. More than the second share of
-# the points are outliers. Without outliers at most 0.02 % of the points are so far off:
+# Least length of gross residuals, in robust standard deviations, and the share of such
+# points above which a table has outliers. Without outliers the share is at most 0.02 %:
 # generated faces, bodies and hands, captured motion, photos of faces, K = 3 and 9. With
-# one wrong point in a thousand, at half the size of a face, 0.06 to 0.13 %.
+# one wrong point in a thousand, at half the size of a face, it is 0.06 to 0.13 %.
 GROSS, MOST_GROSS = 8.0, 5e-4
-# A larger share of a coefficient is called pose. Real faces of 68 points, K = 8, have
-# up to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
+# Threshold of the pose share of a coefficient. Real faces of 68 points, K = 8, have up
+# to 0.70 with the jaw; generated faces, whose points are fixed, at most 0.03.
 MOST_POSE = 0.3
 
 
 class Diagnostics(NamedTuple):
     """
-    How far a table determines a fit.
+    Diagnostics: how well a table determines its fit.
 
     Attributes
     ----------
     camera_singular_values : ndarray of shape (3,)
-        How much the images show of each direction of space: singular values of the
-        stacked cameras, divided by the root of the number of rows. Frames have size
-        one, and the mean shape is white.
+        Visibility of each direction of space in the images: singular values of the
+        stacked cameras, divided by the root of the number of rows, for frames of size
+        one.
     deformation_amplitude : float
-        RMS of the deformation over that of the mean shape, where this is white.
+        RMS of the deformation, relative to that of the mean shape.
     reliability : ndarray of shape (n_components,)
-        Shares of the variance of the coefficients that are not uncertainty, of their
-        own or of the shapes, along uncorrelated directions, decreasing. Directions near
-        zero are noise: the table does not support as many basis shapes.
+        Shares of the variance of the coefficients that are signal, not uncertainty of
+        coefficients or shapes. They belong to uncorrelated directions, in decreasing
+        order. Directions near zero are noise: the table does not support as many basis
+        shapes.
     effective_frames : ndarray of shape (n_components,)
         Effective number of frames that determine each basis shape, ``(sum_i
         alpha_ik^2)^2 / sum_i alpha_ik^4``.
     weak_deviations : ndarray of shape (8 * n_components,)
         Standard deviations of the weakly determined parts of the basis shapes,
         increasing. Shapes ``B_k + V_k B_0`` differ from B_k in the images only by terms
-        of second order in the deformation. Of each V_k (3x3) all but the trace can be
-        determined. These are the standard deviations along the principal directions of
-        all V_k, as far as they come from the noise, given the rest of the shapes. A
-        value of 0.1 adds a tenth of the mean shape, per standard deviation of a
-        coefficient. Calibrated cameras absorb rotations only: for them these are upper
-        bounds.
+        of second order in the deformation. Each V_k (3x3) can be determined except for
+        its trace. These are standard deviations along the principal directions of all
+        V_k. They contain the noise only, with the rest of the shapes known. A value of
+        0.1 adds a tenth of the mean shape, per standard deviation of a coefficient.
+        Calibrated cameras absorb rotations only: for them these are upper bounds.
     depth_uncertainty : float
         Expected RMS error of the depths of the frames, relative to their RMS. NaN for
         affine cameras, whose depth is known up to an affinity only.
@@ -71,9 +71,9 @@ class Diagnostics(NamedTuple):
     camera_meaning : str
         Meaning of that ratio, in a sentence.
     pose_share : ndarray of shape (n_components,)
-        Share of the variance of each coefficient that the pose predicts: R^2 of the
-        frames, each left out of a linear regression on the rotation. Not above zero if
-        there is no relation. NaN with fewer than 20 frames.
+        Share of the variance of each coefficient that the pose predicts: leave-one-out
+        R^2 of a linear regression on the rotation. Zero or negative if there is no
+        relation. NaN with fewer than 20 frames, or if the rotations are not determined.
     outlier_share : float
         Share of the points of a table with gross residuals, more than 8 robust standard
         deviations. NaN without a table.
@@ -81,7 +81,7 @@ class Diagnostics(NamedTuple):
         Row and point of each gross residual, the largest first.
     messages : tuple of str
         Interpretation of the figures, a sentence or two each; empty if all is well.
-        If the table has outliers, and the loss is linear, only they are named.
+        If the table has outliers and the loss is linear, only the outliers are named.
     """
 
     camera_singular_values: NDArray
@@ -99,7 +99,7 @@ class Diagnostics(NamedTuple):
 
 
 def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics:
-    """Return how far the fitted table determines a joint fit, with its frames kept.
+    """Return the diagnostics of a joint fit whose frames were kept.
 
     `distance` (n_rows, n_points) are residuals of frames of size one, NaN where a point
     is missing, and `rows` the names of the rows.
@@ -117,7 +117,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     ) / len(alpha)
     fourth = np.sum(alpha**4, axis=0)
     square = np.sum(alpha**2, axis=0) ** 2
-    # The traces of the V_k, one direction each, are not determined: left out.
+    # The traces of the V_k, one direction each, are not determined and left out.
     information = weak_information(mean_shape, basis, motion, alpha)
     known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
     floats = np.finfo(float)
@@ -141,7 +141,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     names = names_of_points(estimator)
     outliers = outlier_advice(found, rows, names)
     if frames.loss == "linear" and outliers:
-        # They may be the reason for all others.
+        # Outliers may cause all the other messages.
         advice = (
             'they bend the shapes. Use loss="cauchy" (--loss cauchy), or correct them'
         )
@@ -155,11 +155,11 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
 
 
 def pose_share(motion: NDArray, alpha: NDArray) -> NDArray:
-    """Return the share of the variance of coefficients (n_components,) that is pose.
+    """Return the share of the variance of coefficients that the pose predicts.
 
-    Leave-one-out R^2 of a regression on the nine entries of the nearest rotations,
-    second order in yaw, pitch and roll. NaN for zero coefficients, or fewer than 20
-    frames.
+    Leave-one-out R^2 (n_components,) of a regression on the nine entries of the nearest
+    rotations, second order in yaw, pitch and roll. NaN for zero coefficients, or with
+    fewer than 20 frames.
     """
     if len(alpha) < 20:
         return np.full(alpha.shape[1], np.nan)
@@ -182,8 +182,8 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
     """Return the share of points with gross residuals, and their rows and points.
 
     The outliers (n_outliers, 2) are sorted, the largest first. The scale is the median
-    of all residuals, larger for points and frames whose own median is larger: these are
-    badly explained as a whole.
+    residual. It is larger for points and frames with a larger median of their own,
+    which the model fits badly as a whole.
     """
     none = np.empty((0, 2), dtype=np.intp)
     if distance is None or not (shown := np.isfinite(distance)).any():
@@ -201,7 +201,7 @@ def gross_residuals(distance: NDArray | None) -> tuple[float, NDArray]:
 
 
 def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
-    """Return the message on outliers; empty if there are too few to matter."""
+    """Return the message on outliers; empty if they are few enough to ignore."""
     if not found.outlier_share > MOST_GROSS:
         return ""
     frames = np.unique(found.outliers[:, 0])
@@ -210,7 +210,7 @@ def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
     return (
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
-        f"{GROSS:g} standard deviations off, in the rows "
+        f"{GROSS:g} standard deviations from the model, in the rows "
         f"{listed(rows[i] for i in frames)}, most often the points "
         f"{listed(names[j] for j in most)}"
     )
@@ -237,11 +237,11 @@ def _of_support(found: Diagnostics, loss: str) -> str:
     else:
         text = (
             f"the table does not support n_components={n_components}: {unsupported} "
-            "direction(s) of the coefficients may well be noise. Use at most "
+            "direction(s) of the coefficients are probably noise. Use at most "
             f"n_components={n_components - unsupported}"
         )
     if loss == "linear":
-        text += '. If some points are far from where they belong, use loss="cauchy"'
+        text += '. If some points are wrong (outliers), use loss="cauchy"'
     return text
 
 
@@ -254,8 +254,8 @@ def _of_coefficients(
         np.count_nonzero(~np.isnan(alpha[:, 0])),
         found.effective_frames,
     )
-    # The least of any coefficient without outliers: 20 of 307 to 320 of 1000 frames,
-    # of the tables named at GROSS. With outliers 1 to 20.
+    # Smallest numbers without outliers, on the tables named at GROSS: 20 of 307 to 320
+    # of 1000 frames. With outliers: 1 to 20.
     few = (effective > 0) & (effective < min(10.0, 0.1 * n_frames))
     if (found.reliability < LEAST_RELIABILITY).any():
         few[:] = False  # noise
@@ -266,7 +266,7 @@ def _of_coefficients(
             for k in np.flatnonzero(few)
         )
         messages.append(
-            f"a handful of the {n_frames} frames decide {shown}: look for wrong "
+            f"a few of the {n_frames} frames determine {shown}. Look for wrong "
             "landmarks in the frames with the largest coefficients, or use fewer basis "
             "shapes"
         )
@@ -278,14 +278,14 @@ def _of_coefficients(
         messages.append(
             f"the pose predicts {shown}: {len(layout.contour)} points of {layout.name} "
             "follow the visible outline, which slides over the surface as the head "
-            "turns. Fit the others alone (--points inner; in Python the columns "
+            "turns. Fit the other points alone (--points inner; in Python the columns "
             f"get_skeleton({layout.name!r}).inner_columns)"
         )
     return messages
 
 
 def listed(items: Iterable[Any]) -> str:
-    """Return the first items as a text."""
+    """Return the first items as text."""
     texts = [str(item) for item in items]
     return ", ".join(texts[:5]) + ", ..." * (len(texts) > 5)
 
@@ -298,14 +298,13 @@ def camera_meaning(ratio: float) -> str:
         what = "calibrated cameras explain the table as well as affine ones"
     elif ratio < OTHER_CAMERAS:
         what = (
-            "affine cameras explain more than calibrated ones: there may be too few "
-            "basis shapes, whose part the cameras take over, perspective, or images "
-            "that were stretched a little"
+            "affine cameras explain more than calibrated ones: possible reasons are "
+            "too few basis shapes, perspective, or slightly stretched images"
         )
     else:
         what = (
-            "the cameras are hardly calibrated ones: images were stretched, or there "
-            "are far too few basis shapes"
+            "the cameras are probably not calibrated: the images were stretched, or "
+            "there are far too few basis shapes"
         )
     return f"{what} (noise variance {ratio:.3g} times that of affine cameras)"
 
@@ -316,8 +315,8 @@ def camera_advice(camera: str, ratio: float, determined: bool) -> str:
         return ""
     if camera != "affine" and not determined:
         return (
-            "next: a table in which the objects turn, whose model then transforms this "
-            "one, or affine cameras"
+            "next: a table in which the objects turn further (its model can transform "
+            "this one), or affine cameras"
         )
     if ratio >= OTHER_CAMERAS:
         return "keep these cameras" if camera == "affine" else "next: affine cameras"
@@ -335,7 +334,7 @@ def reliabilities(
     alpha: NDArray, covariance: NDArray, moments: NDArray, noise: float
 ) -> NDArray:
     """
-    Return the shares of the variance of coefficients that are neither noise nor chance.
+    Return the shares of the variance of coefficients that are signal.
 
     These are squared correlations (K,) of the coefficients alpha (I, K) with the true
     ones, along uncorrelated directions, decreasing. The covariance is the mean
@@ -360,9 +359,9 @@ def reliabilities(
     share = deviations**2
     left = np.einsum("kd,kl,ld->d", own, covariance, own)  # 1 / y
     caused = np.einsum("kd,kl,ld->d", own, moments, own) / (noise or 1.0)
-    # With a margin for chance: on tables of rigid objects (60 to 1,000 frames, 68 to
-    # 478 points, one to four basis shapes) all reliabilities are zero then. Without it
-    # some are 0.9 (``python -m benchmarks.recovery rigid``).
+    # The factor is a margin for chance. With it all reliabilities are zero on tables of
+    # rigid objects (60 to 1,000 frames, 68 to 478 points, one to four basis shapes).
+    # Without it some are 0.9 (``python -m benchmarks.recovery rigid``).
     gamma = 1.5 * np.maximum(caused, 0.0)  # gamma share / y
     gamma = np.divide(gamma, share, where=share > 0, out=np.ones_like(share))
     rest = share - gamma
@@ -380,8 +379,8 @@ def weak_information(
 ) -> NDArray:
     """Return the information matrix (9K, 9K) of V_1, ..., V_K in ``B_k + V_k B_0``.
 
-    For noise of variance one, unknown cameras (I, 2, 3) and coefficients of frames of
-    size one, and otherwise known shapes.
+    Assumes noise of variance one, frames of size one with unknown cameras (I, 2, 3) and
+    coefficients, and known shapes except for V_k.
     """
     n_frames, n_components = alpha.shape
     chosen = np.unique(np.linspace(0, n_frames - 1, 400).astype(int))
@@ -393,8 +392,8 @@ def weak_information(
         cameras = np.kron(np.eye(2), shape)
         moved = (basis @ motion[i].T).transpose(2, 1, 0).reshape(-1, n_components)
         tangent, _ = np.linalg.qr(np.hstack([cameras, moved]))
-        # Derivatives in the nine entries of V, before the factor alpha_k. What camera
-        # and coefficients can imitate is projected out.
+        # Derivatives in the nine entries of V, before the factor alpha_k. Changes that
+        # camera and coefficients can imitate are projected out.
         strain = np.einsum("ra,jb->rjab", motion[i], mean_shape).reshape(-1, 9)
         strain = strain - tangent @ (tangent.T @ strain)
         total += np.kron(np.outer(alpha[i], alpha[i]), strain.T @ strain)

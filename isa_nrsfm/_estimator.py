@@ -54,8 +54,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         number found.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or
-        `PooledFastICA`, with subspaces of size three. None is ``PooledFastICA()``, with
-        two runs if the joint refinement only starts from it. A clone is fitted. Its
+        Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
+        with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
+        result is only the start of the joint refinement. A clone is fitted. Its
         `random_state`, `n_jobs` and `verbose` are inherited from this estimator unless
         set.
     block_recovery : {"generalized_eigen", "eigen", "irls"}, default=\
@@ -63,9 +64,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Method for the 3x3 matrix of each subspace that brings its motion to the rigid
         motion. "eigen" is the exact minimiser under a norm constraint, "irls" the
         published iteration for the same cost, "generalized_eigen" maximises the
-        explained share of the motion. The first two can collapse onto a direction in
-        which the subspace hardly moves, and "irls" depends on the first frame; the
-        default does neither. With a refinement all three lead to nearly the same
+        explained share of the motion. "eigen" and "irls" can collapse onto a direction
+        in which the subspace hardly moves, and "irls" depends on the first frame. The
+        default has neither problem. With a refinement all three lead to nearly the same
         result, because it starts from more places.
     refinement : {"joint", "alternating", None}, default="joint"
         "joint" finds the cameras, shapes and noise variance of greatest marginal
@@ -81,50 +82,51 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         have the same scale in all frames. With these two, shapes, lengths and angles
         are true, up to one mirror image (`mirrored`).
     independence : {"shapes", "coefficients", None}, default="shapes"
-        Criterion for the basis of the joint refinement: any mixing of the basis shapes
-        is as likely. "shapes" makes them independent of each other over the points, as
-        the paper assumes. "coefficients" makes their coefficients independent over the
-        frames. None takes the principal axes of the deformation. Shapes of frames,
-        reprojection and score do not depend on it. Without the joint refinement
-        "coefficients" is refused.
+        Criterion for the basis of the joint refinement. The likelihood does not depend
+        on the mixing of the basis shapes. "shapes" makes them independent of each other
+        over the points, as the paper assumes. "coefficients" makes their coefficients
+        independent over the frames; it needs the joint refinement. None takes the
+        principal axes of the deformation. Shapes of frames, reprojection and score do
+        not depend on this parameter.
     loss : {"linear", "huber", "cauchy"}, default="linear"
-        Loss of points far from the model. They count less than by their square from 1.5
-        ("huber") or 2.5 ("cauchy") standard deviations of the noise, and not at all
-        beyond six sizes of their frame. Only for the joint refinement.
+        Loss of points far from the model. "huber" reduces the weight of points beyond
+        1.5 standard deviations of the noise. "cauchy" reduces it gradually, to one half
+        at 2.5 standard deviations. With both, points beyond six sizes of their frame
+        have weight zero. They need the joint refinement.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
-        Whether each centred frame is divided by the root mean square of its
-        coordinates before the fit, so that photos of any resolution count alike;
-        the scale is given back to `motion_`. With False frames count by their size.
+        Whether each centred frame is divided by the RMS of its coordinates before the
+        fit, so that photos of any resolution have the same weight. `motion_` is in the
+        units of the table in any case. If False, frames are weighted by their size.
         With orthographic cameras, which have one scale, frames are not scaled.
     max_iter : int, default=1000
         Largest number of steps of the refinement.
     tol : float or None, default=None
         Convergence tolerance. The joint refinement has converged when two successive
-        steps each lower minus twice the log likelihood by less than tol for each frame
+        steps each decrease minus twice the log likelihood by less than tol per frame
         (default 0.025; its first steps, on a sample of a large table, end earlier). The
         alternating refinement has converged when a step gains less than this share of
-        the energy it explains (default 1e-10).
+        the explained energy (default 1e-10).
     random_state : int, RandomState instance or None, default=None
         Seeds the strategy; an int makes the result reproducible.
     keep_frames : bool, default=True
         Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
     frames_folder : str, path-like or None, default=None
         Folder for the kept arrays. Each fit makes a new folder within it, with files
-        ``alpha.npy`` and so on, and the attributes are memory maps of them;
+        Folder for the kept arrays. Each fit makes a new folder within it, with files
+        ``alpha.npy`` and so on. The attributes are memory maps of these files;
         ``alpha_.filename`` is the path. A fit that fails leaves no files. Fits never
-        remove the files of earlier ones, which other models may use. None keeps the
-        arrays in memory.
+        remove the files of earlier fits, because other models may use them. None keeps
+        the arrays in memory.
     working_memory : float or None, default=None
-        Megabytes for a block of a table that is not in memory (a memory map or a table
-        of `isa_nrsfm.io.open_table`); None is scikit-learn's setting `working_memory`.
-        The result does not depend on it. About 1 kB for each frame is in memory in any
-        case.
+        Megabytes per block of a table that is not in memory (a memory map or a table of
+        `isa_nrsfm.io.open_table`). None is scikit-learn's setting `working_memory`. The
+        result does not depend on it. In addition, about 1 kB per frame is always in
+        memory.
     n_jobs : int or None, default=None
-        Number of threads that work on the frames, in `fit` and in the methods for
-        tables, and of joblib workers for strategies that use them. The result does not
-        depend on it.
+        Number of threads for the frames, in `fit` and in the methods for tables, and of
+        joblib workers for strategies that use them. The result does not depend on it.
     verbose : int, default=0
         Above zero, print a line for each stage, above one also the current step. With
         scikit-learn 1.9 and later the stages and steps are reported to the callbacks of
@@ -133,14 +135,14 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     Attributes
     ----------
     mean_shape_ : ndarray of shape (n_points, 3)
-        Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is
-        the identity (of rank two for flat objects). With weak-perspective cameras only
-        the mean square of its coordinates is one, with orthographic ones it is in the
-        units of the table. x and y are the axes of the mean camera (so y points down
-        for image coordinates), z is depth. Its mirror image fits equally well.
+        Mean shape B_0, centred and white: the mean of ``b b^T`` over the points is the
+        identity (of rank two for flat objects). With weak-perspective cameras only the
+        mean square of its coordinates is one. With orthographic ones it is in the units
+        of the table. x and y are the axes of the mean camera (so y points down for
+        image coordinates), z is depth. The mirror image in depth fits equally well.
     basis_ : ndarray of shape (n_components, n_points, 3)
-        Basis shapes B_k, centred, by decreasing energy in the images, each for one
-        standard deviation of `alpha_`. Basis shapes without motion in the table are
+        Basis shapes B_k, centred, sorted by decreasing energy in the images, each for
+        one standard deviation of `alpha_`. Basis shapes without motion in the table are
         zero.
     alpha_ : ndarray of shape (n_frames, n_components)
         Coefficients of the frames, scaled to unit variance; signs chosen so that the
@@ -154,11 +156,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Images of the origin of the shapes, in the units of the table: the centroids of
         complete frames.
     depth_uncertainty_ : float
-        Expected root mean square error of the depths of the frames, relative to their
-        root mean square (calibrated cameras with the joint refinement only).
+        Expected RMS error of the depths of the frames, relative to their RMS
+        (calibrated cameras with the joint refinement only).
     rotations_ : ndarray of shape (n_frames, 3, 3)
-        Rotations of calibrated cameras, of determinant one: the rows are the axes of
-        the image, x, y and z (only with such cameras, as `scales_`).
+        Rotations of calibrated cameras, with determinant one. The rows are the axes of
+        the image, x, y and z. Like `scales_`, only with such cameras.
     scales_ : ndarray of shape (n_frames,)
         Scales of calibrated cameras, in units of the table per unit of the shapes; one
         for orthographic cameras. The image of frame i is ``scales_[i] * S_i @
@@ -170,20 +172,21 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Lowest inverse SNR of any model of rank 3K + 3, with missing points filled in;
         zero where K exceeds the bound of affine cameras.
     noise_variance_ : float
-        Variance of the noise of a coordinate; of frames of size one where frames are
-        scaled (joint refinement only, as are the next four).
+        Noise variance of a coordinate. If frames are scaled, it is that of frames of
+        size one (joint refinement only, as are the next four).
     camera_noise_ratio_ : float
         Noise variance of the fit with calibrated cameras, divided by that of the fit
         with affine ones, from the frames of the first steps; see `diagnostics`.
     reliability_ : ndarray of shape (n_components,)
-        Shares of the variance of the coefficients that are not uncertainty, of their
-        own or of the shapes, along uncorrelated directions, decreasing; zero for noise.
+        Shares of the variance of the coefficients that are signal, not uncertainty of
+        coefficients or shapes, along uncorrelated directions, decreasing. Zero for
+        noise.
     objective_history_ : ndarray of shape (`n_iter_` + 1,)
         Minus twice the log posterior, up to a constant, before the last refinement and
         after each of its steps; it never rises.
     gradient_norm_ : float
-        Norm of its gradient at the end, in the metric of its curvature and relative to
-        the root of the number of coordinates.
+        Norm of the gradient of this objective at the end, in the metric of its
+        curvature, divided by the root of the number of coordinates.
     energy_share_ : ndarray of shape (n_components,)
         Share of each basis shape in the energy of the deformations in the images,
         ``sum_i ||alpha_ik M_i B_k||_F^2``, frames scaled as in the fit.
@@ -196,16 +199,15 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     reference_motion_ : ndarray of shape (2, 3)
         Default camera of `inverse_transform`: the mean view of the table.
     reference_translation_ : ndarray of shape (2,)
-        Its translation, the mean centroid.
+        Default translation of `inverse_transform`: the mean centroid.
     isa_ : object
         The fitted strategy, of the paper's pipeline.
     camera_ : str
         The camera model of the fit.
     frames_scaled_ : bool
-        Whether each frame was divided by a size of its own; never with orthographic
-        cameras.
+        Whether each frame was divided by its own size; never with orthographic cameras.
     n_iter_ : int
-        Steps of the refinement; of a large table those with all of its frames.
+        Number of steps of the refinement; for a large table, of those with all frames.
     n_features_in_ : int
         Number of columns.
     feature_names_in_ : ndarray of shape (`n_features_in_`,)
@@ -222,15 +224,15 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     frame. The affinity is fixed as described for `mean_shape_`; angles and proportions
     in depth are not those of the object.
 
-    `fit` and the methods for new tables accept tables that are not in memory. Of a dask
-    array `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays, and so
-    are the results of `transform`, `decompose`, `reconstruct` and `reproject`.
+    `fit` and the methods for new tables accept tables that are not in memory. For a
+    dask array, `alpha_`, `alpha_std_`, `motion_` and `translation_` are dask arrays,
+    like the results of `transform`, `decompose`, `reconstruct` and `reproject`.
 
     Missing points are NaN, in `fit` and everywhere else. A point with one missing
     coordinate counts as missing, with a warning. Rows without any point are left out of
-    the fit, with a warning, and have NaN in `alpha_` and the other attributes of
-    frames. Rows with too few points to determine a camera are refused by `fit` and have
-    NaN elsewhere.
+    the fit, with a warning. They have NaN in `alpha_` and the other attributes of
+    frames. If a row has too few points to determine a camera, `fit` raises an error and
+    the other methods return NaN.
 
     References
     ----------

@@ -7,7 +7,7 @@
 5. The joint refinement, with `refinement="joint"`, or the frames of the paper.
 6. Measures of the fit.
 
-The first and the last two stages use all frames, the others those of the sample.
+Stages 1, 5 and 6 use all frames, the other stages those of the sample.
 """
 
 import copy
@@ -78,9 +78,8 @@ STAGES = (
     JOINT_STAGE,
     "gauge and coefficients",
 )
-# Convergence tolerances by default. JOINT_TOL: decrease of the objective of the joint
-# refinement for each frame. PAPER_TOL: gain of the paper's refinement, as a share of
-# the energy that it explains.
+# Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
+# frame. PAPER_TOL: gain of the paper's refinement, as a share of the explained energy.
 JOINT_TOL, PAPER_TOL = 0.025, 1e-10
 
 
@@ -103,10 +102,10 @@ class Limits(NamedTuple):
 def fit_table(
     estimator: TableTransformer, source: FrameBlocks, progress: FitProgress
 ) -> Decomposition:
-    """Fit a table, and set the attributes of an estimator whose parameters are checked.
+    """Fit a table, and set the attributes of an estimator.
 
-    Its `isa_` is the unfitted strategy. Returns the fit of all rows, NaN where a row
-    shows no point.
+    Its parameters are checked, and its `isa_` is the unfitted strategy. Returns the fit
+    of all rows, NaN for rows without visible points.
     """
     n_components = estimator.n_components
     if n_components == "auto":
@@ -207,7 +206,7 @@ def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
     factorised = _factorised(trial, table, most, NoProgress())
     paper = _paper_result(trial, factorised.factors, most, NoProgress())
     found = count_components(factorised, paper.shapes, _joint_settings(estimator))
-    # Outliers that count a little look like shapes: a fit with final weights decides.
+    # Down-weighted outliers look like basis shapes: fit again with the final weights.
     while found > 1 and estimator.loss != "linear":
         trial = copy.copy(estimator)
         with warnings.catch_warnings():
@@ -254,7 +253,7 @@ def joint_tol(estimator: TableTransformer) -> float:
 def _joint_settings(
     estimator: TableTransformer, on_step: Callable[[], None] | None = None
 ) -> JointSettings:
-    """Return how the joint refinement fits a table."""
+    """Return the settings of the joint refinement."""
     return JointSettings(
         estimator.camera,
         estimator.loss,
@@ -429,6 +428,6 @@ def _table_model(
     mean_shape: NDArray,
     basis: NDArray,
 ) -> TableModel:
-    """Return the fitted model as a function of tables."""
+    """Return the fitted model for the rows of a table."""
     unit = None if estimator.frames_scaled_ else float(table.sizes[0])
     return TableModel(frames, mean_shape, basis, estimator.layout, unit)

@@ -1,4 +1,4 @@
-"""The fitted model as a function of the rows of a table, one block at a time."""
+"""The fitted model, applied to a table block by block."""
 
 from typing import Any, NamedTuple
 
@@ -23,11 +23,11 @@ from isa_nrsfm._tables.tracks import (
 
 
 class TableModel(NamedTuple):
-    """Model of a frame, shapes and layout: all that the fit of a new table depends on.
+    """Model of a frame, shapes and layout: all that is needed to fit a new table.
 
-    Methods take some rows (n, 2 * n_points) of a table. Results are NaN for rows with
-    too few points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
-    `unit` is the one size of all frames of a table; None where each has its own.
+    Methods take rows (n, 2 * n_points) of a table and return NaN for rows with too few
+    visible points. The mean shape (J, 3) and the basis (K, J, 3) are in the gauge.
+    `unit` is the common size of all frames, or None if each frame has its own.
     """
 
     frames: RigidFrames | PosteriorFrames
@@ -39,7 +39,7 @@ class TableModel(NamedTuple):
     def decompose(
         self, rows: NDArray, deviations: bool = True, dtype: Any = None
     ) -> Decomposition:
-        """Return cameras, positions and coefficients, as numbers of the rows' type."""
+        """Return cameras, positions and coefficients, in the dtype of the rows."""
         usable, centred, translation, sizes = self._ready(self._tracks(rows))
         fit = self.frames.fit(centred, sizes, deviations)
         fit = fit._replace(translation=fit.translation + translation)
@@ -62,8 +62,8 @@ class TableModel(NamedTuple):
     ) -> NDArray:
         """Return the shapes (n, n_points, 3) of frames.
 
-        A metric of space makes them Euclidean; `scaled` gives them the sizes that an
-        orthographic camera shows.
+        A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
+        its camera, as orthographic cameras need.
         """
         motion, _, alpha, _ = self.decompose(rows, deviations=False)
         if metric is None:
@@ -102,20 +102,20 @@ class TableModel(NamedTuple):
     def held_out_energies(self, tracks: NDArray, sizes: NDArray) -> tuple[float, float]:
         """Return the energies of the error and of the signal of held-out points.
 
-        Each of five parts of the points, the same for all tables, is predicted from the
-        others: camera, position and coefficients of each frame are fitted without it.
-        The energies are ``sum ||m - m_hat||^2`` and ``sum ||m - centroid_i||^2`` over
-        the points, divided by the squared sizes (I,) of frames.
+        The points are divided into five parts, the same for all tables. Each part is
+        predicted from the others: camera, position and coefficients of each frame are
+        fitted without it. The energies are ``sum ||m - m_hat||^2`` and ``sum ||m -
+        centroid_i||^2`` over the points, divided by the squared sizes (I,) of frames.
 
-        Points are left out if the others of the frame do not determine its fit, or if
-        in a frame with missing points the affine camera of the mean shape adds more
-        than twice the noise variance to their prediction: a few such frames would
-        decide. This does not depend on the basis, so that scores of different K are of
-        the same points.
+        A point is left out if the other points of its frame do not determine the fit.
+        In frames with missing points it is also left out if the affine camera of the
+        mean shape adds more than twice the noise variance to its prediction: a few such
+        frames would dominate the score. This does not depend on the basis, so scores of
+        different K use the same points.
         """
         folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
         seen = seen_points(tracks)
-        # Complete frames are fitted without the points, others with gaps instead.
+        # Complete frames are fitted without these points, others with NaN instead.
         frames = self.frames
         complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
         complete = complete and bool(seen.all())
@@ -146,10 +146,10 @@ class TableModel(NamedTuple):
             weight = sizes[usable, None, None] ** -2.0
             counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
-            # In 12 scenes of 120 frames, two frames that show six of 23 points multiply
-            # the error by 1.5 to 52 without a limit, and by 1.0 to 1.8 with this one.
-            # With 20 % of all points missing it changes the error by at most 1.2 %; a
-            # limit of 1 changes it by up to 21 %.
+            # Effect of the threshold 2: in 12 scenes of 120 frames, two frames that
+            # show six of 23 points multiply the error by 1.0 to 1.8, and by 1.5 to 52
+            # without a threshold. With 20 % of all points missing it changes the error
+            # by at most 1.2 %; a threshold of 1 changes it by up to 21 %.
             leverage = _camera_leverage(self.mean_shape, seen[usable[some]] & ~held)
             counted[some] &= leverage[:, held] <= 2.0
             noise += np.sum((weight * (part[:, held] - predicted) ** 2)[counted])
@@ -159,7 +159,7 @@ class TableModel(NamedTuple):
     def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
         tracks, n_half, _ = without_half_points(table_to_tracks(rows, self.layout))
-        if n_half.any():  # the number of a row in its block would mislead
+        if n_half.any():  # row numbers within a block would be misleading
             warn_caller(
                 "some points have only one of their two coordinates. They count as "
                 "missing"
@@ -167,7 +167,7 @@ class TableModel(NamedTuple):
         return tracks
 
     def _ready(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return which tracks are usable; these centred, their centres and sizes."""
+        """Return a mask of usable tracks; these centred, their centres and sizes."""
         centred, report = centred_frames(tracks)
         usable = report.usable
         if not usable.all():
@@ -184,10 +184,10 @@ class TableModel(NamedTuple):
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:
-    """Return variances of points (n, J) from cameras, in noise variances."""
+    """Return variances of points (n, J) due to cameras, over the noise variance."""
     points = np.linalg.qr(np.column_stack([mean_shape, np.ones(len(mean_shape))]))[0]
     normal = np.einsum("ij,ja,jb->iab", seen, points, points, optimize=True)
-    # A little more: where the seen points are coplanar, the variance is huge.
+    # A tiny ridge: if the seen points are coplanar, the variance is huge.
     inverse = np.linalg.inv(normal + np.finfo(float).eps * np.eye(4))
     return np.asarray(
         np.einsum("ja,iab,jb->ij", points, inverse, points, optimize=True)

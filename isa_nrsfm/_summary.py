@@ -20,7 +20,7 @@ def summary_html(model: Any) -> str:
 
 
 def _lines(model: Any) -> dict[str, str]:
-    """Return names and values."""
+    """Return the names and values of the key figures."""
     n_components, n_points, _ = model.basis_.shape
     lines = {"Shapes": f"{n_components} basis shapes of {n_points} points"}
     if hasattr(model, "motion_"):

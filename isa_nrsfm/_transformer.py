@@ -43,13 +43,13 @@ class SmoothedCoefficients(NamedTuple):
     ----------
     alpha : ndarray of shape (n_frames, n_components)
         Posterior means. Without dynamics they are those of `AffineNRSfM.transform`.
-        With dynamics, rows of which too little is seen are filled in.
+        With dynamics, rows with too few visible points are filled in.
     alpha_std : ndarray of shape (n_frames, n_components)
         Posterior standard deviations.
     time_scales : ndarray of shape (n_components,) or (0,)
-        Times after which the shape of a frame is forgotten, the longest first, in the
-        units of `time`: ``-1 / log |l|`` with the eigenvalues l of the transition.
-        Infinite where ``|l|`` is one or more. Empty if the frames show no dynamics.
+        Decay times of the coefficients, the longest first, in the units of `time`: ``-1
+        / log |l|`` with the eigenvalues l of the transition. Infinite where ``|l|`` is
+        one or more. Empty if the frames show no dynamics.
     """
 
     alpha: NDArray
@@ -67,7 +67,7 @@ class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
         Parameters
         ----------
         input_features : array-like of str, default=None
-            Checked against the names of the fitted columns, and not used.
+            Checked against the names of the fitted columns; otherwise unused.
 
         Returns
         -------
@@ -159,8 +159,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         ndarray of shape (n_frames, n_components)
-            Coefficients; those of the fitted table are `alpha_`. NaN for rows of which
-            too little is seen.
+            Coefficients; those of the fitted table are `alpha_`. NaN for rows with too
+            few visible points.
         """
         table = self._opened(X)
         found = table.collect(partial(self._model.decompose, deviations=False))
@@ -204,18 +204,18 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one. Within a group its rows are in
-            order of time.
+            A table with the points of the fitted one. The rows of each group are in
+            temporal order.
         time : array-like of shape (n_frames,), default=None
             Times of the frames, numbers or dates (in seconds from the first). Their
-            median difference is a step of the autoregression. Other differences are
-            rounded to whole steps. None for frames one step apart.
+            median difference is one step of the autoregression. Other differences are
+            rounded to whole steps. If None, consecutive frames are one step apart.
         groups : array-like of shape (n_frames,), default=None
-            People, videos or scenes, between which nothing is carried on. Each has an
-            intercept of its own: differences between people are no dynamics. None for
-            one group.
+            Person, video or scene of each frame. Smoothing does not cross groups.
+            Each has its own intercept, so that differences between people are not taken
+            for dynamics. None for one group.
         max_gap : int, default=30
-            After a gap of more steps nothing is carried on.
+            Largest gap, in steps, across which coefficients are smoothed.
         max_iter : int, default=100
             Largest number of iterations of expectation maximisation.
         tol : float, default=1e-3
@@ -235,13 +235,13 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
 
         Notes
         -----
-        A linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway, Stoffer, 1982)
-        that is observed through the likelihood of each frame. The transition has a
-        ridge of greatest evidence. Unless the evidence for dynamics is strong, as it is
-        not for photos in any order, the coefficients are those of `transform`. With
-        groups, the likelihood is compared with that of groups with intercepts alone.
+        The model is a linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway,
+        Stoffer, 1982), observed through the likelihood of each frame. The transition
+        has a ridge of greatest evidence. If the evidence for dynamics is weak, as for
+        photos in any order, the coefficients are those of `transform`. With groups, the
+        likelihood is compared with that of groups with intercepts alone.
         """
-        # With it come linear models, for which `transform` need not wait.
+        # Imported here: it imports linear models, which `transform` does not need.
         from isa_nrsfm.analysis._dynamics import smoothed_posterior
 
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
@@ -277,10 +277,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         ndarray of shape (n_frames, 3, 3)
-            Posterior covariances, in radians squared, of the rotation vectors w by
-            which rotations R may be off: ``R exp(hat(w))``, w in the axes of the
-            shapes: those of the frame plus those of the shapes, from a jackknife over
-            groups of points. NaN for rows with too few visible points.
+            Posterior covariances, in radians squared, of the errors w of the rotations,
+            as rotation vectors: ``R exp(hat(w))``, with w in the axes of the shapes.
+            Each is the covariance of the frame plus that of the shapes, from a
+            jackknife over groups of points. NaN for rows with too few visible points.
 
         Raises
         ------
@@ -308,14 +308,13 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
         camera : {"orthographic", "weak_perspective"} or None, default=None
-            The calibrated cameras that took the images, for a model that was fitted
-            with affine ones. None returns affine shapes, in the space of `mean_shape_`:
-            their angles and proportions in depth are not those of the object.
-            Otherwise shapes are Euclidean. One rotation and one mirror image, the same
-            for all frames, remain unknown. With "weak_perspective" each camera has a
-            scale of its own, and the sizes of the shapes have no meaning. With
-            "orthographic" all cameras have one scale, and shapes are in the units of
-            the table.
+            Calibrated camera model of the images, for a model that was fitted with
+            affine cameras. None returns affine shapes, in the space of `mean_shape_`:
+            their angles and proportions in depth are not those of the object. Otherwise
+            shapes are Euclidean, up to one rotation and one mirror image for all
+            frames. With "weak_perspective" each camera has its own scale, and the sizes
+            of the shapes have no meaning. With "orthographic" all cameras have one
+            scale, and shapes are in the units of the table.
 
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
@@ -324,8 +323,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            Shapes, without camera; NaN for rows of which too little is seen. Euclidean
-            ones are turned to be as near as possible to the mean shape.
+            Shapes in their own axes, not those of the camera. NaN for rows with too few
+            visible points. If `camera` is given for an affine model, each shape is
+            rotated as near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
             Only with `return_std`. Standard deviations of the coordinates of the points
             along the viewing direction of their frame, in the units of the shapes. They
@@ -346,14 +346,15 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
 
         See Also
         --------
-        isa_nrsfm.calibration.euclidean_frames : Rotations and scales, too.
+        isa_nrsfm.calibration.euclidean_frames : Shapes, rotations and scales.
 
         Notes
         -----
         The Euclidean space is that of `isa_nrsfm.calibration.deformation_metric` for
-        `motion_` and `alpha_`, the cameras of the fitted table, whatever X is. Models
-        that were fitted with calibrated cameras have Euclidean shapes already. These
-        are not turned, so that `scales_` and `rotations_` are those of their cameras.
+        `motion_` and `alpha_`, the cameras and coefficients of the fitted table, for
+        any X. If the model was fitted with calibrated cameras, its shapes are Euclidean
+        already. They are not rotated, so that `scales_` and `rotations_` are those of
+        their cameras.
         """
         if camera is not None and camera not in CAMERA_MODELS:
             raise ValueError(
@@ -385,9 +386,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         Return the mirror image of the model in depth, which fits equally well.
 
         Neither affine nor calibrated cameras distinguish an object from its mirror
-        image. The fit chooses the one with a positive skewness of the depths of the
-        mean shape. If that is the wrong one, such as a face whose nose points away, use
-        this method. Coefficients, reprojection and score stay the same.
+        image. The fit chooses the one whose mean shape has depths of positive skewness.
+        Use this method if that is the wrong one, for example a face whose nose points
+        away. Coefficients, reprojection and score stay the same.
 
         Returns
         -------
@@ -423,7 +424,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
 
     def reproject(self, X: Any) -> NDArray:
         """
-        Return the images of the fitted shapes, also of missing points.
+        Return the images of the fitted shapes, including missing points.
 
         Parameters
         ----------
@@ -482,9 +483,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         """
         Return minus the inverse SNR of points held out of the fit of their frame.
 
-        The points are divided into five parts, always the same. Each is predicted from
-        the others, frame by frame. Unlike the reprojection error of fitted points, this
-        error rises with too many basis shapes. So the score can choose `n_components`.
+        The points are divided into five parts, always the same. Each part is predicted
+        from the others, frame by frame. Unlike the reprojection error of fitted points,
+        this error rises with too many basis shapes. So the score can choose
+        `n_components`.
 
         Parameters
         ----------
@@ -497,22 +499,22 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         -------
         float
             ``-sum ||m - m_hat||^2 / sum ||m - centroid_i||^2`` over all points, with
-            frames scaled as in the fit. Larger is better. Points are left out if the
-            others of the frame do not determine its fit, or if points are missing and
-            the camera of the others places them with more than twice the noise
-            variance.
+            frames scaled as in the fit. Larger is better. A point is left out if the
+            other points of its frame do not determine the fit. In frames with missing
+            points it is also left out if the camera of the others adds more than
+            twice the noise variance to its prediction.
         """
         noise, signal = self._opened(X).joined(self._model.held_out).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
     def diagnostics(self, X: Any = None) -> Diagnostics:
         """
-        Return how well the fitted table determines shapes and coefficients.
+        Return diagnostics of how well the fitted table determines its fit.
 
         Parameters
         ----------
         X : array-like of shape (n_frames, 2 * n_points), default=None
-            The fitted table. With it outliers are looked for.
+            The fitted table. If given, it is searched for outliers.
 
         Returns
         -------
@@ -566,7 +568,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
 
 
 def frames_of(estimator: TableTransformer) -> Any:
-    """Return the fitted model of a frame: shapes, noise, starts, and its fit."""
+    """Return the fitted model of single frames."""
     return estimator._model.frames
 
 
@@ -586,7 +588,7 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
 
 
 def check_frames_kept(estimator: Any, what: str) -> None:
-    """Refuse methods that need the frames of the fit where they were not kept."""
+    """Raise an error if the frames of the fit are needed and were not kept."""
     if not hasattr(estimator, "motion_"):
         raise ValueError(
             f"{what} needs the cameras and coefficients of the fitted table, which "

@@ -191,7 +191,7 @@ class TestAssociation:
         [
             (np.zeros(120), {}, "all 120 labels are.*nothing to compare"),
             (np.arange(120), {}, "all different.*kind='number'"),
-            (["a"] * 119 + [None], {}, "missing in 1 of 120, the first is row 119"),
+            (["a"] * 119 + [None], {}, r"missing in 1 of 120 \(first: row 119\)"),
             (np.r_[np.nan, np.ones(119)], {}, "missing in 1 of 120"),
             (np.r_[0.5, np.inf, -np.inf, np.ones(117)], {}, "2 of 120.*in row 1: "),
             (["a", "b"], {}, "each of the 120 frames; got 2"),

@@ -285,12 +285,12 @@ class TestOutliers:
         assert re.search(r"rows image9, .* points 7,", message)
 
 
-def test_a_handful_of_frames_that_decide_a_coefficient_are_said():
+def test_a_few_frames_that_determine_a_coefficient_are_named():
     faces = make_face_tracks(200, n_components=1, noise=0.01, random_state=0)
     tracks = faces.tracks.copy()
     tracks[:4, 48:68, 1] *= 1.3  # all lips of four frames
     model = AffineNRSfM(2, random_state=0).fit(tracks.reshape(200, -1))
-    message = r"a handful of the 200 frames decide alpha_. \(.* most row [0-3]\)"
+    message = r"a few of the 200 frames determine alpha_. \(.* most row [0-3]\)"
     found = model.diagnostics()
     effective = found.effective_frames
     assert any(re.match(message, each) for each in found.messages)

@@ -667,7 +667,9 @@ def test_columns_that_are_no_points_are_refused(library):
         given = pl.DataFrame(dict(table.items()))
     planar, search = estimator(layout="planar"), AffineNRSfMCV([1, 2])
     for model in (estimator(), planar, search, PseudoInverseNRSfM()):
-        with pytest.raises(ValueError, match=r"not the x or y of a point, .*landmark"):
+        with pytest.raises(
+            ValueError, match=r"not named as the x or y of a point .*landmark"
+        ):
             model.fit(given)
     points = landmark_table(table).points
     assert_array_equal(estimator().fit(points).alpha_, estimator().fit(TABLE).alpha_)
@@ -1116,7 +1118,7 @@ def test_intervals_of_coefficients_hold(loss, camera):
     ("truth", "n_components", "least", "most", "meaning"),
     [
         ("weak_perspective", 2, 1.0, 1.1, "as well as affine ones"),
-        ("affine", 2, 10.0, np.inf, "hardly calibrated ones"),
+        ("affine", 2, 10.0, np.inf, "probably not calibrated"),
     ],
 )
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])

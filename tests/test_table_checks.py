@@ -212,8 +212,8 @@ class TestNames:
     def test_columns_beside_those_of_points(self, names, n_others, first, layout):
         with pytest.raises(
             ValueError,
-            match=rf"^{n_others} of the 6 columns are not the x or y of a point, .*; "
-            rf"the first is '{first}'\. .*isa_nrsfm\.io\.landmark_table",
+            match=rf"^{n_others} of the 6 columns are not named as the x or y of "
+            rf"a point \(first: '{first}'\)\. .*isa_nrsfm\.io\.landmark_table",
         ):
             check_names(np.array(names.split()), layout)
 
@@ -239,7 +239,7 @@ class TestOtherLayout:
         with pytest.warns(
             UserWarning,
             match=rf"layout='{true}' explains the table much better than "
-            rf"layout='{given}': what is not rigid has 0\.\d+ times the energy",
+            rf"layout='{given}': its non-rigid part has 0\.\d+ times the energy",
         ):
             warn_if_other_layout(X, given, scale_frames)
 

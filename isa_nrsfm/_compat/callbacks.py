@@ -20,7 +20,7 @@ except ImportError:
 
 
 class _NoContext:
-    """Callback context where there are no callbacks."""
+    """Callback context for versions of scikit-learn without callbacks."""
 
     def _itself(self, **_: Any) -> Self:
         """Return this context."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 def reading(
     path: str | os.PathLike[str], what: str, expected: str | None = None
 ) -> Iterator[None]:
-    """Name the file in any error of reading it; errors of content become ValueErrors.
+    """Name the file in each reading error; raise ValueErrors for damaged content.
 
     Damaged content makes h5py, pyarrow, zipfile, json and others raise errors of many
     undocumented kinds. `what` is the kind of file, `expected` its required content.
@@ -19,7 +19,8 @@ def reading(
     except (ImportError, MemoryError):
         raise
     except Exception as error:
-        # Errors of the system have a number, those that libraries make of content none.
+        # Errors of the system have an errno, errors of libraries for bad content do
+        # not.
         if isinstance(error, OSError) and error.errno is not None:
             error.filename = os.fspath(path)
             raise

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
-# The variable of the environment by which SPEC 1 asks for all imports at once.
+# Environment variable of SPEC 1 that turns lazy imports off.
 EAGER = "EAGER_IMPORT"
 
 

@@ -30,9 +30,9 @@ __all__ = [
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Decorates functions of matrices so small that threads of BLAS wait for each other:
-# beside another program they take 2 to 12 times as long. Blocks of frames run in
-# parallel instead.
+# For functions of small matrices, where threads of BLAS mostly wait for each other.
+# Without it they take 2 to 12 times as long while another program runs. Blocks of
+# frames run in parallel instead.
 one_blas_thread: Callable[[Function], Function] = _threadpool_controller_decorator(
     limits=1, user_api="blas"
 )

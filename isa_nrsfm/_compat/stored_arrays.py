@@ -1,4 +1,4 @@
-"""Arrays in NumPy's format that are not larger than their file."""
+"""Arrays in NumPy's format, checked against the size of their file."""
 
 import io
 import math
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 def array_in(content: bytes) -> NDArray:
     """Return the array of numbers in bytes of NumPy's format.
 
-    NumPy makes room for any shape in the header. Raise if the bytes hold objects, or
-    more or fewer numbers than the header has.
+    NumPy allocates any shape that the header has. Raise an error if the bytes hold
+    objects, or if the number of entries differs from the header.
     """
     stored = io.BytesIO(content)
     version = np.lib.format.read_magic(stored)

@@ -5,8 +5,8 @@ def as_utf8(text: str) -> str:
     r"""
     Return a text that can be written as UTF-8.
 
-    Python marks each byte of a file's name that is not UTF-8 by a lone surrogate, a
-    character that no encoding has (PEP 383). It becomes six characters:
+    Python marks each byte of a file's name that is not UTF-8 by a lone surrogate, which
+    cannot be encoded (PEP 383). It becomes six characters:
 
     >>> import os
     >>> from isa_nrsfm._compat.texts import as_utf8

@@ -1,8 +1,8 @@
 """Files that are written as a whole or not at all.
 
-New contents go to a hidden file or folder beside the old ones, whose name begins with
-`ASIDE`, and take their places by `os.replace`. A write that fails removes it. A killed
-process leaves it behind: it may be deleted.
+New contents are written to a hidden file or folder beside the old ones. Its name begins
+with `ASIDE`. Then `os.replace` moves them to their place. A write that fails removes
+the hidden file. A killed process leaves it behind: it can be deleted.
 """
 
 import contextlib
@@ -28,11 +28,11 @@ def write_whole(path: StrPath, contents: bytes) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
-    """Open a file that has all of its new contents after the block, or stays as it was.
+    """Open a file that is replaced after the block, or unchanged if the block fails.
 
     Permissions and links stay. A path that is no regular file, such as a pipe, is
-    written to directly. OSErrors name the path, even if a library hides them behind its
-    own.
+    written to directly. OSErrors name the path, even if a library wraps them in its own
+    errors.
     """
     target = Path(os.path.realpath(path))
     with _naming(path):
@@ -43,12 +43,12 @@ def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
         mode = check_replaceable(target)
         new = _aside(target.parent)
         try:
-            # Also for reading: NumPy writes around a file that is for writing only, and
-            # then loses the disk's error.
+            # Also readable: NumPy bypasses the buffer of a write-only file, and loses
+            # errors of the disk.
             with new.open("x+b") as file:
                 yield file
                 file.flush()
-                os.fsync(file.fileno())  # errors come now, and not when it is too late
+                os.fsync(file.fileno())  # raise errors before the old file is replaced
             if mode is not None:
                 new.chmod(mode)
             os.replace(new, target)
@@ -58,9 +58,9 @@ def whole_file(path: StrPath) -> Iterator[IO[bytes]]:
 
 @contextlib.contextmanager
 def files_together(folder: StrPath, *, removed: Iterable[str] = ()) -> Iterator[Path]:
-    """Write files to a new folder, which move to a folder after the block.
+    """Write files to a hidden folder, and move them to `folder` after the block.
 
-    If the block fails all old files stay. Otherwise files in `removed` are deleted.
+    If the block fails, all old files stay. Otherwise files in `removed` are deleted.
     """
     folder = Path(folder)
     stage = _aside(folder)
@@ -115,13 +115,13 @@ def check_replaceable(path: Path) -> int | None:
 
 
 def _aside(folder: Path) -> Path:
-    """Return a hidden path in a folder that nothing else has."""
+    """Return a new hidden path in a folder."""
     return folder / f"{ASIDE}{uuid.uuid4().hex}"
 
 
 @contextlib.contextmanager
 def _naming(path: StrPath) -> Iterator[None]:
-    """Raise the OSError behind an error, if there is one, and name the path in it."""
+    """Raise the OSError that caused an error, if any, with the path in its message."""
     try:
         yield
     except Exception as error:

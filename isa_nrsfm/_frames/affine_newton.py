@@ -16,8 +16,8 @@ Write ``P_k = B_k W^T``, ``H_kl = <M B_k, M B_l>`` and c = (1, a). Half the grad
 
     H_kl + s2 d_kl - <F_k A^-1, F_l>,  F_k = M (B_k S^T + S B_k^T) - P_k^T.
 
-The first step from a start takes ``H + s2 I`` in its place, half the Hessian with the
-camera held: f falls. The others are Newton steps, damped by ``H + s2 I``.
+The first step uses ``H + s2 I`` instead, half the Hessian for a fixed camera, so that f
+decreases. The others are Newton steps, damped by ``H + s2 I``.
 """
 
 import numpy as np

@@ -14,9 +14,8 @@ times the Hessian is ::
     tr(D_c A D_d^T) + <G, D_cd> - sum_kl <D_c, F_k> Q_kl <D_d, F_l>,
 
 with ``F_k = M (B_k S^T + S B_k^T) - P_k^T``, ``Q = (H + s2 I)^-1`` and the second
-derivative D_cd of the camera. This is exact but for the log determinant, whose second
-derivative is replaced by the bound that A contains. Steps are damped by
-``tr(D_c A D_d^T)``.
+This is exact except for the log determinant, whose second derivative is replaced by the
+bound that A contains. Steps are damped by ``tr(D_c A D_d^T)``.
 """
 
 import numpy as np
@@ -40,9 +39,9 @@ from isa_nrsfm._linalg.small_matrices import (
     unpacked,
 )
 
-# Takes cameras, in the axes of the mean shape, to those reversed in depth. The images
-# of a flat object do not change when it is reflected at its plane. Those of other
-# objects change the less the thinner they are (Necker reversal).
+# Maps cameras, in the axes of the mean shape, to their depth reversals. Reflecting a
+# flat object at its plane does not change its images. For other objects the images
+# change less the thinner they are (Necker reversal).
 REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 
 
@@ -66,8 +65,9 @@ class CalibratedSearch(FrameSearch):
         """Return the better of cameras (n, 2, 3) and reversed ones, and their mask."""
         M = frames_last(motion @ self.space.T)
         problem = self.problem(products, np.full(len(motion), noise))
-        # The cameras may not be at their minimum yet. Compare minima with minima. With
-        # 3, 6 and 12 steps 22, 7 and 1 % of reversed frames of motion capture are left.
+        # The cameras may not be at their minimum yet: compare minima with minima. With
+        # 3, 6 and 12 steps 22, 7 and 1 % of the reversed frames of motion capture
+        # remain.
         n_steps = 6
         M, _ = self.descend(problem, self.evaluate(problem, M), n_steps)
         M, better, _ = self._better_reversed(problem, M, n_steps)
@@ -78,7 +78,8 @@ class CalibratedSearch(FrameSearch):
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 
-        The better one of the nearest camera and that of `_completed` is taken.
+        Of the nearest camera and that of `_completed`, the one with the lower
+        objective.
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
         starts = []
@@ -131,8 +132,8 @@ class CalibratedSearch(FrameSearch):
     ) -> tuple[NDArray, NDArray]:
         """Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
 
-        With the coupling C and the Hessian Y by the camera, coefficients eliminated,
-        these come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``.
+        They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
+        coupling, Y the Hessian by the camera with the coefficients eliminated.
         """
         M, noise = position, problem.noise
         posterior = _posterior(problem, M)
@@ -146,7 +147,7 @@ class CalibratedSearch(FrameSearch):
     def improved(
         self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
     ) -> NDArray:
-        """Return the better ones of cameras and minima from reversed ones."""
+        """Return cameras, replaced by minima from reversed ones if these are lower."""
         M, better, reached = self._better_reversed(problem, position, n_steps)
         converged[better] = reached[better]
         return M
@@ -164,9 +165,9 @@ class CalibratedSearch(FrameSearch):
     def _better_reversed(
         self, problem: FrameProblem, M: NDArray, max_steps: int
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the better of cameras (2, 3, n) and minima from reversed ones.
+        """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
-        Also returns masks of new cameras (n,) and of searches that converged (n,).
+        Also returns masks (n,) of replaced cameras and of searches that converged.
         """
         value = _value(problem, _posterior(problem, M))
         limit = value - 1e-10 * problem.energy
@@ -179,9 +180,10 @@ class CalibratedSearch(FrameSearch):
 def _completed(M: NDArray) -> tuple[NDArray, NDArray]:
     """Return orthonormal rows and scales from the first two columns of affine cameras.
 
-    For thin objects the third column of cameras (2, 3, n), of the thinnest axis, is not
-    determined. The first two are ``U diag(s_1, s_2) V^T``. In a scaled rotation the
-    third is ``+- sqrt(s_1^2 - s_2^2) u_2``, with the sign of the affine camera.
+    The third column of cameras (2, 3, n) belongs to the thinnest axis. For thin objects
+    it is not determined. The first two are ``U diag(s_1, s_2) V^T``. In a scaled
+    rotation the third is ``+- sqrt(s_1^2 - s_2^2) u_2``, with the sign of the affine
+    camera.
     """
     affine = frames_first(M)
     U, values, Vt = np.linalg.svd(affine[:, :, :2])

@@ -1,4 +1,4 @@
-"""Camera models: which 2x3 matrices a camera may be, and how to move among them.
+"""Camera models: the 2x3 matrices that they allow, and steps between these.
 
 A camera M_i is a free 2x3 matrix (affine), the first two rows of a rotation times a
 scale (weak perspective), or such rows with a known scale (orthographic). Other modules
@@ -65,7 +65,7 @@ class AffineCameras:
         return G.reshape(6, -1)[: self.n_parameters]
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
-        """Return the argument of `product` for curvatures (6, n) by a row."""
+        """Return inverse curvatures, for `product`, of curvatures (6, n) per row."""
         return inverse3(curvature)
 
     def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
@@ -83,7 +83,7 @@ class AffineCameras:
 
 
 class CalibratedCameras:
-    """Rotations times a scale: unknown if scaled, and otherwise left as it is."""
+    """Rotations times a scale, which is fitted if `scaled`, and fixed otherwise."""
 
     calibrated = True
 
@@ -150,7 +150,7 @@ class CalibratedCameras:
         return scales[:, None, None] * rows if self.scaled else rows
 
     def _sizes(self, step: NDArray) -> NDArray:
-        """Return the angles of steps, or the logarithms of scales where larger."""
+        """Return the angles of steps, or the changes of log scale where larger."""
         angle = np.sqrt(np.einsum("an,an->n", step[:3], step[:3]))
         return np.maximum(angle, np.abs(step[3])) if self.scaled else angle
 
@@ -193,7 +193,7 @@ def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
-    """Return rotations (n, 3, 3) and scales (n,) of cameras (n, 2, 3), also NaN."""
+    """Return rotations (n, 3, 3) and scales (n,) of cameras (n, 2, 3); NaN stays."""
     dtype = motion.dtype
     motion = motion.astype(np.float64)  # squares may leave the range of float32
     scales = np.sqrt(np.einsum("irc,irc->i", motion, motion) / 2)
@@ -205,9 +205,9 @@ def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def rigid_cameras(W: NDArray, mean_shape: NDArray) -> NDArray:
-    """Return least squares affine cameras (n, 2, 3) of W (2 n, J) and a shape (J, 3).
+    """Return affine cameras (n, 2, 3) by least squares, for W (2 n, J), a shape (J, 3).
 
-    They are those of least norm where the mean shape is flat.
+    If the mean shape is flat, they are the solutions of least norm.
     """
     return (W @ np.linalg.pinv(mean_shape, rcond=1e-10).T).reshape(-1, 2, 3)
 
@@ -222,11 +222,11 @@ def mean_view(motion: NDArray) -> NDArray | None:
 
 
 def reference_camera(motion: NDArray, sizes: NDArray) -> NDArray:
-    """Return a camera (2, 3) that sees shapes as the table shows them.
+    """Return a typical camera (2, 3) of a table, for default images of shapes.
 
-    The mean of the cameras (n, 2, 3), divided by the sizes (n,) of their frames, times
-    the RMS size. If they have no common view, the view along the third axis, each axis
-    scaled by its RMS length in the cameras.
+    The cameras (n, 2, 3) are divided by the sizes (n,) of their frames. The result is
+    their mean, times the RMS size. If they have no common view, it is the view along
+    the third axis, each axis scaled by its RMS length in the cameras.
     """
     camera = mean_view(motion)
     if camera is None:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Rotations whose standard deviation is a larger share of their spread are not
-# determined. Faces of known shape that turn by 10 degrees have 0.2 to 0.3, by 4 degrees
-# 0.9 to 1.3; bodies that turn by 20 degrees 0.5, by 10 degrees 1.
+# Rotations are not determined if their standard deviation is a larger share of their
+# spread. This share is 0.2 to 0.3 for faces of known shape that turn by 10 degrees, 0.9
+# to 1.3 by 4 degrees; 0.5 for bodies that turn by 20 degrees, 1 by 10 degrees.
 LARGEST_SHARE = 0.55
 
 
@@ -18,11 +18,11 @@ class DepthCertainty(NamedTuple):
     Attributes
     ----------
     total : float
-        Root mean square error of the depths, relative to their root mean square.
+        RMS error of the depths, relative to their RMS.
     turning : float
-        Root mean square rotation of the cameras out of the image plane, in radians,
-        from their mean, without the part that the coefficients predict: it cannot be
-        told from deformation.
+        RMS rotation of the cameras out of the image plane from their mean, in radians.
+        The part that the coefficients predict is left out, because it cannot be
+        distinguished from deformation.
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None
@@ -51,9 +51,9 @@ class DepthCertainty(NamedTuple):
         """Reason and remedy for depths that are not determined."""
         turning, deviation = np.degrees([self.turning, self.turning_deviation])
         return (
-            "the depth of the shapes is not determined: independently of their "
-            f"deformation the objects turn by {turning:.2g} degrees (root mean square) "
-            "out of the image plane, and these rotations have a standard deviation of "
+            "the depth of the shapes is not determined: apart from their deformation "
+            f"the objects turn by {turning:.2g} degrees (root mean square) out of the "
+            "image plane, and these rotations have a standard deviation of "
             f"{deviation:.2g} degrees. Fit a table in which the objects turn further, "
             "and transform this one with that model; or use affine cameras "
             '(camera="affine"). See "How reliable is the depth?" in the documentation'

@@ -1,8 +1,8 @@
 """Camera, position and coefficients of single frames for given shapes.
 
 The result of a frame does not depend on the others. `RigidFrames`, the paper's model,
-takes the camera of the mean shape alone, then coefficients of least squares.
-`PosteriorFrames`, that of the joint refinement, takes the most probable camera and
+fits the camera to the mean shape alone, then the coefficients by least squares.
+`PosteriorFrames`, the joint refinement's model, finds the most probable camera and
 coefficients together.
 """
 
@@ -52,10 +52,10 @@ class Decomposition(NamedTuple):
 
 
 class FrameMap(NamedTuple):
-    """Maps cameras and coefficients of frames to other shapes that fit equally well.
+    """Map of cameras and coefficients of frames to other, equally good shapes.
 
-    mixing (K + 1, K + 1): maps ``(1, alpha)`` to ``scale * (1, new alpha)``. The scale,
-    different for each frame, goes to its camera.
+    mixing (K + 1, K + 1): maps ``(1, alpha)`` to ``scale * (1, new alpha)``. Each
+    camera is multiplied by the scale of its frame.
     space (3, 3): affinity of space, ``new shape = shape @ space.T``.
     """
 
@@ -64,7 +64,7 @@ class FrameMap(NamedTuple):
 
     @classmethod
     def identity(cls, n_components: int) -> "FrameMap":
-        """Return the map that leaves everything as it is."""
+        """Return the identity map."""
         return cls(np.eye(n_components + 1), np.eye(3))
 
     def apply(
@@ -72,8 +72,8 @@ class FrameMap(NamedTuple):
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Return cameras, coefficients and standard deviations for the new shapes.
 
-        Standard deviations (n, K) are to first order, NaN without covariances (n, K,
-        K).
+        Standard deviations (n, K) are to first order. They are NaN without covariances
+        (n, K, K).
         """
         new, deviation, scale = self.coefficients(alpha, covariance)
         cameras = scale[:, None, None] * (motion @ np.linalg.inv(self.space))
@@ -98,8 +98,8 @@ class RigidFrames(NamedTuple):
     """The paper's model of a frame: rigid camera, coefficients by least squares.
 
     Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
-    shape as B_0. The least squares then separate where no point is missing. Calibrated
-    cameras are the nearest to those of the rigid fit.
+    shape as B_0. If no point is missing, each coefficient is then fitted by itself.
+    Calibrated cameras are the nearest to those of the rigid fit.
     """
 
     mean_shape: NDArray
@@ -122,8 +122,9 @@ class RigidFrames(NamedTuple):
     ) -> Decomposition:
         """Return the camera of the rigid fit and the coefficients of least squares.
 
-        ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2`` where no point is missing, or zero
-        if unseen; otherwise the solution of least norm. Ignores the other parameters.
+        If no point is missing, ``alpha_ik = <W_i, M_i B_k> / ||M_i B_k||^2``, or zero
+        if the camera does not show B_k. Otherwise the solution of least norm. Ignores
+        the other parameters.
         """
         n_frames, n_components = len(tracks), len(self.basis)
         fit = Decomposition(
@@ -150,7 +151,7 @@ class RigidFrames(NamedTuple):
         P = (W @ stacked).reshape(len(motion), 2, n_components, 3)
         along = np.einsum("irkc,irc->ik", P, motion)
         # ||M_i B_k|| = ||M_i R_k^T|| with B_k = Q_k R_k. The Gram matrix of B_k would
-        # do as well, but with half the digits.
+        # give only half the digits.
         R = np.linalg.qr(self.basis, mode="r")
         images = np.einsum("irc,kdc->ikrd", motion, R, optimize=True)
         energy = np.einsum("ikrd,ikrd->ik", images, images)
@@ -166,7 +167,7 @@ class RigidFrames(NamedTuple):
         centre, centroid = points.mean(axis=0), mean_shape.mean(axis=0)
         motion = rigid_cameras((points - centre).T, mean_shape - centroid)
         motion = CAMERAS[self.camera].nearest(motion)
-        # Least squares for what the mean shape leaves of the frame
+        # Least squares for the residuals of the mean shape
         basis = self.basis[:, seen]
         middles = basis.mean(axis=1)
         images = (basis - middles[:, None]) @ motion[0].T
@@ -204,11 +205,11 @@ class PosteriorFrames:
 
     @cached_property
     def _search(self) -> FrameSearch:
-        """The search for frames. It serves all tables."""
+        """The search for frames, shared by all tables."""
         return frame_search(self.camera, self.shapes)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes, without what is computed from them."""
+        """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def mirrored(self) -> "PosteriorFrames":
@@ -226,7 +227,7 @@ class PosteriorFrames:
     ) -> Decomposition:
         """Return the fit of tracks (n, J, 2), NaN where missing, of sizes (n,).
 
-        With a robust loss the weights are those of the residuals of the fit.
+        With a robust loss the weights follow from the residuals of the fit.
         """
         unit = tracks / sizes[:, None, None]
         return self.shown(self.posterior(unit, covariances=deviations), sizes)
@@ -251,9 +252,10 @@ class PosteriorFrames:
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """Compute the standard deviations (n, J) of depths with calibrated cameras.
 
-        The variance of a depth is that of the jackknife plus that of its frame, ``Z
-        (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
-        depths by rotation vector, logarithm of the scale (if free) and coefficients.
+        The variance of a depth is the sum of the jackknife variance and that of its
+        frame, ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of
+        image and depths by rotation vector, logarithm of the scale (if free) and
+        coefficients.
         """
         found = self.posterior(tracks / sizes[:, None, None], covariances=False)
         seen, free = seen_points(tracks), CAMERAS[self.camera].scaled
@@ -278,10 +280,10 @@ class PosteriorFrames:
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
         """Return the fit of tracks of frames of size one, before the gauge.
 
-        With a robust loss the weights are those of the residuals, as far as the points
-        that have weights determine a camera.
+        With a robust loss the weights follow from the residuals, as long as the points
+        with positive weights determine a camera.
         """
-        # Rounding depends on the strides: the same for all callers.
+        # Rounding depends on the strides: use the same for all callers.
         tracks = np.ascontiguousarray(tracks)
         fitted = partial(
             self._search.fit_tracks, noise=self.noise_variance, covariances=covariances
@@ -291,7 +293,7 @@ class PosteriorFrames:
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
-        # Where too few points are left, the distant ones count, too.
+        # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
         if len(lost):
             weights[lost] = 1.0
@@ -315,8 +317,8 @@ class PosteriorFrames:
                 weights=weights[changing],
                 initial=fit.alpha[changing],
             )
-            # The weights of a frame that the model does not explain can become so
-            # unequal that no camera is left. Such a frame keeps its fit.
+            # If the model does not explain a frame, its weights can become so unequal
+            # that they determine no camera. Such a frame keeps its fit.
             kept = np.isfinite(refit.objective)
             changing = changing[kept]
             fit.put(changing, refit.take(kept))

@@ -34,8 +34,7 @@ from isa_nrsfm._linalg.small_matrices import (
 # Multiplicity of the entries of packed symmetric 3x3 matrices in ``<S, Q>``: those off
 # the diagonal count twice.
 TWICE = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
-# Shapes are flat along a direction if they extend by less than this share of their
-# largest extent.
+# Shapes are flat along a direction if their extent is below this share of the largest.
 FLAT = 1e-10
 
 
@@ -49,7 +48,7 @@ class Gram:
     def __init__(self, pairs: NDArray) -> None:
         self.pairs = pairs
         self._index = unpacked(np.arange(len(pairs)))  # (n_shapes, n_shapes)
-        # Pairs with k < l stand for two.
+        # Pairs with k < l count twice.
         self._multiplicity = np.bincount(self._index.ravel())[:, None]
         # Products of matrices (a, b) or (a, b, n) with vectors (b, n)
         of_each = partial(np.einsum, "abi,bi->ai")
@@ -97,7 +96,7 @@ class FrameTracks(NamedTuple):
     energy: NDArray
 
     def pieces(self, n_frames: int) -> Iterator[tuple[slice, Self]]:
-        """Yield consecutive frames, n_frames at most at a time, and which they are."""
+        """Yield slices of at most n_frames consecutive frames, and these frames."""
         total = len(self.weight)
         for start in range(0, total, n_frames):
             frames = slice(start, min(start + n_frames, total))
@@ -164,7 +163,8 @@ def affine_cameras(
     """
     T = products.gram.products(c)
     A = np.einsum("ki,kpi->pi", 0.5 * c, T)
-    # A ridge, relative to the moments of all shapes: cameras stay finite for flat ones
+    # A ridge, relative to the moments of all shapes, keeps cameras finite for flat
+    # ones.
     moments = products.gram.pairs[diagonal_of(products.gram.pairs)][:, DIAGONAL]
     A[DIAGONAL] += 1e-13 * moments.sum(axis=0).mean(axis=0)
     inverse = inverse3(A)
@@ -215,7 +215,7 @@ def joined_frames(parts: list[FrameTracks]) -> FrameTracks:
 
 
 def _share(weight: NDArray) -> NDArray:
-    """Return the inverse of sums of weights, and zero for frames without points."""
+    """Return the inverses of sums of weights, zero for frames without points."""
     return np.divide(1.0, weight, where=weight > 0, out=np.zeros_like(weight))
 
 

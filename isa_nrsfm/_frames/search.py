@@ -1,9 +1,9 @@
 """Most probable camera, position and coefficients of frames, for given shapes.
 
 Newton's method for many frames at once, the frame as the last index of all arrays.
-Steps are damped where the Hessian is not positive definite or a step has raised the
-objective of a frame, so that it never rises. Frames start from zero coefficients, badly
-fitted frames again from others.
+Steps are damped if the Hessian is not positive definite or a step has raised the
+objective of a frame, so that it never rises. The search starts from zero coefficients.
+Badly fitted frames start again from others.
 """
 
 from functools import partial
@@ -33,9 +33,9 @@ from isa_nrsfm._tables.tracks import seen_points
 
 # Largest number of steps of a search.
 MAX_STEPS = 60
-# With so much damping a step no longer moves, and the search of the frame ends.
+# The search of a frame ends at this damping: its steps no longer move it.
 LARGEST_DAMPING = 1e8
-# Objectives that differ by less than this share are equal.
+# Objectives with a smaller relative difference are equal.
 EQUAL = 1e-10
 
 
@@ -89,7 +89,7 @@ class FrameProblem(NamedTuple):
 
     @property
     def energy(self) -> NDArray:
-        """``||W||^2 + s2`` (n,): gains and rounding errors are compared with it."""
+        """``||W||^2 + s2`` (n,), the scale of gains and rounding errors."""
         return self.products.energy + self.noise
 
     def take(self, frames: NDArray) -> Self:
@@ -129,8 +129,8 @@ class FrameSearch:
     """A search for cameras of one model that see given shapes, frame by frame.
 
     Shapes (K + 1, 3, J), rows centred, are in the coordinates of the search, to which
-    `space` (3, 3) maps the original ones. A first round has at most `first_steps`
-    steps, block by block. Frames that have not converged are collected from all blocks
+    `space` (3, 3) maps the original ones. In the first round each block takes at most
+    `first_steps` steps. Frames that have not converged are collected from all blocks
     for a second round. Rough cameras take `rough_steps`.
     """
 
@@ -191,12 +191,13 @@ class FrameSearch:
     ) -> FramePosterior:
         """Return the most probable camera, position and coefficients of each frame.
 
-        The shapes are by points or directions, as the frames. `initial` (I, K) is by
-        default zero. Frames whose fit is much worse than the noise explains start again
-        from each of `starts` (n_starts, K). `rough` ends after a few steps.
+        The shapes are by points or directions, as the frames. `initial` (I, K) is zero
+        by default. If the residuals of a frame are much larger than the noise, it
+        starts again from each of `starts` (n_starts, K). `rough` ends after a few
+        steps.
 
-        Frames are independent, and NaN where points do not determine a camera. If only
-        the mean shape is flat, zero can be a saddle point: further starts help.
+        Frames are independent. They are NaN if their points do not determine a camera.
+        If only the mean shape is flat, zero can be a saddle point: further starts help.
         """
         n_frames, n_components = len(frames.weight), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
@@ -211,17 +212,17 @@ class FrameSearch:
         slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
         if len(slow):
             fits.put(slow, fit(slow, fits.alpha[slow], MAX_STEPS))
-        # Further starts for frames that are explained badly, all starts at once. At the
-        # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model:
-        # it is chi-squared distributed, with two degrees of freedom for each point less
-        # the eight of camera and position. Three times its expectation may be another
-        # minimum.
+        # Further starts for badly fitted frames, all starts at once. At the minimum, f
+        # / s2 is the squared Mahalanobis distance of a frame from the model. It is
+        # chi-squared distributed, with two degrees of freedom per point minus the eight
+        # of camera and position. Beyond three times its expectation the minimum may not
+        # be the lowest one.
         freedom = np.maximum(2.0 * frames.weight - 8.0, 1.0)
         poor = np.flatnonzero(fits.objective > 3.0 * noise * freedom)
         if starts is not None and len(starts) and len(poor):
             number = np.repeat(np.arange(len(starts)), len(poor))
             others = fit(np.tile(poor, len(starts)), starts[number], MAX_STEPS)
-            # Of equal minima the first one is kept.
+            # Of equal minima, keep the first.
             objective = others.objective.reshape(len(starts), -1)
             best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
             best = best * len(poor) + np.arange(len(poor))
@@ -284,7 +285,7 @@ class FrameSearch:
         return FrameProblem(products, np.where(noise > 0, noise, 1.0))
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
-        """Return where the search starts from coefficients (K, n)."""
+        """Return the start of the search for coefficients (K, n)."""
         raise NotImplementedError
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
@@ -306,7 +307,7 @@ class FrameSearch:
     def improved(
         self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
     ) -> NDArray:
-        """Return positions of lower minima, and set whether they have converged."""
+        """Return positions, replaced by lower minima, and update their convergence."""
         return position
 
     def moved(self, position: NDArray, step: NDArray) -> NDArray:
@@ -326,21 +327,22 @@ class FrameSearch:
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
-        A frame is given up where its objective will not fall below its limit (n,).
+        A frame is given up if its objective is not expected to fall below its limit
+        (n,).
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
         running, damping = np.arange(n_frames), np.zeros(n_frames)
         limit = np.full(n_frames, np.inf) if limit is None else limit
         for n_left in range(max_steps, -1, -1):
-            # Next step, and convergence test by the decrease that it predicts.
-            # Convergence is quadratic: the step after it would gain far less.
+            # Next step, and convergence test by its predicted decrease. Convergence is
+            # quadratic: the step after it would gain far less.
             step, damping = self.step(state, damping)
             gain = np.einsum("pi,pi->i", state.slope, step)
             small = (damping == 0) & (gain <= 1e-12 * problem.energy)
             leaving = small | (damping >= LARGEST_DAMPING)
             leaving |= state.value - 10.0 * gain > limit
-            # Frames that have ended leave the problem, converged ones with a last step.
+            # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
                 last = self.moved(state.position, np.where(small, step, 0.0))
                 found[..., running[leaving]] = last[..., leaving]
@@ -385,5 +387,5 @@ class FrameSearch:
 
 
 def raised(damping: NDArray) -> NDArray:
-    """Return more damping (n,)."""
+    """Return increased damping (n,)."""
     return np.maximum(8.0 * damping, 0.1)

@@ -5,7 +5,7 @@ of numbers, faster than a call of LAPACK for each matrix of up to fifteen rows. 
 + 1) / 2 entries of a matrix are packed by rows from the diagonal on; those of 3x3
 matrices of space are xx, xy, xz, yy, yz, zz.
 
-A pivot that is not positive is left out: its row and its column count as zero, so that
+Pivots that are not positive are left out: their rows and columns count as zero, so that
 results are finite for any matrix.
 """
 
@@ -125,7 +125,7 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray]:
 def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     """Sweep rows of packed symmetric matrices (n_pairs, n), in place.
 
-    For ``[[C, G^T], [G, A]]``, with A the rows from the first to sweep on, that leaves
+    If A contains the rows from the first to sweep on, ``[[C, G^T], [G, A]]`` becomes
     ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
     SWEEP operator", The American Statistician 33, 1979). Returns ``log det A`` (n,) of
     the positive pivots, and whether all pivots are positive (n,).
@@ -150,14 +150,14 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
             rows[j][i - j] = scaled[j]
         rows[i][1:] = scaled[i + 1 :]
         np.negative(inverse, out=rows[i][0])
-    # With where=... NumPy rounds in another way beside those that are left out.
+    # With where=... NumPy rounds differently next to entries that are left out.
     logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
     return -logarithms.sum(axis=0), positive
 
 
 def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
     """Return inverse pivots (n,), zero where left out; clear `positive` there."""
-    # Less, as a share of the entry before elimination, is rounding error.
+    # Smaller pivots, relative to the entry before elimination, are rounding errors.
     kept = pivot > OF_STEPS * diagonal
     if kept.all():
         return 1.0 / pivot
@@ -171,16 +171,17 @@ def energies(rows: NDArray) -> NDArray[np.float64]:
     return np.vecdot(flat, flat)
 
 
-# Where the number of frames is no multiple of this, sums are rounded in another way for
-# the last of them: by NumPy's einsum for a single frame, by BLAS at the edges of tiles.
+# If the number of frames is not a multiple of this, the sums of the last frames are
+# rounded differently: by NumPy's einsum for one frame, by BLAS at the edges of tiles.
 LANES = 16
 
 
 def in_lanes(frames: NDArray) -> NDArray:
     """Return numbers of frames (n,), the last one repeated up to a multiple of `LANES`.
 
-    With the frame as the last index, results of a frame then do not depend on the
-    number of frames, to the last bit. Repeated frames may be written to the same place.
+    With the frame as the last index, the results of a frame then do not depend on the
+    number of frames, to the last bit. Copies of a frame may be written to the same
+    place.
     """
     return np.concatenate([frames, np.repeat(frames[-1:], -len(frames) % LANES)])
 

@@ -23,16 +23,16 @@ FEWEST_COMPARED = 10
 
 
 def check_names(names: NDArray | None, layout: Layout) -> None:
-    """Refuse column names of another layout than the given one, or of other things."""
+    """Raise an error if column names contradict the layout or are not of points."""
     said = None if names is None else names_layout(names)
     if names is None or said in (None, layout):
         return
     others = [str(name) for name in names if not _is_x_or_y(name)]
     if others:
         raise ValueError(
-            f"{len(others)} of the {len(names)} columns are not the x or y of a point, "
-            f"as the names of the others are; the first is {others[0]!r}. Give only "
-            "the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
+            f"{len(others)} of the {len(names)} columns are not named as the x or "
+            f"y of a point (first: {others[0]!r}). Give only the columns of points: "
+            "isa_nrsfm.io.landmark_table(X).points has them"
         )
     shown = ", ".join(map(str, names[:4]))
     order = (
@@ -123,7 +123,7 @@ def check_size(
 
 
 def visible_points(tracks: NDArray) -> NDArray:
-    """Return which points of tracks (I, J, 2) are seen, eight points in a byte."""
+    """Return a mask of visible points of tracks (I, J, 2), eight points in a byte."""
     return np.packbits(seen_points(tracks), axis=1)
 
 
@@ -136,9 +136,10 @@ def check_points(
 ) -> None:
     """Refuse tables whose visible points do not determine the shapes.
 
-    `visible` is packed by `visible_points`. Equations and unknowns are counted, a
-    necessary condition. A point has 3 (K + 1) unknowns, and two equations in each frame
-    that shows it. A frame of n points has 2 n equations, and 8 + K unknowns of its own.
+    `visible` is packed by `visible_points`. The numbers of equations and unknowns are
+    compared, a necessary condition. A point has 3 (K + 1) unknowns, and two equations
+    per frame that shows it. A frame of n points has 2 n equations, and 8 + K unknowns
+    of its own.
     """
     patterns, counts = np.unique(visible, axis=0, return_counts=True)
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
@@ -176,7 +177,7 @@ def check_points(
 
 
 def _groups(seen: NDArray) -> NDArray:
-    """Return numbers of groups of points (J,) that frames (I, J) show together."""
+    """Return group numbers of points (J,) that frames (I, J) connect."""
     group = np.full(seen.shape[1], -1)
     for number in range(len(group)):
         if (group >= 0).all():
@@ -194,8 +195,8 @@ def warn_if_other_layout(
 ) -> None:
     """Warn if a rigid object fits the other column layout much better.
 
-    Compares mean squares, not shares of the total: the wrong layout mixes x and y,
-    whose offset adds energy that a rigid object explains.
+    Compares mean squares, not shares of the total energy. The wrong layout mixes x and
+    y, and a rigid object explains the energy of their offset.
     """
     if min(rows.n_frames, n_columns // 2) < FEWEST_COMPARED:
         return
@@ -212,7 +213,7 @@ def warn_if_other_layout(
     if min(min(tracks.shape[:2]) for tracks in both) < FEWEST_COMPARED:
         return
     centred, reports = zip(*map(centred_frames, both), strict=True)
-    # The size of a frame is the smaller of the two, that of the right layout.
+    # The size of a frame is the smaller of both layouts, that of the right one.
     sizes = np.min([report.size for report in reports], axis=0)
     if not scale_frames:
         squares = [np.mean(report.size**2) for report in reports]
@@ -223,12 +224,12 @@ def warn_if_other_layout(
     if given > OF_DIFFERENCES and swapped < 0.6 * given:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"what is not rigid has {swapped / given:.2g} times the energy",
+            f"its non-rigid part has {swapped / given:.2g} times the energy",
         )
 
 
 def _rigid_noise(centred: NDArray, sizes: NDArray) -> float:
-    """Return the noise variance of tracks (I, J, 2) over sizes, as a rigid object."""
+    """Return the noise variance of a rigid fit to tracks (I, J, 2) over sizes."""
     rows = (centred / sizes[:, None, None]).transpose(0, 2, 1)
     if np.isfinite(rows).all():
         W = rows.reshape(-1, rows.shape[2])

@@ -4,8 +4,8 @@ Each row of the measurement matrix is modelled as ``w = B^T z + t 1 + noise`` ov
 seen points. The coefficients have the prior z ~ N(0, I), the translation t has none,
 and the noise has one variance everywhere. This is probabilistic principal component
 analysis (Tipping and Bishop 1999) with missing values (Ilin and Raiko 2010). B has the
-rank of the factorisation, 3K + 3. EM finds it, from the principal axes of the table
-with zeros for missing points.
+rank of the factorisation, 3K + 3. It is found by EM, which starts from the principal
+axes of the table with zeros for missing points.
 
 The posterior covariance of z depends on a row only through its *pattern*, the set of
 its seen points. It is computed once for each pattern.
@@ -71,7 +71,7 @@ def complete_rows(
     These are exact for tables of rank 3K + 3 without noise if each frame shows at least
     3K + 4 points. With fewer points the prior fills the gap.
     """
-    # Of many points fewer frames are enough.
+    # With many points, fewer frames are enough.
     most = int(np.clip(300 * model_frames // n_points, 200, model_frames))
     some = rows.take(representative_frames(rows, most))
     model = completion_model(some, 3 * n_components + 3)
@@ -82,7 +82,7 @@ def completion_model(
     rows: NDArray, rank: int, tol: float = 0.02, max_iter: int = 200
 ) -> CompletionModel:
     """
-    Fit the low-rank model to frames (I, 2, J), until EM gains less than a share `tol`.
+    Fit the low-rank model to frames (I, 2, J) by EM, to a relative tolerance `tol`.
 
     Later steps mostly fit the noise.
     """
@@ -107,7 +107,7 @@ def filled_in(rows: NDArray, model: CompletionModel) -> NDArray:
 
 
 def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
-    """Return the model of rows (n_frames, 2, n_points) whose zeros are known."""
+    """Return the model of rows (n_frames, 2, n_points) by principal components."""
     W = rows.reshape(-1, rows.shape[2])
     n_rows, n_points = W.shape
     is_wide = n_points > n_rows
@@ -163,8 +163,8 @@ def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, 
     ]
     products = moved.reshape(-1, n_points).T @ z.reshape(-1, rank)
     products += seen.T @ (noise * cross[pattern])
-    # M step: least squares for each point. One that is seen in fewer rows than the rank
-    # needs the ridge. The translation takes the mean of the points.
+    # M step: least squares for each point. A point that is seen in fewer rows than the
+    # rank needs the ridge. The translation takes the mean of the points.
     moments = _symmetric(seen.T @ squares)
     moments[:, range(rank), range(rank)] += OF_DIFFERENCES * n_frames
     B = np.linalg.solve(moments, products[..., None])[..., 0].T
@@ -174,8 +174,8 @@ def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, 
     mean_square = unpacked(squares.mean(axis=0) / 2)
     B = np.linalg.cholesky(mean_square).T @ B
     # Noise variance: residual energy over degrees of freedom. This is the fixed point
-    # of EM's own step for the variance (MacKay 1992). A row has as many parameters as
-    # coefficients that its points rather than the prior determine, and a translation.
+    # of EM's own step for the variance (MacKay 1992). The parameters of a row are its
+    # translation and the coefficients that its points determine, rather than the prior.
     determined = rank - model.ridge * np.trace(covariance, axis1=1, axis2=2)
     n_numbers = 2.0 * seen.sum()
     freedom = n_numbers - 2.0 * np.sum(determined[pattern] + 1.0)

@@ -27,8 +27,8 @@ WEIGHTS: dict[str, Callable[[NDArray], NDArray]] = {
 }
 # Median distance of normal noise in the plane, in standard deviations of a coordinate.
 MEDIAN_DISTANCE = np.sqrt(2 * np.log(2))
-# A point farther from the spatial median of its frame than this many sizes of the frame
-# does not belong to it.
+# A point does not belong to its frame if it is farther from the spatial median than
+# this many sizes of the frame.
 DISTANT = 6.0
 
 
@@ -56,17 +56,17 @@ def distant_points(tracks: NDArray) -> NDArray:
 
 
 def robust_sizes(centred: NDArray) -> NDArray:
-    """Return sizes (I,) of frames (I, J, 2) that single points hardly change.
+    """Return sizes (I,) of frames (I, J, 2), robust against outliers.
 
     The root of half the median squared distance of the visible points from their
-    `spatial_median`, or the RMS where half of them coincide.
+    `spatial_median`. If half of them coincide, the RMS.
     """
     return _sizes(_squares(centred))
 
 
 def robustly_centred(tracks: NDArray) -> tuple[NDArray, NDArray]:
-    """Return tracks (I, J, 2) from their spatial medians as doubles, and those."""
-    # The same memory order, so that sums are the same to the last bit.
+    """Return tracks (I, J, 2) as doubles minus their spatial medians, and these."""
+    # Keep the memory order, so that sums are the same to the last bit.
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     middle = spatial_median(tracks)
     return tracks - middle[:, None], middle
@@ -87,22 +87,22 @@ def _sizes(square: NDArray) -> NDArray:
 
 
 def spatial_median(tracks: NDArray) -> NDArray:
-    """Return spatial medians (I, 2) of tracks (I, J, 2): least sums of distances.
+    """Return spatial medians (I, 2) of tracks (I, J, 2), of least sum of distances.
 
     A fixed number of steps of Weiszfeld (1937), from the mean of the `_nearest_half`.
-    Unlike medians of x and y it rotates with the image.
+    Unlike the medians of x and y it does not depend on the axes of the image.
     """
     seen = seen_points(tracks)
     points = np.where(seen[..., None], tracks, 0.0)
     half: NDArray = seen * 1.0
     for _ in range(5):
         half, distance, _ = _nearest_half(points, half, seen)
-    # From here on relative to the innermost point: equal points differ by zero.
+    # Subtract the innermost point: equal points then differ by exactly zero.
     innermost = distance.argmin(axis=1)[:, None, None]
     origin = np.take_along_axis(points, innermost, axis=1)
     points = np.where(seen[..., None], points - origin, 0.0)
     weights, distance, median = _nearest_half(points, half, seen)
-    # Where half of the points are in one place, that is the median.
+    # If half of the points coincide, their place is the median.
     least = np.where(median > 0, OF_DISTANCES * median, 1.0)
     counted = np.where(median > 0, seen, distance <= median)
     for _ in range(40):
@@ -135,8 +135,8 @@ def _weighted_middle(points: NDArray, weights: NDArray) -> tuple[NDArray, NDArra
 def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
     """Return a mask (I, J) of the points of rows (I, 2, J) far from any rigid object.
 
-    Their distance from a rigid factorisation of the others is many times the typical
-    one of the table and of the point. None in frames with many such points.
+    Their residual of a rigid factorisation of the other points is many times the
+    typical one of the table and of the point. Frames with many such points have none.
     """
     some = representative_frames(rows, model_frames)
     hidden, axes, limit = _rigid_object(rows.take(some))
@@ -146,10 +146,10 @@ def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
 
 
 def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Factorise frames (I, 2, J) into a rigid object without points that are far off.
+    """Factorise frames (I, 2, J) into a rigid object, without outliers.
 
-    Returns a mask of hidden points (I, J), orthonormal axes (J, 3), and for each point
-    its largest distance (J,). Factorisation and hiding alternate.
+    Returns a mask of hidden points (I, J), orthonormal axes (J, 3), and the threshold
+    of the distance of each point (J,). Factorisation and hiding alternate.
     """
     target, hidden = _start_of_hiding(rows)
     seen = seen_points(target)
@@ -160,12 +160,12 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         W = centred.transpose(0, 2, 1).reshape(-1, rows.shape[2])
         axes = np.linalg.eigh(W.T @ W)[1][:, -3:]
         rigid = _rigid_part(target, ~hidden, axes)
-        # What is typical, of the table and of each point
+        # Typical distances, of the table and of each point
         distance = np.linalg.norm(target - rigid, axis=2)
         typical = max(median_noise(distance[seen]), OF_DISTANCES)
         of_point = np.nanmedian(distance, axis=0) / MEDIAN_DISTANCE
         limit = 4.5 * np.maximum(typical, of_point)
-        # Hide what is too far, and fill hidden points in
+        # Hide points that are too far, and fill them in
         previous, hidden = hidden, ~(distance <= limit)
         before, filled = filled, np.where(hidden[..., None], rigid, target)
         moved = np.abs(filled - before).max()
@@ -175,7 +175,7 @@ def _rigid_object(rows: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
-    """Return which points (n, J) of frames (n, 2, J) are hidden, for a rigid object."""
+    """Return a mask of hidden points (n, J) of frames (n, 2, J), for a rigid object."""
     target, hidden = _start_of_hiding(rows)
     for _ in range(100):  # a frame that is settled stays as it is
         rigid = _rigid_part(target, ~hidden, axes)
@@ -187,7 +187,7 @@ def _far_points(rows: NDArray, axes: NDArray, limit: NDArray) -> NDArray:
 
 
 def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
-    """Return the seen points among hidden ones (n, J), none of frames with many."""
+    """Return the seen ones of hidden points (n, J); none if a frame has too many."""
     seen = ~np.isnan(rows[:, 0])
     gross = hidden & seen
     few = gross.sum(axis=1) <= 0.4 * seen.sum(axis=1)

@@ -107,13 +107,13 @@ def scaled_table(
     warn_if_other_layout(blocks, n_columns, layout, scale_frames)
     translation, size, n_seen = report[:3]
     if robust:
-        # A point far off must not cost the digits of the others.
+        # Outliers must not reduce the precision of other points.
         reach = np.abs(translation).max(axis=1) + DISTANT * size
         largest = np.minimum(largest, reach)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
-    # Single precision for large complete tables: it saves memory, and time in the SVD.
-    # With fewer points matrix products are so small that it saves nothing.
+    # Large complete tables in single precision stay so: it saves memory, and time in
+    # the SVD. With fewer points matrix products are so small that it saves nothing.
     complete = bool((n_seen == n_points).all())
     single = dtype == np.float32 and n_points >= 200 and complete and not robust
     unit_rows = partial(
@@ -139,7 +139,7 @@ def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]
     _, report = centred_frames(tracks)
     shown = report.n_seen > 0
     if robust and shown.any():
-        # A point far off must not move the others.
+        # Outliers must not shift the other points.
         centred, report.translation[shown] = robustly_centred(tracks[shown])
         report.size[shown] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(tracks), axis=(1, 2), initial=0.0)

@@ -30,7 +30,7 @@ def results_of(rows: Sequence[Row]) -> dict[str, Any]:
         **{f"split{i}_test_score": scores[:, i] for i in range(scores.shape[1])},
         "mean_test_score": mean,
         "std_test_score": scores.std(axis=1),
-        # Scores that are not known are worse than any other.
+        # Unknown scores rank last.
         "rank_test_score": rankdata(
             -np.nan_to_num(mean, nan=-np.inf), method="min"
         ).astype(np.int32),
@@ -47,16 +47,15 @@ def selected(scores: NDArray, select: str) -> int:
     """Return the index of the chosen number of basis shapes.
 
     Scores are (n_candidates, n_splits), by ascending number of basis shapes. "best"
-    takes the best mean, "one_standard_error" the fewest basis shapes with a mean at
-    most one standard error below it (Hastie, Tibshirani, Friedman, "The elements of
-    statistical learning", 2009, section 7.10).
+    takes the best mean. "one_standard_error" takes the fewest basis shapes with a mean
+    at most one standard error below the best (Hastie, Tibshirani, Friedman, "The
+    elements of statistical learning", 2009, section 7.10).
     """
     mean = scores.mean(axis=1)
     if np.isnan(mean).all():
         raise ValueError(
-            "n_components cannot be chosen by points that are held out of each frame: "
-            "too few points are visible. Give n_components, or take frames with more "
-            "visible points"
+            "n_components cannot be chosen by held-out points: too few points are "
+            "visible. Give n_components, or take frames with more visible points"
         )
     best = int(np.nanargmax(mean))
     if select == "best":

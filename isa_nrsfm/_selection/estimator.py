@@ -58,42 +58,42 @@ class AffineNRSfMCV(
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
 
     Each number of basis shapes is fitted to parts of the frames and scored on the
-    others. The fits make a path: each starts from others, which takes less than half of
-    the time of a plain search with `GridSearchCV`. Then the table is fitted with the
-    number that is chosen, as `AffineNRSfM` fits it.
+    others. The fits form a path: each starts from earlier ones, which takes less than
+    half the time of a plain search with `GridSearchCV`. Then the whole table is fitted
+    with the chosen number, as by `AffineNRSfM`.
 
     Parameters
     ----------
     n_components : array-like of int, or int, default=(1, 2, 3, 4, 5, 6, 7, 8)
-        The numbers of basis shapes that are tried, such as ``range(1, 9)``, in any
-        order, or the only one. The path is best without large gaps.
+        The numbers of basis shapes to try, such as ``range(1, 9)``, in any order, or a
+        single number. The path works best without large gaps.
     estimator : AffineNRSfM, default=None
         All other parameters, such as the camera; its `n_components` is not used. None
         is ``AffineNRSfM()``. A clone is fitted.
     cv : int, cross-validation generator or iterable, default=None
-        Frames that are held out: None for three blocks of rows, an int for as many
-        blocks, a splitter such as ``GroupKFold()``, which holds out all frames of a
-        person together, or an iterable of pairs (train, test) of row numbers. Blocks
-        are not shuffled, because neighbours in a video are alike.
+        Held-out frames. None for three blocks of rows, an int for as many blocks, a
+        splitter such as ``GroupKFold()``, which holds out all frames of a person
+        together, or an iterable of pairs (train, test) of row numbers. Blocks are not
+        shuffled, because neighbours in a video are alike.
     scoring : str or callable, default=None
         A scorer of scikit-learn, ``scorer(estimator, X, y)``; larger is better. None is
-        `AffineNRSfM.score`: points of the held-out frames that are predicted from the
-        others of their frame.
+        `AffineNRSfM.score`, which predicts points of the held-out frames from the other
+        points of their frame.
     select : {"best", "one_standard_error"}, default="best"
-        Whether the best mean score decides, or the fewest basis shapes are chosen whose
-        mean score is at most one standard error below the best one.
+        "best" takes the best mean score. "one_standard_error" takes the fewest basis
+        shapes with a mean score at most one standard error below the best.
     n_jobs : int or None, default=None
-        Number of parts of the table that are fitted at the same time, as in joblib.
+        Number of parts of the table fitted at the same time, as in joblib.
     verbose : int, default=0
-        Above zero, print a line for each number of basis shapes when it is known.
+        Above zero, print a line for each number of basis shapes when it is done.
 
     Attributes
     ----------
     n_components_ : int
-        The number of basis shapes that was chosen.
+        The chosen number of basis shapes.
     best_estimator_ : AffineNRSfM
-        The fit of all frames with it: the same as that of `AffineNRSfM` with this
-        `n_components`.
+        The fit of all frames with `n_components_` basis shapes: the same as that of
+        `AffineNRSfM` with this `n_components`.
     cv_results_ : dict of ndarrays
         For each number of basis shapes, ascending: `param_n_components`,
         ``split0_test_score`` and so on, `mean_test_score`, `std_test_score`,
@@ -103,13 +103,13 @@ class AffineNRSfMCV(
     best_index_ : int
         The index of `n_components_` in the arrays of `cv_results_`.
     best_score_ : float
-        Its mean score.
+        The mean score of `n_components_`.
     refit_time_ : float
         Seconds of the fit of `best_estimator_`.
     scorer_ : callable
         The scorer.
     n_splits_ : int
-        The number of parts that were held out in turn.
+        The number of parts that are held out in turn.
     n_features_in_ : int
         Number of columns.
     feature_names_in_ : ndarray of shape (`n_features_in_`,)
@@ -123,14 +123,14 @@ class AffineNRSfMCV(
     Notes
     -----
     The table is checked, centred and scaled once. A fit of all frames starts from the
-    one before, from its shapes and the leading directions of the residuals. The fit
-    of a part of the frames starts from that of all frames, and from the one before of
-    the same part. The lower objective decides, on that part alone, and the steps go on
-    until it has converged; a start that falls behind is dropped before. Frames that are
-    held out can offer a start, and have no other influence on the score. ``python -m
-    benchmarks.choice`` compares errors and choices with those of a plain search.
+    previous one: from its shapes and the leading directions of the residuals. The fit
+    of a part of the frames starts from the fit of all frames, and from the previous fit
+    of the same part. The one with the lower objective on that part continues until it
+    has converged; the other is dropped before. Held-out frames can contribute a start,
+    but have no other influence on the score. ``python -m benchmarks.choice`` compares
+    errors and choices with those of a plain search.
 
-    Without the joint refinement no fit can start from another one, and the search is a
+    Without the joint refinement no fit can start from another one. The search is then a
     plain one.
 
     Where metadata routing is enabled, `fit` passes metadata on to the splitter and the
@@ -370,7 +370,7 @@ class AffineNRSfMCV(
 
     def reproject(self, X: Any) -> NDArray:
         """
-        Return the images of the fitted shapes, also of missing points.
+        Return the images of the fitted shapes, including missing points.
 
         Parameters
         ----------
@@ -424,7 +424,7 @@ class AffineNRSfMCV(
 
     def get_metadata_routing(self) -> MetadataRouter:
         """
-        Return where metadata go.
+        Return the metadata routing of this object.
 
         Returns
         -------
@@ -449,7 +449,7 @@ class AffineNRSfMCV(
         )
 
     def __sklearn_tags__(self) -> Any:
-        """Return the estimator's tags, those of the estimator that is fitted."""
+        """Return the tags of the estimator that is fitted."""
         tags, inner = super().__sklearn_tags__(), get_tags(self._estimator())
         tags.transformer_tags.preserves_dtype = inner.transformer_tags.preserves_dtype
         tags.input_tags.allow_nan = inner.input_tags.allow_nan
@@ -472,7 +472,7 @@ class AffineNRSfMCV(
 
     def _splitter(self) -> Any:
         """Return the splitter of the rows of a table."""
-        # More blocks cost more, and hardly change the choice. Neighbours are alike, and
+        # More blocks cost more, and hardly change the choice. Neighbours are alike:
         # large blocks keep them together.
         return check_cv(3 if self.cv is None else self.cv)
 
@@ -509,7 +509,7 @@ def checked_candidates(n_components: Any) -> list[int]:
 
 
 def refuse_blocks(X: Any) -> None:
-    """Refuse a table whose rows cannot be taken one by one."""
+    """Raise an error if the rows of a table cannot be taken one by one."""
     if is_on_dask(X) or isinstance(X, StoredTable):
         raise ValueError(
             "choosing n_components needs a table in memory or a memory map; got a "

@@ -3,8 +3,9 @@
 The table is checked, centred and scaled once. The fit of all frames starts from the one
 with fewer basis shapes and the leading directions of its residuals. The fit of a fold
 starts from the fit of all frames and from that of the fold itself with fewer basis
-shapes; the lower objective on the fold goes on. So held-out frames may offer a start,
-but never choose. The first fits search for their starts as `AffineNRSfM.fit` does.
+shapes. The one with the lower objective on the fold continues. So held-out frames can
+contribute a start, but never select one. The first fits search for their starts as
+`AffineNRSfM.fit` does.
 """
 
 import copy
@@ -84,16 +85,15 @@ def walk(
 ) -> Iterator[Row]:
     """Yield scores of held-out rows, for ascending numbers of basis shapes.
 
-    Each split has the rows that are fitted and those that are held out. With
-    `any_basis` the score does not depend on the basis, and none is looked for. `n_jobs`
-    splits are fitted at a time. Without the joint refinement no fit starts from another
-    one.
+    Each split is a pair of fitted and held-out rows. With `any_basis` the score does
+    not depend on the basis, and no independent one is searched for. `n_jobs` splits are
+    fitted at a time. Without the joint refinement no fit starts from another one.
     """
     estimator, _, table, _ = whole
     joint = estimator.refinement == "joint"
     if any_basis and joint:
         estimator.independence = None
-    # The fits of all frames are only starts: their tolerance is larger.
+    # Fits of all frames are only starts: their tolerance is larger.
     loose = copy.copy(estimator)
     loose.tol = 4.0 * joint_tol(estimator)
     parts = [whole._replace(estimator=loose)]
@@ -175,8 +175,8 @@ def _fitted(
 ) -> Fitted:
     """Return the fit of a part with K basis shapes, and its score if it is a split.
 
-    It starts from `before`, its fit with fewer basis shapes, and `every`, of all
-    frames.
+    It starts from `before`, the fit of this part with fewer basis shapes, and from
+    `every`, the fit of all frames.
     """
     since = time.perf_counter()
     estimator, X, table, split = part

@@ -24,11 +24,11 @@ BLOCK_FRAMES = 2048
 class FrameBlocks:
     """Consecutive blocks of the frames of a table, in memory or read when needed.
 
-    A block is an array with a row for each of some consecutive frames, or any object
-    that a function given to `derive` has returned. `read` returns a block, given its
-    number; `lengths` are their numbers of frames. Derived blocks are computed at once
-    and kept if `cached`, or anew at each reading; `n_threads` work on blocks at the
-    same time. `empty` is a block without frames, known for tables as they were given.
+    A block is an array with a row for each of some consecutive frames, or the result of
+    a function given to `derive`. `read` returns the block of a given number, and
+    `lengths` are the numbers of frames. Derived blocks are computed once if `cached`,
+    and otherwise at each reading. `n_threads` threads work on blocks at the same time.
+    `empty` is a block without frames, known for blocks of `open_table`.
     """
 
     empty: NDArray
@@ -68,7 +68,7 @@ class FrameBlocks:
     def _read_later(
         cls, rows: Callable[[slice], Any], n_frames: int, block_frames: int
     ) -> Self:
-        """Return blocks of rows that a function returns for a slice."""
+        """Return blocks that a function of a slice of rows reads."""
         starts = range(0, n_frames, block_frames)
         parts = [slice(s, min(s + block_frames, n_frames)) for s in starts]
         lengths = [part.stop - part.start for part in parts]
@@ -80,7 +80,7 @@ class FrameBlocks:
         return sum(self.lengths)
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
-        """Return the results of a function of each block and its rows of arrays."""
+        """Return the results of a function of each block, and of its rows of arrays."""
         blocks = map(self.read, range(len(self.lengths)))
         rows = [map(array.__getitem__, self.slices) for array in by_frame]
         if min(self.n_threads, len(self.lengths)) < 2:
@@ -89,7 +89,7 @@ class FrameBlocks:
             return pool.map(function, blocks, *rows)
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
-        """Return new blocks, the results of a function of each of these (see `map`)."""
+        """Return blocks of the results of a function of each block (see `map`)."""
         if self.cached:
             blocks = list(self.map(function, *by_frame))
             return self.of_blocks(blocks, self.lengths, self.n_threads)
@@ -121,7 +121,7 @@ class FrameBlocks:
 
     @one_blas_thread
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:
-        """Return arrays that a function makes of blocks, or a named tuple of them."""
+        """Join the results of a function of each block: arrays, or tuples of them."""
         parts = list(self.map(function, *by_frame)) or [function(self.empty)]
         if isinstance(parts[0], tuple):
             return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
@@ -143,7 +143,7 @@ class FrameBlocks:
         return self.joined(lambda block: block)
 
     def as_collected(self, values: NDArray) -> Any:
-        """Return an array (n_frames, ...) as one of the kind that `collect` returns."""
+        """Return an array (n_frames, ...) in the form that `collect` returns."""
         return values
 
     def regrouped(self, join: Callable[[list[Any]], Any], n_frames: int) -> Self:
@@ -232,7 +232,7 @@ class DaskBlocks(FrameBlocks):
 
 
 def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:
-    """Return the frames of a block that are kept."""
+    """Return the frames of a block selected by a mask."""
     return block[kept]
 
 

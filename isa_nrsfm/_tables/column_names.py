@@ -77,7 +77,7 @@ def names_layout(
     """Return the arrangement of a table's landmark columns.
 
     "interleaved" is x0, y0, x1, y1, ..., "planar" x0, x1, ..., y0, y1, ..., "other" any
-    other order, incomplete points, or further columns. None without both x and y, or if
+    other order, incomplete points, or further columns. None if x or y is missing, or if
     the other columns are pairs that differ in these letters alone, such as lx1, ly1.
     """
     axes, points, rest = [], [], []
@@ -104,7 +104,7 @@ def names_layout(
 
 
 def point_names(x_columns: Iterable[str]) -> tuple[str, ...]:
-    """Name points after their x columns, without the axis if that stays unique."""
+    """Name points after their x columns, without the axis if this stays unique."""
     x_columns = [name.strip() for name in x_columns]
     coordinates = [parse_coordinate(name) for name in x_columns]
     points = tuple(point.point for point in coordinates if point is not None)
@@ -122,7 +122,7 @@ def names_of_points(model: Any) -> tuple[str, ...]:
 
 
 def checked_names(parameter: str, names: Any, default: Any) -> list[str]:
-    """Return names as text; None means the default ones, and there must be as many."""
+    """Return names as text, by default the given ones; their number must agree."""
     names = [str(name) for name in (default if names is None else names)]
     if len(names) != len(default):
         raise ValueError(

@@ -19,7 +19,7 @@ def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
     if len(missing):
         raise ValueError(
             f"{name} must be known for all frames; it is missing in {len(missing)} of "
-            f"{n_frames}, the first is row {missing[0]}"
+            f"{n_frames} (first: row {missing[0]})"
         )
     if column.dtype != object:
         return column
@@ -45,7 +45,7 @@ def group_numbers(groups: Any, n_frames: int) -> NDArray | None:
 
 
 def checked_times(time: Any, n_rows: int) -> NDArray:
-    """Return finite times of rows (n_rows,) in seconds; None means single steps."""
+    """Return finite times of rows (n_rows,) in seconds; row numbers for None."""
     if time is None:
         return np.arange(n_rows, dtype=float)
     time = checked_column("time", time, n_rows)

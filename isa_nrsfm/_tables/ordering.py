@@ -55,10 +55,10 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
 
 
 def _numbers_shown(rows: NDArray, chosen: NDArray) -> NDArray:
-    """Return in how many of the chosen frames points (n_points,) are seen."""
+    """Return the number of chosen frames that show each point (n_points,)."""
     return np.sum(~np.isnan(rows[chosen, 0]), axis=0)
 
 
 def _shows(rows: NDArray, point: int) -> NDArray:
-    """Return which frames (n_frames,) of a block show a point."""
+    """Return a mask (n_frames,) of the frames of a block that show a point."""
     return ~np.isnan(rows[:, 0, point])

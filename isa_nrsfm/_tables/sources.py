@@ -12,8 +12,8 @@ from sklearn.utils import check_array
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
 
-# Range of the coordinates of a frame. Squares of larger and of smaller ones leave the
-# range of double precision; fits at both ends agree with those of sizes about one.
+# Range of the coordinates of a frame: squares beyond it leave the range of double
+# precision. Fits at both ends agree with those of sizes about one.
 LARGEST, SMALLEST = 2e153, 1e-150
 # What `check_array` checks in a table.
 CHECKS: dict[str, Any] = {
@@ -27,8 +27,8 @@ def open_table(
 ) -> FrameBlocks:
     """Return a table (n_frames, 2 * n_points) in blocks of float32 or float64 rows.
 
-    Arrays in memory are checked already and shared by `n_jobs` threads, chunks of dask
-    stay on its workers, blocks of other tables use `working_memory` megabytes.
+    Arrays in memory must be checked already; `n_jobs` threads share them. Chunks of
+    dask stay on its workers. Blocks of other tables use `working_memory` megabytes.
     """
     if X.ndim != 2:
         raise ValueError(
@@ -55,7 +55,7 @@ def open_table(
 
 
 def is_read_later(X: Any) -> bool:
-    """Return whether a table is not to be read at once."""
+    """Return whether a table is read block by block, from disk or on dask."""
     return is_on_dask(X) or isinstance(X, np.memmap | StoredTable)
 
 
@@ -72,7 +72,7 @@ def checked_rows(rows: Any) -> NDArray:
 
 
 def unmasked(X: Any) -> Any:
-    """Return a masked array as one with NaN where it is masked, others unchanged."""
+    """Return a masked array with NaN for masked entries, others unchanged."""
     if not isinstance(X, np.ma.MaskedArray):
         return X
     dtype = X.dtype if X.dtype.kind == "f" else np.float64
@@ -80,7 +80,7 @@ def unmasked(X: Any) -> Any:
 
 
 def checked_range(X: NDArray) -> NDArray:
-    """Refuse a table with rows whose squares leave the range of double precision."""
+    """Raise an error if squares of a row leave the range of double precision."""
     highest = np.fmax.reduce(X, axis=1, initial=0.0)
     lowest = np.fmin.reduce(X, axis=1, initial=0.0)
     largest = np.maximum(highest, -lowest).astype(np.float64)
@@ -90,7 +90,7 @@ def checked_range(X: NDArray) -> NDArray:
         raise ValueError(
             f"the largest coordinate of each frame of X must be between {SMALLEST:g} "
             f"and {LARGEST:g} in magnitude, or all must be zero; got "
-            f"{largest[row]:.3g} in row {row}: give the table in another unit"
+            f"{largest[row]:.3g} in row {row}. Give the table in another unit"
         )
     return X
 
@@ -112,8 +112,8 @@ class StoredTable:
     Parameters
     ----------
     parts : sequence of tuple
-        For each file, in order, its number of rows and a function that returns the rows
-        from one number to another (exclusive) as an array.
+        For each file, in order, its number of rows and a function ``read(start, stop)``
+        that returns these rows as an array (`stop` excluded).
     n_columns : int
         Number of columns.
     dtype : dtype

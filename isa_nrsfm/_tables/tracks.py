@@ -1,4 +1,4 @@
-"""Tables of landmarks, the tracks in them, and which points their frames show.
+"""Tables of landmarks, their tracks, and the visible points of frames.
 
 A *table* has one row a frame and two columns a point, shape ``(n_frames,
 2 * n_points)``, in either layout of the columns. *Tracks* are the same numbers as
@@ -15,9 +15,9 @@ from isa_nrsfm._compat.caller import warn_caller
 # Columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
 Layout = Literal["interleaved", "planar"]
 LAYOUTS: tuple[Layout, ...] = ("interleaved", "planar")
-# Least number of points that a frame must show. Each point gives two equations; an
-# affine camera with its translation has eight unknowns. Coefficients need no further
-# points: their prior determines what the points do not.
+# Least number of visible points of a frame. Each point gives two equations; an affine
+# camera with its translation has eight unknowns. Coefficients need no further points:
+# the prior determines them where the points do not.
 FEWEST_POINTS = 4
 
 
@@ -48,7 +48,7 @@ def tracks_to_table(tracks: NDArray, layout: Layout = "interleaved") -> NDArray:
 
 
 def without_half_points(tracks: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Hide points with one coordinate. Return tracks (I, J, 2), counts, first ones."""
+    """Hide points with one coordinate; return tracks (I, J, 2), counts, first ones."""
     none = np.zeros(len(tracks), dtype=int)
     if not np.isnan(tracks.sum()):  # one NaN makes the sum NaN: a fast test
         return tracks, none, none
@@ -112,9 +112,10 @@ class FrameReport(NamedTuple):
     def usable(self) -> NDArray:
         """Return a mask of frames (n_frames,) with enough points for a camera.
 
-        Four points or more, not all in one place and, if some are missing, not on a
-        line. A complete frame on a line is a flat object seen edge on. With some points
-        missing the line may be one of the object, which can turn around it.
+        They have four points or more, not all in one place. If some points are missing,
+        the others must not be on a line. A complete frame on a line is a flat object
+        seen edge on. With missing points it may be a line of the object, which can turn
+        around it.
         """
         enough = self.n_seen >= FEWEST_POINTS
         return enough & ~self.in_one_place & ~self.on_line
@@ -133,7 +134,7 @@ def seen_points(tracks: NDArray) -> NDArray:
 
 
 def of_all_rows(values: NDArray, shown: NDArray) -> NDArray:
-    """Return values of the rows that are shown as those of all rows, NaN for others."""
+    """Expand values of shown rows to all rows, NaN for the others."""
     if shown.all():
         return values
     all_rows = np.full((len(shown), *values.shape[1:]), np.nan, values.dtype)
@@ -145,12 +146,12 @@ def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
     """Return frames (I, J, 2) centred over their visible points in double precision."""
     # Coordinates are equal up to four units in the last place of the largest one.
     eps = 4 * np.finfo(tracks.dtype).eps
-    # The same memory order, so that sums are the same to the last bit.
+    # Keep the memory order, so that sums are the same to the last bit.
     tracks = np.ascontiguousarray(tracks, dtype=np.float64)
     seen = seen_points(tracks)
     hidden = None if seen.all() else ~seen
     n_seen = seen.sum(axis=1)
-    # Points as complex numbers x + iy: loops over two coordinates would be slow.
+    # Points are complex numbers x + iy: loops over two coordinates would be slow.
     points = tracks.view(np.complex128)[..., 0]
     if hidden is not None:
         points = np.where(seen, points, 0.0)
@@ -176,10 +177,10 @@ def centred_frames(tracks: NDArray) -> tuple[NDArray, FrameReport]:
 def _collinear(
     centred: NDArray, place: NDArray, n_seen: NDArray, eps: float
 ) -> NDArray:
-    """Return in which centred frames (n, J, 2) the visible points are on a line."""
+    """Return a mask of centred frames (n, J, 2) with visible points on one line."""
     x, y = centred[..., 0], centred[..., 1]
-    # The principal axis by its angle. Eigenvalues of the 2x2 second moment would square
-    # the distances from it, and lose half of their digits.
+    # Fit the angle of the principal axis. Eigenvalues of the 2x2 second moment would
+    # square the distances from it, and lose half of their digits.
     angle = 0.5 * np.arctan2(2.0 * np.vecdot(x, y), np.vecdot(x, x) - np.vecdot(y, y))
     across = np.cos(angle)[:, None] * y - np.sin(angle)[:, None] * x
     rounding = eps * (place + np.abs(centred).max(axis=(1, 2)))
@@ -188,7 +189,7 @@ def _collinear(
 
 
 def check_frames(report: FrameReport, n_points: int) -> None:
-    """Refuse frames (but for empty ones) that do not determine their camera."""
+    """Raise an error if frames with points do not determine a camera."""
     n_seen, n_frames = report.n_seen, len(report.n_seen)
     few = (n_seen > 0) & (n_seen < min(FEWEST_POINTS, n_points))
     if few.any():
@@ -209,7 +210,7 @@ def check_frames(report: FrameReport, n_points: int) -> None:
 
 
 def refuse_one_place(report: FrameReport, n_points: int) -> None:
-    """Refuse frames with all seen points in one place."""
+    """Raise an error if all visible points of a frame are in one place."""
     one = report.in_one_place
     if one.any():
         which = "seen points" if (report.n_seen[one] < n_points).any() else "points"
