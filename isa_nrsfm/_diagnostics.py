@@ -36,14 +36,13 @@ MOST_POSE = 0.3
 
 class Diagnostics(NamedTuple):
     """
-    Diagnostics: how well a table determines its fit.
+    Figures and messages on how well a table determines its fit.
 
     Attributes
     ----------
     camera_singular_values : ndarray of shape (3,)
         Visibility of each direction of space in the images: singular values of the
-        stacked cameras, divided by the root of the number of rows, for frames of size
-        one.
+        stacked cameras of frames of size one, over the root of the number of rows.
     deformation_amplitude : float
         RMS of the deformation, relative to that of the mean shape.
     reliability : ndarray of shape (n_components,)
@@ -59,8 +58,8 @@ class Diagnostics(NamedTuple):
         increasing. Shapes ``B_k + V_k B_0`` differ from B_k in the images only by terms
         of second order in the deformation. Each V_k (3x3) can be determined except for
         its trace. These are standard deviations along the principal directions of all
-        V_k. They contain the noise only, with the rest of the shapes known. A value of
-        0.1 adds a tenth of the mean shape, per standard deviation of a coefficient.
+        V_k. They include the noise only: the rest of the shapes is taken as known. 0.1
+        adds a tenth of the mean shape, per standard deviation of a coefficient.
         Calibrated cameras absorb rotations only: for them these are upper bounds.
     depth_uncertainty : float
         Expected RMS error of the depths of the frames, relative to their RMS. NaN for
@@ -117,7 +116,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     ) / len(alpha)
     fourth = np.sum(alpha**4, axis=0)
     square = np.sum(alpha**2, axis=0) ** 2
-    # The traces of the V_k, one direction each, are not determined and left out.
+    # The traces of the V_k, one direction each, are not determined. Leave them out.
     information = weak_information(mean_shape, basis, motion, alpha)
     known = np.linalg.eigvalsh(information)[::-1][: 8 * len(basis)]
     floats = np.finfo(float)

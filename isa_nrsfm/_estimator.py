@@ -35,11 +35,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
-    Factorises a table of 2D landmarks, one frame a row, into a mean 3D shape, basis
-    shapes, and for each frame a camera and coefficients. The coefficients do not depend
-    on the viewpoint if the points are fixed on the surface. No calibration, training
-    data or order of the frames is needed. Row i, reshaped to (n_points, 2), is modelled
-    as::
+    Factorises a table of 2D landmarks, with one row per frame. The result is a mean 3D
+    shape, basis shapes, and a camera and coefficients for each frame. The coefficients
+    do not depend on the viewpoint if the points are fixed on the surface. No
+    calibration, training data or order of the frames is needed. Row i, reshaped to
+    (n_points, 2), is modelled as::
 
         (mean_shape_ + tensordot(alpha_[i], basis_, 1)) @ motion_[i].T + translation_[i]
 
@@ -53,7 +53,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         as many as the table allows (joint refinement only); ``len(basis_)`` is the
         number found.
     isa : object, default=None
-        Strategy of independent subspace analysis, such as `FastISA` or
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
         result is only the start of the joint refinement. A clone is fitted. Its
@@ -63,7 +62,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
 "generalized_eigen"
         Method for the 3x3 matrix of each subspace that brings its motion to the rigid
         motion. "eigen" is the exact minimiser under a norm constraint, "irls" the
-        published iteration for the same cost, "generalized_eigen" maximises the
+        published iteration for the same cost. "generalized_eigen" maximises the
         explained share of the motion. "eigen" and "irls" can collapse onto a direction
         in which the subspace hardly moves, and "irls" depends on the first frame. The
         default has neither problem. With a refinement all three lead to nearly the same
@@ -92,7 +91,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         Loss of points far from the model. "huber" reduces the weight of points beyond
         1.5 standard deviations of the noise. "cauchy" reduces it gradually, to one half
         at 2.5 standard deviations. With both, points beyond six sizes of their frame
-        have weight zero. They need the joint refinement.
+        have weight zero, and both need the joint refinement.
     layout : {"interleaved", "planar"}, default="interleaved"
         Whether the columns are x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=True
@@ -113,7 +112,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     keep_frames : bool, default=True
         Whether `alpha_`, `alpha_std_`, `motion_` and `translation_` are kept.
     frames_folder : str, path-like or None, default=None
-        Folder for the kept arrays. Each fit makes a new folder within it, with files
         Folder for the kept arrays. Each fit makes a new folder within it, with files
         ``alpha.npy`` and so on. The attributes are memory maps of these files;
         ``alpha_.filename`` is the path. A fit that fails leaves no files. Fits never

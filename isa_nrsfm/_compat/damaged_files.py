@@ -19,8 +19,7 @@ def reading(
     except (ImportError, MemoryError):
         raise
     except Exception as error:
-        # Errors of the system have an errno, errors of libraries for bad content do
-        # not.
+        # System errors have an errno, errors of libraries for bad content have none.
         if isinstance(error, OSError) and error.errno is not None:
             error.filename = os.fspath(path)
             raise

@@ -1,7 +1,7 @@
 """Most probable calibrated camera of frames and their coefficients, by Newton's method.
 
-For each frame by itself, given shapes and noise variance s2, this minimises minus twice
-the log marginal likelihood of its camera, with the coefficients integrated out ::
+Shapes and noise variance s2 are given. For each frame by itself, this minimises minus
+twice the log marginal likelihood of its camera, with the coefficients integrated out ::
 
     F(M) = f(M) / s2 + log det(I + H / s2),  f(M) = min_a ||W - M S(a)||^2 + s2 |a|^2,
 
@@ -14,8 +14,9 @@ times the Hessian is ::
     tr(D_c A D_d^T) + <G, D_cd> - sum_kl <D_c, F_k> Q_kl <D_d, F_l>,
 
 with ``F_k = M (B_k S^T + S B_k^T) - P_k^T``, ``Q = (H + s2 I)^-1`` and the second
-This is exact except for the log determinant, whose second derivative is replaced by the
-bound that A contains. Steps are damped by ``tr(D_c A D_d^T)``.
+derivative D_cd of the camera. This is exact except for the log determinant: its second
+derivative is replaced by the bound that A contains. Steps are damped by
+``tr(D_c A D_d^T)``.
 """
 
 import numpy as np
@@ -40,8 +41,8 @@ from isa_nrsfm._linalg.small_matrices import (
 )
 
 # Maps cameras, in the axes of the mean shape, to their depth reversals. Reflecting a
-# flat object at its plane does not change its images. For other objects the images
-# change less the thinner they are (Necker reversal).
+# flat object at its plane does not change its images. The thinner an
+# object is, the less its images change (Necker reversal).
 REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 
 
@@ -66,8 +67,7 @@ class CalibratedSearch(FrameSearch):
         M = frames_last(motion @ self.space.T)
         problem = self.problem(products, np.full(len(motion), noise))
         # The cameras may not be at their minimum yet: compare minima with minima. With
-        # 3, 6 and 12 steps 22, 7 and 1 % of the reversed frames of motion capture
-        # remain.
+        # 3, 6 and 12 steps 22, 7 and 1 % of reversed frames of motion capture remain.
         n_steps = 6
         M, _ = self.descend(problem, self.evaluate(problem, M), n_steps)
         M, better, _ = self._better_reversed(problem, M, n_steps)
@@ -78,8 +78,7 @@ class CalibratedSearch(FrameSearch):
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 
-        Of the nearest camera and that of `_completed`, the one with the lower
-        objective.
+        The better one of the nearest camera and that of `_completed` is taken.
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
         starts = []

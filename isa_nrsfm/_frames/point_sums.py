@@ -1,8 +1,8 @@
 """Sums over the points of each frame: sufficient statistics of a fit of given shapes.
 
-The fit of cameras and coefficients to shapes ``B_k`` (3, J) depends on frame i only
-through its energy, the products ``P_ik`` of its points with the shapes, and the Gram
-matrices ``G_i,kl`` of the shapes over its points ::
+Cameras and coefficients are fitted to shapes ``B_k`` (3, J). The fit depends on frame i
+only through its energy, the products ``P_ik`` of its points with the shapes, and the
+Gram matrices ``G_i,kl`` of the shapes over its points ::
 
     P_ik = sum_j w_ij b_kj (m_ij - mean_i)^T,
     G_i,kl = sum_j w_ij (b_kj - mean_ik) (b_lj - mean_il)^T.
@@ -163,8 +163,7 @@ def affine_cameras(
     """
     T = products.gram.products(c)
     A = np.einsum("ki,kpi->pi", 0.5 * c, T)
-    # A ridge, relative to the moments of all shapes, keeps cameras finite for flat
-    # ones.
+    # A ridge, relative to the moments of all shapes, for finite cameras of flat ones
     moments = products.gram.pairs[diagonal_of(products.gram.pairs)][:, DIAGONAL]
     A[DIAGONAL] += 1e-13 * moments.sum(axis=0).mean(axis=0)
     inverse = inverse3(A)

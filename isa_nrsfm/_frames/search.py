@@ -2,8 +2,8 @@
 
 Newton's method for many frames at once, the frame as the last index of all arrays.
 Steps are damped if the Hessian is not positive definite or a step has raised the
-objective of a frame, so that it never rises. The search starts from zero coefficients.
-Badly fitted frames start again from others.
+objective of a frame. So the objective never rises. The search starts from zero
+coefficients. Badly fitted frames start again from others.
 """
 
 from functools import partial
@@ -193,8 +193,7 @@ class FrameSearch:
 
         The shapes are by points or directions, as the frames. `initial` (I, K) is zero
         by default. If the residuals of a frame are much larger than the noise, it
-        starts again from each of `starts` (n_starts, K). `rough` ends after a few
-        steps.
+        starts again from each of `starts` (n_starts, K). `rough`: end after few steps.
 
         Frames are independent. They are NaN if their points do not determine a camera.
         If only the mean shape is flat, zero can be a saddle point: further starts help.
@@ -327,8 +326,7 @@ class FrameSearch:
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
-        A frame is given up if its objective is not expected to fall below its limit
-        (n,).
+        Gives up a frame if its objective is not expected to fall below its limit (n,).
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)

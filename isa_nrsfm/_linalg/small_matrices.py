@@ -125,7 +125,7 @@ def invert_positive(A: NDArray) -> tuple[NDArray, NDArray]:
 def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     """Sweep rows of packed symmetric matrices (n_pairs, n), in place.
 
-    If A contains the rows from the first to sweep on, ``[[C, G^T], [G, A]]`` becomes
+    If A holds the rows from `first` on, ``[[C, G^T], [G, A]]`` becomes
     ``[[C - G^T A^-1 G, G^T A^-1], [A^-1 G, -A^-1]]`` (Goodnight, "A tutorial on the
     SWEEP operator", The American Statistician 33, 1979). Returns ``log det A`` (n,) of
     the positive pivots, and whether all pivots are positive (n,).

@@ -128,8 +128,8 @@ def _posterior(frames: _Frames, model: CompletionModel) -> _Posterior:
     """
     Return the posterior of coefficients and translations.
 
-    With B_c the seen columns of B, its rows centred over them, ``C = (B_c B_c^T +
-    ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
+    Let B_c be the seen columns of B, its rows centred over them. Then ``C = (B_c B_c^T
+    + ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
     C``, ``t = -z . mean(B)`` are the posterior means.
     """
     rows, patterns, pattern = frames

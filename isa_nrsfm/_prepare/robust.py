@@ -136,7 +136,8 @@ def gross_outliers(rows: FrameBlocks, model_frames: int) -> NDArray:
     """Return a mask (I, J) of the points of rows (I, 2, J) far from any rigid object.
 
     Their residual of a rigid factorisation of the other points is many times the
-    typical one of the table and of the point. Frames with many such points have none.
+    typical one of the table and of the point. Frames with many such points have no
+    outliers.
     """
     some = representative_frames(rows, model_frames)
     hidden, axes, limit = _rigid_object(rows.take(some))
