@@ -195,7 +195,7 @@ class TestAssociation:
             (np.r_[np.nan, np.ones(119)], {}, "missing in 1 of 120"),
             (np.r_[0.5, np.inf, -np.inf, np.ones(117)], {}, "2 of 120.*in row 1: "),
             (["a", "b"], {}, "each of the 120 frames; got 2"),
-            (["a", "b"] * 60, {"kind": "number"}, "numbers are expected; got"),
+            (["a", "b"] * 60, {"kind": "number"}, "labels must be numbers; got"),
             (["a", "b"] * 60, {"kind": "odd"}, "kind must be"),
             (["a", "b"] * 60, {"groups": [1, 2]}, "groups must have one entry"),
             (["a", "b"] * 60, {"n_permutations": 0}, "n_permutations"),
@@ -353,5 +353,5 @@ class TestAlignedFrames:
         assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
 
     def test_refuses_half_a_point(self):
-        with pytest.raises(ValueError, match="two columns a point; got 3"):
+        with pytest.raises(ValueError, match="two columns per point; got 3"):
             AlignedFrames().fit(np.ones((4, 3)))

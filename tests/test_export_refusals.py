@@ -28,7 +28,7 @@ CASES = [
     (write_glb, {"edges": [[0.5, 1, 2]]}, SHAPES),
     (write_glb, {"names": ["one"]}, "names must hold 3 names; got 1"),
     (write_glb, {"camera": "perspective"}, "camera must be"),
-    (write_viewer, {"labels": ["a"]}, "labels must hold 150 labels, one a row; got"),
+    (write_viewer, {"labels": ["a"]}, "labels must hold 150 labels, one per row; got"),
     (write_viewer, {"labels": range(N_FRAMES)}, "at most 30 different .* got 150"),
     (write_viewer, {"n_frames": -1}, "n_frames must be a whole number .*; got -1"),
     (write_viewer, {"n_frames": 2.5}, "n_frames must be a whole number .*; got 2.5"),

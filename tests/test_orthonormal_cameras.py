@@ -233,7 +233,7 @@ class TestColumns:
         ("columns", "message"),
         [
             (np.eye(10, 2)[:, [0, 1, 0, 1]], "three linearly independent columns; 2"),
-            (np.ones((5, 3)), "two rows a frame, an even number; got 5"),
+            (np.ones((5, 3)), "two rows per frame, an even number; got 5"),
             (np.full((6, 3), np.nan), "motion contains NaN"),
         ],
     )

@@ -31,7 +31,7 @@ def canonical_rotation(mean_shape: NDArray, cameras: NDArray) -> NDArray:
 
     The x and y axes are the orthonormal pair nearest to the rows of the mean camera. If
     cameras (I, 2, 3) have no common view, the axes are the principal ones of ``sum_i
-    M_i^T M_i``. The third moment of depth of the mean shape (J, 3) is non-negative.
+    M_i^T M_i``. The depth of the mean shape (J, 3) has non-negative skewness.
     """
     view = mean_view(cameras)
     if view is None:
@@ -54,7 +54,7 @@ def canonical_space(mean_shape: NDArray, motion: NDArray) -> NDArray:
     """
     variance, axes = np.linalg.eigh(mean_shape.T @ mean_shape / len(mean_shape))
     inside = variance > 1e-18 * variance[-1]
-    # Directions in which the shape is flat get the scale of its widest one.
+    # Directions in which the shape is flat get the scale of the widest direction.
     scale = 1.0 / np.sqrt(np.where(inside, variance, variance[-1] or 1.0))
     whitening = (axes * scale) @ axes.T
     white_motion = motion @ np.linalg.inv(whitening)
@@ -87,7 +87,7 @@ def canonical_gauge(
     energy = image_energies(motion, basis, alpha)
     order = np.argsort(-energy, kind="stable")
     rigid = image_energies(motion, mean_shape[None], np.ones((len(motion), 1)))
-    # Others hold only rounding errors.
+    # Basis shapes with less energy are rounding errors.
     moving = energy > OF_RANKS**2 * rigid
     factors = np.where(moving, orientations(alpha.T) * coefficient_sizes(alpha), 0.0)
     scaled = factors[:, None, None] * basis
@@ -105,9 +105,8 @@ def rigid_gauge(
 ) -> tuple[Gauge, Decomposition]:
     """Return the gauge of the paper's pipeline, and the fit of the frames in it.
 
-    It is the gauge of the fit of the frames by their visible points, not of completed
-    frames. `fitted` returns the fit for a mean shape (J, 3) and a basis (K, J, 3),
-    rounded to a dtype.
+    The gauge is that of a fit to visible points, not to completed frames. `fitted`
+    returns the fit for a mean shape (J, 3) and a basis (K, J, 3), rounded to a dtype.
     """
     order, frames = np.arange(len(basis)), fitted(mean_shape, basis)
     # One scaling is enough, unless frames have fewer points than coefficients need.
@@ -122,8 +121,8 @@ def rigid_gauge(
         order = order[gauge.order]
         mean_shape, basis = gauge.mean_shape.astype(dtype), gauge.basis.astype(dtype)
         frames = fitted(mean_shape, basis)
-        # Coefficients follow the scales of the basis shapes, but for frames that leave
-        # some of them open: of these the solution of least norm is another one then.
+        # Coefficients scale with the basis shapes. If a frame does not determine its
+        # coefficients, their solution of minimum norm changes.
         off = coefficient_sizes(frames.alpha)[basis.any(axis=(1, 2))] - 1
         if np.abs(off).max(initial=0.0) <= 1e-6:
             break

@@ -1,10 +1,10 @@
 """The independent basis among all bases that fit a table equally well.
 
 A fit determines the shapes of the frames, up to one affinity of space and one scale a
-frame. It does not determine their basis. Three changes fit equally well:
+frame. It does not determine their basis. Three replacements fit equally well:
 
-- ``B_0 + sum_k u_k B_k`` for B_0, fixed by coefficients with mean zero;
-- ``B_k + v_k B_0`` for B_k, which the scales of the cameras absorb, fixed by basis
+- B_0 by ``B_0 + sum_k u_k B_k``, fixed by coefficients with mean zero;
+- B_k by ``B_k + v_k B_0``, which the scales of the cameras absorb, fixed by basis
   shapes without a part along the mean shape;
 - any invertible mixing of the basis shapes, fixed by independence. This is the
   assumption of Brandt, Ackermann, Grasshof (2018), but with one mixing for all three
@@ -36,9 +36,9 @@ def independent_gauge(
     """Return the independent basis of a fit as a gauge, and the map of frames to it.
 
     Shapes (K + 1, 3, J) are centred, cameras (I, 2, 3) those of frames of size one.
-    "shapes" are to be independent over the points, "coefficients" over the frames; None
-    takes the principal axes of the deformation. `unit` is the size in
-    `euclidean_space`.
+    "shapes" makes basis shapes independent over the points, "coefficients" makes
+    coefficients independent over the frames. None takes the principal axes. `unit` is
+    the size in `euclidean_space`.
     """
     # The shifts u and v, then the affinity of space.
     shift, motion, alpha = _centred(shapes, motion, alpha, camera)
@@ -58,7 +58,7 @@ def independent_gauge(
     basis = np.tensordot(mixing, shapes[1:], 1).transpose(0, 2, 1)
     unmixing = np.linalg.inv(mixing).T
     gauge = canonical_gauge(shapes[0].T, basis, motion, alpha @ unmixing.T, space)
-    # Coefficients (1, alpha_i) change by the inverse transpose of what shapes do.
+    # Coefficients (1, alpha_i) change by the inverse transpose of the mixing of shapes.
     factors = gauge.factors
     scale = np.divide(1.0, factors, where=factors != 0, out=np.zeros_like(factors))
     coefficients = np.linalg.inv(shift).T
@@ -79,9 +79,9 @@ def _centred(
     whitens B_0, that is ``tr(B_k B_0^+) = 0``. With weak-perspective cameras it is
     ``<B_k, B_0> = 0``. Each shift slightly undoes the other, so they alternate.
 
-    Then ``1 - sum_k v_k alpha_ik`` is the factor of the scale of frame i. v is zero
-    where such a factor is not positive or too small, where the alternation does not
-    converge, and for orthographic cameras, whose scale is fixed.
+    Then ``1 - sum_k v_k alpha_ik`` is the factor of the scale of frame i. v is zero if
+    any such factor is not positive or too small, or if the alternation does not
+    converge. It is zero for orthographic cameras, whose scale is fixed.
     """
     rank = max(np.linalg.matrix_rank(shapes[0], rtol=OF_RANKS), 1)
     first = total = _mean_shift(alpha)
@@ -122,7 +122,7 @@ def _mean_shift(alpha: NDArray) -> NDArray:
 
 
 def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
-    """Return the mixing (K, K) to uncorrelated coefficients, orthogonal shapes."""
+    """Return the mixing (K, K) to uncorrelated coefficients and orthogonal shapes."""
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
     variance[variance <= OF_RANKS**2 * max(variance[-1], 1e-300)] = 1.0
     root = (axes * np.sqrt(variance)) @ axes.T

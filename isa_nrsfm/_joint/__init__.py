@@ -1,1 +1,1 @@
-"""Cameras, shapes and noise of greatest marginal likelihood, all frames together."""
+"""Joint fit of cameras, shapes and noise by maximum marginal likelihood."""

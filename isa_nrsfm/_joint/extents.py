@@ -1,26 +1,26 @@
 """Prior of the extents of the shapes, for calibrated cameras.
 
-Images of an object that hardly turns determine its depth only to second order: depths c
-times as large, turned by angles c times smaller, look nearly the same (bas-relief
-ambiguity: Belhumeur, Kriegman, Yuille, 1999). Unmodelled deformation then decides on
-the depth. With the second moments ``G = sum_k B_k B_k^T`` of all shapes the objective
-contains, for N coordinates, ::
+If an object hardly turns, its images determine the depth only to second order. Depths c
+times as large with rotations c times smaller give nearly the same images (bas-relief
+ambiguity: Belhumeur, Kriegman, Yuille, 1999). Unmodelled deformation then dominates the
+estimated depth. With the second moments ``G = sum_k B_k B_k^T`` of all shapes the
+objective contains, for N coordinates, ::
 
     N weight (tr G / (3 det(G)^(1/3)) - 1),
 
-the ratio of the arithmetic to the geometric mean of the squared extents. It is zero for
-shapes that extend alike in all directions, and grows with N as the misfit does.
+with the ratio of the arithmetic to the geometric mean of the squared extents. The
+penalty is zero for equal extents in all directions, and grows with N like the misfit.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-# An extent that is r times as large as both others has to lower the noise variance, by
-# 4 % for r = 5 and by 12 % for r = 10. Frontal photos of faces become needles without
-# it. With 0.015 and 0.02 faces that turn by 6 degrees and more have the same errors as
-# without it.
+# If one extent is r times both others, the fit must lower the noise variance by 4 % for
+# r = 5 and by 12 % for r = 10. Without the penalty, frontal photos of faces give
+# needle-like shapes. Weights of 0.015 and 0.02 do not change the errors of faces that
+# turn by 6 degrees or more.
 EXTENT_WEIGHT = 0.02
-# Least squared extent, as a share of their mean, that counts: flat objects stay flat.
+# Floor of the squared extents, as a share of their mean. Flat objects stay flat.
 FLAT = 1e-3
 
 

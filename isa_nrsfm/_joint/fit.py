@@ -3,12 +3,12 @@
 1. Starts with calibrated cameras (`starts`); the objective chooses the best of them.
 2. The fit of calibrated cameras, shapes and noise, with a floor of the noise variance.
    Otherwise unmodelled deformation would distort depths and cameras.
-3. The fit of affine cameras, from 2 and from the paper's result. The lower objective
-   counts. For calibrated cameras it serves for comparison only.
-4. The judgement. A model is right if its noise is at most that of the spectrum. Then
-   floor and prior are left out.
+3. The fit of affine cameras, from 2 and from the paper's result. The one with the lower
+   objective is kept. With calibrated cameras it only serves for comparison.
+4. The decision whether K is sufficient. If the noise is at most that of the spectrum,
+   the fit is repeated without floor and prior.
 
-Large tables take the first steps on a sample, and the last ones on all frames.
+For large tables, the first steps use a sample and the last ones all frames.
 """
 
 from collections.abc import Iterable, Sequence
@@ -35,7 +35,7 @@ class Spectrum(NamedTuple):
     noise: share of the mean square, the mean of the squared singular values beyond 3K +
     3 (Tipping, Bishop, "Probabilistic principal component analysis", 1999, eq. 8).
     missing: share of the energy beyond the K + 3 largest singular values. For motion
-    capture about the share of the shapes that the best K basis shapes leave.
+    capture, it is about the share of the shapes outside the best K basis shapes.
     """
 
     noise: float
@@ -77,10 +77,9 @@ def fit_jointly(
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    `paper_shapes` (K + 1, 3, J) are unused if `starts` are given. Returns the fit,
-    whose shapes are centred and mixed such that alpha ~ N(0, I) and whose noise is
-    corrected for degrees of freedom; the frames as fitted; and alpha (n_chosen, K) of
-    the sample.
+    `paper_shapes` (K + 1, 3, J) are unused if `starts` are given. Returns the fit, the
+    fitted frames, and alpha (n_chosen, K) of the sample. Shapes are centred and mixed
+    such that alpha ~ N(0, I). The noise is corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1
@@ -141,8 +140,8 @@ def _problems(
 ) -> tuple[list[JointProblem], JointFrames | None]:
     """Return the problems of growing samples and of all frames.
 
-    Of many points frames are completed and given by directions. If points are missing
-    or left out, the second result holds the frames by their visible points.
+    With many points, frames are completed and represented by directions. If points are
+    missing or left out, the second result has the frames by their visible points.
     """
     n_shapes, _, n_points = paper_shapes.shape
     options, outliers = settings.options, table.outliers
@@ -161,8 +160,8 @@ def _problems(
     thorough = frames.n_frames <= options.few_frames
     penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
-    # Each number that is fitted lowers the objective by about one by chance. Steps on a
-    # sample end when they gain less than 3 % of that for all shapes together.
+    # By chance, each fitted parameter lowers the objective by about one. Steps on a
+    # sample end when they gain less than 3 % of the number of shape parameters.
     chance = 0.03 * frames.coordinates(paper_shapes).size
     problems = [
         problem.part(part, tol=max(settings.tol, chance / len(part)))
@@ -174,7 +173,7 @@ def _problems(
 def _first_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
 ) -> tuple[JointFit, JointState]:
-    """Return the fit of the sample, with its ratio of noises, and one of its starts."""
+    """Return the fit of the sample, with its noise ratio, and one of its starts."""
     # Calibrated cameras, from the best starts
     settings, affine = problem.settings, CAMERAS["affine"]
     camera = settings.camera
@@ -190,7 +189,7 @@ def _first_fit(
     max_iter = settings.max_iter
     if camera != "affine":  # only compared
         max_iter = min(max_iter, 60)
-    if not problem.thorough:  # only the better one goes on
+    if not problem.thorough:  # only the better one continues
         few = min(max_iter, 5)
         raced = [problem.refined(each, affine, max_iter=few) for each in states]
         states = [_least(raced).state]
@@ -206,7 +205,8 @@ def _continued_fit(
 ) -> tuple[JointFit, JointState]:
     """Return the fit from the best of given starts, and that start.
 
-    Starts after the first must be able to catch up by the gain of their second half.
+    A later start is dropped if repeating the gain of its second half would not suffice
+    to catch up.
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
@@ -275,8 +275,8 @@ def judged(
 
     Returns the fit, its noise floor and the decision. A model is right if its residual
     is at most the noise of the spectrum. Then the fit is repeated without floor and
-    prior, also from its start: deformation below the floor has vanished from the
-    result.
+    prior, from its result and from its start. The result lacks deformation below the
+    floor.
 
     Otherwise there are too few basis shapes, and cameras or depths explain the missing
     deformation. Calibrated cameras are fitted again, with a noise floor as high as that

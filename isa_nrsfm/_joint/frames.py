@@ -1,4 +1,4 @@
-"""Frames as the joint refinement passes over them: by points or by directions.
+"""Frames of the joint refinement, represented by points or by directions.
 
 If no point is missing, the objective depends on a frame only through its energy and its
 products with directions that span the shapes: cheap for any number of points.
@@ -25,7 +25,7 @@ class WeightedRows(NamedTuple):
 
     @classmethod
     def without(cls, rows: NDArray, left_out: NDArray) -> Self:
-        """Return frames of which some points (n_frames, n_points) do not count."""
+        """Return frames with weight zero for some points (n_frames, n_points)."""
         seen = seen_points(rows.transpose(0, 2, 1))
         return cls(rows, (seen & ~left_out) * 1.0)
 
@@ -97,7 +97,7 @@ class JointFrames:
 
 
 def _totals(block: FrameTracks) -> tuple[float, float]:
-    """Return the number of coordinates that a block shows, and its energy."""
+    """Return the number of visible coordinates of a block, and its energy."""
     weights = block.weights
     points = block.weight.sum() if weights is None else np.count_nonzero(weights)
     return 2.0 * points, block.energy.sum()

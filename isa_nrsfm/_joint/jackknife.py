@@ -1,10 +1,10 @@
 """Errors of a fit with calibrated cameras, by leaving out groups of its points.
 
-Unmodelled deformation is common to neighbouring points and to many frames, and part of
-it looks like a rotation. A posterior covariance with independent noise is therefore too
-small. The delete-a-group jackknife (Efron and Stein, The Annals of Statistics, 1981)
-needs no model of the noise: from fits without each of g groups of neighbouring points
-the variance of an estimate t is ::
+Unmodelled deformation is correlated between neighbouring points and between frames, and
+part of it resembles a rotation. A posterior covariance with independent noise is
+therefore too small. The delete-a-group jackknife (Efron and Stein, The Annals of
+Statistics, 1981) needs no model of the noise: from fits without each of g groups of
+neighbouring points the variance of an estimate t is ::
 
     (g - 1) / g sum_g (t_g - t)^2.
 
@@ -31,22 +31,22 @@ from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
-# Groups of equal size: those of k-means overstate the errors by half.
+# Groups have equal size. With k-means groups the errors are half too large.
 N_GROUPS = 5
 # Largest number of steps of a fit, and its convergence tolerance. 30 steps understate
 # the errors of undetermined depths. A tolerance of 1e-6 changes determined ones by less
 # than 2 %; 1e-2 understates undetermined ones.
 MOST_STEPS, TOL = 100, 1e-3
-# Frames and points of the fits. With 100 frames one deviation changed from
-# 12 to 19 %. Points are assigned to groups in cubic time.
+# Largest numbers of frames and points of the fits. With 100 frames one deviation
+# changed from 12 to 19 %. Points are assigned to groups in cubic time.
 MOST_FRAMES, MOST_POINTS = 200, 200
-# Floor of the noise variance of the fits, as a share of the mean square. In tables
-# without noise surplus basis shapes leave the depth open, and fits stay near their
-# start: errors were 30 times the deviation, with this floor 5 times. It changes no
-# deviation of tables with a noise of 0.1 % by more than a third.
+# Floor of the noise variance of the fits, as a share of the mean square. Without noise,
+# surplus basis shapes leave the depth undetermined, and fits stay near their start.
+# Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
+# %, the floor changes no deviation by more than a third.
 LEAST_NOISE = 1e-6
-# Residuals that are longer, in standard deviations of a coordinate, are left out of the
-# fits of tables with a robust loss: one of 3,000 points without outliers.
+# With a robust loss, points with residuals above this threshold, in standard deviations
+# of a coordinate, are left out. Without outliers this is one point in 3,000.
 OUTLYING = 4.0
 
 
@@ -81,7 +81,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     # Each point is left out of one of the fits
     variances *= N_GROUPS / (N_GROUPS - 1)
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
-    # Rotations out of the image plane; the coefficients cannot predict their rest.
+    # Rotations out of the image plane, and their residuals of a regression on alpha.
     mean_view = Rotation.from_matrix(whole.rotations).mean()
     turning = (Rotation.from_matrix(whole.rotations) * mean_view.inv()).as_rotvec()
     predictors = np.column_stack([np.ones(len(turning)), whole.alpha])
@@ -109,7 +109,7 @@ def neighbours(points: NDArray) -> NDArray:
 
 
 class _Refit:
-    """A fit of some of the points from the fit of all, by a few steps."""
+    """A fit of some of the points, by a few steps from the fit of all points."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class _Refit:
         off = mirror[2] * self.depths - z
         points = np.zeros(len(self.kept))
         points[self.kept] = np.mean(off**2, axis=0)
-        # Rotations up to one of the object
+        # Rotations up to a common rotation of the object
         turned = Rotation.from_matrix(mirror[:, None] * self.rotations * mirror)
         rotations = Rotation.from_matrix(whole.rotations)
         w = (turned * (turned.inv() * rotations).mean() * rotations.inv()).as_rotvec()

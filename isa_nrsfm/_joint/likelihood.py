@@ -1,7 +1,7 @@
 """Marginal likelihood of cameras and shapes, with the coefficients integrated out.
 
-Coefficients have the prior ``N(0, I)``, coordinates noise of variance s2. Write ``c =
-(1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then minus twice the log
+Coefficients have the prior ``N(0, I)``. Coordinates have noise of variance s2. Write
+``c = (1, alpha)`` and ``H_kl = <M B_k, M B_l>`` (k, l >= 1). Then minus twice the log
 likelihood of all frames is, up to a constant ::
 
     N log s2 + sum_i [ min_alpha (||W_i - M_i sum_k c_k B_k||^2 / s2 + ||alpha||^2)
@@ -18,8 +18,8 @@ The gradient follows from the first two posterior moments of the coefficients, a
 expectation maximisation (Tipping, Bishop, "Probabilistic principal component analysis",
 1999; Bishop, "Pattern recognition and machine learning", 2006, section 12.2).
 
-All terms are sums over blocks of frames. Inside a block the frame is the last index,
-with cameras M and the gradient G by them (2, 3, n_frames).
+All terms are sums over blocks of frames. Inside a block the frame is the last index.
+Cameras M and their gradient G are (2, 3, n_frames).
 """
 
 from collections.abc import Iterable
@@ -45,14 +45,14 @@ from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 class LikelihoodTerms(NamedTuple):
     """Objective, derivatives and posterior moments, from one pass over the frames.
 
-    shape_gradient (n_shapes, 3, J): derivative of the value by the shapes.
-    noise_gradient: derivative by the logarithm of the noise variance.
+    shape_gradient (n_shapes, 3, J): derivative of the value with respect to the shapes.
+    noise_gradient: derivative with respect to the logarithm of the noise variance.
     shape_curvature (J or 1, 3 n_shapes, 3 n_shapes): ``sum_i w_ij E_i (x) M_i^T M_i``
     with the posterior second moments E_i of (1, alpha). Times ``2 / s2`` it is the
     Hessian by point j of the shapes, posterior and positions held fixed. One matrix for
     all points if all weights are one.
     residual: sum of squared residuals of the tracks at the posterior means.
-    motion_gradient (2, 3, I): derivative by the cameras.
+    motion_gradient (2, 3, I): derivative with respect to the cameras.
     motion_curvature (6, I): ``sum_kl E_kl B_k B_l^T``, packed: the same for each row.
     alpha (K, I): posterior means of the coefficients.
     """
@@ -97,7 +97,8 @@ class MarginalLikelihood:
             # With one curvature for all points the shapes are centred already.
             penalty, slope = extent_penalty(shapes, centred=len(curvature) == 1)
             value += weight * penalty
-            # Points that no frame shows stay in place: they have no curvature.
+            # Points that are visible in no frame stay in place: their curvature is
+            # zero.
             seen = curvature.any(axis=(1, 2))
             shape_gradient = shape_gradient + weight * np.where(seen, slope, 0.0)
         return terms._replace(
@@ -112,8 +113,8 @@ class MarginalLikelihood:
         return np.ascontiguousarray(self._sums(shapes, motion, noise).alpha.T)
 
     def _sums(self, shapes: NDArray, motion: NDArray, noise: float) -> LikelihoodTerms:
-        """Return the sums over all frames, the curvature by the shapes packed."""
-        # With tiny noise normal equations get a step of iterative refinement.
+        """Return the sums over all frames, with the curvature of the shapes packed."""
+        # If the noise is tiny, refine the solution of the normal equations by one step.
         tiny_noise = noise * self.n_seen < 1e-7 * self.square
         over_block = partial(
             _block_terms,
@@ -161,7 +162,7 @@ def _frame_terms(
 ) -> LikelihoodTerms:
     """Return the sums over frames, M (2, 3, n_frames), as `MarginalLikelihood._sums`.
 
-    The curvature by the shapes is packed: (n_pairs, 6, n_points or 1).
+    The curvature of the shapes is packed: (n_pairs, 6, n_points or 1).
     """
     n_shapes, _, n_points = shapes.shapes.shape
     products = frame_sums(block, shapes)
@@ -176,12 +177,12 @@ def _frame_terms(
     moments = posterior.second_moments(noise)
     moments[diagonal_of(moments)[1:]] += noise * np.reshape(penalty, (-1, 1))
     cameras = camera_gram(M)
-    # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
+    # With respect to the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
     motion_curvature = products.gram.moments(moments)
     A = unpack3(motion_curvature)
     G = np.einsum("rbi,bai->rai", M, A)
     G -= np.einsum("ki,kari->rai", c, products.cross)
-    # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
+    # With respect to the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
     X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
     shape_gradient = X @ block.weighted.reshape(n_points, -1).T
     if block.weights is None:

@@ -1,4 +1,4 @@
-"""The joint fit as a problem: frames, penalty, and how long to iterate."""
+"""The joint fit as an optimisation problem: frames, penalty and stopping rule."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,7 +30,8 @@ class FactorisedTable(NamedTuple):
     rows: centred frames (I, 2, J) of size one, NaN where a point is missing.
     completed: the same with missing points and outliers filled in.
     n_seen (I,): number of visible points.
-    outliers (I, J): points that a robust loss leaves out at first, None for others.
+    outliers (I, J): points that a robust loss leaves out at first; None for other
+    losses.
     triplets: the 3K + 3 largest singular values of the completed table, and the rest.
     sample, factors: frames of the first steps, and factors of their matrix.
     """
@@ -45,7 +46,7 @@ class FactorisedTable(NamedTuple):
 
 
 class JointSettings(NamedTuple):
-    """How a table is fitted, as in `AffineNRSfM` and `refine_joint`."""
+    """Settings of the joint fit, as in `AffineNRSfM` and `refine_joint`."""
 
     camera: str
     loss: str
@@ -75,7 +76,7 @@ class JointProblem:
 
     @property
     def mean_square(self) -> float:
-        """Mean square of the coordinates that the frames show."""
+        """Mean square of the visible coordinates."""
         n_seen, energy = self.frames.totals
         return energy / n_seen
 
@@ -99,8 +100,8 @@ class JointProblem:
     ) -> tuple[JointState, int]:
         """Return a state without frames that are reversed in depth, and their number.
 
-        The search for each frame is repeated from its camera reversed in depth, and its
-        result taken where the objective is lower.
+        The search for each frame is repeated from its camera reversed in depth. The
+        result is used if its objective is lower.
         """
         function = partial(
             _reversed_back,
@@ -119,7 +120,7 @@ class JointProblem:
         max_iter: int | None = None,
         tol: float | None = None,
     ) -> JointFit:
-        """Return the joint refinement of a state, by default with the settings."""
+        """Refine a state jointly, by default with the settings of the problem."""
         settings, likelihood = self.settings, self.likelihood
         if tol is None:
             tol = settings.tol * (0.1 if self.thorough else 1.0)
@@ -141,7 +142,7 @@ class JointProblem:
 def _reversed_back(
     block: FrameTracks, motion: NDArray, search: CalibratedSearch, noise: float
 ) -> tuple[NDArray, NDArray]:
-    """Return the better cameras (n_frames, 2, 3), and which ones were reversed."""
+    """Return the better cameras (n_frames, 2, 3), and the mask of reversed ones."""
     found = [
         search.reversed_cameras(frame_sums(piece, search.shared), noise, motion[frames])
         for frames, piece in block.pieces(BLOCK_FRAMES)

@@ -23,7 +23,7 @@ from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 # keeps the objective finite for tables without noise.
 NOISE_FLOOR = 1e-11
 
-# Pairs of a step, and of the change of the gradient, with their product.
+# Steps, changes of the gradient, and their inner products.
 Memory = deque[tuple[NDArray, NDArray, float]]
 
 
@@ -41,8 +41,8 @@ class JointFit(NamedTuple):
     history (n_iter + 1,): objective at the start and after each step; it never rises.
     gradient_norm: ``sqrt(g^T D g / N)`` at the end, with the gradient g, the inverse D
     of the approximate Hessian and the number N of coordinates. Its square is about half
-    to twice the decrease of the objective for each coordinate that is still possible.
-    left: the larger one of the noise variance and the mean square residual at the
+    to twice the possible further decrease of the objective per coordinate.
+    left: the maximum of the noise variance and the mean square residual at the
     posterior means of the coefficients. camera_noise_ratio: noise variance with
     calibrated cameras divided by that with affine ones, for the sample of
     `fit_jointly`. NaN with given starts.
@@ -86,14 +86,14 @@ def refine_joint(
     while len(history) <= max_iter and small_steps < 2:
         if on_step is not None:
             on_step()
-        # L-BFGS direction, or the preconditioned gradient if that is no descent
+        # L-BFGS direction, or the preconditioned gradient if L-BFGS does not descend
         direction = -_inverse_hessian_product(iterate, memory)
         if not iterate.gradient @ direction < 0:
             memory.clear()
             direction = -iterate.precondition(iterate.gradient)
         reached, step = _line_search(iterate, direction)
         if reached is None:
-            if not memory:  # the gradient itself fails: rounding errors are left
+            if not memory:  # even the gradient fails: only rounding errors remain
                 small_steps = 2
             memory.clear()
             continue
@@ -151,7 +151,7 @@ class _Iterate:
 
     @cached_property
     def metric(self) -> tuple[NDArray, NDArray]:
-        """Inverses of the curvatures by the shapes and by the cameras."""
+        """Inverses of the curvatures of the shapes and of the cameras."""
         by_shapes, by_cameras = self.curvature
         inverse = self.cameras.inverse_curvature(self.M, by_cameras)
         return np.linalg.inv(regular(by_shapes)), inverse
@@ -159,8 +159,8 @@ class _Iterate:
     def precondition(self, vector: NDArray) -> NDArray:
         """Return a vector times the inverse of the approximate Hessian.
 
-        The Hessian is ``2 / s2`` times the curvature by shapes and cameras, and N by
-        ``log s2``, without blocks across these three.
+        The Hessian is block diagonal: ``2 / s2`` times the curvatures of shapes and
+        cameras, and N for ``log s2``.
         """
         half = self.state.noise / 2
         shapes, steps, noise = self.split(vector)
@@ -196,7 +196,7 @@ class _Iterate:
 def regular(curvature: NDArray) -> NDArray:
     """Return curvatures (n, m, m) with a small ridge, as they can be singular."""
     size = curvature.shape[-1]
-    # Points that no frame shows have no curvature, and no gradient either.
+    # Points that are visible in no frame have zero curvature and zero gradient.
     ridge = OF_DIFFERENCES * np.trace(curvature, axis1=1, axis2=2).mean() / size or 1.0
     return curvature + ridge * np.eye(size)
 

@@ -1,8 +1,8 @@
 """Number of basis shapes that a table determines.
 
-The 3J numbers of each basis shape, as the images show them, have a prior variance v_k
-that is estimated (automatic relevance determination: MacKay, "Bayesian interpolation",
-1992; Bishop, "Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the
+The images of the 3J coordinates of each basis shape have a prior variance v_k, which is
+estimated (automatic relevance determination: MacKay, "Bayesian interpolation", 1992;
+Bishop, "Bayesian PCA", 1999). With the posterior covariance ``cov B_k``, the
 coefficients' moments held fixed, and ``C = mean_i M_i^T M_i`` the iteration is
 
     g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
@@ -46,7 +46,7 @@ def relevant_components(
         # Posterior covariance of each point: half the Hessian is curvature / s2.
         curvature = part.likelihood(*state).shape_curvature
         covariance = state.noise * np.linalg.inv(regular(curvature))
-        # One matrix stands for all points where all weights are one.
+        # If all weights are one, one matrix is valid for all points.
         total = covariance.sum(axis=0) * (n_points / len(covariance))
         total = total.reshape(len(shapes), 3, len(shapes), 3)
         uncertain = np.einsum("ab,kakb->k", C, total)[1:]

@@ -28,15 +28,15 @@ def reweighted(
 ) -> tuple[JointFit, float]:
     """Iterate refinement and weights until the weights agree with the residuals.
 
-    Points `left_out` (I, J) have not counted in `fit`; the others had weight one.
-    Returns the refinement and the noise variance of a coordinate, from the median of
-    the residuals, corrected for the degrees of freedom.
+    In `fit`, points `left_out` (I, J) had weight zero, the others weight one. Returns
+    the refinement and the noise variance of a coordinate, from the median of the
+    residuals, corrected for the degrees of freedom.
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
     sizes = rows.joined(_sizes)
     weighted = rows.derive(WeightedRows.without, left_out)
-    # The noise is that of the residuals of at most about 2,000 frames.
+    # Estimate the noise from the residuals of at most about 2,000 frames.
     few = representative_frames(rows, 2000)
     few_rows = rows.take(few)
     weights = WeightedRows.without(few_rows, left_out[few]).weights
@@ -79,7 +79,7 @@ def _residual_deviations(
     (n_frames, n_points), (_, n_components) = weights.shape, alpha.shape
     n_pose = 2 + cameras.n_parameters
     deviations = np.empty(weights.shape)
-    # Derivatives of as many frames at a time as fit into 32 MB
+    # Process frames in slices whose derivatives fit into 32 MB
     length = max(2**22 // (2 * n_points * (n_pose + n_components)), 1)
     for first in range(0, n_frames, length):
         part = slice(first, first + length)

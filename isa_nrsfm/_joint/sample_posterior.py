@@ -46,8 +46,9 @@ def shape_uncertainty(
 ) -> NDArray:
     """Return the covariance of a point of the shapes for noise of variance one.
 
-    The inverse of ``sum_i share_i E_i (x) M_i^T M_i`` with the second moments E_i of
-    (1, alpha), where frame i shows a share of the points, in slices of frames.
+    The inverse of ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of
+    (1, alpha) and the share of visible points of frame i. The sum is over slices of
+    frames.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
@@ -64,17 +65,17 @@ def shown_frames(
     frames: PosteriorFrames,
     uncertainty: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
-    """Return fits in the gauge, and how far their noise enters their own coefficients.
+    """Return fits in the gauge, and the effect of their noise on their coefficients.
 
-    The noise of frame i is in the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
-    M_i``. From there it moves the coefficients of the frame by ``n_i s2_i Sigma_i / s2
-    tr(M_i (N^-1 X_i^T)_k)`` on average. The second result (K, K) is the sum over the
-    frames of ``alpha_i`` times that shift times s2, the third the sum of s2_i.
+    The noise of frame i changes the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
+    M_i``. This shifts the coefficients of the frame by ``n_i s2_i Sigma_i / s2 tr(M_i
+    (N^-1 X_i^T)_k)`` on average. The second result (K, K) is the sum over the frames of
+    ``alpha_i`` times that shift times s2, the third the sum of s2_i.
     """
     motion, alpha = posterior.motion, posterior.alpha
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
     Z = X @ uncertainty
-    # Degrees of freedom of the residual, without those that the shapes take
+    # Degrees of freedom of the residual, minus those of the shapes
     leverage = np.einsum("irp,irp->i", X, Z)
     n_pose = 2 + CAMERAS[frames.camera].n_parameters
     noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - n_pose, 1.0)

@@ -42,8 +42,8 @@ def rigid_start(
 ) -> tuple[NDArray, NDArray]:
     """Return the paper's result with calibrated cameras (I, 2, 3) and its shapes.
 
-    The cameras are the nearest to the rigid ones, in the metric of space in which those
-    are most nearly calibrated; without `scaled` all have the scale one.
+    After a metric upgrade of the rigid cameras, takes the nearest calibrated ones.
+    Unless `scaled`, all cameras have scale one.
     """
     rigid = factors.rigid_motion.reshape(-1, 2, 3)
     Q = best_metric(rigid)
@@ -73,7 +73,7 @@ def mixed_cameras(
     if rank < 3:
         return
     few = P[chosen].reshape(2 * len(chosen), -1)
-    # Each width starts from the mixture of the one before.
+    # Each width starts from the mixture of the previous width.
     mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=20)
     for n in sorted({min(n, rank) for n in widths if n < rank + 3}):
         mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=20)
@@ -84,8 +84,8 @@ def mixed_cameras(
 def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
     """Return shapes (K + 1, 3, J) that fit calibrated cameras and rows (I, 2, J).
 
-    The mean shape is that of least squares, ``(sum_i M_i^T M_i) B_0 = sum_i M_i^T
-    W_i``, the others those of `extended_shapes`.
+    The mean shape solves the least squares problem ``(sum_i M_i^T M_i) B_0 = sum_i
+    M_i^T W_i``. The others are those of `extended_shapes`.
     """
     gram = np.einsum("ira,irb->ab", motion, motion)
     right = np.einsum("ira,irj->aj", motion, rows)
@@ -148,7 +148,7 @@ def best_starts(
     """Return the likeliest starts, best first: three of small tables, one of others."""
     frames, options = problem.frames, problem.settings.options
     factors, thorough = table.factors, problem.thorough
-    # Frames that are compared: evenly from the most to the least rigid one
+    # Frames for the comparison, spread evenly from the most to the least rigid
     rows = frames.coordinates(table.sample.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
     few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
@@ -158,7 +158,7 @@ def best_starts(
     trials: list[tuple[float, JointState, NDArray]] = []
 
     def compare(motion: NDArray, shapes: NDArray) -> None:
-        """Add a start after some steps of its shapes, with the cameras of all."""
+        """Refine the shapes of a start with fixed cameras, and add it to the trials."""
         state = _first_state(part, seen, motion[few], shapes)
         fit = part.refined(state, AffineCameras(held=True), max_iter=HELD_STEPS)
         trials.append((fit.value, fit.state, motion))
@@ -169,8 +169,9 @@ def best_starts(
     )
     compare(motion, _scaled(seen, motion[few], shapes))
     compare(motion, lifted_shapes(seen, motion[few], n_components))
-    # Mixtures of more and more columns, until the objective rises. For small tables
-    # all of them, without and with scales: few steps do not show which is the best.
+    # Mixtures of more and more columns, until the objective rises. Small tables use all
+    # mixtures, without and with scales, because a few steps do not identify the best
+    # one.
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
     families = [scales, None] if cameras.scaled and thorough else [scales]
     for given in families if cameras.scaled else [None]:
@@ -206,7 +207,7 @@ def _first_state(
 
 
 def with_prior(problem: JointProblem, state: JointState) -> JointState:
-    """Return a state with its basis shapes mixed and scaled as the prior asks for."""
+    """Return a state with its basis shapes mixed and scaled to the likeliest basis."""
     shapes, motion, _ = state
     alpha = problem.likelihood.coefficients(*state)
     shapes = likely_basis(shapes, motion, alpha, problem.penalty)
@@ -219,8 +220,9 @@ def likely_basis(
     """Return the same shapes (K + 1, 3, J) in the basis of greatest likelihood.
 
     Without noise neither a shift of the mean shape along the basis shapes nor a mixing
-    A of these changes the residual: alpha becomes ``A^-1 (alpha - mean)``. Of the
-    objective there remains, with n frames and ``H_kl = sum_i <M_i B_k, M_i B_l>``,
+    A of these changes the residual: alpha becomes ``A^-1 (alpha - mean)``. The
+    remaining terms of the objective, with n frames and ``H_kl = sum_i <M_i B_k, M_i
+    B_l>``, are
 
         n log det(A A^T) + sum_i ||A^-1 (alpha_i - mean)||^2 + penalty tr(A^T H A).
 
@@ -251,7 +253,7 @@ def likely_basis(
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
     """Return shapes (n, 3, J) over the standard deviation of their coefficients.
 
-    These are least squares, ``<M_i B_k, W_i> / ||M_i B_k||^2``: shapes are orthogonal.
+    Shapes are orthogonal, so least squares gives ``<M_i B_k, W_i> / ||M_i B_k||^2``.
     """
     images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
     along = np.einsum("ikrj,irj->ik", images, rows)

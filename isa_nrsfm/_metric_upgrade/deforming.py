@@ -34,10 +34,10 @@ class DeformationMetric(NamedTuple):
         The upgrade of the mean shape: symmetric and positive definite, as in
         `MetricUpgrade`.
     strain : ndarray of shape (n_components, 3, 3)
-        E_k, symmetric and without trace, for one unit of coefficient k: ``M_i Q
-        exp(sum_k alpha_ik E_k / 2)`` is nearly two rows of a scaled rotation.
+        E_k, symmetric with trace zero, for one unit of coefficient k: ``M_i Q exp(sum_k
+        alpha_ik E_k / 2)`` is nearly two rows of a scaled rotation.
     residual : float
-        Root mean square residual of the cameras, see `MetricUpgrade`, with the strain.
+        Root mean square residual of the cameras with the strain, see `MetricUpgrade`.
     condition_number : float
         Condition number of the metric, see `MetricUpgrade`.
     """
@@ -76,14 +76,15 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     Affine cameras can absorb part of the deformation. To first order, the basis shape
     :math:`B_k + V B_0` gives the same images as :math:`B_k`, with cameras :math:`M_i (I
     - \alpha_{ik} V)`. The rows of such cameras are not orthogonal, which determines V
-    up to rotations and scales. So the one Q of `metric_upgrade` becomes ``Q exp(sum_k
-    alpha_ik E_k / 2)`` for frame i, with symmetric strains E_k without trace.
+    up to rotations and scales. The matrix Q of `metric_upgrade` therefore becomes ``Q
+    exp(sum_k alpha_ik E_k / 2)`` for frame i. The strains E_k are symmetric with trace
+    zero.
 
     Parameters
     ----------
     motion : array-like of shape (n_frames, 2, 3)
-        Affine cameras, such as `AffineNRSfM.motion_`. Those that are zero or NaN are
-        left out.
+        Affine cameras, such as `AffineNRSfM.motion_`. Cameras that are zero or NaN are
+        ignored.
     alpha : array-like of shape (n_frames, n_components)
         Coefficients of the frames, such as `AffineNRSfM.alpha_`, in units of their
         standard deviation.
@@ -97,7 +98,7 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     ------
     ValueError
         If the arrays are not of the shapes above or have infinite entries, or if the
-        cameras together see less than three directions of space.
+        cameras together see fewer than three directions of space.
 
     Warns
     -----
@@ -111,11 +112,12 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     Notes
     -----
     The sum of the squared weak-perspective residuals plus a ridge times the squared
-    norm of the strains is minimised. The ridge is the ratio of two variances, of
-    residuals and of entries of the strains, which are taken as normally distributed.
-    Both are estimated by maximising the evidence (MacKay, "Bayesian interpolation",
-    Neural Computation 4, 1992), the second being at most :math:`0.3^2`. Few frames, or
-    cameras that are not weak-perspective ones, lead to small strains.
+    norm of the strains is minimised. The ridge is the ratio of two variances, that of
+    the residuals and that of the entries of the strains. Both are assumed to be
+    normally distributed. The variances are estimated by maximising the evidence
+    (MacKay, "Bayesian interpolation", Neural Computation 4, 1992), with at most
+    :math:`0.3^2` for the strains. Few frames, or cameras that are not weak-perspective
+    ones, lead to small strains.
     """
     cameras, usable = usable_cameras(motion)
     weights = np.asarray(alpha, dtype=np.float64)
@@ -145,15 +147,15 @@ def euclidean_frames(
     """
     Return Euclidean shapes, rotations and scales of frames.
 
-    Each frame is taken by itself: its result does not depend on the others.
+    The result of a frame does not depend on the other frames.
 
     Parameters
     ----------
     metric : DeformationMetric
-        Of `deformation_metric`, from the table that the shapes were fitted to.
+        Result of `deformation_metric` for the table that the shapes were fitted to.
     motion : array-like of shape (n_frames, 2, 3)
-        Affine cameras of these or other frames, as `AffineNRSfM.decompose` returns
-        them.
+        Affine cameras of these or other frames, for example from
+        `AffineNRSfM.decompose`.
     alpha : array-like of shape (n_frames, n_components)
         Their coefficients.
     mean_shape : array-like of shape (n_points, 3)
@@ -171,7 +173,7 @@ def euclidean_frames(
     Raises
     ------
     ValueError
-        If the arrays do not fit each other.
+        If the shapes of the arrays are inconsistent.
 
     Notes
     -----
@@ -180,7 +182,7 @@ def euclidean_frames(
     1. The metric of the frame is applied. Eigenvalues of its strain are limited to one;
        only unusual coefficients, or a failed fit, exceed that.
     2. The camera is now nearly a scaled rotation. The smallest stretch in the image
-       plane that makes it exactly one is moved to the shape.
+       plane that makes it exact is moved from the camera to the shape.
     3. The shape is rotated to be as near as possible to the mean shape. Images do
        not determine whether the object or the camera turned, nor how much of a rotation
        is deformation.
@@ -230,8 +232,8 @@ def euclidean_frames(
     shapes = shapes @ np.linalg.inv(Q).transpose(0, 2, 1)
     rotations, stretches = nearest_rotations(cameras @ Q)
     scales = np.trace(stretches, axis1=1, axis2=2) / 2
-    # Cameras are stretches times rotations. Seen in the axes of the image, the shape
-    # takes over the stretch, and the scaled rotation is left.
+    # A camera is a stretch times a rotation. In the axes of the image, the stretch is
+    # moved to the shape, and the scaled rotation remains.
     seen = shapes @ rotations.transpose(0, 2, 1)
     seen[:, :, :2] = seen[:, :, :2] @ (stretches / scales[:, None, None])
     shapes = seen @ rotations

@@ -21,9 +21,9 @@ def orthonormal_mixture(
     """Mix columns such that rows are most nearly orthonormal; return Q (n, 3) and cost.
 
     The columns (2 I, n) are about as long as columns of cameras. `mixing` (n_before, 3)
-    is the start, the best mixture of the first columns. If these are three, each triple
-    of columns is a start as well. The cost is the mean over the frames of the squared
-    norm of `orthonormality_residuals`, plus a penalty ``||L Q||_F^2``.
+    is the start, the best mixture of the first columns. If there are three of these,
+    each triple of columns is another start. The cost is the mean over the frames of the
+    squared norm of `orthonormality_residuals`, plus a penalty ``||L Q||_F^2``.
     """
     n = basis.shape[1]
     L = np.zeros((0, n)) if penalty is None else penalty

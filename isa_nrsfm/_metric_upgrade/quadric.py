@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.rounding import OF_RANKS
 
 # Bound on the ratio of stretches of space by a root Q of the metric G. It is exceeded
-# where the cameras hardly show the depth, which noise then stretches without limit.
+# if the cameras hardly determine the depth, which noise can then stretch without limit.
 LARGEST_STRETCH = 20.0
 
 CalibratedCamera = Literal["orthographic", "weak_perspective"]
@@ -29,7 +29,7 @@ def unit_cameras(motion: NDArray) -> NDArray:
     usable = np.isfinite(size) & (size > 0)
     if not usable.any():
         raise ValueError(
-            "the viewing frame needs at least one finite camera other than zero; "
+            "the viewing frame needs at least one finite, non-zero camera; "
             f"got none among the {len(motion)} cameras"
         )
     return motion[usable] / size[usable, None, None]
@@ -50,8 +50,8 @@ def symmetric_power(matrix: NDArray, power: float) -> NDArray:
 def strain_basis(camera: CalibratedCamera) -> NDArray:
     """Return an orthonormal basis of the strains that change the residuals.
 
-    Six symmetric matrices for orthographic cameras, five without trace for
-    weak-perspective ones: the trace only changes the scales of the frames.
+    Six symmetric matrices for orthographic cameras. Five with trace zero for
+    weak-perspective ones, as the trace only changes the scales of the frames.
     """
     basis = np.zeros((6, 3, 3))
     diagonal = np.array([[1, -1, 0], [1, 1, -2], [1, 1, 1]]) / np.sqrt([[2], [6], [3]])
@@ -66,7 +66,7 @@ def conformal_equations(cameras: NDArray) -> NDArray:
 
     For cameras (I, 2, 3) with rows m1 and m2 these are the coefficients (2 I, 6) of
     ``m1 G m1^T - m2 G m2^T`` and of ``2 m1 G m2^T`` in the coordinates of G in
-    `strain_basis`. Roll of a frame turns the two into each other.
+    `strain_basis`. Rotating a frame in the image mixes the two.
     """
     basis = strain_basis("orthographic")
     (xx, xy), (_, yy) = np.einsum("ira,nab,isb->rsin", cameras, basis, cameras)
@@ -77,17 +77,17 @@ def metric_quadric(motion: NDArray) -> NDArray | None:
     """Find the symmetric G under which cameras (I, 2, 3) are weak-perspective ones.
 
     The equations of `conformal_equations` are solved by least squares, with the mean of
-    ``m1 G m1^T + m2 G m2^T`` fixed to one. With a fixed norm of G instead, a G along a
-    direction that the cameras hardly see would nearly solve them. None if they do not
-    determine G, or if it is not safely positive definite.
+    ``m1 G m1^T + m2 G m2^T`` fixed to one. With a fixed norm of G, a direction that the
+    cameras hardly see would nearly solve them. Returns None if they do not determine G,
+    or if G is not safely positive definite.
     """
     cameras = unit_cameras(motion)
     gram = mean_gram(cameras)
     eigenvalues = np.linalg.eigvalsh(gram)
     if eigenvalues[0] <= OF_RANKS * eigenvalues[-1]:
         return None
-    # In coordinates where the mean of M_i^T M_i is the identity, the mean that is fixed
-    # is the trace of G. So G is I / 3 plus a matrix without trace, of five unknowns.
+    # In coordinates where the mean of M_i^T M_i is the identity, the fixed mean is the
+    # trace of G. So G is I / 3 plus a matrix of trace zero with five unknowns.
     whitening = symmetric_power(gram, -0.5)
     equations = conformal_equations(cameras @ whitening)
     unknowns, _, _, singular_values = np.linalg.lstsq(

@@ -12,8 +12,8 @@ have an indefinite solution. The derivative of the exponential is that of Daleck
 Krein (Higham, "Functions of matrices", 2008, theorem 3.11).
 
 The strain of a frame, ``sum_k alpha_ik E_k``, has five or six coordinates in
-`strain_basis`. Derivatives in those of E_k are alpha_ik times the derivatives in these:
-only the sums ``J^T J`` and ``J^T r`` over the frames are formed.
+`strain_basis`. Derivatives with respect to those of E_k are alpha_ik times derivatives
+with respect to these. Only the sums ``J^T J`` and ``J^T r`` over the frames are formed.
 """
 
 from collections.abc import Callable
@@ -44,9 +44,10 @@ class MetricFit(NamedTuple):
     """A metric, with its cost and derivatives.
 
     Q (3, 3): ``G = Q Q^T`` is the metric of frames without deformation.
-    strain (K, 3, 3): E_k, symmetric and without trace.
+    strain (K, 3, 3): E_k, symmetric with trace zero.
     cost: sum of the squared residuals of `orthonormality`.
-    curvature: ``J^T J`` of these by the coordinates of E_0, E_1, ... in `strain_basis`.
+    curvature: ``J^T J`` with the Jacobian of the residuals in the coordinates of E_0,
+    E_1, ... in `strain_basis`.
     gradient: ``J^T r`` with r the residuals.
     """
 
@@ -227,8 +228,9 @@ def levenberg_marquardt(
 def safe_start(motion: NDArray, G: NDArray, camera: CalibratedCamera) -> NDArray:
     """Return Q of a positive definite metric near to a symmetric G, to start from.
 
-    Where the mean of ``M_i^T M_i`` is the identity, it has the axes of G, and stretches
-    that differ by at most `STRETCH_OF_START`. Only orthographic cameras fix its scale.
+    In coordinates where the mean of ``M_i^T M_i`` is the identity, it has the axes of
+    G. Its stretches have ratios of at most `STRETCH_OF_START`. Only orthographic
+    cameras fix its scale.
     """
     counted = motion if camera == "orthographic" else unit_cameras(motion)
     root = symmetric_power(mean_gram(counted), 0.5)

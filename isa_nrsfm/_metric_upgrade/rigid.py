@@ -20,13 +20,13 @@ from isa_nrsfm._metric_upgrade.refinement import (
     safe_start,
 )
 
-# Above this condition number the cameras hardly determine the metric. Rotations by
-# about five degrees have it.
+# Above this condition number the cameras hardly determine the metric. It is that of
+# rotations by about five degrees.
 LARGEST_CONDITION = 50.0
 
 
 def usable_cameras(motion: ArrayLike, least: int = 1) -> tuple[NDArray, NDArray]:
-    """Return cameras (I, 2, 3), and a mask of the at least `least` not NaN or zero."""
+    """Return cameras (I, 2, 3) and the mask of usable ones, at least `least`."""
     cameras = np.asarray(motion, dtype=np.float64)
     if cameras.ndim != 3 or cameras.shape[1:] != (2, 3) or len(cameras) < least:
         raise ValueError(
@@ -100,7 +100,7 @@ def of_all_frames(values: NDArray, usable: NDArray) -> NDArray:
 
 
 def warn_if_degenerate(condition_number: float) -> None:
-    """Warn where the cameras hardly determine the metric."""
+    """Warn if the cameras hardly determine the metric."""
     if condition_number > LARGEST_CONDITION:
         warn_caller(
             f"the cameras hardly determine the metric of space: its condition number "

@@ -5,7 +5,7 @@ The cameras and the subspaces are fixed. For each subspace k the cost
     sum_i ||M_ik - alpha_ik M_0^i E_k||_F^2
 
 is minimised over alpha and the 3x3 matrix E (Brandt et al. 2018, section 3.5). With the
-best alpha put in, that is to maximise the explained energy
+optimal alpha, this is equivalent to maximising the explained energy
 
     f(E) = sum_i <M_ik, M_0^i E>^2 / ||M_0^i E||^2
 
@@ -24,7 +24,7 @@ def refine_alternating(
 ) -> tuple[NDArray, NDArray, int, bool]:
     """Return the blocks that explain most of the motion, each from several starts.
 
-    Of the starts (n_blocks, n_starts, 3, 3) the best one after six steps is used. A
+    From the starts (n_blocks, n_starts, 3, 3), the best one after six steps is used. A
     block has converged when a step gains less than `tol` of its energy.
 
     Returns the blocks E (n_blocks, 3, 3) of unit norm and arbitrary sign, ``M_ik ~

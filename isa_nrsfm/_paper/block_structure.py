@@ -55,9 +55,9 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
     Return D_k (n_blocks, 3, 3) that maps the motion of subspaces to the rigid motion.
 
     D_k and alpha_k make ``sum_i ||M_ik D_k - alpha_ik M_0^i||_F^2`` small. With the
-    best alpha_k put in, this is a quadratic form in vec(D_k). The methods
-    `BLOCK_RECOVERIES` differ in how they exclude ``D_k = 0``. Norm one, arbitrary sign;
-    zero without motion.
+    optimal alpha_k, this is a quadratic form in vec(D_k). The methods
+    `BLOCK_RECOVERIES` differ in how they exclude ``D_k = 0``. D_k has norm one and
+    arbitrary sign, and is zero for a subspace without motion.
     """
     energy = products.rigid_energies()
     blocks = products.blocks()
@@ -74,9 +74,9 @@ def recover_blocks(products: MotionProducts, method: str) -> NDArray:
             # subspace hardly moves.
             d = eigh(moved - _explained(m, energy))[1][:, 0]
         elif method == "irls" and m[0].any():
-            # As published: alpha of the first frame is held, D solves the linear least
-            # squares, the held alpha is divided by the norm of D (appendix A). D is
-            # proportional to the held alpha, so one step ends the iteration.
+            # As published (appendix A): with alpha of the first frame fixed, D solves a
+            # linear least squares problem, and alpha is divided by the norm of D. D is
+            # proportional to the fixed alpha, so the iteration ends after one step.
             d = np.linalg.lstsq(moved - _explained(m[1:], energy[1:]), m[0])[0]
         else:
             # The largest share of the motion M_k D that the rigid motion explains,

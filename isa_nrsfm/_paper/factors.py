@@ -18,7 +18,7 @@ from isa_nrsfm._paper.svd import Triplets, leading_triplets
 class Factorisation(NamedTuple):
     """Rigid and non-rigid part of W, ``W ~ M_0 B_0 + M' B'`` of rank 3K + 3.
 
-    rigid_motion (2I, 3): M_0, two rows a frame; its columns are orthogonal. rigid_shape
+    rigid_motion (2I, 3): M_0, two rows per frame; columns are orthogonal. rigid_shape
     (3, J): B_0, centred and white: ``B_0 B_0^T = n_points I``. Rows are zero where W
     has a rank below 3. motion (2I, n_signals): M', by decreasing column norm. signals
     (n_signals, J): B', centred and white, orthogonal to B_0. `n_signals` is 3K, or

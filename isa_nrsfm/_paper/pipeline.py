@@ -70,7 +70,7 @@ def run_paper_pipeline(
         )
     report("block structure and refinement")
 
-    # Shapes. Subspaces that W has no rank for stay zero.
+    # Shapes. Subspaces beyond the rank of W stay zero.
     shapes = np.zeros((n_components + 1, 3, n_points))
     shapes[0] = factors.rigid_shape
     shapes[1 : len(E) + 1] = E @ (components @ factors.signals).reshape(len(E), 3, -1)
@@ -84,9 +84,9 @@ def _independent_subspaces(
 ) -> NDArray:
     """Fit a strategy to signals (n_signals, n_points) and return its unmixing matrix.
 
-    A parameter `covariance` of its `fit` gets the covariance over the images, ``C = (J
-    / 2I) M'^T M'`` (Brandt et al. 2018, section 3.3), without their mean, which would
-    depend on the rotation of single images. A parameter `criterion` gets
+    If its `fit` has a parameter `covariance`, this is ``C = (J / 2I) M'^T M'``, the
+    covariance over the images (Brandt et al. 2018, section 3.3). No mean is subtracted,
+    as it would depend on the rotation of single images. A parameter `criterion` is
     `structure_energies`.
     """
     fit_params: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Frames of a large table for the first stages, which only make a start.
+"""A sample of the frames of a large table, for the first stages.
 
 A sample is spread evenly from the most to the least rigid frame, so that the order of
 the frames does not matter.
@@ -36,7 +36,7 @@ def sample_frames(
     """
     Return frames for the first stages, from blocks of complete ones (n, 2, n_points).
 
-    Tables with fewer coordinates than `small_table` are taken whole.
+    If a table has fewer coordinates than `small_table`, all frames are returned.
     """
     n_frames = rows.n_frames
     parts: list[NDArray] = []

@@ -11,7 +11,7 @@ from isa_nrsfm._linalg.small_matrices import energies
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import order_by_halves, spread
 
-# A matrix with more rows and more columns is not factorised as a whole.
+# Larger matrices, with more rows and more columns, are not factorised as a whole.
 DENSE = 1500
 
 
@@ -46,10 +46,10 @@ def block_triplets(
 
     The right singular vectors of a tall matrix are those of its triangular factor,
     joined from those of the blocks (Demmel, Grigori, Hoemmen, Langou,
-    "Communication-optimal parallel and sequential QR and LU factorizations", 2012). Of
+    "Communication-optimal parallel and sequential QR and LU factorizations", 2012). For
     a matrix with many rows and columns, a block Krylov method finds the leading right
-    subspace (Golub, Van Loan, "Matrix computations", 2013, section 10.3.6). Without
-    ``W^T W`` small singular values keep their precision.
+    subspace (Golub, Van Loan, "Matrix computations", 2013, section 10.3.6). As ``W^T
+    W`` is never formed, small singular values keep their precision.
     """
     n_rows, n_columns = shape
     if min(shape) > max(dense, 4 * k):

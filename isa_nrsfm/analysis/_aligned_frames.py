@@ -10,16 +10,16 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
     """
-    Frames moved, scaled and turned in the image to be nearest to their mean.
+    Align frames with their mean by translation, scale and rotation in the image.
 
     Generalised Procrustes analysis in the plane (Gower, "Generalized Procrustes
-    analysis", 1975). PCA of such frames is what coefficients are to be compared with:
-    it sees the same table, but mixes the view with the deformation.
+    analysis", 1975). PCA of aligned frames is a baseline for coefficients. It uses the
+    same table, but mixes the view with the deformation.
 
     Parameters
     ----------
     turn : bool, default=True
-        Whether frames are turned; without it they are centred and scaled.
+        Whether to rotate frames. If False, they are only centred and scaled.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class AlignedFrames(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
 def _unit_points(X: NDArray) -> NDArray:
     """Return frames (n, 2J) as complex numbers (n, J) of mean zero, mean square one."""
     if X.shape[1] % 2:
-        raise ValueError(f"X must have two columns a point; got {X.shape[1]} columns")
+        raise ValueError(f"X must have two columns per point; got {X.shape[1]} columns")
     points = np.ascontiguousarray(X, dtype=float).view(complex)
     points = points - points.mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(np.abs(points) ** 2, axis=1, keepdims=True))

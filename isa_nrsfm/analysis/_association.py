@@ -45,14 +45,15 @@ class Association(NamedTuple):
         between the classes, from 0 to 1. Spearman's rank correlation for numbers, from
         -1 to 1.
     p_value : ndarray of shape (n_components,)
-        Permutation p-values, corrected for the number of coefficients: the share of
-        permutations in which this coefficient, or any weaker one, has at least the
-        observed statistic.
+        Permutation p-values, corrected for the number of coefficients. Each is the
+        share of permutations in which this coefficient, or any weaker one, has at least
+        the observed statistic.
     n_frames : int
         Number of frames with coefficients.
     permuted : str
         The units that were permuted: "frames", "groups", "blocks of 37 frames" or
-        "sequences shifted in time"; with "within groups" where they were.
+        "sequences shifted in time"; with "within groups" if frames were permuted within
+        groups.
     """
 
     kind: str
@@ -133,12 +134,12 @@ def association(
     "Resampling-based multiple testing", 1993): without any association, the probability
     that any of them falls below a level is at most that level.
 
-    Labels that differ between groups and within them are tested as both together. Each
-    part is divided by its mean over the permutations, and the parts are summed.
+    If labels differ both between and within groups, both parts are tested together.
+    Each part is divided by its mean over the permutations, and the parts are summed.
 
-    A block has five times the integrated autocorrelation time of labels and
-    coefficients together. It is measured on the part of the coefficients that labels
-    do not explain, so that frames sorted by their label can be independent.
+    The length of a block is five times the integrated autocorrelation time of labels
+    and coefficients together. This time is estimated from the part of the coefficients
+    that labels do not explain. Frames sorted by their label can thus be independent.
 
     Examples
     --------
@@ -268,7 +269,7 @@ def _step_down_p_values(energies: NDArray) -> NDArray:
     weakest_first = np.argsort(energies[0], kind="stable")
     energies = energies[:, weakest_first]
     largest = np.maximum.accumulate(energies, axis=1)
-    # Rounding: a permutation that changes nothing counts as large.
+    # Tolerance for rounding: equal energies count as large.
     larger = (largest >= energies[0] * (1 - 1e-12)).mean(axis=0)
     p_value = np.empty(len(larger))
     p_value[weakest_first] = np.maximum.accumulate(larger[::-1])[::-1]

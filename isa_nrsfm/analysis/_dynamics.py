@@ -7,12 +7,12 @@ The coefficients x_t of the frames of a sequence follow a first-order autoregres
 With sequences of several people, ``x_t - u`` follows the autoregression: u is an
 intercept of the sequence, drawn from N(0, B). The state of the filter is (x_t, u) then,
 and ``x_1 - u`` has the covariance of all ``x_t - u``. So differences between people are
-no dynamics.
+not taken for dynamics.
 
 A frame is observed through its likelihood as a function of x, a normal density with the
 precision L_t and the information vector h_t. The posterior of a frame by itself, mean
-m_t and covariance C_t, contains the prior N(0, I). Without it there remain ``L_t =
-C_t^-1 - I`` and ``h_t = C_t^-1 m_t``, and zeros for an unseen frame.
+m_t and covariance C_t, contains the prior N(0, I). The likelihood without it has ``L_t
+= C_t^-1 - I`` and ``h_t = C_t^-1 m_t``, and zeros for an unseen frame.
 
 References: Rauch, Tung, Striebel, "Maximum likelihood estimates of linear dynamic
 systems", 1965; Shumway, Stoffer, "An approach to time series smoothing and forecasting
@@ -76,13 +76,13 @@ def smoothed_posterior(
     """Return posterior means and covariances, given all frames of their sequences.
 
     Means (I, K), NaN for frames without a fit, and covariances (I, K, K) of the frames
-    by themselves have the prior N(0, I). They are returned as they came if there are no
-    dynamics. The time scales (K,) or (0,) are ``-1 / log |l|`` of the eigenvalues l of
+    by themselves have the prior N(0, I). If there are no dynamics, they are returned
+    unchanged. The time scales (K,) or (0,) are ``-1 / log |l|`` of the eigenvalues l of
     the transition, the longest first, infinite where |l| >= 1.
     """
     times, numbers = checked_times(time, len(mean)), group_numbers(groups, len(mean))
     sequences, unit = sequences_of(times, numbers, max_gap)
-    # Differences between groups are no dynamics.
+    # Differences between groups are not taken for dynamics.
     intercepts = numbers is not None and bool(numbers.any())
     K, size = mean.shape[1], mean.shape[1] * (1 + intercepts)
     precision, information = observations(mean, covariance)
@@ -122,7 +122,7 @@ def sequences_of(
         if len(falling):
             first, second = rows[falling[0]], rows[falling[0] + 1]
             raise ValueError(
-                f"times must rise from row to row of a group; row {second} has "
+                f"times must increase within a group; row {second} has "
                 f"{time[second]:g} after {time[first]:g} of row {first}"
             )
     differences = np.concatenate([np.diff(time[rows]) for rows in rows_of])
@@ -146,7 +146,7 @@ def observations(mean: NDArray, covariance: NDArray) -> Observations:
     precision, information = np.zeros((n_frames, K, K)), np.zeros((n_frames, K))
     known = np.isfinite(mean).all(axis=1)
     inverse = np.linalg.inv(covariance[known])
-    # A posterior is no wider than its prior: less than zero are rounding errors.
+    # A posterior is no wider than its prior: negative values are rounding errors.
     values, axes = np.linalg.eigh(inverse - np.eye(K))
     scaled = axes * np.maximum(values, 0.0)[:, None]
     precision[known] = scaled @ axes.swapaxes(1, 2)
@@ -211,10 +211,10 @@ def _most_likely(
     tol: float,
     intercepts: bool,
 ) -> Dynamics | None:
-    """Maximise the likelihood from a transition F (K, K), which stays if it is zero."""
+    """Maximise the likelihood from a transition F (K, K). A zero F stays zero."""
     K = len(F)
     moves, one = F.any(), np.eye(K) / (1 + intercepts)
-    # From the state to what follows the autoregression, x_t - u
+    # Map from the state to x_t - u, which follows the autoregression
     relative = np.hstack([np.eye(K), -np.eye(K)][: 1 + intercepts])
     moving = Dynamics(F, one - F @ one @ F.T, one)
     dynamics = _joined(moving, one) if intercepts else moving
@@ -270,8 +270,8 @@ def _shrunk_regression(across: NDArray, early: NDArray, Q: NDArray) -> NDArray:
     Return the transition of greatest posterior density, with a ridge from the evidence.
 
     The rows of ``Q^-1/2 F`` have the prior ``N(0, I / ridge)``. The ridge maximises the
-    evidence; if that is hardly greater than for a transition of zero, this is returned.
-    The moments are ``sum_t E x_t+1 x_t^T`` and ``sum_t E x_t x_t^T``.
+    evidence. If the evidence is hardly greater than for a transition of zero, the
+    result is zero. The moments are ``sum_t E x_t+1 x_t^T`` and ``sum_t E x_t x_t^T``.
     """
     K = len(Q)
     values, axes = np.linalg.eigh(early)
@@ -283,7 +283,7 @@ def _shrunk_regression(across: NDArray, early: NDArray, Q: NDArray) -> NDArray:
         gain = K * np.log1p(values / ridge) - energy / (values + ridge)
         return float(0.5 * gain.sum())
 
-    # One minimum between ridges that are nothing and everything beside the moments
+    # Grid from negligible to dominating ridges, relative to the moments
     grid = np.log(values.max()) + np.linspace(-20.0, 20.0, 81)
     best = min(grid, key=minus_log_evidence)
     if minus_log_evidence(best) > -STRONG_EVIDENCE:

@@ -10,7 +10,7 @@ Kind = Literal["classes", "number"]
 
 
 def kind_of(y: NDArray, kind: str) -> Kind:
-    """Return whether labels (n_frames,) are classes or numbers; refuse useless ones.
+    """Return whether labels (n_frames,) are classes or numbers; refuse unusable ones.
 
     "auto" takes names, truth values and whole numbers for classes, as scikit-learn
     does.
@@ -21,14 +21,14 @@ def kind_of(y: NDArray, kind: str) -> Kind:
     if n_values == 1:
         raise ValueError(f"all {len(y)} labels are {y[0]}: there is nothing to compare")
     if kind == "number" and y.dtype.kind not in "biuf":
-        raise ValueError(f"labels that are numbers are expected; got {str(y[0])!r}")
+        raise ValueError(f"labels must be numbers; got {str(y[0])!r}")
     found: Kind = "classes"
     if kind == "number" or (kind == "auto" and type_of_target(y) == "continuous"):
         found = "number"
     if found == "classes" and n_values == len(y):
         raise ValueError(
             f"the {len(y)} labels are all different, so that no class has two frames; "
-            "for a measure of something say kind='number'"
+            "for a measured quantity use kind='number'"
         )
     return found
 

@@ -1,10 +1,10 @@
 """Permutations of labels among people, and among blocks of dependent frames.
 
-Labels may be exchanged only between units that are exchangeable if nothing goes with
-the labels (Winkler, Webster, Vidaurre, Nichols, Smith, "Multi-level block permutation",
-2015). The means of labels over groups are permuted among the groups. The differences
-from these means are permuted within each group: frame by frame, or in blocks where
-neighbouring frames of a video depend on each other.
+Labels may be permuted only between units that are exchangeable under the null
+hypothesis of no association (Winkler, Webster, Vidaurre, Nichols, Smith, "Multi-level
+block permutation", 2015). The means of labels over groups are permuted among the
+groups. The differences from these means are permuted within each group: frame by frame,
+or in blocks if neighbouring frames of a video depend on each other.
 """
 
 from collections.abc import Iterable, Iterator
@@ -46,7 +46,7 @@ class FrameOrder(NamedTuple):
         return np.asarray(np.add.reduceat(values, self.first) / self.sizes[:, None])
 
     def blocks(self, length: int) -> NDArray:
-        """Number the blocks of so many ordered frames within groups (n_frames,)."""
+        """Number the blocks of `length` ordered frames within groups (n_frames,)."""
         place = np.arange(len(self.rows)) - self.first[self.groups]
         n_blocks = -(-self.sizes // length)
         return np.asarray(
@@ -73,7 +73,7 @@ def dependent_blocks(
     # blocks have p <= .05 (autoregressions of .3 to .98, 150 to 570 frames); the power
     # is larger with 5.
     n_times = 5
-    # Neighbours of one class are alike because of the class: the rest is measured.
+    # Neighbours of one class are alike because of the class: measure the residuals.
     rest = alpha - labels @ np.linalg.lstsq(labels, alpha)[0]
     energy, of_labels = np.sum(rest**2, axis=0), np.sum(labels**2)
     energy[energy <= ROUNDING * np.sum(alpha**2, axis=0)] = np.inf

@@ -1,4 +1,4 @@
-"""Coefficients relative to a person, and how much persons differ."""
+"""Coefficients relative to a person, and their variance between persons."""
 
 from typing import Any, NamedTuple, Self
 
@@ -61,7 +61,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         groups : array-like of shape (n_frames,), default=None
             Group of each frame; None for one group.
         neutral : array-like of bool, shape (n_frames,), default=None
-            Frames whose mean is taken; None for all.
+            Neutral frames, which define the means; None for all.
 
         Returns
         -------
@@ -86,10 +86,10 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         X : array-like of shape (n_frames, n_features)
             Coefficients; NaN where a frame has none.
         groups : array-like of shape (n_frames,), default=None
-            Group of each frame; None for one group. Groups of the fit have the mean
-            that the fit found. Others have that of their frames in X.
+            Group of each frame; None for one group. Groups of the fit keep their fitted
+            mean. For new groups, the mean of their frames in X is used.
         neutral : array-like of bool, shape (n_frames,), default=None
-            Frames of new groups whose mean is taken; None for all.
+            Neutral frames, which define the means of new groups; None for all.
 
         Returns
         -------
@@ -139,7 +139,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         groups : array-like of shape (n_frames,), default=None
             Group of each frame; None for one group.
         neutral : array-like of bool, shape (n_frames,), default=None
-            Frames whose mean is taken; None for all.
+            Neutral frames, which define the means; None for all.
 
         Returns
         -------
@@ -149,7 +149,7 @@ class WithinGroups(OneToOneFeatureMixin, TransformerMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            As `fit`.
+            See `fit`.
 
         Warns
         -----
@@ -204,9 +204,9 @@ def _warn_of_single_frames(names: NDArray) -> None:
     single = np.unique(names, return_counts=True)[1] == 1
     if single.any():
         warn_caller(
-            f"groups with a single frame: {single.sum()} of {len(single)}. Relative to "
-            "itself this frame is zero. Remove these groups, or say which frames are "
-            "neutral"
+            f"groups with a single frame: {single.sum()} of {len(single)}. Their "
+            "differences from the group are zero. Remove these groups, or mark neutral "
+            "frames"
         )
 
 
@@ -219,7 +219,7 @@ class BetweenShare(NamedTuple):
     between : ndarray of shape (n_components,)
         Variance between groups divided by the whole variance, from 0 to 1.
     within : ndarray of shape (n_components,)
-        The rest, that within groups.
+        Variance within groups divided by the whole variance.
     n_groups : int
         Number of groups.
     n_frames : int
@@ -259,10 +259,11 @@ def between_share(alpha: Any, groups: Any) -> BetweenShare:
 
     Notes
     -----
-    The intraclass correlation ICC(1): the variance components of one-way random effects
-    are estimated from the mean squares between and within groups (Searle, Casella,
-    McCulloch, "Variance components", 1992, section 3.6). Random groups have a share of
-    about zero, regardless of the number of frames. Negative estimates are set to zero.
+    The share is the intraclass correlation ICC(1). The variance components of one-way
+    random effects are estimated from the mean squares between and within groups
+    (Searle, Casella, McCulloch, "Variance components", 1992, section 3.6). Random
+    groups have a share of about zero, regardless of the number of frames. Negative
+    estimates are set to zero.
     """
     X = check_array(alpha, dtype=np.float64, input_name="alpha", **CHECKS)
     known = np.isfinite(X).all(axis=1)

@@ -1,25 +1,25 @@
 """From affine to Euclidean space: metric upgrade of cameras and shapes, upright poses.
 
-A factorisation into affine cameras and shapes is known up to one 3x3 affinity of space:
-its lengths and angles mean nothing. If the cameras are known to be orthographic or
-scaled orthographic (weak perspective) ones, as those of objects that are small
-compared with their distance, and with square pixels, the space can be upgraded to one
-with true angles and proportions. ``AffineNRSfM(camera="weak_perspective")`` and
-``"orthographic"`` fit such cameras, and their shapes need no upgrade. For affine ones,
-and cameras of other programs:
+A factorisation into affine cameras and shapes is known up to one 3x3 affinity of space,
+so its lengths and angles have no meaning. If the cameras are known to be orthographic
+or scaled orthographic (weak perspective), the space can be upgraded to true angles and
+proportions. This holds for square pixels and objects that are small compared with their
+distance. ``AffineNRSfM(camera="weak_perspective")`` and ``"orthographic"`` fit such
+cameras, and their shapes need no upgrade. For affine cameras, and for cameras of other
+programs:
 
 - `metric_upgrade` finds the affinity from the cameras, `euclidean_shapes` applies it;
 - `deformation_metric` and `euclidean_frames` do the same for shapes that deform. They
   also recover the part of the deformation that affine cameras absorb;
 - `orthonormal_cameras` finds orthographic cameras directly in the motion factor of a
-  deforming shape, mixtures of as many of its columns as it takes;
-- `canonical_pose` turns a shape upright and frontal, and `view_angles` says by how much
-  each frame is turned.
+  deforming shape, as mixtures of its columns;
+- `canonical_pose` turns a shape upright and frontal, and `view_angles` returns yaw,
+  pitch and roll of each frame.
 
 In the image x points right and y points down; in space z points away from the camera,
-so that ``R`` with rows x, y and z is a rotation. What stays unknown is the unit of
-length, the coordinate axes, and whether the depth has the right sign: the mirror image
-of everything, ``z -> -z``, has the same images.
+so that ``R`` with rows x, y and z is a rotation. The unit of length, the coordinate
+axes and the sign of the depth remain unknown: the mirror image, ``z -> -z``, has the
+same images.
 """
 
 from isa_nrsfm._metric_upgrade.deforming import (

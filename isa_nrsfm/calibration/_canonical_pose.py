@@ -21,8 +21,8 @@ class CanonicalPose(NamedTuple):
         away from the viewer, who looks along z.
     rotation : ndarray of shape (3, 3)
         An orthogonal matrix, with determinant -1 if the shape is mirrored and +1
-        otherwise. Everything else that lives in the space of the shape follows by it:
-        basis shapes as the shape does, and cameras M become ``M @ rotation.T``.
+        otherwise. Transform other arrays in the same space by it: basis shapes like the
+        shape, and cameras M to ``M @ rotation.T``.
     mirrored : bool
         Whether the shape is the mirror image of the given one.
     """
@@ -41,32 +41,32 @@ def canonical_pose(
     scheme: Skeleton | str | None = None,
 ) -> CanonicalPose:
     """
-    Turn a shape upright and frontal, as the image of a passport shows it.
+    Turn a shape upright and frontal, as in a passport photo.
 
-    Directions that are given in terms of points of the object make this independent of
-    the cameras. Angles have to be true: in the coordinates of `AffineNRSfM` they are
-    not, `euclidean_shapes` has to come first.
+    If directions are given by points of the object, the pose does not depend on the
+    cameras. Shapes must have true angles. Apply `euclidean_shapes` first to shapes of
+    affine cameras.
 
     Parameters
     ----------
     shape : array-like of shape (n_points, 3)
         The shape, such as a mean shape in Euclidean coordinates.
     left_right : array-like of int, shape (n_pairs, 2), default=None
-        Pairs of points, the first of which the viewer sees on the left and the second
-        on the right: the right eye of a person comes before the left one. The x axis is
-        the principal axis of their differences.
+        Pairs of points: the first is on the left for the viewer, the second on the
+        right. The right eye of a person comes before the left one. The x axis is the
+        principal axis of their differences.
     up : array-like, default=None
         A direction (3,) in the coordinates of the shape, or pairs of points (n_pairs,
-        2), a lower one and one above it, whose mean difference is the direction. An
-        upright shape has it opposite to the y axis, orthogonal to x.
+        2), the lower one first. The mean difference of pairs is the direction. In an
+        upright shape it is opposite to the y axis and orthogonal to x.
     front : array-like, default=None
-        Which way the object faces the viewer: a direction (3,), or pairs of points
-        (n_pairs, 2), one behind and one in front of it, as for `up`. With both
-        `left_right` and `up` it selects the mirror image: if it points away from the
-        viewer, the sign of the depth is changed.
+        Direction from the object to the viewer: a direction (3,), or pairs of points
+        (n_pairs, 2), the one behind first. If `left_right` and `up` are given, it
+        selects the mirror image: if it points away from the viewer, the sign of the
+        depth is changed.
     scheme : Skeleton or str, default=None
-        The layout of the points, or its name in `isa_nrsfm.skeletons.SKELETONS`, which
-        supplies the directions that are not given. For ``"ibug-68"``: all symmetric
+        The layout of the points, or its name in `isa_nrsfm.skeletons.SKELETONS`. It
+        defines the directions that are not given. For ``"ibug-68"``: all symmetric
         points as `left_right`, from the chin to the root of the nose as `up`, and from
         the ends of the jaw to the tip of the nose as `front`. Hands define only `up`:
         the side that faces the viewer stays the same.
@@ -87,13 +87,13 @@ def canonical_pose(
     Notes
     -----
     Two of the three directions determine the rotation, with x before y before z where
-    they are not orthogonal. Without any, the axes become the principal axes of the
-    points, each the one that is nearest to it already: what is upright up to some
-    tens of degrees stays so.
+    they are not orthogonal. If none is given, each axis becomes the nearest principal
+    axis of the points. A shape that is upright up to some tens of degrees stays
+    upright.
 
-    Affine cameras do not distinguish a shape from its mirror image in depth. Nothing is
-    mirrored here unless all three directions are given and contradict each other. Note
-    that pairs of points with left and right confused do so as well.
+    Affine cameras do not distinguish a shape from its mirror image in depth. The shape
+    is mirrored only if all three directions are given and contradict each other. They
+    also do so if left and right are confused in the pairs of points.
 
     Examples
     --------
@@ -164,7 +164,7 @@ def _frame(axes: list[NDArray | None]) -> NDArray:
 
 
 def _principal_axes(points: NDArray) -> NDArray:
-    """Return the principal axes as a rotation, each near to where it is now."""
+    """Return the principal axes as a rotation, each nearest to its coordinate axis."""
     centred = points - points.mean(axis=0)
     axes = np.linalg.eigh(centred.T @ centred)[1].T
     chosen, places = linear_sum_assignment(np.abs(axes), maximize=True)
@@ -187,7 +187,7 @@ def _principal_direction(points: NDArray, pairs: ArrayLike) -> NDArray:
 
 
 def _direction(name: str, points: NDArray, given: ArrayLike) -> NDArray:
-    """Return the unit vector that is given as it is or by pairs of points."""
+    """Return the unit vector of a direction, given itself or by pairs of points."""
     vector = np.asarray(given)
     if vector.shape == (3,):
         vector = vector.astype(np.float64)

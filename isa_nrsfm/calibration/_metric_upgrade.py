@@ -25,15 +25,15 @@ class MetricUpgrade(NamedTuple):
     ----------
     Q : ndarray of shape (3, 3)
         ``motion_i @ Q`` is nearly ``scales_i * rotations_i[:2]``. Symmetric and
-        positive definite: of all matrices ``Q O`` with O orthogonal, which fit as well,
-        the one that leaves the coordinate axes as near as possible to where they are,
-        and does not change the handedness of the space. The root mean square of the
-        scales is one, so that Euclidean shapes are in units of the images.
+        positive definite: all matrices ``Q O`` with O orthogonal fit equally well, and
+        this one changes the coordinate axes least. It preserves the handedness of the
+        space. The root mean square of the scales is one, so Euclidean shapes are in
+        units of the images.
     rotations : ndarray of shape (n_frames, 3, 3)
         Rotations, of determinant one: the rows are the axes of the image, x, y and z.
         NaN for frames without camera.
     scales : ndarray of shape (n_frames,)
-        Scales of the cameras, not negative; all equal to one for orthographic cameras.
+        Non-negative scales of the cameras; all equal to one for orthographic cameras.
         NaN for frames without camera.
     residual : float
         Deviation from Euclidean cameras, zero for perfect ones. For weak-perspective
@@ -41,7 +41,7 @@ class MetricUpgrade(NamedTuple):
         s2^2)``, with the singular values s1 and s2 of ``motion_i @ Q``. For
         orthographic ones it is that of ``||M_i Q Q^T M_i^T - I||_F``.
     condition_number : float
-        Largest over smallest amplification of errors of the cameras, over the
+        Ratio of the largest to the smallest amplification of camera errors, over all
         directions of space. It is about one for cameras all round the object, 2.5 for a
         full turn about an axis in the image, 4 for rotations of about 20 degrees, 14
         for 10, and 54 for 5. It is about twice as large for rotations about one axis,
@@ -57,7 +57,7 @@ class MetricUpgrade(NamedTuple):
 
     def mirrored(self) -> Self:
         """
-        Return the other upgrade, which fits as well: that to the mirror image.
+        Return the upgrade to the mirror image, which fits equally well.
 
         Returns
         -------
@@ -83,12 +83,12 @@ def metric_upgrade(
     Parameters
     ----------
     motion : array-like of shape (n_frames, 2, 3)
-        Affine cameras, such as `AffineNRSfM.motion_`. Those that are zero or NaN are
-        left out.
+        Affine cameras, such as `AffineNRSfM.motion_`. Cameras that are zero or NaN are
+        ignored.
     camera : {"weak_perspective", "orthographic"}, default="weak_perspective"
-        Whether each camera has a scale of its own or all have the same. Only cameras of
-        a rigid shape can have a common scale: for a shape that deforms, scales are a
-        matter of convention.
+        Whether each camera has its own scale or all have the same scale. Only cameras
+        of a rigid shape can have a common scale. For a deforming shape, scales are a
+        convention.
 
     Returns
     -------
@@ -100,29 +100,29 @@ def metric_upgrade(
     Raises
     ------
     ValueError
-        If `motion` is not of the shape above, has infinite entries, if `camera` is
-        none of the two, or if the cameras together see less than three directions of
-        space.
+        If `motion` is not of the shape above or has infinite entries, if `camera` is
+        not one of the two, or if the cameras together see fewer than three directions
+        of space.
 
     Warns
     -----
     UserWarning
         If the condition number is above 50: the cameras turn too little, or there are
-        too few, to say how deep the object is.
+        too few, to determine the depth.
 
     See Also
     --------
-    euclidean_shapes : Take shapes to the new coordinates.
+    euclidean_shapes : Transform shapes to the new coordinates.
     deformation_metric : The same for a shape that deforms.
 
     Notes
     -----
     ``G = Q Q^T`` solves ``M_i G M_i^T = s_i^2 I``, equations that are linear in G
-    (Tomasi, Kanade 1992; Poelman, Kanade 1997). If there is no exact solution, that of
-    least squares minimises an algebraic error, and may not be positive definite. It is
-    only a start for the minimisation of the sum of squares of `residual` over positive
-    definite matrices. A second start is the metric in which the cameras see all
-    directions alike. The better of the two results is taken.
+    (Tomasi, Kanade 1992; Poelman, Kanade 1997). If there is no exact solution, the
+    least squares solution minimises an algebraic error and may not be positive
+    definite. It is only a start for the minimisation of the sum of squares of
+    `residual` over positive definite matrices. A second start is the metric in which
+    the cameras see all directions alike. The better of the two results is taken.
 
     References
     ----------
@@ -143,8 +143,8 @@ def metric_upgrade(
     >>> upgrade.residual < 1e-10, round(upgrade.condition_number, 1)
     (True, 3.8)
 
-    The face has true proportions again: distances between its points are those of the
-    truth up to one factor.
+    The face has true proportions again: distances between its points are correct up to
+    one factor.
 
     >>> affine = faces.mean_shape @ np.linalg.inv(affinity).T
     >>> shape = euclidean_shapes(affine, upgrade.Q)
@@ -169,7 +169,7 @@ def metric_upgrade(
 
 def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
     """
-    Take shapes to the coordinates in which the cameras are Euclidean ones.
+    Transform shapes to the coordinates in which the cameras are Euclidean.
 
     Parameters
     ----------
@@ -178,13 +178,13 @@ def euclidean_shapes(shapes: ArrayLike, Q: ArrayLike) -> NDArray[np.float64]:
         shapes of frames (n_frames, n_points, 3), in the coordinates of the affine
         cameras.
     Q : array-like of shape (3, 3)
-        Of `metric_upgrade`.
+        The matrix Q of `metric_upgrade`.
 
     Returns
     -------
     ndarray of shape (..., n_points, 3)
-        ``Q^-1 b`` for each point b. Cameras go with ``M Q``, so that the images stay
-        what they are.
+        ``Q^-1 b`` for each point b. Cameras become ``M Q``, so that the images do not
+        change.
 
     Raises
     ------

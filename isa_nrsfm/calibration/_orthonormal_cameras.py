@@ -60,7 +60,7 @@ def orthonormal_cameras(
         Variance of the errors of the entries of P. It is that of the entries of W if P
         is its left singular vectors times its singular values.
     max_iter : int, default=2000
-        The most steps for each number of columns.
+        Maximum number of steps for each number of columns.
 
     Returns
     -------
@@ -111,7 +111,7 @@ def orthonormal_cameras(
     P = check_array(motion, dtype=np.float64, input_name="motion", ensure_min_samples=2)
     if len(P) % 2:
         raise ValueError(
-            f"motion must have two rows a frame, an even number; got {len(P)} rows"
+            f"motion must have two rows per frame, an even number; got {len(P)} rows"
         )
     if not noise_variance >= 0:
         raise ValueError(f"noise_variance must not be negative; got {noise_variance}")

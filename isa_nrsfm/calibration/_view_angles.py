@@ -34,8 +34,8 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
     ----------
     rotations : array-like of shape (n_frames, 3, 3)
         Rotations R of a space in which x points to the viewer's right, y down and z
-        away from the viewer, as `canonical_pose` has it. The rows of R see the object:
-        a frontal object has the identity. NaN for frames without one.
+        away from the viewer, as in `canonical_pose`. The rows of R are the axes of the
+        image: a frontal object has the identity. NaN for frames without one.
 
     Returns
     -------
@@ -47,12 +47,12 @@ def view_angles(rotations: ArrayLike) -> ViewAngles:
     Raises
     ------
     ValueError
-        If these are not rotations: orthogonal with determinant one, to 1e-6.
+        If the matrices are not orthogonal with determinant one, up to 1e-6.
 
     Notes
     -----
-    An object that looks straight up or down (pitch 90 or -90) has no yaw of its own:
-    yaw and roll then describe the same turn.
+    An object that looks straight up or down (pitch 90 or -90) has no unique yaw: yaw
+    and roll then describe the same rotation.
 
     Examples
     --------
@@ -93,8 +93,8 @@ def angle_deviations(angles: ViewAngles, covariance: ArrayLike) -> ViewAngles:
     angles : ViewAngles
         The angles of rotations R.
     covariance : array-like of shape (n_frames, 3, 3)
-        Covariances, in radians squared, of the rotation vectors w by which the
-        rotations may be off, ``R exp(hat(w))``: w is in the axes of the object. See
+        Covariances, in radians squared, of the rotation vectors w of the errors, ``R
+        exp(hat(w))``. The vectors w are in the axes of the object. See
         `AffineNRSfM.rotation_covariance`, rotated to these axes.
 
     Returns

@@ -1,4 +1,4 @@
-"""The parts of a shape that are drawn: triangles, edges or only points."""
+"""Choice of the drawn parts of a shape: triangles, edges or only points."""
 
 from typing import Any
 

@@ -64,7 +64,7 @@ def write_glb(
     Write the mean shape with the basis shapes as morph targets to a glTF 2.0 file.
 
     The weight of a morph target is the coefficient: with the weights ``alpha_[i]`` the
-    shape is that of frame i. An animation swings them one after the other.
+    shape is that of frame i. An animation plays the morph targets one after the other.
 
     Parameters
     ----------
@@ -73,12 +73,12 @@ def write_glb(
     path : str or path-like
         The file, with the suffix ``.glb``. An existing file is replaced.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
-        What is drawn beside the points: a layout of `isa_nrsfm.skeletons` or its name,
-        whose left and right are primitives with colours of their own; integers of shape
-        (n_edges, 2), pairs of points to be joined; or (n_triangles, 3), the triangles
-        of a surface, counter-clockwise as seen from outside; or None for nothing.
-        "auto" is the layout of hands and bodies, if one is known by the names or the
-        number and order of the points, and otherwise a surface of the Delaunay
+        Parts to draw in addition to the points: a layout of `isa_nrsfm.skeletons` or
+        its name, with left and right as separate primitives and colours; integers of
+        shape (n_edges, 2), pairs of points to be joined; or (n_triangles, 3), the
+        triangles of a surface, counter-clockwise as seen from outside; or None for
+        nothing. "auto" is the layout of hands and bodies, if one is known by the names
+        or the number and order of the points, and otherwise a surface of the Delaunay
         triangles of the front view, on which the layout of a face is drawn. More than
         400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
@@ -89,16 +89,16 @@ def write_glb(
         model with calibrated cameras has Euclidean shapes.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
-        for a y that points up. "auto" is "lower" where a face or a body would stand on
-        its head otherwise.
+        for a y that points up. "auto" is "lower" if a face or a body would otherwise be
+        upside down.
     mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table as well. Faces
-        and bodies of known layouts have the right depth without.
+        Whether to take the mirror image in depth, which fits the table equally well. By
+        default, faces and bodies of known layouts have the right depth.
 
     Raises
     ------
     ValueError
-        If the model has kept no frames, if the cameras see less than three directions
+        If the model has kept no frames, if the cameras see fewer than three directions
         of space, if a parameter is not of the kind given above, or the points have no
         triangles in the front view.
     OSError
@@ -115,10 +115,10 @@ def write_glb(
 
     Notes
     -----
-    As glTF wants it, y points up and z to the viewer. The largest extent of the mean
-    shape is one unit, since the true size is not known; ``extras`` of the mesh has the
-    names of the points and by what the shapes were multiplied. Euclidean basis shapes
-    of affine cameras are the least squares fit to the shapes of the frames; those of
+    As required by glTF, y points up and z to the viewer. The true size is unknown, so
+    the largest extent of the mean shape is one unit. ``extras`` of the mesh has the
+    names of the points and the scale factor of the shapes. Euclidean basis shapes of
+    affine cameras are the least squares fit to the shapes of the frames; those of
     calibrated cameras are the model's.
     """
     suffix_of(path, [".glb"])
@@ -194,7 +194,7 @@ class Binary:
         """
         kind, dtype = FLOATS, "<f4"
         if array.dtype.kind in "iu":
-            # Shorts have no index 65535: it means something else.
+            # For short integers the index 65535 is reserved.
             short = array.max(initial=0) < 65535
             kind, dtype = (SHORTS, "<u2") if short else (INTEGERS, "<u4")
         array = array.astype(dtype)
@@ -260,7 +260,8 @@ def _primitives(
     if surface is not None:
         indices = file.add(surface.ravel(), INDICES)
         normals = vertex_normals(mean, surface)
-        # Normals add up with the weights; what one standard deviation does to them.
+        # Viewers add normals with the weights: store their change by one standard
+        # deviation.
         turns = [vertex_normals(mean + drift, surface) - normals for drift in basis]
         parts = [
             part | {"NORMAL": file.add(normal, VERTICES)}
@@ -291,7 +292,7 @@ def _swings(n_components: int) -> tuple[NDArray, NDArray]:
     """Return times (n,) and weights (n, n_components) of swings one after the other."""
     phase = np.linspace(0, 1, 17)[1:]
     swing = 2.0 * np.sin(2 * np.pi * phase)  # standard deviations
-    # Exactly at rest where the next one begins.
+    # Weights are exactly zero at the start of the next swing.
     swing[-1] = 0.0
     weights = np.kron(np.eye(n_components), swing[:, None])
     times = (np.arange(n_components)[:, None] + phase).ravel()

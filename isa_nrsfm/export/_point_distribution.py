@@ -24,7 +24,7 @@ from isa_nrsfm.plotting._edges import Origin
 SUFFIXES = (".txt", ".mat", ".npz")
 COMMENTS = (
     "The mean values of the components: x, y and z of all points",
-    "The principal components (eigenvectors), one a column",
+    "The principal components (eigenvectors), one per column",
     "The variances of the components (eigenvalues)",
 )
 
@@ -58,8 +58,8 @@ class PointDistributionModel(NamedTuple):
         Parameters
         ----------
         factor : float
-            By how much the numbers grow: for millimetres, a distance on the object in
-            millimetres over the same distance on `mean`.
+            Scale factor of the lengths. For millimetres, a distance on the object in
+            millimetres divided by the same distance on `mean`.
 
         Returns
         -------
@@ -96,20 +96,20 @@ def point_distribution_model(
     model : AffineNRSfM
         A fitted model that has kept its frames.
     n_modes : int, float or None, default=None
-        Number of modes, or a share of the variance, between 0 and 1, of which as few
-        modes are taken as have it. None takes as many as there are basis shapes.
+        Number of modes. If between 0 and 1, the smallest number of modes whose share of
+        the variance reaches it. If None, the number of basis shapes.
     camera : {"weak_perspective", None}, default="weak_perspective"
-        Camera model for a model with affine cameras. "weak_perspective"
-        takes the Euclidean shapes of the frames, as `AffineNRSfM.reconstruct` has them,
-        aligned by rotations and scales. None takes the affine shapes as they are. A
-        model with calibrated cameras has Euclidean shapes, which are aligned likewise.
+        Camera model for a model with affine cameras. "weak_perspective" takes the
+        Euclidean shapes of the frames, as from `AffineNRSfM.reconstruct`, aligned by
+        rotations and scales. None takes the affine shapes unchanged. A model with
+        calibrated cameras has Euclidean shapes, which are aligned in the same way.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
-        for a y that points up. "auto" is "lower" where 68 points of a face would stand
-        on their head otherwise.
+        for a y that points up. "auto" is "lower" if 68 points of a face would otherwise
+        be upside down.
     mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table as well. Faces
-        of 68 points in the order of iBUG have the right depth without.
+        Whether to take the mirror image in depth, which fits the table equally well. By
+        default, faces of 68 points in the order of iBUG have the right depth.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def point_distribution_model(
     Raises
     ------
     ValueError
-        If the model has kept no frames, if the cameras see less than three directions
+        If the model has kept no frames, if the cameras see fewer than three directions
         of space, if a parameter is not of the kind given above, or if the shapes have
         fewer principal axes than `n_modes`.
 
@@ -131,7 +131,7 @@ def point_distribution_model(
 
     See Also
     --------
-    write_pdm : Write it to a file, for OpenFace among others.
+    write_pdm : Write the model to a file, for example for OpenFace.
 
     Notes
     -----
@@ -187,20 +187,20 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     Raises
     ------
     ValueError
-        If the suffix is another one, or the arrays do not fit each other.
+        If the suffix is another one, or the shapes of the arrays are inconsistent.
     OSError
         If the file cannot be written.
 
     See Also
     --------
-    read_pdm : Read it again.
+    read_pdm : Read such a file.
 
     Notes
     -----
     The text has three matrices: mean (3n x 1), principal components (3n x m) and
-    variances (1 x m), with the x of all n points first, then y, then z. Each has lines
-    of comment that begin with ``#``, its numbers of rows and columns, the number 6 (for
-    doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
+    variances (1 x m), with the x of all n points first, then y, then z. Each has
+    comment lines that begin with ``#``, its numbers of rows and columns, the number 6
+    (for doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
     suffix = suffix_of(path, SUFFIXES)
     mean, modes, eigenvalues = map(np.asarray, pdm)
@@ -233,14 +233,14 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
     Returns
     -------
     PointDistributionModel
-        Named tuple of mean, modes and eigenvalues. What may follow them in a text, as
-        modes of expressions alone, is not read.
+        Named tuple of mean, modes and eigenvalues. Further matrices in a text file,
+        such as modes of expressions alone, are ignored.
 
     Raises
     ------
     ValueError
-        If the suffix is none of ``.txt``, ``.mat`` and ``.npz``, or the file does not
-        have the three matrices, of finite numbers and shapes that fit each other.
+        If the suffix is not ``.txt``, ``.mat`` or ``.npz``, or if the file does not
+        have three finite matrices of consistent shapes.
     OSError
         If the file cannot be opened.
 
@@ -250,7 +250,8 @@ def read_pdm(path: str | os.PathLike[str]) -> PointDistributionModel:
 
     Notes
     -----
-    SciPy reads ``.mat`` files. Damaged ones can end Python: of strangers, take a text.
+    SciPy reads ``.mat`` files. Damaged ``.mat`` files can crash Python. Use text files
+    if you do not trust the source.
     """
     suffix = suffix_of(path, SUFFIXES)
     with reading(path, "a point distribution model"):

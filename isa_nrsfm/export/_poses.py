@@ -35,8 +35,8 @@ class FramePoses(NamedTuple):
     scale : ndarray of shape (n_frames,)
         Pixels, or units of the table, per unit of the shapes.
     yaw_std : ndarray of shape (n_frames,)
-        Posterior standard deviation of yaw in degrees. Like the others NaN without a
-        table, and for models with affine cameras: these have no rotations of their own.
+        Posterior standard deviation of yaw in degrees. NaN without a table `X`, and for
+        models with affine cameras, which have no rotations.
     pitch_std : ndarray of shape (n_frames,)
         That of pitch.
     roll_std : ndarray of shape (n_frames,)
@@ -64,8 +64,9 @@ def frame_poses(
     """
     Return yaw, pitch and roll of the object in each frame.
 
-    The angles are those of an upright, frontal object, where its layout is known
-    (`isa_nrsfm.skeletons`); of other objects, those of the view of the mean camera.
+    If the layout of the points is known (`isa_nrsfm.skeletons`), angles are relative to
+    an upright, frontal object. Otherwise they are relative to the view of the mean
+    camera.
 
     Parameters
     ----------
@@ -96,8 +97,7 @@ def frame_poses(
     Warns
     -----
     UserWarning
-        If the fitted table does not determine the depth, and so the angles, which are
-        NaN then.
+        If the fitted table does not determine the depth. The angles are then NaN.
 
     Examples
     --------
@@ -151,7 +151,7 @@ def point_distances(
         A table with the points of the fitted one. By default the fitted table.
     unit : (int or str, int or str), default=None
         Two points whose distance in the mean shape is `length`. By default the outer
-        corners of the eyes where the points are 68 in the order of iBUG.
+        corners of the eyes, if the points are the 68 of a face in the order of iBUG.
     length : float, default=1.0
         Their distance, for instance 90 for millimetres.
     camera : {"weak_perspective"}, default="weak_perspective"
@@ -166,7 +166,8 @@ def point_distances(
     ------
     ValueError
         If there is no such point, if `length` is not positive, if `unit` is not given
-        and the points are not those of a face, or if `frame_poses` raises it.
+        and the points are not those of a face, or for the reasons given in
+        `frame_poses`.
 
     Examples
     --------

@@ -24,7 +24,7 @@ class ShapeArrays(NamedTuple):
     Attributes
     ----------
     mean_shape : ndarray of shape (n_points, 3)
-        Mean shape, in the space of the cameras; Euclidean where these are calibrated.
+        Mean shape, in the space of the cameras; Euclidean if these are calibrated.
     basis : ndarray of shape (n_components, n_points, 3)
         Basis shapes, for one standard deviation of their coefficients.
     alpha : ndarray of shape (n_frames, n_components)
@@ -78,7 +78,7 @@ def shape_arrays(model: Any) -> ShapeArrays:
 
     See Also
     --------
-    write_shapes : Write them to a file.
+    write_shapes : Write these arrays to a file.
     """
     check_class(model, "model")
     check_is_fitted(model)

@@ -2,7 +2,7 @@
 
 In that space x points right, y down and z away from the viewer, who sees the object
 from the front. Its lengths and angles are Euclidean as far as the cameras of the fitted
-table determine them. Shapes of calibrated cameras are only turned.
+table determine them. Shapes of calibrated cameras are only rotated.
 """
 
 from typing import Any, Literal, NamedTuple
@@ -138,8 +138,8 @@ def upright_basis(
 ) -> tuple[NDArray, NDArray]:
     """Return the mean shape and the basis shapes in the upright space.
 
-    Euclidean shapes of affine cameras are not exactly linear in the coefficients: these
-    are the least squares fit to the frames of the table, computed in blocks.
+    Euclidean shapes of affine cameras are not exactly linear in the coefficients. For
+    these, the result is a least squares fit to the frames of the table, in blocks.
     """
     if space.metric is None:
         return model.mean_shape_ @ space.transform.T, model.basis_ @ space.transform.T

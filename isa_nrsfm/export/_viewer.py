@@ -1,4 +1,4 @@
-"""A page that shows a shape model in any browser, without anything else."""
+"""A self-contained page that shows a shape model in any browser."""
 
 import base64
 import hashlib
@@ -54,12 +54,12 @@ def write_viewer(
     mirrored: bool = False,
 ) -> None:
     """
-    Write a page on which anybody can look at a shape model, in a browser.
+    Write a page that shows a shape model in any browser.
 
     The page is one file that needs no network and no other program. It shows the mean
-    shape in 3D with a slider for each basis shape, plays the frames of a table, with or
-    without their cameras, and has a plane of two coefficients in which a click shows a
-    frame.
+    shape in 3D with a slider for each basis shape. It plays the frames of a table, with
+    or without their cameras. In a scatter plot of two coefficients, click on a frame to
+    show it.
 
     Parameters
     ----------
@@ -69,22 +69,22 @@ def write_viewer(
         The file, with the suffix ``.html``. An existing file is replaced.
     X : array-like of shape (n_rows, 2 * n_points), default=None
         The table whose frames are shown; by default the one that the model was fitted
-        to. The page calls frames by their number, from 0, or by the index of a pandas
+        to. Frames are named by their number, from 0, or by the index of a pandas
         DataFrame.
     labels : array-like of shape (n_rows,), default=None
         Labels of the rows of the table, text or numbers, at most 30 different ones.
-        Frames have colours by them. None and NaN are rows without a label.
+        They determine the colours of frames. Rows with None or NaN have no label.
     times : array-like of shape (n_rows,), default=None
         Seconds at which the rows were taken, or dates. The page plays them at true
         speed; a row that is not later than the one before follows after the median
         time between rows.
     n_frames : int, default=1000
-        The page has no more frames than this, of rows evenly spread over the table.
+        Maximum number of frames of the page, spread evenly over the table.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
-        What is joined: a layout of `isa_nrsfm.skeletons` or its name, pairs of points
-        (n_edges, 2), or triangles (n_triangles, 3), whose sides are drawn. "auto" is
-        the layout that the points have by their names or by their number and order, if
-        one is known. Left and right of a layout have colours of their own.
+        Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, pairs of points
+        (n_edges, 2), or triangles (n_triangles, 3), whose sides are drawn. "auto"
+        recognises a known layout by the names or by the number and order of the points.
+        A layout has separate colours for left and right.
     names : sequence of str of length n_components, default=None
         Names of the basis shapes; by default alpha_1, alpha_2, ...
     camera : {"weak_perspective", None}, default="weak_perspective"
@@ -94,18 +94,18 @@ def write_viewer(
         determined, the page has a note, and None avoids the warning.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero in the table: "upper" for images, whose y points down, "lower"
-        for a y that points up. "auto" is "lower" where a face or a body would stand on
-        its head otherwise.
+        for a y that points up. "auto" is "lower" if a face or a body would otherwise be
+        upside down.
     mirrored : bool, default=False
-        Whether to take the mirror image in depth, which fits the table as well. The
-        page has a switch for it.
+        Whether to take the mirror image in depth, which fits the table equally well.
+        The page has a switch for it.
 
     Raises
     ------
     ValueError
-        If the model has kept no frames, if the cameras see less than three directions
-        of space, if there is not one label a row, or if a parameter is not of the kind
-        given above.
+        If the model has kept no frames, if the cameras see fewer than three directions
+        of space, if there is not one label per row, or if a parameter is not of the
+        kind given above.
     OSError
         If the file cannot be written.
 
@@ -121,8 +121,8 @@ def write_viewer(
     Notes
     -----
     Euclidean basis shapes of affine cameras are the least squares fit to the shapes of
-    the frames; those of calibrated cameras are the model's. Rows of which too little is
-    seen are not shown; the page has their number.
+    the frames; those of calibrated cameras are the model's. Rows with too few visible
+    points are not shown; the page gives their number.
     """
     suffix_of(path, [".html", ".htm"])
     if not isinstance(cast(Any, n_frames), Integral) or n_frames < 0:
@@ -187,7 +187,7 @@ def _page(content: dict[str, Any]) -> str:
     page = (folder / "viewer.html").read_text(encoding="utf-8")
     script = (folder / "viewer.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    # Nothing in the data can end the element that holds it.
+    # Escape data that would end its HTML element.
     data = json.dumps(content, separators=(",", ":"), allow_nan=False)
     data = data.replace("<", "\\u003c")
     page = page.replace("{{script-hash}}", f"sha256-{digest}", 1)
@@ -201,7 +201,7 @@ def _encoded(array: NDArray, dtype: str) -> str:
 
 
 def _count(n_rows: int, n_chosen: int, n_shown: int) -> str:
-    """Say how many frames the page has."""
+    """Return a text with the number of frames on the page."""
     text = f"{n_chosen} of {n_rows} rows, evenly spread"
     if n_chosen == n_rows:
         text = f"{n_rows} rows"
@@ -217,7 +217,7 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
     values = np.asarray(labels)
     if values.shape != (n_rows,):
         raise ValueError(
-            f"labels must hold {n_rows} labels, one a row; got shape {values.shape}"
+            f"labels must hold {n_rows} labels, one per row; got shape {values.shape}"
         )
     texts, order = [], {}
     for value in values.tolist():

@@ -1,4 +1,4 @@
-"""Independent subspace analysis: strategies that can be used on their own."""
+"""Independent subspace analysis: estimators that can be used separately."""
 
 from isa_nrsfm.isa._density import SqrtDensity
 from isa_nrsfm.isa._fastisa import FastISA

@@ -24,7 +24,7 @@ class BaseSubspaceAnalysis(
     BaseEstimator,
     metaclass=ABCMeta,
 ):
-    """Validation, whitening and projection. A strategy adds `_unmix`."""
+    """Validation, whitening and projection. Subclasses implement `_unmix`."""
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "subspace_size": [Interval(Integral, 1, None, closed="left")],
@@ -34,7 +34,7 @@ class BaseSubspaceAnalysis(
         "random_state": ["random_state"],
     }
 
-    # Threads cost more than they give on matrices of this size.
+    # For matrices of this size, threads take more time than they save.
     @one_blas_thread
     def _fit_signals(self, signals: Any, **fit_params: Any) -> Self:
         """Validate, whiten and unmix signals (n_samples, n_signals)."""
@@ -72,7 +72,7 @@ class BaseSubspaceAnalysis(
         Parameters
         ----------
         signals : array-like of shape (n_samples, n_signals)
-            The signals, one a column.
+            The signals, one per column.
 
         Returns
         -------

@@ -23,13 +23,13 @@ class SqrtDensity(BaseEstimator):
     """
     The heavy-tailed density ``F(u) = -sqrt(u + eps)`` of a subspace's energy u.
 
-    Up to a constant ``F`` is the logarithm of the density of one point of the
-    subspace, and u the squared norm of the point, the sources having unit variance.
+    Up to a constant, ``F`` is the logarithm of the density of a point of the subspace.
+    The energy u is the squared norm of the point. Sources have unit variance.
 
     Parameters
     ----------
     eps : float, default=0.1
-        Smooths the density at the origin; above zero.
+        Smoothing of the density at the origin. Must be positive.
 
     References
     ----------

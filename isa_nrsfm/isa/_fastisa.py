@@ -22,9 +22,9 @@ class FastISA(BaseSubspaceAnalysis):
     """
     Independent subspace analysis by fixed-point iteration from many starts.
 
-    Finds a linear transformation of the signals whose rows fall into groups of
-    `subspace_size` such that the groups are as independent of each other as possible
-    and the sources inside a group share their energy.
+    Finds a linear transformation of the signals into sources. Consecutive groups of
+    `subspace_size` sources are as independent of each other as possible. Inside a
+    group, the energies of the sources depend on each other.
 
     Each start takes a random orthogonal matrix, runs symmetric FastICA with the same
     density (subspaces of size one), groups its rows by greedy swaps and runs FastISA.
@@ -41,38 +41,37 @@ class FastISA(BaseSubspaceAnalysis):
         ``log_density(energy)`` and ``derivatives(energy)``; None is
         ``SqrtDensity(eps=0.1)``.
     max_iter : int, default=500
-        The most steps of each of the two iterations of a start.
+        Maximum number of steps of each of the two iterations of a start.
     tol : float, default=1e-4
-        An iteration has converged when no subspace turns by more than this mean
-        square sine of the principal angles.
+        Tolerance of both iterations: the largest change of a subspace, as the mean
+        squared sine of the principal angles.
     random_state : int, RandomState instance or None, default=None
-        Draws the starts; an int makes the result reproducible.
+        Determines the random starts. Pass an int for reproducible results.
     n_jobs : int or None, default=None
-        Number of joblib workers that share the starts; the result does not depend on
-        it.
+        Number of joblib workers for the starts. The result does not depend on it.
     verbose : int, default=0
-        Above zero, print a line for each batch of starts.
+        If positive, print a line for each batch of starts.
 
     Attributes
     ----------
     components_ : ndarray of shape (n_signals, n_signals)
         Unmixing matrix, whitening included: ``(signals - mean_) @ components_.T`` are
-        the sources, uncorrelated with unit variance; consecutive rows form a
-        subspace. Orthogonal when the signals are white already.
+        the sources. Sources are uncorrelated and have unit variance. Consecutive rows
+        form a subspace. The matrix is orthogonal if the signals are white.
     mean_ : ndarray of shape (n_signals,)
         Mean of the signals.
     log_likelihood_ : float
-        Mean log-likelihood of a sample, up to a constant, of the start that is kept.
+        Mean log-likelihood per sample of the best start, up to a constant.
     log_likelihoods_ : ndarray of shape (n_init,)
         The same for every start.
     n_iter_ : int
-        Steps of the start that is kept, of both iterations together.
+        Number of steps of the best start, in both iterations together.
     n_iters_ : ndarray of int, shape (n_init,)
         The same for every start.
     n_features_in_ : int
         Number of signals.
     feature_names_in_ : ndarray of shape (n_signals,)
-        Names of the signals, where they came in a dataframe with string names.
+        Names of the signals. Defined only if all names are strings.
 
     See Also
     --------
@@ -134,7 +133,7 @@ class FastISA(BaseSubspaceAnalysis):
         Parameters
         ----------
         signals : array-like of shape (n_samples, n_signals)
-            The signals, one a column.
+            The signals, one per column.
         y : None
             Ignored.
 
@@ -158,7 +157,8 @@ class FastISA(BaseSubspaceAnalysis):
         starts = orthogonalise(
             random_state.standard_normal((self.n_init, n_signals, n_signals))
         )
-        # Batches that make numpy's overhead small and whose arrays stay in the cache.
+        # Batches that reduce the overhead of NumPy, with arrays that fit into the
+        # cache.
         batches = [starts[first : first + 16] for first in range(0, self.n_init, 16)]
         n_jobs = min(effective_n_jobs(self.n_jobs), len(batches))
         runs = Parallel(n_jobs=n_jobs, return_as="generator")(
@@ -181,7 +181,7 @@ class FastISA(BaseSubspaceAnalysis):
         if not converged[best]:
             warn_caller(
                 f"FastISA did not converge in max_iter={self.max_iter} steps: its "
-                "best start still moves; increase max_iter or tol",
+                "best start still changes. Increase max_iter or tol",
                 ConvergenceWarning,
             )
         self.log_likelihoods_ = log_likelihoods
@@ -200,8 +200,8 @@ def _run(
     tol: float,
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return unmixing, likelihood, steps and convergence of starts (n_batch, n, n)."""
-    # FastICA: subspaces of size one. Inside a subspace the components may not be
-    # determined, so it does not need to converge further than this.
+    # FastICA: subspaces of size one. Inside a subspace the components may be
+    # undetermined, so a moderate convergence is enough.
     W, n_iter_ica, _ = iterate(
         starts, Z, 1, density, max_iter=max_iter, tol=max(tol, 1e-4)
     )

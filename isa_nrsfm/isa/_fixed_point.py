@@ -53,9 +53,9 @@ def fixed_point_step(
 ) -> NDArray:
     """Return W (n_batch, n, n) after one step of FastISA (Hyvarinen and Koster 2006).
 
-    For each row w of subspace k, with y = w z, that is the orthogonalised ``E[z y
-    g(u_k)] - E[g(u_k) + 2 y^2 g'(u_k)] w``. With a step length (n_batch,) below 1.0 a
-    multiple of w is added, so that each row turns by about this share of the full step.
+    A row w of subspace k, with y = w z, becomes ``E[z y g(u_k)] - E[g(u_k) + 2 y^2
+    g'(u_k)] w``. Then W is orthogonalised. If the step length (n_batch,) is below 1.0,
+    a multiple of w is added. Each row then turns by about this share of the full step.
     The fixed points are the same.
     """
     n_batch, n_signals, n_samples = len(W), *Z.shape
@@ -94,8 +94,8 @@ def iterate(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Repeat `fixed_point_step` on each start until `subspace_change` is below `tol`.
 
-    With few samples the published iteration mostly ends in cycles. The step length of a
-    start that cycles is halved. Returns the last iterates (n_batch, n, n), and for each
+    With few samples the published iteration mostly ends in cycles. If a start cycles,
+    its step length is halved. Returns the last iterates (n_batch, n, n), and for each
     start the number of steps and whether it has converged.
     """
     W = W.copy()

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm.isa._density import SubspaceDensity
 
-# Takes an assignment (n_signals,) of signals to subspaces. Returns the gain of the
-# objective by the swap of any two signals, (n_signals, n_signals), and the size of the
+# Takes an assignment (n_signals,) of signals to subspaces. Returns the gain (n_signals,
+# n_signals) of the objective by a swap of any two signals. Also returns the size of the
 # objective, to which rounding errors are relative.
 Gains = Callable[[NDArray], tuple[NDArray, float]]
 
 
 def swap_until_best(assignment: NDArray, gains: Gains) -> NDArray:
-    """Swap the two signals whose swap gains most, until no swap gains."""
+    """Swap the two signals with the largest gain, until no swap has a gain."""
     assignment = assignment.copy()
     while True:
         gain, size = gains(assignment)
@@ -44,8 +44,8 @@ def covariance_gains(covariance: NDArray) -> Gains:
 
     def gains(assignment: NDArray) -> tuple[NDArray, float]:
         member = assignment[:, None] == np.arange(assignment.max() + 1)
-        # Half the gain by signal a of a swap with b: it then shares energy with the
-        # others of b's subspace (without b), and no more with the others of its own.
+        # Half the gain of signal a in a swap with b. It gains the energy shared with
+        # the subspace of b, without b, and loses that shared with its own subspace.
         with_subspace = energy @ member  # (n_signals, n_subspaces)
         with_b = with_subspace[:, assignment]  # of a with the subspace of b
         minus_own = diagonal - np.diag(with_b)

@@ -31,9 +31,9 @@ class PooledFastICA(BaseSubspaceAnalysis):
     Independent subspace analysis by FastICA and pooling of its components.
 
     The independent components of scikit-learn's FastICA are pooled into groups of
-    `subspace_size` by greedy pairwise swaps, such that a covariance matrix over other
-    data (for landmarks: over the images) becomes as block-diagonal as possible, or
-    without one such that the likelihood of independent subspaces is largest.
+    `subspace_size` by greedy pairwise swaps. If a covariance matrix over other data is
+    given (for landmarks: over the images), the swaps make it as block-diagonal as
+    possible. Otherwise they maximise the likelihood of independent subspaces.
 
     Parameters
     ----------
@@ -41,36 +41,37 @@ class PooledFastICA(BaseSubspaceAnalysis):
         Dimension of each subspace; the number of signals must be a multiple of it.
     n_init : int, default=16
         Number of runs of FastICA from different starts. With few samples the runs end
-        in different places; the best by the criterion of `fit` is kept.
+        in different local optima. The best run by the criterion of `fit` is kept.
     fun : {"exp", "logcosh", "cube"}, default="exp"
         Contrast function of FastICA.
     max_iter : int, default=200
-        The most steps of a run of FastICA.
+        Maximum number of steps of a run of FastICA.
     tol : float, default=1e-4
         Tolerance of FastICA.
     random_state : int, RandomState instance or None, default=None
-        Draws the starts; an int makes the result reproducible.
+        Determines the random starts. Pass an int for reproducible results.
 
     Attributes
     ----------
     components_ : ndarray of shape (n_signals, n_signals)
         Unmixing matrix, whitening included: ``(signals - mean_) @ components_.T`` are
-        the sources, uncorrelated with unit variance; consecutive rows form a
-        subspace. Orthogonal when the signals are white already.
+        the sources. Sources are uncorrelated and have unit variance. Consecutive rows
+        form a subspace. The matrix is orthogonal if the signals are white.
     mean_ : ndarray of shape (n_signals,)
         Mean of the signals.
     criteria_ : ndarray of shape (n_init,)
-        Value of each run by the criterion of `fit`. The run of largest value is kept.
+        Value of the criterion of `fit` for each run. The run with the largest value is
+        kept.
     n_iter_ : int
         Steps of FastICA in the run that is kept.
     n_features_in_ : int
         Number of signals.
     feature_names_in_ : ndarray of shape (n_signals,)
-        Names of the signals, where they came in a dataframe with string names.
+        Names of the signals. Defined only if all names are strings.
 
     See Also
     --------
-    FastISA : Subspaces by a fixed-point iteration of their own.
+    FastISA : Independent subspaces by a fixed-point iteration.
 
     References
     ----------
@@ -125,21 +126,21 @@ class PooledFastICA(BaseSubspaceAnalysis):
         Parameters
         ----------
         signals : array-like of shape (n_samples, n_signals)
-            The signals, one a column.
+            The signals, one per column.
         y : None
             Ignored.
         covariance : array-like of shape (n_signals, n_signals), default=None
-            Symmetric, in the coordinates of the signals: the sources are pooled such
-            that ``components_ @ covariance @ components_.T`` has least energy outside
-            its diagonal blocks. Without it they are pooled by the likelihood of
-            independent subspaces.
+            Symmetric covariance in the coordinates of the signals. The pooling
+            minimises the energy of ``components_ @ covariance @ components_.T`` outside
+            its diagonal blocks. If None, it maximises the likelihood of independent
+            subspaces.
         criterion : callable, default=None
             Takes candidates for subspaces, ndarray of shape (n_candidates,
             subspace_size, n_signals) with rows of `components_`, and returns the value
-            of each, ndarray of shape (n_candidates,). The run with the largest sum
-            over its subspaces is kept, and its components change places between
-            subspaces as long as that raises the sum. None keeps the run that is best
-            by the objective of the pooling, as pooled.
+            of each, ndarray of shape (n_candidates,). The run with the largest sum over
+            its subspaces is kept. Its components are then swapped between subspaces as
+            long as the sum rises. If None, the run with the best objective of the
+            pooling is kept, without further swaps.
 
         Returns
         -------
@@ -150,7 +151,8 @@ class PooledFastICA(BaseSubspaceAnalysis):
         ------
         ValueError
             If the number of signals is not a multiple of `subspace_size`, the signals
-            are linearly dependent, or `covariance` is not a symmetric matrix of theirs.
+            are linearly dependent, or `covariance` is not a symmetric matrix of shape
+            (n_signals, n_signals).
         """
         return self._fit_signals(signals, covariance=covariance, criterion=criterion)
 
@@ -201,7 +203,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
 
     def _fastica(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
         """Return unmixing, steps and convergence of one run on white signals."""
-        # With it come all linear models, for which `transform` need not wait.
+        # This imports all linear models, which `transform` does not need.
         from sklearn.decomposition import FastICA
 
         ica = FastICA(

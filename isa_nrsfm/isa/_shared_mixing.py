@@ -1,4 +1,4 @@
-"""Independent signals whose samples are vectors, all coordinates mixed alike.
+"""Independent component analysis of vectors, with one mixing of all coordinates.
 
 A sample of a signal is a vector of d coordinates. Independent subspace analysis mixes
 all dK coordinates of K signals. Here the same K x K matrix mixes each coordinate: the
@@ -16,8 +16,8 @@ from isa_nrsfm._linalg.small_matrices import orientations
 from isa_nrsfm._tables.ordering import spread
 from isa_nrsfm.isa._fixed_point import orthogonalise
 
-# The densities among which each signal chooses, by their *tail*: degrees of freedom of
-# Student's t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).
+# Candidate densities of each signal, by their *tail*: degrees of freedom of Student's
+# t, or LIGHT for one with lighter tails than a Gaussian, exp(-c ||y||^4).
 LIGHT = 0.0
 TAILS = (LIGHT, 16.0, 8.0, 4.0, 2.0)
 # Each density is multiplied by a Gaussian of this inverse variance. Otherwise the
@@ -29,23 +29,23 @@ def shared_mixing(signals: NDArray, n_starts: int = 8) -> NDArray[np.float64]:
     """
     Return the mixing W, the same for all coordinates, that makes signals independent.
 
-    The signals (n_signals, n_samples, size) are whitened, without removing means. From
-    several orthogonal starts a few steps of FastICA for vectors are taken (Hyvarinen,
-    "Fast and robust fixed-point algorithms for independent component analysis", 1999).
-    From the likeliest result the likelihood of independent spherical signals, ``sum_k E
-    log p_k(||y_k||) + size * log |det W|`` with ``y = W signals``, is maximised over
-    all invertible W by Newton steps. Each density p_k is the likeliest of a few, with
-    heavy or light tails.
+    The signals (n_signals, n_samples, size) are whitened, without removing means.
+    Several orthogonal starts are improved by a few steps of FastICA for vectors
+    (Hyvarinen, "Fast and robust fixed-point algorithms for independent component
+    analysis", 1999). Newton steps from the likeliest result then maximise the
+    likelihood of independent spherical signals over all invertible W. It is ``sum_k E
+    log p_k(||y_k||) + size * log |det W|`` with ``y = W signals``. Each density p_k is
+    the likeliest of a few, with heavy or light tails.
 
     The independent signals have mean square 1 and non-negative skewness, the least
     Gaussian one first. If the signals have a rank r below their number, only the first
     r rows of W give independent signals, the others zeros. The result does not depend
     on the order of the samples, the basis of the signals or a rotation common to all
-    samples. If several signals are Gaussian, or there are too few samples, it has no
-    meaning. One Newton step takes ``O(n_signals^3 n_samples size + n_signals^6)``
-    operations (gradient and Hessian: Ablin, Cardoso, Gramfort, "Faster independent
-    component analysis by preconditioning with Hessian approximations", 2018, here
-    without approximation).
+    samples. If several signals are Gaussian, or if there are too few samples, the
+    result is meaningless. One Newton step takes ``O(n_signals^3 n_samples size +
+    n_signals^6)`` operations (gradient and Hessian: Ablin, Cardoso, Gramfort, "Faster
+    independent component analysis by preconditioning with Hessian approximations",
+    2018, here without approximation).
     """
     signals = np.ascontiguousarray(signals, dtype=np.float64)
     n_signals, _, size = signals.shape
@@ -281,7 +281,7 @@ def _relative_derivatives(
 
 
 def _ascent(gradient: NDArray, hessian: NDArray, shift: float) -> NDArray | None:
-    """Return the step ``E = (shift I - H)^-1 G``, None if this is not definite."""
+    """Return ``E = (shift I - H)^-1 G``, None unless the matrix is definite."""
     matrix = shift * np.eye(gradient.size) - hessian.reshape(gradient.size, -1)
     try:
         factor = cho_factor(matrix)

@@ -20,21 +20,21 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     r"""
     Compare 3D shapes up to one affinity of space and one scale per frame.
 
-    Affine images determine the shapes of all frames up to a common 3x3 affinity A and
-    a scale :math:`s_i` of each frame. This is the mean over the frames of
-    :math:`\|S_i - s_i A X_i\|_F / \|S_i\|_F`, all shapes centred over the points.
+    Affine images determine the shapes of all frames up to a common 3x3 affinity A and a
+    scale :math:`s_i` of each frame. The error is the mean over the frames of
+    :math:`\|S_i - s_i A X_i\|_F / \|S_i\|_F`, with all shapes centred over the points.
 
     Parameters
     ----------
     S : array-like of shape (n_frames, n_points, 3)
         The true shapes.
     X : array-like of shape (n_frames, n_points, 3)
-        The shapes to be judged, as `AffineNRSfM.reconstruct` returns them.
+        The estimated shapes, for example from `AffineNRSfM.reconstruct`.
 
     Returns
     -------
     float
-        The mean relative error: 0 for shapes that are right up to the affinity and
+        The mean relative error: 0 for shapes that are correct up to the affinity and
         the scales, at most 1.
 
     Raises
@@ -52,10 +52,10 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     minimised to machine precision by Newton's method from several deterministic
     starts.
 
-    The scales may be negative. An affine camera M sees in X what -M sees in -X, so
-    a shape and its reflection through the centroid have the same images, and the
-    sum of squares does not depend on the signs of the X_i. For estimates that resemble
-    the truth all scales have the same sign.
+    The scales may be negative. An affine camera M sees in X what -M sees in -X, so a
+    shape and its reflection through the centroid have the same images, and the sum of
+    squares does not depend on the signs of the X_i. If estimates are close to the
+    truth, all scales have the same sign.
 
     Examples
     --------
@@ -102,20 +102,20 @@ def basis_similarity(
     basis_true : array-like of shape (n_components_true, n_points, 3)
         The true basis shapes.
     basis : array-like of shape (n_components, n_points, 3)
-        The basis shapes to be judged.
+        The estimated basis shapes.
     mean_shape_true, mean_shape : array-like of shape (n_points, 3), default=None
         The mean shapes that belong to the bases. If they are given (both or none), A
         is the affinity that maps `mean_shape` onto `mean_shape_true` best in the sense
         of least squares. Otherwise A is estimated from the bases together with the
         matching.
     modulo_mean_shape : bool, default=False
-        Whether to take the multiples of the mean shape out of the basis shapes first;
-        needs the mean shapes. With affine cameras :math:`B_k` and :math:`B_k + v B_0`
-        explain the same images, as the cameras absorb the changes of scale. With True
-        the similarity is not reduced by this, with False it measures the shapes as
-        they are.
+        Whether to remove multiples of the mean shape from the basis shapes first.
+        Requires the mean shapes. With affine cameras :math:`B_k` and :math:`B_k + v
+        B_0` explain the same images, as the cameras absorb the changes of scale. If
+        True, such multiples do not reduce the similarity. If False, the shapes are
+        compared unchanged.
     return_matching : bool, default=False
-        Whether to return the matching as well.
+        Whether to return the matching.
 
     Returns
     -------
@@ -136,11 +136,10 @@ def basis_similarity(
     Notes
     -----
     The matching maximises the sum of the squared similarities. Without mean shapes A
-    maximises the same sum, in alternation with the matching, from the identity and
-    from the affinities that map single basis shapes onto single true ones. The nine
-    numbers of A are fitted to the basis, so that the similarities of few basis shapes
-    with few points are larger than they deserve; give the mean shapes where they are
-    known.
+    maximises the same sum, in alternation with the matching, starting from the identity
+    and from affinities that map one basis shape onto a true one. The nine numbers of A
+    are fitted to the basis, so the similarities of few basis shapes with few points are
+    too large. Give the mean shapes if they are known.
 
     Examples
     --------

@@ -46,7 +46,7 @@ def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> Matched:
     best, tried = match_basis(truth, shapes, starts[0]), set()
     for start in starts:
         rows, columns, cosines = match_basis(truth, shapes, start)
-        # What follows depends on the pairs only, so none is worth a second visit.
+        # The next steps depend only on the pairs: stop if they repeat.
         while (pairs := (rows.tobytes(), columns.tobytes())) not in tried:
             tried.add(pairs)
             affinity = best_affinity(truth[rows], shapes[columns])
@@ -57,7 +57,7 @@ def match_basis_up_to_affinity(truth: NDArray, shapes: NDArray) -> Matched:
 
 
 def without_mean_shape(shapes: NDArray, mean_shape: NDArray) -> NDArray:
-    """Take multiples of the mean shape out of unit shapes; return unit shapes.
+    """Remove multiples of the mean shape from unit shapes; return unit shapes.
 
     The rest is orthogonal to the mean shape in the coordinates in which that is white,
     so that the multiples do not change under an affinity of both.
@@ -100,16 +100,16 @@ def _climb(
     a = start / np.linalg.norm(start)
     value, gradient, hessian = _squared_cosines(a, cross, scatter)
     for _ in range(100):
-        # The function does not change along a: that direction is barred.
+        # The function does not change along a: exclude this direction.
         tangent = np.eye(len(a)) - np.outer(a, a)
         values, axes = np.linalg.eigh(tangent @ hessian @ tangent - np.outer(a, a))
-        # Uphill also where the curvature has the wrong sign; flat directions stay.
+        # Ascend even if the curvature has the wrong sign. Bound its size from below.
         curvature = np.maximum(np.abs(values), 1e-8 * np.abs(values).max())
         step = axes @ ((axes.T @ gradient) / curvature)
         gain = float(gradient @ step)
         if gain <= 1e-28 * len(cross):
             break
-        # Where the gain is lost in the rounding of the value, steps are taken on trust.
+        # If the gain is smaller than the rounding of the value, accept any step.
         needed = 0.1 * gain if gain > 1e-10 * len(cross) else -np.inf
         for fraction in 0.5 ** np.arange(30):
             moved = a + fraction * step

@@ -58,35 +58,34 @@ def mean_shape_error_3d(
     S : array-like of shape (n_frames, n_points, 3)
         The true shapes.
     X : array-like of shape (n_frames, n_points, 3)
-        The shapes to be judged, as ``AffineNRSfM.reconstruct(X, camera=...)`` returns
-        them: lengths and angles should be true. Shape i in the axes of its camera is
-        ``X[i] @ rotations[i].T``, times the scale of the camera.
+        The estimated shapes, for example from ``AffineNRSfM.reconstruct(X,
+        camera=...)``. Lengths and angles should be true. Shape i in the axes of its
+        camera is ``X[i] @ rotations[i].T``, times the scale of the camera.
     convention : {"sequence", "frame", "camera"}, default="sequence"
-        Which error to compute. All but "frame" also count rotations of the estimated
-        shapes against each other.
+        Convention of the error. All except "frame" include rotations of the estimated
+        shapes relative to each other.
     scale : bool, default=None
         Whether to fit a scale: one for each frame for "frame", a common one for the
-        others. By default that is True for "frame" only; otherwise shapes have to have
-        the true size.
+        others. The default is True for "frame". It is False for the others, where
+        shapes must have the true size.
 
     Returns
     -------
     float
-        The error, 0 for shapes that are right after the alignment. A shape whose
+        The error, 0 for shapes that are correct after the alignment. A shape whose
         points are all equal has the errors 1 ("frame" and "camera") and about 1.6
         ("sequence").
 
     Raises
     ------
     ValueError
-        If the arrays differ in shape, are not of the shape above, have entries that
-        are not finite (there is no convention for missing points), if `convention` is
-        none of the three, or if all points of a true shape are equal.
+        If the arrays differ in shape, are not of the shape above, have entries that are
+        not finite (there is no convention for missing points), if `convention` is not
+        one of the three, or if all points of a true shape are equal.
 
     See Also
     --------
-    affine_shape_error : The error up to an affinity of space, which is all that affine
-        images determine.
+    affine_shape_error : The error up to an affinity of space, for affine cameras.
 
     Notes
     -----
@@ -95,10 +94,10 @@ def mean_shape_error_3d(
     have the same orthographic images. With "frame" this applies to each frame, so
     frames that are mirror images of each other have no error.
 
-    The program of Akhter et al. takes the orthogonal matrix that is nearest to the best
-    affinity, which is not quite the best orthogonal matrix: for reconstructions of
-    motion capture its errors differ by up to 5 percent. That of Kong and Lucey takes
-    the ratio of the norms for the scale of a frame.
+    The program of Akhter et al. uses the orthogonal matrix that is nearest to the best
+    affinity. This is not exactly the best orthogonal matrix: for reconstructions of
+    motion capture the errors differ by up to 5 percent. The program of Kong and Lucey
+    uses the ratio of the norms as the scale of a frame.
 
     References
     ----------
@@ -133,7 +132,7 @@ def mean_shape_error_3d(
     >>> mean_shape_error_3d(S, mirrored) < 1e-12
     True
 
-    Shapes of twice the size have the wrong size for two of the conventions:
+    Shapes of twice the size have no error only with "frame":
 
     >>> round(mean_shape_error_3d(S, 2 * S), 2)
     1.65

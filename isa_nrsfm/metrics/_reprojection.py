@@ -31,8 +31,8 @@ def inverse_snr(
     Parameters
     ----------
     X : array-like of shape (n_frames, 2 * n_points)
-        The table. Points of which a coordinate is NaN were not seen: they are left
-        out, in both tables, of the centroids and of the sums.
+        The table. Points with a NaN coordinate were not seen. They are ignored in both
+        tables.
     X_hat : array-like of shape (n_frames, 2 * n_points)
         The reprojection. It must be finite at the points seen in `X`.
     layout : {"interleaved", "planar"}, default="interleaved"
@@ -40,7 +40,8 @@ def inverse_snr(
     scale_frames : bool, default=False
         Whether to divide the frames of both tables by the root mean square of the
         centred coordinates seen in the frame of `X`, so that small and large images
-        count alike. This is the weighting of ``AffineNRSfM(scale_frames=True)``.
+        have the same weight. This is the weighting of
+        ``AffineNRSfM(scale_frames=True)``.
 
     Returns
     -------
@@ -89,7 +90,7 @@ def inverse_snr(
 def frame_energies(
     X: ArrayLike, X_hat: ArrayLike, layout: Layout
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Return each frame's energy, that of its error, and the mask of seen points."""
+    """Return energies of frames and of their errors, and the mask of seen points."""
     tables = [
         check_array(
             unmasked(table),

@@ -13,16 +13,16 @@ def subspace_distance(
     r"""
     Compare two groupings of directions into subspaces.
 
-    Consecutive groups of `subspace_size` rows span K subspaces on either side. They
-    are matched one to one; the distance of a pair is the root mean square of the sines
-    of its principal angles. The result is that of the worst pair, for the matching
-    that makes it smallest.
+    Consecutive groups of `subspace_size` rows span K subspaces on either side. They are
+    matched one to one. The distance of a pair is the root mean square of the sines of
+    its principal angles. The result is the distance of the worst pair in the best
+    matching.
 
     Parameters
     ----------
     components_a, components_b : array-like of shape (n_components, n_features)
-        The directions, one a row. Only the span of each group counts: rows may be
-        turned, scaled or mixed within their group, and groups may change places. They
+        The directions, one per row. Only the span of each group matters: rows may be
+        rotated, scaled or mixed within their group, and groups may be permuted. They
         need not be orthonormal.
     subspace_size : int, default=3
         Number of rows of each group.
@@ -43,7 +43,7 @@ def subspace_distance(
     Notes
     -----
     To judge an independent subspace analysis of signals with a known mixing, compare
-    its `components_` with the true unmixing. Angles have a meaning where the signals
+    its `components_` with the true unmixing. Angles are meaningful only if the signals
     are white. If the observed signals are x = A s, with groups of independent white
     sources s, and z = V x are the whitened signals that were analysed, then compare
     `components_` with the inverse of V A. If x itself was analysed, `components_`
@@ -67,7 +67,7 @@ def subspace_distance(
     bases_a = _orthonormal_blocks("components_a", components_a, subspace_size)
     bases_b = _orthonormal_blocks("components_b", components_b, subspace_size)
     check_same_shape("components_a", bases_a, "components_b", bases_b)
-    # What is left of b outside of a; 1 - cosine^2 would lose half of the digits.
+    # Component of b orthogonal to a; 1 - cosine^2 would lose half of the digits.
     inner = np.einsum("kim,ljm->klij", bases_a, bases_b)
     outside = bases_b - np.einsum("klij,kim->kljm", inner, bases_a)
     distances = np.sqrt(np.sum(outside**2, axis=(2, 3)) / subspace_size)
@@ -99,7 +99,7 @@ def _orthonormal_blocks(name: str, components: ArrayLike, size: int) -> NDArray:
 
 
 def _bottleneck(costs: NDArray) -> float:
-    """Return the largest cost in the matching whose largest cost is smallest."""
+    """Return the largest cost of a matching, minimised over all matchings."""
     levels = np.unique(costs)
     low, high = 0, len(levels) - 1
     while low < high:

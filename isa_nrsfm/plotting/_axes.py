@@ -63,13 +63,13 @@ def percent(fraction: float) -> str:
     if 0 < value < 1e-3:
         return f"{value:.1e} %"
     if 0 < value < 100:
-        value = float(f"{value:.1e}")  # first of all: 9.96 becomes 10
+        value = float(f"{value:.1e}")  # round first: 9.96 becomes 10
     exponent = int(np.floor(np.log10(value))) if value > 0 else 1
     return f"{value:.{max(1 - exponent, 0)}f} %"
 
 
 def wrap_title(title: str, axes: NDArray) -> str:
-    """Break a title in small print where it is wider than the axes it stands over."""
+    """Break a title in small print if it is wider than the axes below it."""
     import textwrap
 
     from matplotlib.font_manager import FontProperties
@@ -91,12 +91,12 @@ def row_width(axes: NDArray) -> float:
     if figure.get_layout_engine() is None or None in specs:
         left, right = first.get_position().x0, last.get_position().x1
         share = right - left
-    else:  # the layout is yet to come: by the ratios of the columns
+    else:  # not laid out yet: use the ratios of the columns
         grid = specs[0].get_gridspec()
         ratios = np.asarray(grid.get_width_ratios(), dtype=float)
         columns = slice(specs[0].colspan.start, specs[-1].colspan.stop)
         share = 0.97 * ratios[columns].sum() / ratios.sum()
-    # Axes that are not side by side: the first one's width has to do.
+    # If the axes are not side by side, use the width of the first one.
     if share <= 0:
         share = first.get_position().width
     return share * figure.bbox.width / figure.dpi

@@ -34,7 +34,7 @@ from isa_nrsfm.plotting._page import (
 )
 from isa_nrsfm.plotting._views import view_and_layout
 
-# Arrows that end where their points go, and are of the same width in all axes.
+# Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {
     **{"angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches"},
     **{"width": 0.008, "headwidth": 3.8, "headlength": 4.2, "headaxislength": 3.8},
@@ -46,35 +46,33 @@ class BasisShapeDisplay:
     """
     Mean shape and basis shapes from the front and from the side.
 
-    For each basis shape the mean shape is drawn with arrows to where its points drift,
-    between the shapes at both ends of the drift. Shapes of more than 400 points are
-    drawn as two clouds on either side of the mean, without arrows. All are drawn to
-    one scale, except basis shapes that drift out of all proportion: those are smaller,
-    and the title has the factor. It is recommended to use `from_estimator` to create
-    the display.
+    For each basis shape, the mean shape is drawn between the shapes at both ends of the
+    drift, with arrows along the drift. Shapes of more than 400 points are drawn as two
+    clouds on either side of the mean, without arrows. All shapes have the same scale,
+    except basis shapes with a very large drift. These are drawn smaller, and the title
+    gives the factor. It is recommended to use `from_estimator` to create the display.
 
     Parameters
     ----------
     mean_shape : ndarray of shape (n_points, 3)
-        The mean shape in the frame to be looked at: x points right, y along the
-        image's y, z is the depth.
+        The mean shape in viewing coordinates: x points right, y along the y axis of the
+        image, and z is the depth.
     basis : ndarray of shape (n_components, n_points, 3)
         The basis shapes in the same frame, each as a drift by one standard deviation
         of its coefficient.
     energy_share : ndarray of shape (n_components,), default=None
-        The share of each basis shape, between 0 and 1, in the energy of the
-        deformations, for the titles.
+        Share of each basis shape in the energy of the deformations, between 0 and 1,
+        for the titles.
     component_names : list of str of length n_components, default=None
         Names of the basis shapes. By default their numbers, from 1.
     edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
             default="auto"
-        What is joined: a layout of `isa_nrsfm.skeletons` or its name, whose left and
-        right have colours of their own in the mean shape, or pairs of points. "auto" is
-        the layout that the points have by their number and order, if one is known.
+        Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+        points. A layout has separate colours for left and right in the mean shape.
+        "auto" recognises a known layout by the number and order of the points.
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
-        points up. "auto" is "lower" where a face or a body would stand on its head
-        otherwise.
+        points up. "auto" is "lower" if a face or a body would otherwise be upside down.
 
     Attributes
     ----------
@@ -87,7 +85,7 @@ class BasisShapeDisplay:
     component_names : list of str
         The names of the basis shapes.
     skeleton : Skeleton or None
-        What is drawn; None for points alone.
+        The layout that is drawn; None for points alone.
     edges : ndarray of shape (n_edges, 2) or None
         The pairs of points that are joined.
     origin : {"upper", "lower"}
@@ -110,7 +108,7 @@ class BasisShapeDisplay:
     ------
     ValueError
         If the shapes of the arrays do not fit together, `edges` names points that do
-        not exist, or there is not one name a basis shape.
+        not exist, or the number of names is not that of the basis shapes.
 
     See Also
     --------
@@ -121,12 +119,12 @@ class BasisShapeDisplay:
     -----
     An affine factorisation leaves a 3x3 affinity of space open. `from_estimator`
     chooses the one under which the cameras come nearest to scaled orthographic ones
-    [1]_, so that shapes have natural proportions, and turns the mean camera's view to
-    the front. Shapes of calibrated cameras are only turned. Where the cameras go round
-    the object and have no mean view, their axis keeps its direction in the images and
-    the front is where the object is broadest. Faces, bodies and hands of known layouts
-    are then turned upright (`isa_nrsfm.calibration.canonical_pose`). Depth is known up
-    to its mirror image: the side view may show the left or the right side.
+    [1]_, so that shapes have natural proportions. The front view is that of the mean
+    camera. Shapes of calibrated cameras are only rotated. If the cameras go round the
+    object and have no mean view, their axis keeps its direction in the images, and the
+    front is the broadest side of the object. Faces, bodies and hands of known layouts
+    are then turned upright (`isa_nrsfm.calibration.canonical_pose`). The sign of the
+    depth is unknown: the side view may be from the left or from the right.
 
     References
     ----------
@@ -169,7 +167,7 @@ class BasisShapeDisplay:
             self.energy_share = np.asarray(energy_share, dtype=float)
             if self.energy_share.shape != (n_components,):
                 raise ValueError(
-                    f"energy_share must hold {n_components} numbers, one a basis "
+                    f"energy_share must hold {n_components} numbers, one per basis "
                     f"shape; got shape {self.energy_share.shape}"
                 )
         self.component_names = checked_names(
@@ -200,16 +198,16 @@ class BasisShapeDisplay:
             Names of the basis shapes. By default their numbers, from 1.
         edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
                 default="auto"
-            What is joined: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
-            points. "auto" is the layout that the points have by their names or by their
-            number and order, if one is known. Faces, bodies and hands of known layouts
-            stand upright, whatever is joined.
+            Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+            points. "auto" recognises a known layout by the names or by the number and
+            order of the points. Faces, bodies and hands of known layouts stand upright
+            for any value of `edges`.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
-            that points up. "auto" is "lower" where a face or a body would stand on its
-            head otherwise.
+            that points up. "auto" is "lower" if a face or a body would otherwise be
+            upside down.
         ax : array-like of matplotlib Axes, default=None
-            Axes to draw on, two a shape. By default a new figure.
+            Axes to draw on, two per shape. By default a new figure.
         **kw : dict
             Further arguments of `plot`.
 
@@ -258,18 +256,18 @@ class BasisShapeDisplay:
         Parameters
         ----------
         ax : array-like of matplotlib Axes, default=None
-            Axes to draw on, two a shape, the mean shape's first. By default a new
+            Axes to draw on, two per shape, the mean shape first. By default a new
             figure with a legend below.
         n_std : float or array-like of shape (n_drawn,), default=2.0
-            How far the shapes drift to both sides, in standard deviations of the
-            coefficients. An array has a number for each basis shape that is drawn, to
-            show weak ones larger; the titles have the numbers.
+            Length of the drift to both sides, in standard deviations of the
+            coefficients. Give an array with a number for each drawn basis shape to
+            enlarge weak ones. The titles give the numbers.
         components : array-like of int, default=None
             The basis shapes to draw. By default all of them.
         n_columns : int, default=None
             Shapes side by side in the new figure. By default as few as fit on a page.
         point_kw : dict, default=None
-            Arguments for the scatters of points, before those chosen here.
+            Arguments for the scatters of points. They override the defaults.
         edge_kw : dict, default=None
             Arguments for the LineCollections of joined points.
         arrow_kw : dict, default=None
@@ -283,8 +281,9 @@ class BasisShapeDisplay:
         Raises
         ------
         ValueError
-            If there are not two axes a shape, `components` names a basis shape that
-            does not exist, or `n_std` is not one number or one a basis shape.
+            If there are not two axes per shape, if `components` names a basis shape
+            that does not exist, or if `n_std` is neither a number nor one per basis
+            shape.
         """
         import_optional("matplotlib", extra="plot")
         n_components = len(self.basis)

@@ -21,8 +21,8 @@ from isa_nrsfm.plotting._page import PAGE_WIDTH, grid
 
 Kind = Literal["classes", "number", "time"]
 THIN = {"linewidth": 0.7}
-# Groups or classes that are drawn: more of them cover each other, and a figure of eight
-# basis shapes and 1,000 classes takes 47 s.
+# Largest number of groups or classes that are drawn. More of them overlap, and a figure
+# of eight basis shapes and 1,000 classes takes 47 s.
 MOST_GROUPS = 50
 
 
@@ -31,8 +31,8 @@ class CoefficientsDisplay:
     Coefficients of frames: by class, against a number, or in time.
 
     There is one panel for each basis shape. Classes are drawn as box plots over their
-    frames. Curves in time have a band of one standard deviation where it is known. It
-    is recommended to use `from_estimator` to create the display.
+    frames. Curves in time have a band of one standard deviation if it is known. It is
+    recommended to use `from_estimator` to create the display.
 
     Parameters
     ----------
@@ -41,15 +41,16 @@ class CoefficientsDisplay:
     alpha_std : array-like of shape (n_frames, n_components), default=None
         Their standard deviations.
     y : array-like of shape (n_frames,), default=None
-        A label for each frame: classes, or a number. Of more than 50 classes those with
-        the most frames are drawn, which the title mentions.
+        A label for each frame: classes, or a number. If there are more than 50 classes,
+        those with the most frames are drawn, and the title mentions it.
     time : array-like of shape (n_frames,), default=None
         Times of the frames. By default their numbers.
     groups : array-like of shape (n_frames,), default=None
-        Videos or people: a curve does not go from one to another. Of more than 50 those
-        with the most frames are drawn in time, which the title mentions.
+        Videos or people. Curves are not joined between groups. If there are more than
+        50 groups, those with the most frames are drawn in time, and the title mentions
+        it.
     label : str, default=None
-        What `y` is, for the axis. By default "label".
+        Name of `y` on the axis. By default "label".
     component_names : list of str of length n_components, default=None
         Names of the basis shapes. By default their numbers, from 1.
 
@@ -69,8 +70,8 @@ class CoefficientsDisplay:
 
     See Also
     --------
-    BasisShapeDisplay : What the basis shapes look like.
-    isa_nrsfm.analysis.association : How coefficients go with a label, in numbers.
+    BasisShapeDisplay : The mean shape and the basis shapes.
+    isa_nrsfm.analysis.association : Test of association with a label.
 
     Examples
     --------
@@ -143,10 +144,10 @@ class CoefficientsDisplay:
         time : array-like of shape (n_frames,), default=None
             Times of the frames. By default their numbers.
         groups : array-like of shape (n_frames,), default=None
-            Videos or people: a curve does not go from one to another. Of more than 50
-            those with the most frames are drawn.
+            Videos or people. Curves are not joined between groups. If there are more
+            than 50 groups, those with the most frames are drawn.
         label : str, default=None
-            What `y` is, for the axis. By default "label".
+            Name of `y` on the axis. By default "label".
         component_names : list of str of length n_components, default=None
             Names of the basis shapes. By default their numbers, from 1.
         ax : array of n_components matplotlib Axes, default=None
@@ -194,7 +195,7 @@ class CoefficientsDisplay:
             Axes to draw on. By default a new figure.
         kind : {"auto", "classes", "number", "time"}, default="auto"
             Box plots for each class of `y`, points against the numbers of `y`, or
-            curves in time. "auto" is the kind of `y`, and "time" without `y`.
+            curves in time. "auto" is the kind of `y`, or "time" if `y` is not given.
 
         Returns
         -------
@@ -247,7 +248,7 @@ class CoefficientsDisplay:
         assert self.y is not None
         classes, members = _rows_of_largest(self.y)
         known = [rows[np.isfinite(self.alpha[rows, k])] for rows in members]
-        rng = np.random.default_rng(0)  # where points lie sideways means nothing
+        rng = np.random.default_rng(0)  # horizontal positions have no meaning
         places = np.repeat(np.arange(len(classes)), [len(rows) for rows in known])
         _scatter(
             axes,

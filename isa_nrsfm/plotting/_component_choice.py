@@ -27,8 +27,8 @@ class ComponentChoiceDisplay:
     chosen : int, default=None
         The number that was chosen, which is marked.
     held_out_error : bool, default=True
-        Whether scores are those of `AffineNRSfM.score`, minus held-out errors. The
-        errors are drawn then, in percent.
+        Whether scores are those of `AffineNRSfM.score`, that is, minus the held-out
+        errors. If True, the errors are drawn in percent.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ class ComponentChoiceDisplay:
         sklearn.exceptions.NotFittedError
             If the estimator is not fitted.
         ValueError
-            If `ax` is not one.
+            If `ax` is not a single Axes.
         """
         check_is_fitted(estimator)
         results = estimator.cv_results_
@@ -145,7 +145,7 @@ class ComponentChoiceDisplay:
         ax : matplotlib Axes, default=None
             Axes to draw on. By default a new figure.
         errorbar_kw : dict, default=None
-            Arguments for matplotlib's ``errorbar``, before those chosen here.
+            Arguments for matplotlib's ``errorbar``. They override the defaults.
 
         Returns
         -------

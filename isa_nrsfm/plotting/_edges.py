@@ -1,4 +1,4 @@
-"""Which points a figure joins, and which way is up in it."""
+"""Lines between points and the upward direction of a figure."""
 
 from typing import Any, Literal
 
@@ -35,7 +35,7 @@ def choose_lines(
 def choose_layout(
     edges: Any, shape: NDArray, names: tuple[str, ...] | None = None
 ) -> Skeleton | None:
-    """Return the layout of points that `edges` is or names, or that is recognised."""
+    """Return the layout of points given by `edges`, or the recognised one."""
     if isinstance(edges, Skeleton) or (isinstance(edges, str) and edges != "auto"):
         return checked_skeleton(edges, len(shape))
     return find_skeleton(len(shape), names, shape=shape)

@@ -13,7 +13,7 @@ from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm.plotting._axes import check_axes
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
-LINEAR_SHARE = 0.02  # of the largest absolute value, where colours cease to be linear
+LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
 
 
 def correlations(covariance: NDArray) -> NDArray:
@@ -35,13 +35,14 @@ class ModeCovarianceDisplay:
     """
     Mode covariance matrix with the 3x3 blocks of the basis shapes.
 
-    Where the independent subspaces are found, the energy lies in the blocks on the
-    diagonal. It is recommended to use `from_estimator` to create the display.
+    If the independent subspaces are correct, the energy is in the diagonal blocks. It
+    is recommended to use `from_estimator` to create the display.
 
     Parameters
     ----------
     mode_covariance : ndarray of shape (3 * n_components, 3 * n_components)
-        The symmetric covariance of the modes, the three of a basis shape side by side.
+        The symmetric covariance of the modes, with the three modes of a basis shape
+        side by side.
     component_names : list of str of length n_components, default=None
         Names of the basis shapes. By default their numbers, from 1.
 
@@ -52,8 +53,8 @@ class ModeCovarianceDisplay:
     component_names : list of str
         The names of the basis shapes.
     off_block_share : float
-        Share, between 0 and 1, of the sum of squares of the matrix that lies outside
-        its diagonal blocks.
+        Share of the sum of squares of the matrix outside its diagonal blocks, between 0
+        and 1.
     ax_ : matplotlib Axes
         The axes with the image.
     figure_ : matplotlib Figure
@@ -68,8 +69,8 @@ class ModeCovarianceDisplay:
     Raises
     ------
     ValueError
-        If the matrix is not square with three rows a basis shape, or there is not one
-        name a basis shape.
+        If the matrix is not square with three rows per basis shape, or the number of
+        names is not that of the basis shapes.
 
     See Also
     --------
@@ -95,7 +96,7 @@ class ModeCovarianceDisplay:
         n_modes = len(matrix) if matrix.ndim == 2 else 0
         if not n_modes or matrix.shape != (n_modes, n_modes) or n_modes % BLOCK:
             raise ValueError(
-                "mode_covariance must be a square matrix with three rows a basis "
+                "mode_covariance must be a square matrix with three rows per basis "
                 f"shape; got shape {matrix.shape}"
             )
         self.mode_covariance = matrix
@@ -144,7 +145,8 @@ class ModeCovarianceDisplay:
         sklearn.exceptions.NotFittedError
             If the estimator is not fitted.
         ValueError
-            If the number of names is not that of the basis shapes, or `ax` is not one.
+            If the number of names is not that of the basis shapes, or `ax` is not a
+            single Axes.
         """
         check_is_fitted(estimator, "mode_covariance_")
         display = cls(
@@ -175,14 +177,14 @@ class ModeCovarianceDisplay:
         normalize : bool, default=False
             Whether to show correlations instead of covariances.
         scale : {"asinh", "linear"}, default=None
-            How values become colours; "asinh" is linear up to 2 % of the largest
-            absolute value, and from there on logarithmic. By default "linear" for
-            correlations and "asinh" for covariances: the energy of basis shapes falls
-            quickly, and on a linear scale the first ones may be all that is seen.
+            Scale of the colours. "asinh" is linear up to 2 % of the largest absolute
+            value, and logarithmic beyond. By default "linear" for correlations and
+            "asinh" for covariances: the energy of basis shapes falls quickly, and on a
+            linear scale only the first ones may be visible.
         colorbar : bool, default=True
             Whether to add a colour bar.
         im_kw : dict, default=None
-            Arguments for matplotlib's ``imshow``, before those chosen here.
+            Arguments for matplotlib's ``imshow``. They override the defaults.
 
         Returns
         -------
@@ -192,7 +194,7 @@ class ModeCovarianceDisplay:
         Raises
         ------
         ValueError
-            If `ax` holds several axes, or `scale` is none of those above.
+            If `ax` holds several axes, or `scale` is not one of those above.
         """
         plt = import_optional("matplotlib.pyplot", extra="plot")
         from matplotlib.collections import LineCollection

@@ -27,7 +27,7 @@ def grid(n_axes: int, n_columns: int, **options: Any) -> NDArray[Any]:
 
 
 def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
-    """Return the part of space to draw each block of shapes in, and its reduction.
+    """Return the limits of space for each block of shapes, and its reduction.
 
     Blocks are (n_shapes, n_points, 3), the mean shape first. Limits (n_blocks, 3, 2)
     have one scale. Blocks whose extent relative to the first exceeds twice the median
@@ -35,7 +35,7 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
     """
     low = np.array([block.min(axis=(0, 1)) for block in blocks])
     high = np.array([block.max(axis=(0, 1)) for block in blocks])
-    # All points may be equal: axes must not have limits that coincide.
+    # If all points are equal, keep the limits of the axes apart.
     margin = 0.02 * ((high - low)[0].max() or 1.0)
     low, high = low - margin, high + margin
     extent = high - low
@@ -50,7 +50,7 @@ def block_limits(blocks: list[NDArray]) -> tuple[NDArray, NDArray]:
 
 
 def choose_n_columns(n_shapes: int, aspect: float) -> int:
-    """Return the fewest columns of shapes, of that width over height, to fit a page."""
+    """Return the smallest number of columns of shapes of an aspect that fits a page."""
     for n_columns in range(1, n_shapes):
         height = PAGE_WIDTH / n_columns / aspect
         n_rows = -(-n_shapes // n_columns)

@@ -52,7 +52,7 @@ PANEL_WIDTH = 2.3  # inches
 
 class ReprojectionDisplay:
     """
-    Observed against reprojected points, one panel a frame.
+    Observed against reprojected points, one panel per frame.
 
     It is recommended to use `from_estimator` to create the display.
 
@@ -61,53 +61,53 @@ class ReprojectionDisplay:
     observed : ndarray of shape (n_frames, n_points, 2)
         The points of the frames, NaN where a point was not seen.
     reprojected : ndarray of shape (n_frames, n_points, 2)
-        The same points as the model has them.
+        The same points, reprojected by the model.
     frames : ndarray of shape (n_frames,), default=None
         Their row numbers. By default 0, 1, ...
     frame_names : list of str of length n_frames, default=None
         Names of the frames, for the titles. By default their row numbers.
     edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
             default=None
-        What is joined: a layout of `isa_nrsfm.skeletons` or its name, whose left and
-        right have colours of their own, or pairs of points. "auto" is the layout that
-        the points have by their number and order, judged by the first frame.
+        Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+        points. A layout has separate colours for left and right. "auto" recognises a
+        known layout by the number and order of the points in the first frame.
     origin : {"auto", "upper", "lower"}, default="upper"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
-        points up. "auto" is "lower" where a face or a body would stand on its head
-        otherwise, judged by the first frame.
+        points up. "auto" is "lower" if a face or a body would otherwise be upside down
+        in the first frame.
 
     Attributes
     ----------
     observed : ndarray of shape (n_frames, n_points, 2)
         The points of the frames.
     reprojected : ndarray of shape (n_frames, n_points, 2)
-        The same points as the model has them.
+        The same points, reprojected by the model.
     frames : ndarray of shape (n_frames,)
         The row numbers.
     frame_names : list of str
         The names of the frames.
     inverse_snr : ndarray of shape (n_frames,)
-        For each frame the squared error of its observed points relative to their
-        squared distance from their centroid, a fraction.
+        For each frame, the squared error of its observed points divided by their
+        squared distance from their centroid.
     skeleton : Skeleton or None
-        What is drawn; None for points alone.
+        The layout that is drawn; None for points alone.
     edges : ndarray of shape (n_edges, 2) or None
         The pairs of points that are joined.
     origin : {"upper", "lower"}
         Where y is zero.
     axes_ : ndarray of shape (n_frames,)
-        The axes, one a frame.
+        The axes, one per frame.
     figure_ : matplotlib Figure
         The figure that holds them.
     observed_ : list of matplotlib PathCollection
-        The observed points, one entry a frame.
+        The observed points, one entry per frame.
     reprojected_ : list of matplotlib PathCollection
-        The reprojected points, one entry a frame.
+        The reprojected points, one entry per frame.
     errors_ : list of matplotlib LineCollection
-        The segments from observed to reprojected points, one entry a frame; empty
-        for dense shapes, of more than 400 points.
+        The segments from observed to reprojected points, one entry per frame. Empty for
+        dense shapes of more than 400 points.
     edges_ : list of matplotlib LineCollection
-        The joined reprojected points, one entry a frame; empty without edges.
+        The lines between reprojected points, one entry per frame; empty without edges.
 
     Raises
     ------
@@ -181,7 +181,7 @@ class ReprojectionDisplay:
         **kw: Any,
     ) -> ReprojectionDisplay:
         """
-        Draw some frames of a table, as observed and as a fitted estimator has them.
+        Draw some frames of a table and their reprojection by a fitted estimator.
 
         Parameters
         ----------
@@ -199,15 +199,15 @@ class ReprojectionDisplay:
             Determines the random rows. Pass an int for the same rows at each call.
         edges : "auto", Skeleton, str, None or array-like of shape (n_edges, 2), \
                 default="auto"
-            What is joined: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
-            points. "auto" is the layout that the points have by their names or by the
-            number and order of the points of the mean shape, if one is known.
+            Lines to draw: a layout of `isa_nrsfm.skeletons` or its name, or pairs of
+            points. "auto" recognises a known layout by the names of the points, or by
+            the number and order of those of the mean shape.
         origin : {"auto", "upper", "lower"}, default="auto"
             Where y is zero: "upper" for images, whose y points down, "lower" for a y
-            that points up. "auto" is "lower" where a face or a body would stand on its
-            head otherwise.
+            that points up. "auto" is "lower" if a face or a body would otherwise be
+            upside down.
         ax : array-like of matplotlib Axes, default=None
-            Axes to draw on, one a frame. By default a new figure.
+            Axes to draw on, one per frame. By default a new figure.
         **kw : dict
             Further arguments of `plot`.
 
@@ -221,9 +221,9 @@ class ReprojectionDisplay:
         sklearn.exceptions.NotFittedError
             If the estimator is not fitted.
         ValueError
-            If there are no such rows in `X` or fewer than `n_frames`, no point of a row
-            was seen, there are not as many axes as frames, or `edges` or `origin`
-            is not of the kind given above.
+            If `X` lacks the rows of `frames` or has fewer than `n_frames`, if no point
+            of a row was seen, if there are not as many axes as frames, or if `edges` or
+            `origin` is not of the kind given above.
         """
         check_is_fitted(estimator, "mean_shape_")
         rows = choose_frames(len(X), n_frames, frames, random_state)
@@ -259,11 +259,11 @@ class ReprojectionDisplay:
         Parameters
         ----------
         ax : array-like of matplotlib Axes, default=None
-            Axes to draw on, one a frame. By default a new figure with a legend below.
+            Axes to draw on, one per frame. By default a new figure with a legend below.
         n_columns : int, default=None
             Columns of panels of the new figure. By default 3 or fewer.
         observed_kw : dict, default=None
-            Arguments for the scatter of observed points, before those chosen here.
+            Arguments for the scatter of observed points. They override the defaults.
         reprojected_kw : dict, default=None
             Arguments for the scatter of reprojected points.
         edge_kw : dict, default=None

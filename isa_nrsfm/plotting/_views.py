@@ -1,9 +1,9 @@
 """The frame in which shapes are viewed.
 
-Affine cameras and shapes are known up to one 3x3 affinity of space: drawn as they are,
-the shapes look squashed and sheared. Here the affinity is found under which the cameras
-are most nearly weak-perspective ones, and shapes face the mean camera. Shapes of
-calibrated cameras are only turned.
+Affine cameras and shapes are known up to one 3x3 affinity of space: without a choice,
+shapes look squashed and sheared. The viewing affinity makes the cameras as nearly
+weak-perspective as possible, and shapes face the mean camera. Shapes of calibrated
+cameras are only rotated.
 """
 
 from typing import Any, Literal
@@ -25,10 +25,10 @@ from isa_nrsfm.skeletons import Skeleton
 def viewing_rotation(cameras: NDArray, reference: NDArray, spread: NDArray) -> NDArray:
     """Return the directions of space (3, 3) that are right, down and away in the view.
 
-    Right and down are nearest to the reference camera (2, 3). Unit cameras (n_frames,
-    2, 3) that go round the object have one direction of their axis in the images: it is
-    kept, and the object, with the covariance `spread` of its points, shown at its
-    broadest.
+    Right and down are nearest to the reference camera (2, 3). If unit cameras
+    (n_frames, 2, 3) go round the object, the direction of their axis in the images is
+    kept. The view is then of the broadest side of the object, from the covariance
+    `spread` of its points.
     """
     left, shared, right = np.linalg.svd(cameras.mean(axis=0), full_matrices=False)
     row = np.sqrt(np.mean(np.sum(cameras**2, axis=(1, 2))) / 2)
