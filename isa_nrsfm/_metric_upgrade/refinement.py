@@ -6,10 +6,10 @@ two rows of a scaled rotation. It may change with the deformation of the object,
 ``G_i = Q exp(sum_k alpha_ik E_k) Q^T`` with symmetric strains E_k.
 
 The sum of squares of the residuals (`orthonormality`) is minimised by damped
-Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``, and in the strains, so that
-``Q Q^T`` stays positive definite even where the linear equations (`metric_quadric`)
-have an indefinite solution. The derivative of the exponential is that of Daleckii and
-Krein (Higham, "Functions of matrices", 2008, theorem 3.11).
+Gauss-Newton steps along geodesics, ``Q <- Q exp(E_0 / 2)``, and in the strains. So ``Q
+Q^T`` stays positive definite, even if the linear equations (`metric_quadric`) have an
+indefinite solution. The derivative of the exponential is that of Daleckii and Krein
+(Higham, "Functions of matrices", 2008, theorem 3.11).
 
 The strain of a frame, ``sum_k alpha_ik E_k``, has five or six coordinates in
 `strain_basis`. Derivatives with respect to those of E_k are alpha_ik times derivatives

@@ -79,10 +79,10 @@ def canonical_pose(
     Raises
     ------
     ValueError
-        If only one of the three directions is given, if two of them are parallel or
-        one is zero, if points do not exist, if the scheme is not known, has another
-        number of points or defines no pose, or if the shape is not of the shape above
-        or not finite.
+        If only one of the three directions is given, if two are parallel or one is
+        zero, or if points do not exist. If the scheme is unknown, has another number of
+        points or defines no pose. If `shape` does not have the shape above or is not
+        finite.
 
     Notes
     -----

@@ -77,9 +77,9 @@ def write_glb(
         its name, with left and right as separate primitives and colours; integers of
         shape (n_edges, 2), pairs of points to be joined; or (n_triangles, 3), the
         triangles of a surface, counter-clockwise as seen from outside; or None for
-        nothing. "auto" is the layout of hands and bodies, if one is known by the names
-        or the number and order of the points, and otherwise a surface of the Delaunay
-        triangles of the front view, on which the layout of a face is drawn. More than
+        nothing. "auto" recognises the layout of hands and bodies by the names or the
+        number and order of the points. Otherwise it is a surface of the Delaunay
+        triangles of the front view, with the layout of a face drawn on it. More than
         400 points of a surface are not drawn as points.
     names : sequence of str of length n_components, default=None
         Names of the morph targets; by default alpha_1, alpha_2, ...

@@ -52,10 +52,9 @@ def affine_shape_error(S: ArrayLike, X: ArrayLike) -> float:
     minimised to machine precision by Newton's method from several deterministic
     starts.
 
-    The scales may be negative. An affine camera M sees in X what -M sees in -X, so a
-    shape and its reflection through the centroid have the same images, and the sum of
-    squares does not depend on the signs of the X_i. If estimates are close to the
-    truth, all scales have the same sign.
+    The scales may be negative. The images of X by an affine camera M and of -X by -M
+    are the same. So the sum of squares does not depend on the signs of the X_i. If
+    estimates are close to the truth, all scales have the same sign.
 
     Examples
     --------
@@ -93,9 +92,9 @@ def basis_similarity(
     Match basis shapes with the true ones and measure how similar they are.
 
     The similarity of a true basis shape :math:`B` and an estimated one :math:`B'` is
-    :math:`|\langle B, A B' \rangle_F| / (\|B\|_F \|A B'\|_F)`, all shapes centred over
-    the points, with one 3x3 affinity A for the whole basis. It ignores order, signs
-    and scales.
+    :math:`|\langle B, A B' \rangle_F| / (\|B\|_F \|A B'\|_F)`, with one 3x3 affinity A
+    for the whole basis. All shapes are centred over the points. Order, signs and scales
+    are ignored.
 
     Parameters
     ----------

@@ -38,9 +38,8 @@ def inverse_snr(
     layout : {"interleaved", "planar"}, default="interleaved"
         Order of the columns: x0, y0, x1, y1, ... or x0, x1, ..., y0, y1, ...
     scale_frames : bool, default=False
-        Whether to divide the frames of both tables by the root mean square of the
-        centred coordinates seen in the frame of `X`, so that small and large images
-        have the same weight. This is the weighting of
+        Whether to divide each frame of both tables by the RMS of its centred, seen
+        coordinates in `X`. Small and large images then have the same weight, as in
         ``AffineNRSfM(scale_frames=True)``.
 
     Returns

@@ -121,10 +121,10 @@ class BasisShapeDisplay:
     chooses the one under which the cameras come nearest to scaled orthographic ones
     [1]_, so that shapes have natural proportions. The front view is that of the mean
     camera. Shapes of calibrated cameras are only rotated. If the cameras go round the
-    object and have no mean view, their axis keeps its direction in the images, and the
-    front is the broadest side of the object. Faces, bodies and hands of known layouts
-    are then turned upright (`isa_nrsfm.calibration.canonical_pose`). The sign of the
-    depth is unknown: the side view may be from the left or from the right.
+    object, they have no mean view. Their axis then keeps its direction in the images,
+    and the front is the broadest side of the object. Faces, bodies and hands of known
+    layouts are then turned upright (`isa_nrsfm.calibration.canonical_pose`). The sign
+    of the depth is unknown: the side view may be from the left or from the right.
 
     References
     ----------
