@@ -125,7 +125,7 @@ class TestEdges:
         with pytest.warns(
             ConvergenceWarning,
             match="FastISA did not converge in max_iter=1 steps: its best start still "
-            "moves; increase max_iter or tol",
+            "changes. Increase max_iter or tol",
         ):
             isa = FastISA(n_init=2, max_iter=1, random_state=0).fit(few_samples())
         assert_array_equal(isa.n_iters_, 2)  # one of either iteration

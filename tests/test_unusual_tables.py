@@ -106,7 +106,7 @@ def test_coordinates_outside_the_range_are_refused_with_the_range(
         estimator().fit(size * X)
     with pytest.raises(ValueError, match=match):
         PseudoInverseNRSfM(1).fit(size * X)
-    with pytest.raises(ValueError, match="in row 2: give"):
+    with pytest.raises(ValueError, match=r"in row 2\. Give"):
         model.transform(np.concatenate([X[:2], size * X]))
     np.save(tmp_path / "X.npy", size * X)
     with pytest.raises(ValueError, match=match):
