@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import polar
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera, strain_basis
@@ -17,11 +16,11 @@ from isa_nrsfm._metric_upgrade.refinement import (
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
     nearest_rotations,
-    of_all_frames,
-    scaled,
+    symmetric_upgrade,
     usable_cameras,
     warn_if_degenerate,
 )
+from isa_nrsfm._tables.tracks import of_all_rows
 
 
 class DeformationMetric(NamedTuple):
@@ -130,9 +129,8 @@ def deformation_metric(motion: ArrayLike, alpha: ArrayLike) -> DeformationMetric
     cameras, weights = cameras[usable], weights[usable]
     fit = fit_strain(cameras, weights, fit_metric(cameras, "weak_perspective"))
     # The symmetric Q is fit.Q times a rotation, which turns the strains as well.
-    turn, Q = polar(fit.Q, side="left")
+    turn, Q = symmetric_upgrade(fit.Q, cameras)
     strain = turn @ fit.strain @ turn.T
-    Q = scaled(Q, cameras)
     warn_if_degenerate(fit.condition_number)
     return DeformationMetric(Q, strain, fit.residual, fit.condition_number)
 
@@ -240,7 +238,7 @@ def euclidean_frames(
     # The rotation nearest to the mean shape.
     turns = _rotations_to_mean(shapes, mean @ np.linalg.inv(metric.Q).T)
     found = shapes @ turns, rotations @ turns, scales
-    return EuclideanFrames(*(of_all_frames(values, usable) for values in found))
+    return EuclideanFrames(*(of_all_rows(values, usable) for values in found))
 
 
 def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:

@@ -72,16 +72,20 @@ def best_metric(motion: NDArray) -> NDArray:
         fit = fit_metric(cameras[usable], "weak_perspective")
     except ValueError:
         return np.eye(3)
-    return scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
+    return symmetric_upgrade(fit.Q, cameras[usable])[1]
 
 
-def scaled(Q: NDArray, cameras: NDArray) -> NDArray:
-    """Scale Q (3, 3) such that the scales of cameras (I, 2, 3) have mean square one."""
+def symmetric_upgrade(Q: NDArray, cameras: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the orthogonal O and the symmetric S of ``Q = S O``, S (3, 3) scaled.
+
+    The scales of the upgraded cameras (I, 2, 3) have mean square one.
+    """
+    turn, Q = linalg.polar(Q, side="left")
     # A scale is s = (s1 + s2) / 2 with the singular values of a camera. Then
     # s^2 = (s1^2 + s2^2) / 4 + s1 s2 / 2, and s1 s2 is the area that the rows span.
     rows = cameras @ Q
     area = np.linalg.norm(np.cross(rows[:, 0], rows[:, 1]), axis=1)
-    return Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
+    return turn, Q / np.sqrt((np.sum(rows**2) / 4 + np.sum(area) / 2) / len(rows))
 
 
 def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
@@ -90,13 +94,6 @@ def nearest_rotations(cameras: NDArray) -> tuple[NDArray, NDArray]:
     depth = np.cross(rows[:, 0], rows[:, 1])
     stretches = (axes * values[:, None]) @ axes.transpose(0, 2, 1)
     return np.concatenate([rows, depth[:, None]], axis=1), stretches
-
-
-def of_all_frames(values: NDArray, usable: NDArray) -> NDArray:
-    """Return values (n_usable, ...) as (n_frames, ...), NaN for the other frames."""
-    found = np.full((len(usable), *values.shape[1:]), np.nan)
-    found[usable] = values
-    return found
 
 
 def warn_if_degenerate(condition_number: float) -> None:

@@ -4,17 +4,16 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg
 
 from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS, CalibratedCamera
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
     nearest_rotations,
-    of_all_frames,
-    scaled,
+    symmetric_upgrade,
     usable_cameras,
     warn_if_degenerate,
 )
+from isa_nrsfm._tables.tracks import of_all_rows
 
 
 class MetricUpgrade(NamedTuple):
@@ -157,12 +156,12 @@ def metric_upgrade(
     if camera not in CAMERA_MODELS:
         raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
-    Q = scaled(linalg.polar(fit.Q, side="left")[1], cameras[usable])
+    _, Q = symmetric_upgrade(fit.Q, cameras[usable])
     rotations, stretches = nearest_rotations(cameras[usable] @ Q)
     scales = np.trace(stretches, axis1=1, axis2=2) / 2
     if camera == "orthographic":
         scales = np.ones(len(scales))
-    rotations, scales = (of_all_frames(each, usable) for each in (rotations, scales))
+    rotations, scales = (of_all_rows(each, usable) for each in (rotations, scales))
     warn_if_degenerate(fit.condition_number)
     return MetricUpgrade(Q, rotations, scales, fit.residual, fit.condition_number)
 
