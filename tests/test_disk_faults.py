@@ -82,8 +82,16 @@ def every_fault(folder, strike, prepare, act, stride=1):
         yield raised, before, faults.operations
 
 
-@pytest.mark.parametrize("exists", slow_after(1, [True, False]))
-@pytest.mark.parametrize("strike", slow_after(1, STRIKES))
+# What was there decides which operations there are, not what a strike does to them.
+@pytest.mark.parametrize(
+    ("strike", "exists"),
+    slow_after(
+        1,
+        [(strike, True) for strike in STRIKES]
+        + [(strike, False) for strike in ("disk full", "killed")],
+        together=True,
+    ),
+)
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     write, whole = WRITERS[name], tmp_path / name

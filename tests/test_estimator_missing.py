@@ -95,9 +95,20 @@ def frames_with_outliers(n_frames=24):
 
 
 @pytest.mark.parametrize(
-    "camera", slow_after(1, ["affine", "weak_perspective", "orthographic"])
+    ("loss", "camera"),
+    slow_after(
+        2,
+        [
+            ("linear", "affine"),
+            ("huber", "affine"),
+            ("cauchy", "affine"),
+            ("linear", "weak_perspective"),
+            ("cauchy", "weak_perspective"),
+            ("huber", "orthographic"),
+        ],
+        together=True,
+    ),
 )
-@pytest.mark.parametrize("loss", slow_after(2, LOSSES))
 @pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     X, Y = frames_with_outliers()
@@ -148,6 +159,7 @@ def with_empty_rows(table):
     return np.where(EMPTY[:, None], np.nan, table)
 
 
+@cache
 def fitted_with_empty_rows(**params):
     """Return the model of a table with rows of NaN, which are warned of."""
     message = r"5 of 90 rows \(first: row 0\)"
@@ -157,10 +169,16 @@ def fitted_with_empty_rows(**params):
     return fitted
 
 
+@cache
+def fitted_without_empty_rows(**params):
+    """Return the model of the other rows, to be left as it is."""
+    return estimator(**params).fit(HOLED.data[~EMPTY])
+
+
 @pytest.mark.parametrize("params", VARIANTS[:2] + VARIANTS[3:4], ids=str)
 def test_rows_that_show_nothing_are_left_out_of_the_fit(params):
     fitted = fitted_with_empty_rows(**params)
-    expected = estimator(**params).fit(HOLED.data[~EMPTY])
+    expected = fitted_without_empty_rows(**params)
     names = [name for name in ATTRIBUTES_OF_FRAMES if name in vars(expected)]
     assert len(names) > 2
     for name in names:
@@ -172,8 +190,8 @@ def test_rows_that_show_nothing_are_left_out_of_the_fit(params):
 
 
 def test_methods_make_nothing_of_rows_that_show_nothing():
-    fitted = fitted_with_empty_rows()
-    expected = estimator().fit(HOLED.data[~EMPTY])
+    fitted = fitted_with_empty_rows(refinement="joint")
+    expected = fitted_without_empty_rows(refinement="joint")
     table = with_empty_rows(HOLED.data)
     assert fitted.score(table) == expected.score(HOLED.data[~EMPTY])
     for found, wanted in zip(fitted.diagnostics(), expected.diagnostics(), strict=True):
@@ -282,7 +300,9 @@ def test_points_with_one_coordinate_count_as_missing_and_warn(complete_model, me
 def test_the_fitted_table_has_its_coefficients_to_the_bit(variant, scale_frames):
     if scale_frames:
         fitted = variant
-        assert_array_equal(clone(fitted).fit_transform(HOLED.data), fitted.alpha_)
+        if fitted.loss == "linear":
+            again = clone(fitted).fit_transform(HOLED.data)
+            assert_array_equal(again, fitted.alpha_)
     else:
         fitted = clone(variant).set_params(scale_frames=False).fit(HOLED.data)
     frames = fitted.decompose(HOLED.data)
@@ -314,13 +334,13 @@ def test_a_stream_of_frames_keeps_its_memory(model):
         gc.collect()
 
     tracemalloc.start()
-    stream(500)  # Python and NumPy fill caches of their own
+    stream(200)  # Python and NumPy fill caches of their own
     before, _ = tracemalloc.get_traced_memory()
-    stream(500)
+    stream(200)
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     # Fewer bytes a frame than the header of an array
-    assert after - before < 100 * 500
+    assert after - before < 100 * 200
 
 
 def with_unknown_rows():
@@ -404,7 +424,7 @@ def with_outliers(made, seed, share=0.05, size=1.0):
 
 @pytest.mark.parametrize(
     ("seed", "size"),
-    slow_after(1, [(0, 5.0), (0, 1.0), (1, 1.0), (2, 1.0)], together=True),
+    slow_after(1, [(0, 5.0), (0, 1.0), (1, 1.0)], together=True),
 )
 @pytest.mark.parametrize("loss", LOSSES[1:])
 def test_robust_losses_withstand_outliers(loss, seed, size):
