@@ -158,8 +158,12 @@ class TestPosteriorFrames:
         again = fit_posterior(
             tracks, frames.shapes, NOISE**2, weights=weights, initial=fitted.alpha
         )
+        # The fit ends when its weights change by less than 1e-4. Entries of cameras can
+        # change by more where points are missing.
+        apart = distances(tracks, frames.shapes, *again[:3])
+        new = np.nan_to_num(WEIGHTS[loss](apart / NOISE))
+        assert_allclose(new, weights, rtol=0, atol=1e-4)
         assert_allclose(again.alpha, fitted.alpha, atol=1e-4)
-        assert_allclose(again.motion, fitted.motion, atol=1e-4)
 
     @pytest.mark.parametrize(("size", "point"), [(2.0, 0), (20.0, 7)])
     @pytest.mark.parametrize("loss", LOSSES[1:])
