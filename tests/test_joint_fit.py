@@ -8,7 +8,7 @@ import pytest
 from layers import slow_after
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from scenes import with_gaps
+from scenes import random_scene, with_gaps
 
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
@@ -17,6 +17,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._joint import problem as problem_module
 from isa_nrsfm._joint.fit import Spectrum
 from isa_nrsfm._joint.problem import FactorisedTable
+from isa_nrsfm._joint.reweighting import residual_deviations
 from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._paper.svd import Triplets
 from isa_nrsfm._parameters.choices import LOSSES
@@ -271,6 +272,34 @@ class TestLargeTables:
 
 
 class TestRobustLoss:
+    @pytest.mark.parametrize("camera", CAMERAS)
+    def test_deviations_of_residuals_by_dense_matrices(self, camera):
+        # I - A (A^T W A + P)^-1 A^T W, with A by differences.
+        variance, step, model = 0.3, 1e-6, CAMERAS[camera]
+        scene = random_scene(camera=camera, kind="missing", n_frames=5)
+        n_pose = model.n_parameters + 2
+        unknowns = np.eye(n_pose + scene.alpha.shape[1])
+        prior = np.diag(np.arange(len(unknowns)) >= n_pose) * variance
+        expected = np.empty(scene.weights.shape)
+        for i, weights in enumerate(scene.weights):
+
+            def image(change, i=i):
+                turn, t, a = np.split(change, [model.n_parameters, n_pose])
+                M = model.moved(scene.motion[i, ..., None], turn[:, None])[..., 0]
+                a = scene.alpha[i] + a
+                shape = scene.shapes[0] + np.tensordot(a, scene.shapes[1:], 1)
+                return (M @ shape + t[:, None]).ravel()
+
+            A = np.stack([image(step * e) - image(-step * e) for e in unknowns], 1)
+            A, W = A / (2 * step), np.diag(np.tile(weights, 2))
+            left = np.eye(len(A)) - A @ np.linalg.solve(A.T @ W @ A + prior, A.T @ W)
+            square = np.sum(left**2, axis=1).reshape(2, -1)
+            expected[i] = np.sqrt(square.mean(axis=0))
+        got = residual_deviations(
+            scene.motion, scene.alpha, scene.shapes, scene.weights, variance, model
+        )
+        assert_allclose(got, expected, rtol=1e-6)
+
     @ROBUST
     def test_tables_without_noise(self, loss):
         tracks, truth = random_table(deviation=0.0)

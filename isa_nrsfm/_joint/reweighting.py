@@ -47,7 +47,7 @@ def reweighted(
         model = motion, position, alpha, sizes
         M, t, a, few_sizes = (part[few] for part in model)
         distance = distances(few_rows.transpose(0, 2, 1), shapes, M, t, a)
-        distance /= _residual_deviations(M, a, shapes, weights, variance, cameras)
+        distance /= residual_deviations(M, a, shapes, weights, variance, cameras)
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
         new = partial(_weighted, shapes=shapes, loss=settings.loss, deviation=deviation)
@@ -62,7 +62,7 @@ def reweighted(
     return fit, deviation**2
 
 
-def _residual_deviations(
+def residual_deviations(
     motion: NDArray,
     alpha: NDArray,
     shapes: NDArray,
