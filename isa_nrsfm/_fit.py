@@ -312,7 +312,8 @@ def _paper_result(
         if estimator.refinement == "joint":  # it only starts from this result
             max_iter, tol = 200, 1e-5
             if estimator.isa is None:
-                warnings.filterwarnings("ignore", "FastICA did not", ConvergenceWarning)
+                message = "PooledFastICA did not"
+                warnings.filterwarnings("ignore", message, ConvergenceWarning)
         return run_paper_pipeline(
             factors,
             n_components,

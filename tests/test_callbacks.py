@@ -20,7 +20,7 @@ from isa_nrsfm.io import load_model, save_model
 
 callback = pytest.importorskip("sklearn.callback", reason="new in scikit-learn 1.9")
 
-pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
+pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 
 TABLE = make_nonrigid_tracks(40, 16, 1, noise=0.02, random_state=0).data
 

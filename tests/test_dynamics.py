@@ -242,7 +242,7 @@ class TestSmooth:
             model.smooth(table, **options)
 
     # Whether FastICA converges on one basis shape depends on the version of SciPy.
-    @pytest.mark.filterwarnings("ignore:FastICA did not converge")
+    @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
     def test_needs_a_posterior(self, waving):
         _, table = waving
         model = AffineNRSfM(1, refinement=None, random_state=0).fit(table)

@@ -13,7 +13,7 @@ from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 pytestmark = [
     pytest.mark.filterwarnings("ignore:layout=:UserWarning"),
     # Of the paper's pipeline: the joint refinement does not say so.
-    pytest.mark.filterwarnings("ignore:FastICA did not converge"),
+    pytest.mark.filterwarnings("ignore:PooledFastICA did not converge"),
 ]
 
 VARIANTS = {

@@ -18,7 +18,7 @@ from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error
 
 # Of the paper's pipeline: the joint refinement does not say so.
-pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
+pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]

@@ -99,7 +99,7 @@ class TestLikelihood:
         expected = -np.sqrt(u + 0.1).mean(axis=0).sum()
         assert_allclose(isa.criteria_.max(), expected)
 
-    @pytest.mark.filterwarnings("ignore:FastICA did not converge")
+    @pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
     @pytest.mark.parametrize("seed", range(8))
     def test_best_of_all_groupings(self, seed):
         # So few samples that no grouping stands out.
@@ -128,7 +128,8 @@ class TestComponents:
     def test_not_converged(self):
         with pytest.warns(
             ConvergenceWarning,
-            match="FastICA did not converge in max_iter=1 steps in the run that is",
+            match="PooledFastICA did not converge in max_iter=1 steps in the run .*"
+            "try another fun or larger n_init or max_iter",
         ):
             PooledFastICA(n_init=2, max_iter=1, random_state=0).fit(
                 spherical_sources(0, 68, 9)

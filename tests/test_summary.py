@@ -11,7 +11,7 @@ from sklearn.pipeline import make_pipeline
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
-pytestmark = pytest.mark.filterwarnings("ignore:FastICA did not converge")
+pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 
 TABLE = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
 

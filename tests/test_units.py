@@ -91,7 +91,7 @@ def test_the_page_has_all_attributes():
 
 
 # The paper's pipeline says so of tables with as few points as this one.
-@pytest.mark.filterwarnings("ignore:FastICA did not converge")
+@pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 @pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating", None]))
 @pytest.mark.parametrize("column", range(len(COLUMNS)))
 def test_attributes_have_the_units_of_the_page(column, refinement):

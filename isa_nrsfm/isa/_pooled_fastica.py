@@ -175,7 +175,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
         groupings = [in_order, *(random_state.permutation(in_order) for _ in range(7))]
         runs: list[tuple[float, NDArray, int, bool]] = []
         for start in starts:
-            W, n_iter, converged = self._fastica(Z, start)
+            W, n_iter, converged = self._components(Z, start)
             gains, value_of = _objective(W, Z, covariance, in_order)
             swapped = [swap_until_best(first, gains) for first in groupings]
             rows = max(map(rows_by_subspace, swapped), key=value_of)
@@ -193,16 +193,20 @@ class PooledFastICA(BaseSubspaceAnalysis):
             gains = value_gains(lambda groups: criterion(components[groups]), n_signals)
             W = W[rows_by_subspace(swap_until_best(in_order, gains))]
         if not converged:
+            other = "another fun or " if "fun" in self.get_params() else ""
             warn_caller(
-                f"FastICA did not converge in max_iter={self.max_iter} steps in the "
-                "run that is kept: its sources may be ill determined; try "
-                f"{type(self).__name__} with another fun or larger n_init or max_iter",
+                f"{type(self).__name__} did not converge in max_iter={self.max_iter} "
+                "steps in the run that is kept: its sources may be ill determined; try "
+                f"{other}larger n_init or max_iter",
                 ConvergenceWarning,
             )
         return W
 
-    def _fastica(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
-        """Return unmixing, steps and convergence of one run on white signals."""
+    def _components(self, Z: NDArray, start: NDArray) -> tuple[NDArray, int, bool]:
+        """Return unmixing, steps and convergence of one run on white signals.
+
+        Z is (n_signals, n_samples), start and unmixing (n_signals, n_signals).
+        """
         # This imports all linear models, which `transform` does not need.
         from sklearn.decomposition import FastICA
 
