@@ -86,7 +86,7 @@ class TestFrameWeights:
     @pytest.mark.parametrize("loss", ROBUST)
     def test_points_that_do_not_belong_to_their_frame_have_none(self, loss):
         distance = np.array(
-            [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e140]]
+            [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e200]]
         )
         weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]))
         expected = WEIGHTS[loss](distance[:, :3] / 0.5)

@@ -41,7 +41,8 @@ def frame_weights(
     shapes towards such points.
     """
     belongs = distance <= DISTANT * sizes[:, None]
-    return np.where(belongs, WEIGHTS[loss](distance / deviation), 0.0)
+    near = np.where(belongs, distance, 0.0)  # powers of others could overflow
+    return np.where(belongs, WEIGHTS[loss](near / deviation), 0.0)
 
 
 def median_noise(distance: NDArray) -> float:
