@@ -13,7 +13,14 @@ from sklearn.utils import check_random_state
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import JOINT_STAGE, STAGES, Limits, fit_table
+from isa_nrsfm._fit import (
+    CONSENSUS_STAGE,
+    JOINT_STAGE,
+    STAGES,
+    STEPWISE,
+    Limits,
+    fit_table,
+)
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
@@ -354,10 +361,12 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             table much better, or if a refinement has not converged.
         """
         self._forget()
-        joint = self.refinement == "joint"
-        stages = [stage for stage in STAGES if joint or stage != JOINT_STAGE]
+        left_out = set() if self._is_joint else {JOINT_STAGE}
+        if self.refinement != "consensus":
+            left_out.add(CONSENSUS_STAGE)
+        stages = [stage for stage in STAGES if stage not in left_out]
         with kept_arrays(self.frames_folder) as keep:
-            progress = FitProgress(self, stages, stepwise=JOINT_STAGE, X=X, y=y)
+            progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             fitted = copy.copy(self)
             source = fitted._checked(X)
             frames = fit_table(fitted, source, progress)
@@ -397,7 +406,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             "loss": self.loss != "linear",
             "independence": self.independence == "coefficients",
         }
-        if self.refinement != "joint":
+        if not self._is_joint:
             got = f"needs refinement='joint'; got refinement={self.refinement!r}"
             for name, asked_for in only_joint.items():
                 if asked_for:
@@ -406,6 +415,12 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
                 raise ValueError(f"a table that is not in memory {got}")
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
+        if self.refinement == "consensus" and self.camera == "affine":
+            raise ValueError(
+                "refinement='consensus' needs calibrated cameras, because depths of "
+                "groups of points with affine cameras have no common unit. Set "
+                "camera='weak_perspective' or camera='orthographic'"
+            )
         source = self._opened(X, reset=True)
         check_names(getattr(self, "feature_names_in_", None), self.layout)
         self.isa_ = self._strategy()
@@ -417,7 +432,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         if self.isa is not None:
             isa = clone(self.isa)
         else:
-            isa = PooledFastICA(n_init=2 if self.refinement == "joint" else 16)
+            isa = PooledFastICA(n_init=2 if self._is_joint else 16)
         params = isa.get_params(deep=False)
         if params.get("subspace_size", 3) != 3:
             raise ValueError(
@@ -442,7 +457,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     def _set_frames(self, *frames: NDArray) -> None:
         """Set the attributes of the frames, in the order of `Decomposition`."""
         self.motion_, self.translation_, self.alpha_, alpha_std = frames
-        if self.refinement == "joint":
+        if self._is_joint:
             self.alpha_std_ = alpha_std
         if self.camera != "affine":
             self.rotations_, self.scales_ = full_rotations(self.motion_)

@@ -28,6 +28,7 @@ from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
+from isa_nrsfm._frames.depth import NOT_ESTIMATED
 from isa_nrsfm._frames.models import (
     Decomposition,
     FrameMap,
@@ -43,12 +44,12 @@ from isa_nrsfm._gauge.canonical import (
     rigid_gauge,
 )
 from isa_nrsfm._gauge.independent import independent_gauge
+from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
 from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
 from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
-from isa_nrsfm._joint.quasi_newton import JointFit
 from isa_nrsfm._joint.sample_posterior import (
     posterior_blocks,
     posterior_moments,
@@ -70,14 +71,19 @@ from isa_nrsfm._transformer import TableTransformer
 
 # Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
+# Reported only with the consensus of groups.
+CONSENSUS_STAGE = "consensus of groups of points"
 STAGES = (
     "table",
     "factorisation",
     "independent subspaces",
     "block structure and refinement",
     JOINT_STAGE,
+    CONSENSUS_STAGE,
     "gauge and coefficients",
 )
+# Stages that report steps.
+STEPWISE = JOINT_STAGE, CONSENSUS_STAGE
 # Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
 # frame. PAPER_TOL: gain of the paper's refinement, as a share of the explained energy.
 JOINT_TOL, PAPER_TOL = 0.025, 1e-10
@@ -111,10 +117,7 @@ def fit_table(
     if n_components == "auto":
         n_components = _count_components(estimator, source)
     table = ready_table(estimator, source, n_components)
-    frames = fit_ready_table(estimator, table, n_components, progress)
-    if estimator.camera != "affine":
-        _estimate_errors(estimator, table)
-    return frames
+    return fit_ready_table(estimator, table, n_components, progress, errors=True)
 
 
 @one_blas_thread
@@ -124,9 +127,13 @@ def fit_ready_table(
     n_components: int,
     progress: FitProgress | NoProgress,
     starts: Sequence[Start] = (),
+    errors: bool = False,
 ) -> Decomposition:
-    """Fit a checked and scaled table, as `fit_table`."""
+    """Fit a checked and scaled table, as `fit_table`; estimate errors on demand."""
     # 1. and 2. The rest of the table, and its factorisation
+    wanted = n_components
+    if estimator.refinement == "consensus":
+        n_components = min(n_components, MOST_FIRST)
     factorised = _factorised(estimator, table, n_components, progress)
     factors = factorised.factors
     # 3. and 4. The paper's pipeline
@@ -135,12 +142,23 @@ def fit_ready_table(
     else:
         paper = _paper_result(estimator, factors, n_components, progress)
     # 5. Refinement, gauge and frames
-    if estimator.refinement == "joint":
+    if estimator._is_joint:
         shapes = starts[0].shapes if paper is None else paper.shapes
         settings = _joint_settings(estimator, progress.step)
         fitted, tracks, alpha = fit_jointly(factorised, shapes, settings, starts)
+        model = _frame_model(estimator, fitted.state.shapes, fitted.state.noise, alpha)
         progress(JOINT_STAGE)
-        frames = _joint_frames(estimator, table, fitted, tracks, alpha)
+        if errors and estimator.camera != "affine":
+            model = replace(model, certainty=depth_certainty(model, table.rows))
+        if estimator.refinement == "consensus":
+            model = _consensus_model(estimator, table, model, settings, wanted)
+            tracks = JointFrames.from_points(table.rows, table.complete)
+            progress(CONSENSUS_STAGE)
+        frames = _joint_frames(estimator, table, model, tracks)
+        estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
+        estimator.objective_history_ = fitted.history
+        estimator.gradient_norm_ = fitted.gradient_norm
+        estimator.n_iter_ = len(fitted.history) - 1
         converged = fitted.converged
     else:
         assert paper is not None
@@ -155,7 +173,7 @@ def fit_ready_table(
     # 6. Measures of the fit
     unit, fit = estimator._model.unit or 1.0, estimator._model
     estimator.mean_shape_, estimator.basis_ = fit.mean_shape, fit.basis
-    estimator.camera_, estimator._n_features_out = estimator.camera, n_components
+    estimator.camera_, estimator._n_features_out = estimator.camera, len(fit.basis)
     estimator.rank_floor_ = factorised.triplets.rest_share
     estimator.singular_values_ = unit * factorised.triplets.values
     estimator.mode_covariance_ *= unit**2
@@ -185,16 +203,6 @@ def fit_ready_table(
 
 
 @one_blas_thread
-def _estimate_errors(estimator: TableTransformer, table: ScaledTable) -> None:
-    """Estimate the errors of a joint fit with calibrated cameras, and set them."""
-    frames = estimator._model.frames
-    if isinstance(frames, PosteriorFrames):
-        frames = replace(frames, certainty=depth_certainty(frames, table.rows))
-        estimator._model = estimator._model._replace(frames=frames)
-        estimator.depth_uncertainty_ = frames.certainty.total
-
-
-@one_blas_thread
 def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
     """Return the number of basis shapes that a table supports, of at most twelve."""
     with warnings.catch_warnings():
@@ -203,12 +211,13 @@ def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
     possible = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(12, possible)
     trial = copy.copy(estimator)
+    trial.refinement = "joint"
     factorised = _factorised(trial, table, most, NoProgress())
     paper = _paper_result(trial, factorised.factors, most, NoProgress())
     found = count_components(factorised, paper.shapes, _joint_settings(estimator))
     # Down-weighted outliers look like basis shapes: fit again with the final weights.
     while found > 1 and estimator.loss != "linear":
-        trial = copy.copy(estimator)
+        trial = copy.copy(trial)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             fit_ready_table(trial, table, found, NoProgress())
@@ -242,7 +251,7 @@ def ready_table(
 
 def joint_camera(estimator: TableTransformer) -> str | None:
     """Return the camera model of the joint refinement, None without it."""
-    return estimator.camera if estimator.refinement == "joint" else None
+    return estimator.camera if estimator._is_joint else None
 
 
 def joint_tol(estimator: TableTransformer) -> float:
@@ -286,7 +295,7 @@ def _factorised(
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(completed, shape, n_triplets, limits.dense)
-    if estimator.refinement == "joint":
+    if estimator._is_joint:
         rigid, first = triplets.vectors[:3], limits.sample
         sample = sample_frames(completed, n_points, rigid, first, limits.small_table)
     else:
@@ -309,7 +318,7 @@ def _paper_result(
     max_iter = estimator.max_iter if estimator.refinement else 0
     tol = PAPER_TOL if estimator.tol is None else estimator.tol
     with warnings.catch_warnings():
-        if estimator.refinement == "joint":  # it only starts from this result
+        if estimator._is_joint:  # it only starts from this result
             max_iter, tol = 200, 1e-5
             if estimator.isa is None:
                 message = "PooledFastICA did not"
@@ -358,23 +367,45 @@ def _paper_frames(
     return frames
 
 
-def _joint_frames(
-    estimator: TableTransformer,
-    table: ScaledTable,
-    fitted: JointFit,
-    tracks: JointFrames,
-    alpha: NDArray,
-) -> Decomposition:
-    """Return the frames of a joint fit in the independent gauge, and set the model."""
-    shapes, _, noise_variance = fitted.state
-    frames = PosteriorFrames(
+def _frame_model(
+    estimator: TableTransformer, shapes: NDArray, noise: float, alpha: NDArray
+) -> PosteriorFrames:
+    """Return the model of a frame for shapes (K + 1, 3, J), before the gauge."""
+    return PosteriorFrames(
         shapes,
-        noise_variance,
+        noise,
         spread_starts(alpha, 8),
         estimator.loss,
         FrameMap.identity(len(shapes) - 1),
         estimator.camera,
     )
+
+
+def _consensus_model(
+    estimator: TableTransformer,
+    table: ScaledTable,
+    model: PosteriorFrames,
+    settings: JointSettings,
+    n_components: int,
+) -> PosteriorFrames:
+    """Return the consensus of groups of points, with the errors of the depths."""
+    wanted = None if estimator.n_components == "auto" else n_components
+    most = most_components(len(table.sizes), table.n_points, estimator.camera)
+    most = min(most, MOST_COMPONENTS)
+    found = consensus(model, table.rows, settings, wanted, most, estimator.n_jobs)
+    certainty = model.certainty._replace(points=found.variances)
+    model = _frame_model(estimator, found.shapes, found.noise, found.alpha)
+    return replace(model, certainty=certainty)
+
+
+def _joint_frames(
+    estimator: TableTransformer,
+    table: ScaledTable,
+    frames: PosteriorFrames,
+    tracks: JointFrames,
+) -> Decomposition:
+    """Return the frames of a joint fit in the independent gauge, and set the model."""
+    shapes = frames.shapes
     posteriors = posterior_blocks(frames, tracks, table.rows)
     motion, alpha, covariance = posterior_moments(posteriors)
     unknown = np.isnan(motion).any(axis=(1, 2))
@@ -411,14 +442,13 @@ def _joint_frames(
     )
     cameras = shown.motion / table.sizes[:, None, None]
     estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
-    estimator.noise_variance_ = (estimator._model.unit or 1.0) ** 2 * noise_variance
-    estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
+    unit = estimator._model.unit or 1.0
+    estimator.noise_variance_ = unit**2 * frames.noise_variance
+    if frames.certainty is not NOT_ESTIMATED:
+        estimator.depth_uncertainty_ = frames.certainty.total
     estimator.reliability_ = reliabilities(
         alpha, covariance, *(sum(part) for part in chance)
     )
-    estimator.objective_history_ = fitted.history
-    estimator.gradient_norm_ = fitted.gradient_norm
-    estimator.n_iter_ = len(fitted.history) - 1
     return shown._replace(translation=shown.translation + table.translation)
 
 

@@ -22,6 +22,7 @@ from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -135,6 +136,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         tags.transformer_tags.preserves_dtype = ["float64", "float32"]
         tags.input_tags.allow_nan = True
         return tags
+
+    @property
+    def _is_joint(self) -> bool:
+        """Whether the refinement is the joint fit, or begins with it."""
+        return self.refinement in JOINT_REFINEMENTS
 
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""

@@ -30,14 +30,19 @@ class _NoContext:
 
 
 class FitProgress:
-    """Reports the stages of a fit, and the steps of the stage `stepwise`.
+    """Reports the stages of a fit, and the steps of the stages `stepwise`.
 
     Callbacks get tasks for the fit, its stages and their steps. `verbose` prints a line
     after each stage; above one it overwrites the current step.
     """
 
     def __init__(
-        self, estimator: Any, stages: Sequence[str], *, stepwise: str, **data: Any
+        self,
+        estimator: Any,
+        stages: Sequence[str],
+        *,
+        stepwise: Sequence[str],
+        **data: Any,
     ):
         self.about = {"estimator": estimator, **data}
         self.left = list(stages)
@@ -72,7 +77,7 @@ class FitProgress:
         name, self.n_steps, self.last_step = self.left[0], 0, None
         self._print(2, name, end="\r")
         self.since = time.perf_counter()
-        n_steps = None if name == self.stepwise else 0
+        n_steps = None if name in self.stepwise else 0
         self.stage: Any = self.fit.subcontext(task_name=name, max_subtasks=n_steps)
         self.stage.call_on_fit_task_begin(**self.about)
 

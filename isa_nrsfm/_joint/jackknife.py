@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.models import PosteriorFrames
-from isa_nrsfm._frames.projection import distances
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.options import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
+from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
@@ -45,9 +45,6 @@ MOST_FRAMES, MOST_POINTS = 200, 200
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
 # %, the floor changes no deviation by more than a third.
 LEAST_NOISE = 1e-6
-# With a robust loss, points with residuals above this threshold, in standard deviations
-# of a coordinate, are left out. Without outliers this is one point in 3,000.
-OUTLYING = 4.0
 
 
 def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
@@ -55,12 +52,7 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)
-    tracks = part.transpose(0, 2, 1)
-    found = frames.posterior(tracks, covariances=False)
-    if frames.loss != "linear":
-        off = distances(tracks, frames.shapes, *found[:3])
-        outlying = off > OUTLYING * np.sqrt(frames.noise_variance)
-        part = np.where(outlying[:, None], np.nan, part)
+    part, found = inlying_rows(frames, part)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]

@@ -9,10 +9,27 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import Decomposition, PosteriorFrames
-from isa_nrsfm._frames.projection import stacked_motion
+from isa_nrsfm._frames.projection import distances, stacked_motion
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._tables.blocks import FrameBlocks
+
+# With a robust loss, points with residuals above this threshold, in standard deviations
+# of a coordinate, are left out. Without outliers this is one point in 3,000.
+OUTLYING = 4.0
+
+
+def inlying_rows(
+    model: PosteriorFrames, rows: NDArray
+) -> tuple[NDArray, FramePosterior]:
+    """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
+    tracks = rows.transpose(0, 2, 1)
+    found = model.posterior(tracks, covariances=False)
+    if model.loss != "linear":
+        off = distances(tracks, model.shapes, *found[:3])
+        outlying = off > OUTLYING * np.sqrt(model.noise_variance)
+        rows = np.where(outlying[:, None], np.nan, rows)
+    return rows, found
 
 
 def posterior_blocks(

@@ -4,7 +4,9 @@ No imports: the help of the command line must not wait for NumPy or scikit-learn
 """
 
 BLOCK_RECOVERIES = ("generalized_eigen", "eigen", "irls")
-REFINEMENTS = ("joint", "alternating")
+REFINEMENTS = ("joint", "consensus", "alternating")
+# Refinements that begin with the joint fit.
+JOINT_REFINEMENTS = ("joint", "consensus")
 CAMERA_NAMES = ("affine", "weak_perspective", "orthographic")
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
