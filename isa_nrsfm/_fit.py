@@ -393,7 +393,9 @@ def _consensus_model(
     most = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(most, MOST_COMPONENTS)
     found = consensus(model, table.rows, settings, wanted, most, estimator.n_jobs)
-    certainty = model.certainty._replace(points=found.variances)
+    certainty = model.certainty
+    if found.variances is not None:
+        certainty = certainty._replace(points=found.variances)
     model = _frame_model(estimator, found.shapes, found.noise, found.alpha)
     return replace(model, certainty=certainty)
 

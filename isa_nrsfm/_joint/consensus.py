@@ -40,6 +40,8 @@ from isa_nrsfm._tables.tracks import FEWEST_POINTS
 # with 2 % noise is .045 instead of .036. Groups that share nearly all points agree,
 # however large their error.
 GROUPS, LARGEST_SHARE = ((12, 8), (20, 12), (30, 12)), 0.75
+# Groups that contain a point, on average, of each size.
+COVER = 6
 # Weight of the mean distance of two points beside its standard deviation, in the
 # choice of neighbours: of two rigidly connected points the near one comes first.
 NEARNESS = 0.15
@@ -64,13 +66,14 @@ class Consensus(NamedTuple):
     shapes (K + 1, 3, J): centred, for coefficients of variance one.
     noise: noise variance of a coordinate.
     alpha (n, K): coefficients of some frames.
-    variances (J,): mean square changes of the depths of the points.
+    variances (J,): mean square changes of the depths of the points, None if there are no
+    groups.
     """
 
     shapes: NDArray
     noise: float
     alpha: NDArray
-    variances: NDArray
+    variances: NDArray | None
 
 
 class Scene(NamedTuple):
@@ -134,24 +137,30 @@ def consensus(
         first[:, :, chosen],
         found.motion,
         1.0 / (options.basis_std**2 * mean_square),
-        FLOOR_SHARE * min(model.noise_variance, options.least_noise * mean_square),
+        FLOOR_SHARE * options.least_noise * mean_square,
     )
-    distances = neighbour_distances(shapes[:, :, chosen])
-    groups = fitted_groups(scene, distances, len(model.shapes) - 1, settings, n_jobs)
-    noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
-    # Coordinates of all points: changes of the chosen ones, interpolated
-    excess = noise - scene.floor
-    merged = merge(scene, weighted(scene, groups), excess / noise)
-    change = (merged - scene.first) @ interpolation(model.shapes[0], chosen)
-    change -= change.mean(axis=2, keepdims=True)
+    noise, change, groups = model.noise_variance, np.zeros_like(first), []
+    # Groups cannot improve a fit whose noise is below their floor.
+    if noise >= scene.floor:
+        distances = neighbour_distances(shapes[:, :, chosen])
+        most_group = len(model.shapes) - 1
+        groups = fitted_groups(scene, distances, most_group, settings, n_jobs)
+    if groups:
+        noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
+        # Coordinates of all points: changes of the chosen ones, interpolated
+        share = 1.0 - scene.floor / noise
+        merged = merge(scene, weighted(scene, groups), share)
+        change = (merged - scene.first) @ interpolation(model.shapes[0], chosen)
+        change -= change.mean(axis=2, keepdims=True)
     # Shapes in the axes of the object, and their principal components
     S = shapes + rotations.transpose(0, 2, 1) @ change / scales[:, None, None]
     fitted, alpha, rest = principal_shapes(
         S,
         most if n_components is None else n_components,
-        0.0 if n_components else excess + LEFT * scene.floor,
+        0.0 if n_components else LEFT * noise,
     )
-    return Consensus(fitted, noise + rest, alpha, np.mean(change[:, 2] ** 2, axis=0))
+    variances = np.mean(change[:, 2] ** 2, axis=0) if groups else None
+    return Consensus(fitted, noise + rest, alpha, variances)
 
 
 def fitted_groups(
@@ -208,9 +217,25 @@ def neighbour_distances(shapes: NDArray) -> NDArray:
 
 
 def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
-    """Return the different groups of each point and its neighbours, and how often."""
-    order = np.argsort(distances, axis=1, kind="stable")[:, :size]
-    groups, counts = np.unique(np.sort(order, axis=1), axis=0, return_counts=True)
+    """Return the different groups of points and their neighbours, and how often.
+
+    The points are the first ones by farthest point sampling, and all points that are in
+    none of their groups.
+    """
+    n_points = len(distances)
+    nearest = np.sort(np.argsort(distances, axis=1, kind="stable")[:, :size], axis=1)
+    most = min(-(-COVER * n_points // size), n_points)
+    centres = [int(np.argmin(distances.sum(axis=1)))]
+    covered = np.zeros(n_points, dtype=bool)
+    while len(centres) < most or not covered.all():
+        covered[nearest[centres[-1]]] = True
+        if len(centres) == n_points:
+            break
+        left = distances[:, centres].min(axis=1)
+        if len(centres) >= most:
+            left = np.where(covered, -1.0, left)
+        centres.append(int(np.argmax(left)))
+    groups, counts = np.unique(nearest[centres], axis=0, return_counts=True)
     return list(zip(groups, counts.tolist(), strict=True))
 
 

@@ -1,0 +1,158 @@
+"""Print errors of the consensus of groups of points beside those of the joint fit.
+
+Run ``python -m benchmarks.consensus [section ...] [--seeds N] [--jobs N]``. Errors are
+those of `mean_shape_error_3d`, of shapes in the axes of their cameras, in the
+conventions "sequence" (Akhter, Dai), "camera" (Lee) and "frame". "error / std" is the
+RMS of the errors of the depths over the standard deviations of
+``reconstruct(X, return_std=True)``, "rank" their rank correlation over the points.
+"fits" is the CPU time of a fit, in joint fits with twelve basis shapes.
+"""
+
+import time
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from benchmarks._command import run
+from benchmarks._sets import SETS, is_present, load, shapes_in_camera
+from benchmarks.recovery import instance
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
+
+CAPTURED = ("yoga", "pickup", "drink")
+# Markers near 15 joints of the body, of the 41 of the motion capture.
+JOINTS = (0, 4, 7, 10, 15, 17, 19, 22, 24, 25, 28, 29, 33, 35, 40)
+CONVENTIONS = ("sequence", "camera", "frame")
+
+
+def fitted(X, refinement, n_components, camera, n_jobs=None, seed=0):
+    """Return a fit of a table, and its CPU seconds."""
+    model = AffineNRSfM(
+        n_components,
+        camera=camera,
+        refinement=refinement,
+        random_state=seed,
+        n_jobs=n_jobs,
+    )
+    start = time.process_time()
+    return model.fit(X), time.process_time() - start
+
+
+def in_camera(model, X):
+    """Return the shapes of frames and the deviations of depths, in the camera's axes."""
+    shapes, deviations = model.reconstruct(X, return_std=True)
+    rotations, scales = full_rotations(model.decompose(X).motion)
+    shapes = scales[:, None, None] * shapes @ rotations.transpose(0, 2, 1)
+    return shapes, scales[:, None] * deviations
+
+
+def report(title, X, truth, cases, scale=False, n_jobs=None):
+    """Print a row for each case (refinement, K, camera) of a table of known shapes."""
+    _, unit = fitted(X, "joint", min(12, X.shape[1] // 2 - 4), cases[0][2])
+    for refinement, n_components, camera in cases:
+        model, seconds = fitted(X, refinement, n_components, camera, n_jobs)
+        shapes, deviations = in_camera(model, X)
+        known = np.isfinite(shapes).all(axis=(1, 2))
+        errors = [
+            mean_shape_error_3d(
+                truth[known], shapes[known], convention=convention, **scaled
+            )
+            for convention in CONVENTIONS
+            for scaled in [{"scale": scale} if convention == "sequence" else {}]
+        ]
+        z, d = (
+            S[known, :, 2] - S[known, :, 2].mean(1)[:, None] for S in (truth, shapes)
+        )
+        size = np.sum(np.abs(z * d)) / np.sum(d * d) if scale else 1.0
+        off = size * np.sign(np.sum(z * d)) * d - z
+        std = size * deviations[known]
+        ratio = np.sqrt(np.mean((off / std) ** 2))
+        rank = spearmanr(*(np.mean(each**2, axis=0) for each in (off, std)))[0]
+        name = f"{title}, {refinement} {n_components}, {camera}"
+        print(
+            f"{name:52}{len(model.basis_):4}"
+            + "".join(f"{error:9.4f}" for error in errors)
+            + f"{ratio:8.2f}{rank:6.2f}{seconds / unit:7.1f}",
+            flush=True,
+        )
+
+
+def heading():
+    """Print the names of the columns of `report`."""
+    columns = "".join(f"{name:>9}" for name in CONVENTIONS)
+    print(f"{'table, refinement, K, camera':52}{'K':>4}{columns}   e/std  rank   fits")
+
+
+def both(n_components, camera="orthographic"):
+    """Return the joint fit and the consensus with automatic numbers of shapes."""
+    return [("joint", n_components, camera), ("consensus", "auto", camera)]
+
+
+def complete(options):
+    """Complete tables; the refined model with the numbers of components it finds."""
+    heading()
+    for name in filter(is_present, CAPTURED):
+        X, truth = load(name).X, shapes_in_camera(name)
+        cases = [
+            *both(12),
+            ("consensus", 40, "orthographic"),
+            *both(12, "weak_perspective"),
+        ]
+        report(name, X, truth, cases, n_jobs=options.jobs)
+    others = [
+        ("shark", both("auto")),
+        ("flag", both(12, "weak_perspective")),
+        ("flag", [("consensus", 12, "weak_perspective")]),
+        ("ict_68", both(9, "weak_perspective")),
+        ("ict_68", [("consensus", 9, "weak_perspective")]),
+    ]
+    for name, cases in others:
+        if is_present(name):
+            scale = SETS[name].camera != "orthographic"
+            X, truth = load(name).X, shapes_in_camera(name)
+            report(name, X, truth, cases, scale, options.jobs)
+
+
+def spoiled(options):
+    """Missing points (40 %), noise (2 % of the size), and 15 points of a body."""
+    heading()
+    for name in filter(is_present, CAPTURED[:2]):
+        X, truth = load(name).X, shapes_in_camera(name)
+        tracks = X.reshape(len(X), -1, 2)
+        size = np.sqrt(np.mean((tracks - tracks.mean(axis=1, keepdims=True)) ** 2))
+        for seed in range(options.seeds):
+            rng = np.random.default_rng(seed)
+            noise = 0.02 * size * rng.standard_normal(tracks.shape)
+            hidden = rng.random(tracks.shape[:2])[:, :, None] < 0.4
+            holes = np.where(hidden, np.nan, tracks).reshape(X.shape)
+            report(f"{name} 40 % missing", holes, truth, both(12), n_jobs=options.jobs)
+            noisy = (tracks + noise).reshape(X.shape)
+            report(f"{name} 2 % noise", noisy, truth, both(12), n_jobs=options.jobs)
+        few = tracks[:, JOINTS].reshape(len(X), -1)
+        cases = [("joint", 3, "orthographic"), *both("auto")]
+        report(f"{name} 15 joints", few, truth[:, JOINTS], cases, n_jobs=options.jobs)
+
+
+def synthetic(options):
+    """Affine error of synthetic tables with the true K and 2 % noise, over the joint."""
+    for seed in range(options.seeds):
+        tracks = instance(seed, 68, 3, 0.02, camera="weak_perspective")
+        errors = []
+        for refinement in ("joint", "consensus"):
+            model, _ = fitted(tracks.data, refinement, 3, "weak_perspective")
+            errors.append(
+                affine_shape_error(tracks.shapes, model.reconstruct(tracks.data))
+            )
+        print(
+            f"seed {seed}: joint {errors[0]:.5f}, consensus {errors[1]:.5f}, ratio "
+            f"{errors[1] / errors[0]:.3f}",
+            flush=True,
+        )
+
+
+SECTIONS = {"complete": complete, "spoiled": spoiled, "synthetic": synthetic}
+
+if __name__ == "__main__":
+    jobs = {"type": int, "default": None, "help": "processes of the groups"}
+    run(__doc__, SECTIONS, n_seeds=1, options={"jobs": jobs})
