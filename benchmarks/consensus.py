@@ -40,7 +40,7 @@ def fitted(X, refinement, n_components, camera, n_jobs=None, seed=0):
 
 
 def in_camera(model, X):
-    """Return the shapes of frames and the deviations of depths, in the camera's axes."""
+    """Return shapes of frames, and deviations of depths, in the axes of cameras."""
     shapes, deviations = model.reconstruct(X, return_std=True)
     rotations, scales = full_rotations(model.decompose(X).motion)
     shapes = scales[:, None, None] * shapes @ rotations.transpose(0, 2, 1)
@@ -135,7 +135,7 @@ def spoiled(options):
 
 
 def synthetic(options):
-    """Affine error of synthetic tables with the true K and 2 % noise, over the joint."""
+    """Affine errors of synthetic tables with the true K and 2 % noise."""
     for seed in range(options.seeds):
         tracks = instance(seed, 68, 3, 0.02, camera="weak_perspective")
         errors = []

@@ -225,7 +225,8 @@ def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
         if n_supported == found:
             break
         found = max(n_supported, 1)
-    if found == most:
+    # A consensus has more components.
+    if found == most and estimator.refinement != "consensus":
         warn_caller(
             f"all {most} basis shapes that were tried are relevant: more than "
             f"n_components={most} may be needed for this table"

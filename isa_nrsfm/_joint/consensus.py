@@ -66,8 +66,7 @@ class Consensus(NamedTuple):
     shapes (K + 1, 3, J): centred, for coefficients of variance one.
     noise: noise variance of a coordinate.
     alpha (n, K): coefficients of some frames.
-    variances (J,): mean square changes of the depths of the points, None if there are no
-    groups.
+    variances (J,): mean square changes of the depths, None without groups.
     """
 
     shapes: NDArray
@@ -147,18 +146,20 @@ def consensus(
         groups = fitted_groups(scene, distances, most_group, settings, n_jobs)
     if groups:
         noise = max(float(np.mean([group.noise for group in groups])), scene.floor)
-        # Coordinates of all points: changes of the chosen ones, interpolated
         share = 1.0 - scene.floor / noise
         merged = merge(scene, weighted(scene, groups), share)
+        # Changes of all points: depths interpolated, x and y from their own images
         change = (merged - scene.first) @ interpolation(model.shapes[0], chosen)
-        change -= change.mean(axis=2, keepdims=True)
+        others = np.setdiff1d(np.arange(n_points), chosen)
+        off = (1.0 - share) * np.nan_to_num(part - first[:, :2])
+        change[:, :2, others] = off[:, :, others]
+        change = centred(change)
     # Shapes in the axes of the object, and their principal components
     S = shapes + rotations.transpose(0, 2, 1) @ change / scales[:, None, None]
-    fitted, alpha, rest = principal_shapes(
-        S,
-        most if n_components is None else n_components,
-        0.0 if n_components else LEFT * noise,
-    )
+    if n_components is None:
+        fitted, alpha, rest = principal_shapes(S, most, LEFT * noise)
+    else:
+        fitted, alpha, rest = principal_shapes(S, n_components)
     variances = np.mean(change[:, 2] ** 2, axis=0) if groups else None
     return Consensus(fitted, noise + rest, alpha, variances)
 
@@ -195,7 +196,8 @@ def fitted_groups(
         if settings.on_step is not None:
             settings.on_step()
         if fit is not None:
-            groups.append(Group(points, *fit, count))
+            frames, coordinates, noise = fit
+            groups.append(Group(points, frames, coordinates, noise, count))
     return groups
 
 
@@ -302,7 +304,7 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
     """
     rounding = OF_DISTANCES**2 * float(np.mean(scene.first**2))
     found = []
-    for size in {len(group.points) for group in groups}:
+    for size in sorted({len(group.points) for group in groups}):
         same = [group for group in groups if len(group.points) == size]
         merged = merge(scene, same)[:, 2]
         off = [
@@ -370,7 +372,7 @@ def interpolation(mean_shape: NDArray, chosen: NDArray) -> NDArray:
 
 
 def principal_shapes(
-    S: NDArray, most: int, noise: float
+    S: NDArray, most: int, noise: float = 0.0
 ) -> tuple[NDArray, NDArray, float]:
     """Return mean and principal components (K + 1, 3, J) of shapes (I, 3, J).
 

@@ -130,8 +130,9 @@ class AffineNRSfMCV(
     but have no other influence on the score. ``python -m benchmarks.choice`` compares
     errors and choices with those of a plain search.
 
-    Without the joint refinement no fit can start from another one. The search is then a
-    plain one.
+    With ``refinement="consensus"`` the search compares joint fits. Only the chosen K is
+    fitted with the consensus. With ``refinement="alternating"`` or None no fit can
+    start from another one. The search is then a plain one.
 
     Where metadata routing is enabled, `fit` passes metadata on to the splitter and the
     scorer, and `score` to the scorer. `groups` go to the splitter in any case.

@@ -70,6 +70,8 @@ class Fitted(NamedTuple):
 def ready_part(estimator: AffineNRSfM, X: Any, n_components: int) -> Part:
     """Return a table checked for fits of at most K basis shapes, and scaled."""
     estimator = clone(estimator)
+    if estimator.refinement == "consensus":  # only of the chosen K
+        estimator.refinement = "joint"
     source = estimator._checked(X)
     return Part(estimator, X, ready_table(estimator, source, n_components))
 

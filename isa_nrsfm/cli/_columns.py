@@ -11,6 +11,7 @@ from sklearn.decomposition import PCA
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
 from isa_nrsfm.analysis import (
     AlignedFrames,
@@ -98,7 +99,7 @@ def column_results(
             report["groups"]["not_divided"] = str(error)
         within = WithinGroups().fit_transform(alpha, groups=asked.groups)
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
-    if asked.times is not None and estimator.refinement == "joint":
+    if asked.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
         smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
         found = smooth.alpha

@@ -22,6 +22,7 @@ from isa_nrsfm._compat.whole_files import (
     folder_for_writing,
 )
 from isa_nrsfm._fit import joint_camera
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
 from isa_nrsfm._selection.choice import standard_errors
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
@@ -142,9 +143,10 @@ def _check_options(args: Namespace) -> None:
         import_optional("matplotlib", extra="plot")
     joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
     for option, is_given in joint.items():
-        if is_given and args.refinement != "joint":
+        if is_given and args.refinement not in JOINT_REFINEMENTS:
             raise ValueError(
-                f"{option} needs --refinement joint; got --refinement {args.refinement}"
+                f"{option} needs --refinement joint or consensus; got --refinement "
+                f"{args.refinement}"
             )
 
 

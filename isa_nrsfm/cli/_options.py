@@ -311,8 +311,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     "refinement": _choice(
         (*REFINEMENTS, NONE),
-        "joint: cameras, coefficients and basis shapes together; alternating: the "
-        "refinement of the paper, with cameras of the rigid part",
+        "joint: cameras, coefficients and basis shapes together; consensus: "
+        "afterwards groups of neighbouring points, for the truest shapes of "
+        "calibrated cameras; alternating: the refinement of the paper, with cameras "
+        "of the rigid part",
     ),
     "independence": _choice(
         (*INDEPENDENCE, NONE),

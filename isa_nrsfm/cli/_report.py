@@ -18,6 +18,7 @@ from isa_nrsfm._diagnostics import (
     camera_meaning,
     outlier_advice,
 )
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._outputs import fitted_table
@@ -79,7 +80,9 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
     _, layout, _, _ = view_and_layout(estimator, edges)
-    found = estimator.diagnostics(X) if estimator.refinement == "joint" else None
+    found = (
+        estimator.diagnostics(X) if estimator.refinement in JOINT_REFINEMENTS else None
+    )
     for message in () if found is None else found.messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.calibration import angle_deviations, view_angles
@@ -122,7 +123,7 @@ def frame_poses(
         rotations = np.full_like(rotations, np.nan)
     angles = view_angles(rotations)
     deviations = np.full((3, len(scales)), np.nan)
-    if X is not None and space.metric is None and model.refinement == "joint":
+    if X is not None and space.metric is None and model.refinement in JOINT_REFINEMENTS:
         covariance = model.rotation_covariance(X)
         turned = space.transform @ covariance @ space.transform.T
         deviations = np.array(angle_deviations(angles, turned))
