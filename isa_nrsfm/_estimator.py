@@ -13,14 +13,7 @@ from sklearn.utils import check_random_state
 from isa_nrsfm._compat.callbacks import CallbackSupportMixin, FitProgress
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import HasMethods, Interval, StrOptions, fit_context
-from isa_nrsfm._fit import (
-    CONSENSUS_STAGE,
-    JOINT_STAGE,
-    STAGES,
-    STEPWISE,
-    Limits,
-    fit_table,
-)
+from isa_nrsfm._fit import STEPWISE, Limits, fit_table, stages_of
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._parameters.choices import (
     BLOCK_RECOVERIES,
@@ -369,10 +362,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             table much better, or if a refinement has not converged.
         """
         self._forget()
-        left_out = set() if self._is_joint else {JOINT_STAGE}
-        if self.refinement != "consensus":
-            left_out.add(CONSENSUS_STAGE)
-        stages = [stage for stage in STAGES if stage not in left_out]
+        stages = stages_of(self.refinement)
         with kept_arrays(self.frames_folder) as keep:
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             fitted = copy.copy(self)

@@ -4,7 +4,8 @@
 2. Factorisation of the measurement matrix, of the frames of a sample if there are many.
 3. and 4. The paper's pipeline: independent subspaces, then block structure and
    refinement. With the joint refinement its result is only a start.
-5. The joint refinement, with `refinement="joint"`, or the frames of the paper.
+5. The joint refinement, and the consensus of groups of points with
+   `refinement="consensus"`; or the frames of the paper.
 6. Measures of the fit.
 
 Stages 1, 5 and 6 use all frames, the other stages those of the sample.
@@ -61,6 +62,7 @@ from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
 from isa_nrsfm._paper.sample import Sample, sample_frames
 from isa_nrsfm._paper.svd import DENSE, block_triplets
+from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import gross_outliers
@@ -69,19 +71,8 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import of_all_rows
 from isa_nrsfm._transformer import TableTransformer
 
-# Reported only with the joint refinement.
 JOINT_STAGE = "joint refinement"
-# Reported only with the consensus of groups.
 CONSENSUS_STAGE = "consensus of groups of points"
-STAGES = (
-    "table",
-    "factorisation",
-    "independent subspaces",
-    "block structure and refinement",
-    JOINT_STAGE,
-    CONSENSUS_STAGE,
-    "gauge and coefficients",
-)
 # Stages that report steps.
 STEPWISE = JOINT_STAGE, CONSENSUS_STAGE
 # Default tolerances. JOINT_TOL: decrease of the objective of the joint refinement per
@@ -103,6 +94,17 @@ class Limits(NamedTuple):
     small_table: int = 150_000
     model_frames: int = 5_000
     joint: JointOptions = JointOptions()
+
+
+def stages_of(refinement: str | None) -> list[str]:
+    """Return the names of the stages of a fit, in order."""
+    stages = ["table", "factorisation"]
+    stages += ["independent subspaces", "block structure and refinement"]
+    if refinement in JOINT_REFINEMENTS:
+        stages.append(JOINT_STAGE)
+    if refinement == "consensus":
+        stages.append(CONSENSUS_STAGE)
+    return [*stages, "gauge and coefficients"]
 
 
 def fit_table(

@@ -14,7 +14,7 @@ from sklearn.pipeline import make_pipeline
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import callbacks as _callbacks
-from isa_nrsfm._fit import JOINT_STAGE, STAGES
+from isa_nrsfm._fit import JOINT_STAGE, stages_of
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 
@@ -76,12 +76,12 @@ class TestAlone:
         _, recorder = recorded(estimator(max_iter=200))
         assert_nested(recorder)
         stages = [task for task in recorder.tasks() if task != "step"]
-        assert stages == [*STAGES, "fit"]
+        assert stages == [*stages_of("joint"), "fit"]
 
     def test_the_papers_refinement_has_no_joint_stage(self):
         _, recorder = recorded(estimator(refinement="alternating"))
         assert_nested(recorder)
-        expected = [stage for stage in STAGES if stage != JOINT_STAGE]
+        expected = stages_of("alternating")
         assert recorder.tasks() == [*expected, "fit"]
 
     def test_steps_are_told_of_the_joint_refinement(self):
