@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.depth import DepthCertainty
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._joint.extents import extent_penalty
-from isa_nrsfm._joint.jackknife import N_GROUPS, neighbours
+from isa_nrsfm._joint.jackknife import N_GROUPS, depth_certainty, neighbours
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
 from isa_nrsfm.io import load_model, save_model
@@ -233,6 +235,32 @@ def test_unestimated_certainty_withholds_nothing():
     assert DepthCertainty().determined
     assert not DepthCertainty(turning=0.1, turns=0.01 * np.eye(3)).determined
     assert DepthCertainty(turning=0.5, turns=0.01 * np.eye(3)).determined
+
+
+def test_outliers_are_left_out_with_a_robust_loss():
+    rng = np.random.default_rng(0)
+    shapes = rng.normal(size=(2, 3, 20)) * [[[1.0]], [[0.1]]]
+    shapes -= shapes.mean(axis=2, keepdims=True)
+    rotations = Rotation.from_rotvec(0.4 * rng.normal(size=(12, 3))).as_matrix()
+    alpha, noise = rng.normal(size=(12, 1, 1)), 0.03
+    complete = (rotations @ (shapes[0] + alpha * shapes[1]))[:, :2]
+    complete += noise * rng.normal(size=complete.shape)
+    hidden, spoilt = complete.copy(), complete.copy()
+    hidden[::4, :, 3] = np.nan
+    spoilt[::4, 0, 3] += 12 * noise
+
+    def error(rows, loss="cauchy"):
+        starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
+        frames = PosteriorFrames(
+            shapes, noise**2, starts, loss, gauge, camera="weak_perspective"
+        )
+        return depth_certainty(frames, FrameBlocks.of_array(rows, 8)).total
+
+    expected = error(hidden)
+    assert_allclose(error(spoilt), expected, rtol=0.002)
+    # Others are not, and with the linear loss none is.
+    assert abs(error(complete) / expected - 1) > 0.02
+    assert error(spoilt, "linear") > 1.1 * expected
 
 
 def test_neighbours_are_groups_of_equal_size():

@@ -1,6 +1,7 @@
 """What a fit says of itself: reliabilities and information, by their definitions."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -295,3 +296,16 @@ def test_a_few_frames_that_determine_a_coefficient_are_named():
     effective = found.effective_frames
     assert any(re.match(message, each) for each in found.messages)
     assert effective.min() < 10 < effective.max()
+
+
+def test_messages_on_the_basis_come_first():
+    table = make_nonrigid_tracks(60, 16, 2, noise=0.02, random_state=0).data
+    model = AffineNRSfM(2, random_state=0, independence=None).fit(table)
+    model.alpha_ = model.alpha_.copy()
+    model.alpha_[7, 0] = 30.0
+    model.reliability_ = np.ones(2)
+    frames = replace(model._model.frames, noise_variance=1e6)
+    model._model = model._model._replace(frames=frames)
+    first, second = model.diagnostics().messages
+    assert first.startswith("the basis shapes are uncertain")
+    assert second.startswith("a few of the 60 frames determine alpha_1")

@@ -182,6 +182,13 @@ class TestLargeBothWays:
         assert_allclose(leading.rest, whole.rest, rtol=1e-6, atol=1e-14 * kept)
         assert_allclose(leading.values, whole.values, rtol=1e-3)
 
+    @pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
+    def test_units(self, unit):
+        W = low_rank(0, 8, 60, 70) + 1e-2 * centred_matrix(1, 60, 70)
+        expected, found = (leading_triplets(each, 9, KRYLOV) for each in (W, unit * W))
+        assert_allclose(found.values, unit * expected.values, rtol=1e-12)
+        assert_allclose(found.rest, unit**2 * expected.rest, rtol=1e-9)
+
     @pytest.mark.parametrize("block_frames", [1, 7, 60])
     @pytest.mark.parametrize("size", [(60, 70), (40, 25), (60, 8)])
     def test_blocks_make_no_difference(self, size, block_frames):

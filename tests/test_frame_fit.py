@@ -7,10 +7,13 @@ import pytest
 from frame_parts import fit_posterior
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, with_gaps
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
+from isa_nrsfm._joint.sample_posterior import shape_uncertainty, shown_frames
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
 
@@ -202,6 +205,96 @@ class TestPosteriorFrames:
         fitted = replace(frames, shapes=shapes).posterior(tracks)
         images = project(mean_shape[None], fitted.motion, fitted.translation)
         assert_allclose(images[0, seen], tracks[0, seen], atol=1e-2)
+
+
+class TestDepthDeviations:
+    @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+    @GAPS
+    def test_without_certainty_are_those_of_the_frame(self, camera, missing):
+        frames, tracks = posterior_frames(0)
+        frames, tracks = replace(frames, camera=camera), with_gaps(tracks, missing)
+        found = frames.depth_deviations(tracks, np.ones(len(tracks)))
+        fit = frames.posterior(tracks)
+        n_pose = CAMERAS[camera].n_parameters
+        prior = np.diag([0.0] * n_pose + [1.0] * 2)
+        for i, M in enumerate(fit.motion):
+            seen = np.isfinite(tracks[i]).all(axis=1)
+            scale = np.linalg.norm(M) / np.sqrt(2)
+            R = np.vstack([M, np.cross(*M) / scale])
+
+            def points(step, i=i, R=R, seen=seen):
+                turned = Rotation.from_rotvec(step[:3]).as_matrix()
+                weights = np.append(1.0, fit.alpha[i] + step[n_pose:])
+                points = R @ turned @ np.tensordot(weights, frames.shapes, 1)
+                points = points - points[:, seen].mean(axis=1, keepdims=True)
+                return np.exp(step[3:n_pose].sum()) * points
+
+            steps = 1e-5 * np.eye(n_pose + 2)
+            D = np.array([points(step) - points(-step) for step in steps]) / 2e-5
+            T = D[:, :2, seen].reshape(len(D), -1)
+            covariance = np.linalg.inv(T @ T.T / NOISE**2 + prior)
+            variances = np.diag(D[:, 2].T @ covariance @ D[:, 2])
+            assert_allclose(found[i], np.sqrt(variances), rtol=1e-5)
+
+    def test_variances_of_points_and_of_the_frame_add_up(self):
+        frames, tracks = posterior_frames(0)
+        frames = replace(frames, camera="weak_perspective")
+        sizes = np.linspace(1.0, 2.0, len(tracks))
+        tracks = sizes[:, None, None] * tracks
+        alone = frames.depth_deviations(tracks, sizes)
+        points = np.linspace(0.0, 1e-2, tracks.shape[1])
+        frames = replace(frames, certainty=DepthCertainty(points=points))
+        expected = alone**2 + sizes[:, None] ** 2 * points
+        found = frames.depth_deviations(tracks, sizes)
+        assert_allclose(found**2, expected, rtol=1e-9)
+
+
+def posteriors(camera):
+    """Return random fits of frames, their model, and the covariance of a point."""
+    rng = np.random.default_rng(0)
+    frames, tracks = posterior_frames(0)
+    frames = replace(frames, camera=camera)
+    root = rng.normal(size=(9, 12))
+    # Leverages differ between frames and are far from zero.
+    return frames.posterior(tracks), frames, 5e-3 * root @ root.T
+
+
+class TestSamplePosterior:
+    def test_uncertainty_of_the_shapes_is_the_inverse_of_their_information(self):
+        rng = np.random.default_rng(0)
+        motion, alpha = rng.normal(size=(12, 2, 3)), rng.normal(size=(12, 2))
+        root, share = rng.normal(size=(2, 2)), rng.uniform(0.5, 1.0, 12)
+        information = np.zeros((9, 9))
+        for M, a, weight in zip(motion, alpha, share, strict=True):
+            c = np.append(1.0, a)
+            moments = np.outer(c, c)
+            moments[1:, 1:] += root @ root.T
+            information += weight * np.kron(moments, M.T @ M)
+        found = shape_uncertainty(
+            motion, alpha, root @ root.T, share, [slice(0, 5), slice(5, 12)]
+        )
+        assert_allclose(found, np.linalg.inv(information), atol=1e-10)
+
+    @CAMERA
+    def test_effect_of_the_noise_of_a_frame_on_its_coefficients(self, camera):
+        posterior, frames, uncertainty = posteriors(camera)
+        n_pose = {"affine": 8, "weak_perspective": 6, "orthographic": 5}[camera]
+        n_seen = np.arange(9, 21)
+        moments, noises = np.zeros((2, 2)), []
+        for i, (M, a) in enumerate(zip(posterior.motion, posterior.alpha, strict=True)):
+            X = np.kron(np.append(1.0, a), M)
+            used = np.trace(X @ uncertainty @ X.T)
+            assert 0.05 < used < 1.9
+            freedom = n_seen[i] * (2 - used) - n_pose
+            noises.append(posterior.objective[i] / max(freedom, 1.0))
+            change = (uncertainty @ X.T).reshape(3, 3, 2)[1:]
+            own = np.trace(M @ change, axis1=1, axis2=2)
+            shift = n_seen[i] * noises[i] * posterior.covariance[i] @ own
+            moments += np.outer(a, shift)
+        sizes = np.ones(12)
+        _, found, total = shown_frames(posterior, sizes, n_seen, frames, uncertainty)
+        assert_allclose(found, moments, rtol=1e-9)
+        assert_allclose(total, sum(noises), rtol=1e-9)
 
 
 class TestComposeAndProject:

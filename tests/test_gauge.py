@@ -116,6 +116,14 @@ class TestSpace:
         )
         assert np.isfinite(gauge.basis).all()
 
+    @pytest.mark.parametrize("flat", [1, 2])
+    def test_flat_directions_get_the_scale_of_the_widest(self, flat):
+        scene = Scene(flat=flat)
+        A = canonical_space(scene.mean_shape, scene.motion)
+        widths = np.linalg.svd(scene.mean_shape, compute_uv=False)[: 3 - flat]
+        expected = np.sort(np.append(widths, [widths[0]] * flat))[::-1] / 5
+        assert_allclose(1 / np.linalg.svd(A, compute_uv=False)[::-1], expected)
+
 
 class TestEuclideanSpace:
     """With calibrated cameras space is turned, not stretched."""

@@ -381,6 +381,16 @@ class TestDegenerate:
         along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
         assert_allclose(along, 0, atol=1e-8)
 
+    @pytest.mark.parametrize(("far", "removed"), [(2.9, True), (3.05, False)])
+    def test_scales_stay_above_a_tenth_of_their_mean(self, far, removed):
+        fit = random_fit(n_frames=600, n_points=30, n_components=1)
+        fit.shapes[1] -= 0.3 * fit.shapes[0]
+        alpha = np.clip(fit.alpha, -2, 2)
+        alpha[7] = far
+        result, _ = canonical(fit._replace(alpha=alpha))
+        along = np.einsum("kaj,aj->k", result.shapes[1:], result.shapes[0])
+        assert (np.abs(along) < 1e-8).all() == removed
+
     @staticmethod
     def check_extreme(fit, independence):
         """Assert that the basis shapes keep their parts along the mean shape."""

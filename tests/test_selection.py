@@ -20,7 +20,8 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
-from isa_nrsfm._selection.choice import selected
+from isa_nrsfm._selection.choice import results_of, selected
+from isa_nrsfm._selection.path import Row
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 X = make_nonrigid_tracks(60, 20, 2, noise=0.01, random_state=0).data
@@ -315,3 +316,19 @@ def test_fits_that_do_not_converge_are_counted():
         search.fit(X)
     first = str(told[0].message)
     assert re.match(r"not all fits .* of 1, 2 did not. Increase", first)
+
+
+def test_held_out_rows_are_not_fitted_without_joint_refinement():
+    table, estimator = X[:, :20], inner(n_components=1, refinement=None)
+    search = AffineNRSfMCV((1,), estimator=estimator, cv=2).fit(table)
+    ours = [search.cv_results_[f"split{i}_test_score"][0] for i in range(2)]
+    assert_allclose(ours, cross_val_score(estimator, table, cv=2), rtol=1e-9)
+
+
+def test_the_best_mean_score_ranks_first_and_unknown_ones_last():
+    means = [-0.5, np.nan, -0.2, -0.5, -0.9]
+    ones = np.ones(2)
+    rows = [
+        Row(k, mean * ones, ones, ones, 0.0, 0) for k, mean in enumerate(means, start=1)
+    ]
+    assert_array_equal(results_of(rows)["rank_test_score"], [2, 5, 1, 2, 4])

@@ -95,3 +95,10 @@ def test_names_of_columns_are_escaped(model):
     shown = make_pipeline(named)._repr_html_() + named._repr_html_()
     assert "<marked>" not in shown
     assert "isa-nrsfm-summary" in shown
+
+
+@pytest.mark.parametrize(("n_components", "more"), [(12, ""), (13, ", ...")])
+def test_energies_of_the_first_twelve_basis_shapes_are_shown(model, n_components, more):
+    model = copy(model)
+    model.energy_share_ = np.full(n_components, 0.05)
+    assert summary(model)["Energy of each"] == ", ".join(["5 %"] * 12) + more

@@ -159,6 +159,8 @@ class TestSize:
             surplus = n_equations_minus_unknowns(frames[-1], n_points, K, True)
             assert surplus >= 0
             few = frames[-1] - 1
+            if few >= -(-8 * (K + 2) // 5):  # the bound of affine cameras
+                assert n_equations_minus_unknowns(few, n_points, K, True) < 0
             if few >= smallest_n_frames(affine, n_points):
                 assert most_components(few, n_points, "orthographic") < K
             assert most_components(frames[-1], n_points, "orthographic") >= K
