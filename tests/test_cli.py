@@ -357,7 +357,7 @@ def test_standard_deviations_are_written_where_they_are_known(
     options = ["--refinement", "none", *NO_FIGURES]
     for wrong in ("--std", "--n-components=auto"):
         message = fails("fit", table, "-o", folder, *options, wrong)
-        assert "needs --refinement joint; got --refinement none" in message
+        assert "needs --refinement joint or consensus; got --refinement none" in message
     assert not folder.exists()
     assert run("fit", table, "-o", folder, *options)[0] == 0
     message = fails("transform", folder / MODEL, table, "-o", output, "--std")
