@@ -76,7 +76,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         "consensus" continues from there, with calibrated cameras: it fits overlapping
         groups of neighbouring points by themselves, with rotations of their own, and
         merges them. Bodies become more accurate by a quarter to a third, and a fit
-        takes 5 to 20 times as long. Set ``n_components="auto"`` or about 40 with it.
+        takes 5 to 30 times as long. Set ``n_components="auto"`` or about 40 with it.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"

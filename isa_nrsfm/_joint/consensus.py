@@ -41,14 +41,17 @@ from isa_nrsfm._tables.tracks import FEWEST_POINTS
 # error. Groups have as many basis shapes as the joint fit: with 8 instead of 10, the
 # error of pickup with 15 joints is .060 instead of .028.
 SIZES, LARGEST_SHARE = (12, 20, 30), 0.75
-# Groups that contain a point, on average, of each size.
+# Groups that contain a point, on average, of each size. With 4, 6 and 8 the error of
+# yoga is .0143, .0137, .0136, that of pickup .0158, .0152, .0151.
 COVER = 6
 # Weight of the mean distance of two points beside its standard deviation, in the
 # choice of neighbours: of two rigidly connected points the near one comes first.
 NEARNESS = 0.15
-# Floor of the noise variance of the groups, as a share of the noise of the joint fit.
+# Floor of the noise variance of the groups, as a share of that of the joint fit. With
+# 0.2, 0.1 and 0.04 the error of yoga, groups of 12, is .0137, .0131, .0148.
 FLOOR_SHARE = 0.2
-# Steps without the prior of the basis shapes, and most steps after them.
+# Steps without the prior of the basis shapes, and most steps after them. Without, with
+# 10 and with 30 of the first the error of yoga, groups of 12, is .0169, .0163, .0132.
 FREE_STEPS, MOST_STEPS = 30, 300
 # Weight of the joint fit among the groups. It only matters for points that no group
 # determines.
@@ -56,6 +59,7 @@ WEIGHT_OF_WHOLE = 1e-3
 # Largest numbers of frames and of points of the groups.
 MOST_FRAMES, MOST_POINTS = 1200, 100
 # Mean square that free numbers of components leave, as a share of the noise variance.
+# With 1 the error of drink is .0106 instead of .0067.
 LEFT = 0.01
 # Largest number of basis shapes of the joint fit, and of the consensus if it is free.
 MOST_FIRST, MOST_COMPONENTS = 12, 40
