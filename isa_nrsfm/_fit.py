@@ -29,7 +29,6 @@ from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
-from isa_nrsfm._frames.depth import NOT_ESTIMATED
 from isa_nrsfm._frames.models import (
     Decomposition,
     FrameMap,
@@ -152,6 +151,7 @@ def fit_ready_table(
         progress(JOINT_STAGE)
         if errors and estimator.camera != "affine":
             model = replace(model, certainty=depth_certainty(model, table.rows))
+            estimator.depth_uncertainty_ = model.certainty.total
         if estimator.refinement == "consensus":
             model = _consensus_model(estimator, table, model, settings, wanted)
             tracks = JointFrames.from_points(table.rows, table.complete)
@@ -449,8 +449,6 @@ def _joint_frames(
     estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
     unit = estimator._model.unit or 1.0
     estimator.noise_variance_ = unit**2 * frames.noise_variance
-    if frames.certainty is not NOT_ESTIMATED:
-        estimator.depth_uncertainty_ = frames.certainty.total
     estimator.reliability_ = reliabilities(
         alpha, covariance, *(sum(part) for part in chance)
     )

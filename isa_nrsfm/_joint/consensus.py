@@ -259,10 +259,9 @@ def group_fit(
     if len(frames) <= n_components:
         return None
     seen, motion = seen[frames], scene.motion[frames]
-    x, y, z = scene.first[frames].transpose(1, 0, 2)
-    tracks = scene.rows[frames]
+    tracks, first = scene.rows[frames], scene.first[frames]
     # Start: shapes that fit the cameras, missing points as in the joint fit
-    rows = centred(np.where(seen[:, None], tracks, np.stack([x, y], axis=1)))
+    rows = centred(np.where(seen[:, None], tracks, first[:, :2]))
     shapes = centred(lifted_shapes(rows, motion, n_components))
     noise = max(0.1 * float(np.mean((rows - motion @ shapes[0]) ** 2)), scene.floor)
     start = JointState(shapes, motion, noise)
@@ -297,7 +296,7 @@ def group_fit(
     # Positions from the visible points, and the mirror image nearest to the joint fit
     off = np.where(seen[:, None], tracks - found[:, :2], 0.0).sum(axis=2)
     found[:, :2] += (off / seen.sum(axis=1)[:, None])[:, :, None]
-    if np.sum(centred(z) * found[:, 2]) < 0:
+    if np.sum(centred(first[:, 2]) * found[:, 2]) < 0:
         found[:, 2] *= -1.0
     return frames, found, noise
 
@@ -313,9 +312,9 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
         same = [group for group in groups if len(group.points) == size]
         merged = merge(scene, same)[:, 2]
         off = [
-            group.weight * np.mean(centred(depths - merged[at]) ** 2)
+            group.weight
+            * np.mean(centred(group.coordinates[:, 2] - merged[place(group)]) ** 2)
             for group in same
-            for depths, at in [(group.coordinates[:, 2], place(group))]
         ]
         total = sum(group.weight for group in same)
         weight = 1.0 / (size * (sum(off) / total + rounding))
@@ -337,14 +336,13 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     b = small * centred(scene.first[:, 2])
     weight, total = np.full(b.shape, small), small * scene.first[:, :2]
     for group in groups:
-        n = len(group.points)
-        at, middle = place(group), np.eye(n) - 1.0 / n
-        A[at[0][:, None], at[1][..., None], at[1]] += group.weight * middle
+        frames, points = group.frames, group.points
+        n, at = len(points), place(group)
+        A[np.ix_(frames, points, points)] += group.weight * (np.eye(n) - 1.0 / n)
         b[at] += group.weight * centred(group.coordinates[:, 2])
         weight[at] += group.weight
-        total[at[0], :, at[1]] += group.weight * group.coordinates[:, :2].transpose(
-            0, 2, 1
-        )
+        images = group.weight * group.coordinates[:, :2]
+        total[np.ix_(frames, np.arange(2), points)] += images
     fitted = total / weight[:, None]
     visible = np.isfinite(scene.rows)
     images = np.where(visible, scene.rows, fitted)
@@ -353,9 +351,9 @@ def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
     return np.concatenate([images, depths.transpose(0, 2, 1)], axis=1)
 
 
-def place(group: Group) -> tuple[NDArray, NDArray]:
+def place(group: Group) -> tuple[NDArray, ...]:
     """Return the index of the frames and points of a group in an array (I, n)."""
-    return group.frames[:, None], group.points[None]
+    return np.ix_(group.frames, group.points)
 
 
 def centred(depths: NDArray) -> NDArray:
