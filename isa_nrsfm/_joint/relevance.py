@@ -52,7 +52,7 @@ def relevant_components(
         uncertain = np.einsum("ab,kakb->k", C, total)[1:]
         # g_k and v_k, with penalty = 1 / (v_k n_frames)
         determined = 1.0 - uncertain * penalty * n_frames / n_numbers
-        determined = np.clip(determined, 1e-9, 1.0)
+        determined = np.maximum(determined, 1e-9)
         variance = np.maximum(energy / (n_numbers * determined), 1e-9 * energy.max())
         penalty = 1.0 / (variance * n_frames)
     return int(np.sum(determined > problem.settings.options.determined))
