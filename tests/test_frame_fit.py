@@ -13,9 +13,17 @@ from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.depth import DepthCertainty
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames, RigidFrames
 from isa_nrsfm._frames.projection import compose, distances, project
-from isa_nrsfm._joint.sample_posterior import shape_uncertainty, shown_frames
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.sample_posterior import (
+    inlying_rows,
+    posterior_blocks,
+    posterior_moments,
+    shape_uncertainty,
+    shown_frames,
+)
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm._prepare.robust import WEIGHTS, distant_points
+from isa_nrsfm._tables.blocks import FrameBlocks
 
 
 def orthogonal_shapes(seed, n_components=2, n_points=20):
@@ -259,7 +267,45 @@ def posteriors(camera):
     return frames.posterior(tracks), frames, 5e-3 * root @ root.T
 
 
+def rows_of(tracks):
+    """Return tracks as centred rows, in blocks of five frames."""
+    rows = (tracks - tracks.mean(axis=1, keepdims=True)).transpose(0, 2, 1)
+    return rows, FrameBlocks.of_array(rows, 5)
+
+
 class TestSamplePosterior:
+    @pytest.mark.parametrize(
+        ("loss", "compressed"), [("linear", False), ("linear", True), ("huber", False)]
+    )
+    def test_blocks_have_the_fits_of_their_frames(self, loss, compressed):
+        model, tracks = posterior_frames(0, loss)
+        rows, blocks = rows_of(tracks)
+        frames = JointFrames.from_points(blocks, True)
+        if compressed:
+            directions = np.linalg.svd(model.shapes.reshape(9, -1))[2][:9]
+            frames = JointFrames.from_directions(blocks, directions)
+        found = posterior_blocks(model, frames, blocks)
+        expected = model.posterior(rows.transpose(0, 2, 1))
+        motion, alpha, covariance = posterior_moments(found)
+        assert_allclose(motion, expected.motion, atol=1e-7)
+        assert_allclose(alpha, expected.alpha, atol=1e-7)
+        assert_allclose(covariance, expected.covariance.mean(axis=0), rtol=1e-6)
+
+    def test_outliers_are_points_beyond_four_deviations(self):
+        model, tracks = posterior_frames(0, "huber")
+        tracks[np.arange(12), np.arange(12), 0] += NOISE * np.linspace(1.0, 8.0, 12)
+        rows, _ = rows_of(tracks)
+        cleaned, found = inlying_rows(model, rows)
+        expected = model.posterior(rows.transpose(0, 2, 1))
+        assert_array_equal(found.alpha, expected.alpha)
+        far = distances(rows.transpose(0, 2, 1), model.shapes, *expected[:3])
+        outlying = far > 4 * NOISE
+        assert 2 < outlying.sum() < 12
+        for row in range(2):
+            assert_array_equal(np.isnan(cleaned[:, row]), outlying)
+        assert_array_equal(cleaned[~np.isnan(cleaned)], rows[~np.isnan(cleaned)])
+        assert_array_equal(inlying_rows(replace(model, loss="linear"), rows)[0], rows)
+
     def test_uncertainty_of_the_shapes_is_the_inverse_of_their_information(self):
         rng = np.random.default_rng(0)
         motion, alpha = rng.normal(size=(12, 2, 3)), rng.normal(size=(12, 2))
