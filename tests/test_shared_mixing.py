@@ -262,6 +262,61 @@ class TestDensities:
         assert_array_equal(tails, [8.0, LIGHT])
         assert_allclose(variance[0], scale**2, rtol=0.05)
 
+    def test_scale_is_the_likeliest_and_no_change_of_units(self):
+        Z = sources(["student", "uniform", "product"], 0, 300, 3)
+        total, tails, variance, of_signals = _shared_mixing._fit_densities(np.eye(3), Z)
+        assert total == pytest.approx(of_signals.sum())
+        for y, tail, v, value in zip(Z, tails, variance, of_signals, strict=True):
+            tail, u = np.array(tail), np.sum(y**2, axis=1)
+
+            def likelihood(v, tail=tail, u=u):
+                F = _shared_mixing._log_density(u / v, tail, 3).mean()
+                return F - _shared_mixing._log_integral(tail, 3) - 1.5 * np.log(v)
+
+            values = [likelihood(factor * v) for factor in (0.999, 1.0, 1.001)]
+            assert np.argmax(values) == 1
+            assert values[1] == pytest.approx(value)
+        units = np.diag([0.1, 1.0, 30.0])
+        assert _shared_mixing._fit_densities(units, Z)[0] == pytest.approx(total)
+
+
+class TestSteps:
+    def test_few_samples_are_spread_from_the_smallest_to_the_largest(self):
+        rng = np.random.default_rng(0)
+        few = rng.normal(size=(2, 3000, 3))
+        assert _shared_mixing._few_samples(few) is few
+        many = rng.normal(size=(2, 6000, 3))
+        chosen = _shared_mixing._few_samples(many)
+        assert chosen.shape == (2, 1500, 3)
+        sizes = [np.sort(np.sum(Z**2, axis=(0, 2))) for Z in (chosen, many)]
+        place = np.searchsorted(sizes[1], sizes[0])
+        assert place[0] == 0
+        assert place[-1] == 5999
+        assert set(np.diff(place)) <= {3, 4, 5}
+
+    def test_fixed_point_by_plain_loops(self):
+        Z = white(sources(["student", "uniform"], 0, 50, 3))
+        W = _shared_mixing._starts(Z, 3)
+        found = _shared_mixing._fixed_point(W, Z, 1)
+        for start, end in zip(W, found, strict=True):
+            Y = np.tensordot(start, Z, 1)
+            u = np.sum(Y**2, axis=2)
+            g, dg = _shared_mixing._slopes(u, np.array(8.0), 3)
+            for k in range(2):
+                up = np.mean(np.sum(Z * (g[k][:, None] * Y[k]), axis=2), axis=1)
+                start[k] = up - np.mean(3 * g[k] + 2 * u[k] * dg[k]) * start[k]
+            U, _, Vt = np.linalg.svd(start)
+            assert_allclose(end, U @ Vt, atol=1e-10)
+
+    def test_ascent_maximises_the_quadratic_model_or_there_is_none(self):
+        rng = np.random.default_rng(0)
+        root, gradient = rng.normal(size=(4, 4)), rng.normal(size=(2, 2))
+        H = -(root @ root.T)
+        E = _shared_mixing._ascent(gradient, H.reshape((2,) * 4), 0.5)
+        model = H - 0.5 * np.eye(4)
+        assert_allclose(gradient.ravel() + model @ E.ravel(), 0, atol=1e-10)
+        assert _shared_mixing._ascent(gradient, -H.reshape((2,) * 4), 0.0) is None
+
 
 class TestDegenerate:
     def test_one_signal(self):
