@@ -1,5 +1,6 @@
 """Blocks of frames: any way of splitting and computing them gives the same."""
 
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -116,6 +117,15 @@ def test_small_blocks_are_regrouped(array, n_frames, lengths):
     larger = blocks.regrouped(np.concatenate, n_frames)
     assert larger.lengths == lengths
     assert_array_equal(larger.whole(), array)
+
+
+@pytest.mark.parametrize(
+    ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
+)
+def test_threads_are_used_for_several_blocks(array, n_threads, length, others):
+    blocks = FrameBlocks.of_array(array, length, n_threads=n_threads)
+    threads = set(blocks.map(lambda block: threading.get_ident()))
+    assert (threading.get_ident() not in threads) == others
 
 
 def test_an_error_in_a_thread_is_raised(array):

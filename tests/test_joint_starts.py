@@ -265,6 +265,13 @@ class TestAffineStart:
             left += np.sum((W - M @ paper[0]) ** 2)
         assert state.noise == pytest.approx(0.1 * left / scene.rows.size)
 
+    def test_noise_is_not_below_the_floor(self):
+        scene = random_scene(amplitude=0.0)
+        problem = problem_of(scene)
+        state = affine_start(problem, scene.W, paper_shapes(scene.factors))
+        floor = problem.settings.options.least_noise * np.mean(scene.rows**2)
+        assert state.noise == pytest.approx(floor)
+
     def test_basis_shapes_are_one_deviation_of_their_coefficients(self):
         scene = random_scene(noise=0.02)
         paper = paper_shapes(scene.factors)
