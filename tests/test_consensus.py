@@ -1,5 +1,7 @@
 """The consensus of groups: neighbours, fits, merge, and the refinement as a whole."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -7,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
+from isa_nrsfm._joint import consensus as consensus_module
 from isa_nrsfm._joint.consensus import (
     COVER,
     Group,
@@ -21,6 +25,7 @@ from isa_nrsfm._joint.consensus import (
     weighted,
 )
 from isa_nrsfm._joint.problem import JointSettings
+from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
@@ -261,6 +266,81 @@ class TestGroupFit:
         scene, _ = self.scene()
         scene.rows[2:, :, 3:] = np.nan
         assert group_fit(scene, 2, SETTINGS) is None
+
+
+class TestConsensus:
+    """Scene of the groups, and the model from their merge, without any fit."""
+
+    def found(self, monkeypatch, noise=1e-4, shift=None):
+        """Return the model, its frames, what groups are fitted to, and the result."""
+        rng = np.random.default_rng(0)
+        shapes = centred(rng.standard_normal((3, 3, 20)))
+        shapes[1:] *= 0.3
+        motion = Rotation.random(30, rng).as_matrix()[:, :2]
+        frames = shapes[0] + np.tensordot(rng.standard_normal((30, 2)), shapes[1:], 1)
+        rows = centred(motion @ frames + 0.01 * rng.standard_normal((30, 2, 20)))
+        model = PosteriorFrames(
+            shapes, noise, np.zeros((0, 2)), "linear", FrameMap.identity(2)
+        )
+        model = replace(model, camera="orthographic")
+        passed = []
+
+        def fitted_groups(scene, *others):
+            passed.extend([scene, *others])
+            if shift is None:
+                return []
+            coordinates = scene.first + shift
+            return [Group(np.arange(20), np.arange(30), coordinates, 2e-4, 1.0)]
+
+        monkeypatch.setattr(consensus_module, "fitted_groups", fitted_groups)
+        blocks = FrameBlocks.of_array(rows, 30)
+        result = consensus_module.consensus(model, blocks, SETTINGS, 29, 40)
+        return model, rows, passed, result
+
+    def test_scene_of_the_groups(self, monkeypatch):
+        """Groups start from the joint fit; prior and floor are shares of its size."""
+        model, rows, (scene, distances, n_components, *_), result = self.found(
+            monkeypatch
+        )
+        fit = model.posterior(rows.transpose(0, 2, 1))
+        shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
+        assert_array_equal(scene.rows, rows)
+        assert_allclose(scene.motion, fit.motion)
+        images = fit.motion @ shapes + fit.translation[:, :, None]
+        assert_allclose(scene.first[:, :2], images, atol=1e-12)
+        depths = np.cross(fit.motion[:, 0], fit.motion[:, 1])[:, None] @ shapes
+        assert_allclose(scene.first[:, 2:], depths, atol=1e-12)
+        assert scene.price == pytest.approx(1 / (0.008**2 * np.mean(rows**2)))
+        assert scene.floor == pytest.approx(0.2 * 5e-5 * np.mean(rows**2))
+        assert_allclose(distances, neighbour_distances(shapes), atol=1e-12)
+        assert n_components == 2
+        assert result.variances is None
+        assert result.noise == pytest.approx(model.noise_variance)
+
+    def test_noise_below_the_floor_needs_no_groups(self, monkeypatch):
+        """The result is the joint fit."""
+        *_, passed, result = self.found(monkeypatch, noise=1e-7)
+        assert not passed
+        assert result.variances is None
+
+    def test_variances_are_mean_square_changes_of_depths(self, monkeypatch):
+        """The noise is that of the groups."""
+        d = centred(np.random.default_rng(1).standard_normal((30, 20)))
+        shift = np.zeros((30, 3, 20))
+        shift[:, 2] = 0.1 * d
+        *_, (scene, *_), result = self.found(monkeypatch, shift=shift)
+        # The joint fit counts a thousandth.
+        assert_allclose(result.variances, 0.01 * np.mean(d**2, axis=0), rtol=3e-3)
+        shapes = result.shapes[0] + np.tensordot(result.alpha, result.shapes[1:], 1)
+        M = np.concatenate(
+            [scene.motion, np.cross(*scene.motion.swapaxes(0, 1))[:, None]], axis=1
+        )
+        off = centred(scene.rows - scene.first[:, :2])
+        share = scene.floor / 2e-4
+        expected = centred(scene.first + shift)
+        expected[:, :2] += share * off
+        assert_allclose(centred(M @ shapes), expected, atol=2e-3)
+        assert result.noise == pytest.approx(2e-4)
 
 
 def articulated(n_frames=80, noise=1e-4, seed=0):

@@ -145,6 +145,19 @@ class TestWeakInformation:
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
+    def test_some_of_many_frames_stand_for_all(self):
+        rng = np.random.default_rng(0)
+        mean_shape, basis = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
+        motion, alpha = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
+        one = weak_information(mean_shape, basis, motion, alpha)
+        many = weak_information(
+            mean_shape,
+            basis,
+            np.repeat(motion, 1000, axis=0),
+            np.repeat(alpha, 1000, 0),
+        )
+        assert_allclose(many, 1000 * one, atol=1e-9 * np.abs(many).max())
+
 
 @pytest.fixture(scope="module")
 def model():
