@@ -23,7 +23,8 @@ from isa_nrsfm.analysis import (
 from isa_nrsfm.analysis._dynamics import sequences_of
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import Frames, column_named
+from isa_nrsfm.cli._reading import Frames, cells_of, column_named
+from isa_nrsfm.cli._times import read_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -60,8 +61,14 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
     times = None
+    if args.time_format is not None and args.time is None:
+        raise ValueError("--time-format needs --time")
     if args.time is not None:
-        times = _times(_cells(table, args.time, "--time"))
+        try:
+            cells = cells_of(table, args.time, "--time")
+            times = read_times(cells, args.time_format)
+        except ValueError as error:
+            raise ValueError(f"--time {args.time}: {error}") from error
     elif args.fps is not None:
         times = np.asarray(table.index) / args.fps
     if times is not None:
@@ -145,59 +152,48 @@ def _numbered(
 
 def _label(table: "pd.DataFrame", text: str) -> Label:
     """Return the label of COLUMN, COLUMN:classes or COLUMN:number."""
+    pd = import_optional("pandas", extra="io")
     name, colon, kind = text.rpartition(":")
     if not colon or kind not in ("classes", "number"):
         name, kind = text, "auto"
-    column = _cells(table, name, "--label")
-    known = column.notna().to_numpy()
-    values = column[known].to_numpy()
+    column = cells_of(table, name, "--label")
+    known = column.notna()
+    names = _names(column[known])
+    if names.empty:
+        raise ValueError(f"--label: no frame has a {name!r}")
+    numbers = pd.to_numeric(names, errors="coerce")
+    if kind == "auto" and numbers.notna().all() and (numbers % 1 != 0).any():
+        kind = "number"
+    values = numbers if kind == "number" and numbers.notna().all() else names
+    values = values.to_numpy()
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
-    if not len(values):
-        raise ValueError(f"--label: no frame has a {name!r}")
     refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
     try:
-        return Label(name, kind_of(values, kind), values, known)
+        return Label(name, kind_of(values, kind), values, known.to_numpy())
     except ValueError as error:
         raise ValueError(f"--label {text}: {error}") from error
 
 
 def _groups(table: "pd.DataFrame", name: str) -> NDArray:
     """Return the column with the group of each frame."""
-    column = _cells(table, name, "--group")
-    if column.isna().any():
+    column = cells_of(table, name, "--group")
+    missing = column.isna()
+    if missing.any():
+        cell = column_named(table, name, "--group")[missing].iloc[0]
         raise ValueError(
-            f"--group: {column.isna().sum()} of {len(column)} frames have no {name!r}"
+            f"--group: {missing.sum()} of {len(column)} frames have no {name!r} "
+            f"(first: row {missing.idxmax()}, {cell!r}); name the group of each frame, "
+            "or leave these rows out with --skip-rows"
         )
-    return np.asarray(column.to_numpy())
+    return np.asarray(_names(column).to_numpy())
 
 
-def _cells(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
-    """Return a column, as numbers if all cells are numbers; NA for empty cells."""
+def _names(known: "pd.Series") -> "pd.Series":
+    """Return texts as they are, or as numbers if these are written the same."""
     pd = import_optional("pandas", extra="io")
-    column = column_named(table, name, option)
-    if column.dtype == object or pd.api.types.is_string_dtype(column):
-        text = column.where(column.notna(), "").astype(str).str.strip()
-        column = column.where(text != "")
-        numbers = pd.to_numeric(text.where(text != ""), errors="coerce")
-        if (numbers.isna() == column.isna()).all():
-            return numbers
-    return column
-
-
-def _times(column: "pd.Series") -> NDArray:
-    """Return a column as numbers, or as dates if it has none."""
-    pd = import_optional("pandas", extra="io")
-    if pd.api.types.is_numeric_dtype(column):
-        return column.to_numpy(dtype=float, na_value=np.nan)
-    dates = pd.to_datetime(column, errors="coerce", format="mixed")
-    wrong = dates.isna() & column.notna()
-    if wrong.any():
-        raise ValueError(
-            f"--time: expected numbers or dates; {wrong.sum()} of {len(column)} frames "
-            f"have neither (first: row {wrong.idxmax()}, {column[wrong].iloc[0]!r})"
-        )
-    return np.asarray(dates.to_numpy())
+    numbers = pd.to_numeric(known, errors="coerce")
+    return numbers if numbers.astype(str).equals(known.astype(str)) else known
 
 
 def _aligned_pca(estimator: AffineNRSfM, X: "pd.DataFrame") -> NDArray:

@@ -9,7 +9,7 @@ from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
 from isa_nrsfm.cli._outputs import read_model, refuse_overwriting
 from isa_nrsfm.cli._reading import (
     as_fitted,
-    column_named,
+    cells_of,
     drawing,
     drawing_files,
     read_frames,
@@ -52,7 +52,7 @@ def run(args: Namespace, warned: list[str]) -> str:
         sections["Table"] = table_section(table, unusable="not shown")
         options["X"] = as_fitted(estimator, frames.X)
         if args.label is not None:
-            labels = column_named(frames.other, args.label, "--label")
+            labels = cells_of(frames.other, args.label, "--label")
             options["labels"] = labels[frames.usable]
     if "edges" in _OPTIONS[content]:
         names = names_of_points(estimator)

@@ -114,7 +114,7 @@ def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
     return CoefficientsDisplay(
         alpha=alpha[label.known],
         y=label.values,
-        label=label.name,
+        label=label.name.replace("$", r"\$"),  # no mathematics
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind=label.kind)
 
@@ -156,5 +156,5 @@ def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
             axis.set(xlim=limits[x], ylim=limits[y])
             axis.yaxis.set_inverted(whole.origin == "upper")
         title = wrap_title(f"{name} ({count} frames)", pair)
-        pair[0].set_title(title, loc="left", fontsize="small")
+        pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
     return display

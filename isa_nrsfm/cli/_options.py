@@ -284,6 +284,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "time": _option(
         "COLUMN", "times of the frames, numbers or dates: adds smoothed coefficients"
     ),
+    "time_format": _option(
+        "FORMAT",
+        "how the cells of --time are written, if that is ambiguous: %%d/%%m/%%Y (day "
+        "first), %%M:%%S (minutes and seconds), or other codes of strptime",
+    ),
     "fps": _option("NUMBER", "instead of --time, the frames per second of a video"),
     # The method.
     "n_components": _option(
@@ -426,6 +431,7 @@ coefficients. The results replace those of an earlier run in the output folder."
             "output": ("output", "no_figures", "std", *DRAWING),
             "other columns": (
                 *("label", "group", "distance", "unit", "length", ("time", "fps")),
+                "time_format",
             ),
             "method": (
                 *("n_components", "camera", "isa", "n_init", "block_recovery"),

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 INNER, WITHOUT = "inner", "without:"
+# Words for an empty cell in the column of a label or a group. "None" is a class, such
+# as that of people without glasses.
+_MISSING = ("", "na", "n/a", "#n/a", "<na>", "nan", "nat", "null")
 
 
 class Frames(NamedTuple):
@@ -125,6 +128,18 @@ def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
             f"{_shortened(names, 8) or 'none'}"
         )
     return table[by_name[name.strip()]]
+
+
+def cells_of(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
+    """Return a column, missing where its text is empty or a word for missing."""
+    pd = import_optional("pandas", extra="io")
+    column = column_named(table, name, option)
+    if isinstance(column.dtype, pd.CategoricalDtype):
+        column = column.astype(object)
+    if column.dtype != object and not pd.api.types.is_string_dtype(column):
+        return column
+    text = column.astype(str).str.strip()
+    return text.where(column.notna() & ~text.str.lower().isin(_MISSING))
 
 
 def as_fitted(estimator: AffineNRSfM, points: "pd.DataFrame") -> Any:

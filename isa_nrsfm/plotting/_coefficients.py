@@ -265,7 +265,9 @@ class CoefficientsDisplay:
         )
         names = [str(each) for each in classes]
         slanted = max(map(len, names)) * len(names) > 60
-        axes.set_xticks(range(len(classes)), names, rotation=30 * slanted)
+        axes.set_xticks(
+            range(len(classes)), names, rotation=30 * slanted, parse_math=False
+        )
 
     def _draw_number(self, axes: Any, k: int) -> None:
         """Draw the frames as points against their number."""

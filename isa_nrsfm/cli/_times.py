@@ -1,0 +1,113 @@
+"""Times of frames: numbers, dates and durations, each in one reading for all rows."""
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._compat.optional import import_optional
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
+_DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
+_DATES = (
+    *("%d{0}%m{0}%Y", "%m{0}%d{0}%Y"),
+    *("%d{0}%m{0}%y", "%m{0}%d{0}%y", "%y{0}%m{0}%d"),
+    *("%d{0}%b{0}%Y", "%d{0}%B{0}%Y", "%d{0}%b{0}%y", "%b{0}%d,{0}%Y"),
+    "%B{0}%d,{0}%Y",
+)
+_OF_DAY = ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f", "%I:%M %p", "%I:%M:%S %p")
+_ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
+
+
+def read_times(column: "pd.Series", format: str | None) -> NDArray:
+    """Return times as numbers, dates, or durations in seconds.
+
+    All cells are read in one format, which is given, or the only one that reads all.
+    """
+    pd = import_optional("pandas", extra="io")
+    types = pd.api.types
+    if types.is_timedelta64_dtype(column):
+        return np.asarray(column.dt.total_seconds())
+    if types.is_datetime64_any_dtype(column):
+        return np.asarray(pd.to_datetime(column, utc=True).dt.tz_localize(None))
+    column = column.astype(str).where(column.notna())
+    known = column[column.notna()]
+    numbers = pd.to_numeric(column, errors="coerce")
+    if format is None and numbers.notna().equals(column.notna()):
+        return np.asarray(numbers, dtype=float)
+    zoned = known.str.fullmatch(f".*{_ZONE}")
+    if zoned.any() and not zoned.all():
+        raise ValueError(
+            f"{zoned.sum()} of {len(known)} frames have a time zone, such as Z or "
+            f"+01:00, and others have none (first: {_cell(known, ~zoned)})"
+        )
+    formats = [format] if format else _formats()
+    readings = {
+        each: _read(known, each)
+        for each in formats
+        if format or _read(known.iloc[:1], each).notna().all()
+    }
+    whole = {each: read for each, read in readings.items() if read.notna().all()}
+    if not whole:  # the format that reads most rows before it fails
+        unread = [read.isna() for read in readings.values()]
+        wrong = max(unread, key=lambda each: each.argmax(), default=known.notna())
+        expected = f"times written as {format}" if format else "numbers or dates"
+        raise ValueError(
+            f"expected {expected}, written alike in all frames; {wrong.sum()} of "
+            f"{len(column)} are not (first: {_cell(known, wrong)}). Name how they are "
+            "written with --time-format, such as %d.%m.%Y, or use numbers"
+        )
+    first, *others = whole.values()
+    if differing := [other for other in others if not other.equals(first)]:
+        row = (differing[0] != first).idxmax()
+        listed = [
+            f"{_shown(read[row])} (--time-format '{each}')"
+            for each, read in whole.items()
+            if each == next(iter(whole)) or any(read is other for other in differing)
+        ]
+        raise ValueError(
+            f"{known[row]!r} in row {row} can be {' or '.join(listed)}, and no other "
+            "row decides it: choose one with --time-format"
+        )
+    return np.asarray(first.reindex(column.index))
+
+
+def _formats() -> list[str]:
+    """Return the ways in which dates and durations are usually written."""
+    dates = [date.format(sign) for date, sign in product(_DATES, "/-. ")]
+    of_day = [" ".join(pair) for pair in product(dates, _OF_DAY)]
+    return ["ISO8601", *dates, *of_day, *_OF_DAY[3:], _MINUTES, _HOURS]
+
+
+def _read(cells: "pd.Series", format: str) -> "pd.Series":
+    """Return the dates or seconds of a format, missing where cells are not written so.
+
+    Minutes and seconds may have hours before them in some rows.
+    """
+    pd = import_optional("pandas", extra="io")
+    if format not in _DURATIONS:
+        dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
+        return dates.dt.tz_localize(None)
+    parts = cells.str.extract(f"^{_DURATION}$").astype(float)
+    hours = parts[0].fillna(0.0)
+    seconds = 3600 * hours + 60 * parts[1] + parts[2]
+    if format == _MINUTES:
+        return seconds
+    if format == _ALL_THREE:
+        return seconds.where(parts[0].notna())
+    of_day = parts[0].isna() & (parts[1] < 24) & ~cells.str.contains(".", regex=False)
+    return (60 * seconds).where(of_day)
+
+
+def _shown(time: object) -> str:
+    """Return a date, or seconds, as they are read by people."""
+    return f"{time:g} s" if isinstance(time, float) else str(time)
+
+
+def _cell(cells: "pd.Series", which: "pd.Series") -> str:
+    """Name the first of some cells."""
+    return f"row {which.idxmax()}, {cells[which].iloc[0]!r}"

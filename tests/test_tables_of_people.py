@@ -1,0 +1,219 @@
+"""Tables as people write them: CONTRIBUTING lists each way and what happens."""
+
+import numpy as np
+import pytest
+from fit_runs import fit, write_landmarks
+
+pd = pytest.importorskip("pandas")
+
+from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
+from isa_nrsfm.cli._options import build_parser  # noqa: E402
+from isa_nrsfm.cli._reading import read_frames  # noqa: E402
+from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
+
+N = 24
+POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
+
+
+def landmarks(n_frames=N):
+    scene = make_nonrigid_tracks(n_frames, 12, 1, noise=0.01, random_state=0)
+    return pd.DataFrame(scene.data, columns=POINTS)
+
+
+@pytest.fixture
+def asked(tmp_path):
+    """Return a function that reads a table as the command fit does, without a fit."""
+
+    def read(columns, *options, suffix=".csv"):
+        columns = pd.DataFrame(columns)
+        table = pd.concat([landmarks(len(columns)), columns], axis=1)
+        path = tmp_path / f"table{suffix}"
+        if suffix == ".csv":
+            table.to_csv(path, index=False)
+        else:
+            table.to_parquet(path, index=False)
+        args = ["fit", path, "-o", tmp_path / "out", *options]
+        args = build_parser().parse_args([str(word) for word in args])
+        return asked_columns(args, read_frames(args))
+
+    return read
+
+
+def seconds(times):
+    times = np.asarray(times)
+    if times.dtype.kind == "M":
+        return (times - times[0]) / np.timedelta64(1, "s")
+    return times - times[0]
+
+
+DAY = 86400.0
+
+
+@pytest.mark.parametrize(
+    ("cells", "steps"),
+    [
+        (["11/02/2024", "12/02/2024", "13/02/2024"], [0, DAY, 2 * DAY]),
+        (["02/11/2024", "02/12/2024", "02/13/2024"], [0, DAY, 2 * DAY]),
+        (["1.2.2024 9:05", "13.2.2024 9:05"], [0, 12 * DAY]),
+        (["2/1/24 9:05 AM", "2/13/24 9:05 PM"], [0, 12.5 * DAY]),
+        (["01/01/2024", "02/02/2024"], [0, 32 * DAY]),  # both orders agree
+        (["2024-02-01", "2024-02-02T12:00:00.5"], [0, 1.5 * DAY + 0.5]),
+        (["01-Feb-24", "02-Feb-24"], [0, DAY]),
+        (["2024-02-01T12:00:00Z", "2024-02-01T12:00:01.5Z"], [0, 1.5]),
+        (["2024-03-31T01:59:59+01:00", "2024-03-31T03:00:00+02:00"], [0, 1]),
+        (["0:58.5", "0:59.0", "1:00"], [0, 0.5, 1.5]),
+        (["59:59", "1:00:00"], [0, 1]),
+        (["23:59", "24:01"], [0, 2]),
+        (["0:00:58", "0:01:00"], [0, 2]),
+        (["58", "60.5"], [0, 2.5]),
+    ],
+)
+def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
+    # The time of a column is that of its rows: short ones are repeated by groups.
+    n_groups = -(-N // len(cells))
+    columns = {"t": cells * n_groups, "g": np.repeat(range(n_groups), len(cells))}
+    found = asked(columns, "--time", "t", "--group", "g").times
+    np.testing.assert_allclose(seconds(found)[: len(cells)], steps, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        (
+            "{:02d}/02/2024",
+            r"'01/02/2024' in row 0 can be 2024-02-01 .*'%d/%m/%Y'\) or "
+            r"2024-01-02 .*'%m/%d/%Y'\), and no other row decides",
+        ),
+        ("{:02d}.02.24", r"2024-02-01 .*%d\.%m\.%y.* or 2024-01-02 .* or 2001-02-24 "),
+        ("0:{:02d}", r"'0:01' in row 0 can be 1 s .*'%M:%S'\) or 60 s .*'%H:%M'\)"),
+        ("T{}", "expected numbers or dates, .* 12 of 12 are not .*row 0, 'T1'"),
+        ("{}st", "expected numbers or dates, .* 12 of 12 are not .*row 0, '1st'"),
+        ("0,{:02d}", "expected numbers or dates, .* 12 of 12 are not .*'0,01'"),
+        ("00:00:01:{:02d}", "expected numbers or dates, .*'00:00:01:01'"),
+    ],
+)
+def test_times_of_several_readings_or_none_are_refused(asked, cell, message):
+    with pytest.raises(ValueError, match=f"--time t: .*{message}"):
+        asked({"t": [cell.format(i) for i in range(1, 13)]}, "--time", "t")
+
+
+def test_times_of_several_ways_of_writing_are_refused(asked):
+    cells = [f"{i}/03/2024" for i in range(8, N + 7)]
+    with pytest.raises(ValueError, match=r"1 of 24 are not .*row 23, 'tomorrow'"):
+        asked({"t": [*cells, "tomorrow"]}, "--time", "t")
+    cells = [f"2024-02-01T12:00:{i}Z" for i in range(10, N + 9)]
+    with pytest.raises(ValueError, match=r"23 of 24 .* zone, .* none .*row 23, '2024"):
+        asked({"t": [*cells, "2024-02-01T13:00:00"]}, "--time", "t")
+
+
+@pytest.mark.parametrize(
+    ("cell", "format", "step"),
+    [
+        ("{:02d}/02/2024", "%d/%m/%Y", DAY),
+        ("{:02d}/02/2024", "%m/%d/%Y", 31 * DAY),
+        ("202402{:02d}", "%Y%m%d", DAY),
+        ("0:{:02d}", "%M:%S", 1),
+        ("99:{:02d}", "%M:%S", 1),
+        ("0:{:02d}", "%H:%M", 60),
+        ("1:00:{:02d}", "%H:%M:%S", 1),
+    ],
+)
+def test_time_format_decides(asked, cell, format, step):
+    cells = {"t": [cell.format(i) for i in range(1, 13)]}
+    found = asked(cells, "--time", "t", "--time-format", format).times
+    assert seconds(found)[1] == step
+    with pytest.raises(ValueError, match=f"written as {format}x.*12 of 12"):
+        asked(cells, "--time", "t", "--time-format", f"{format}x")
+    with pytest.raises(ValueError, match="--time-format needs --time"):
+        asked(cells, "--time-format", format)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        pd.date_range("2024-10-27", periods=N, freq="h", tz="Europe/Berlin"),
+        pd.to_timedelta(np.arange(N), unit="h"),
+        pd.date_range("2024-10-27", periods=N, freq="h"),
+    ],
+)
+def test_times_of_parquet_files_keep_their_type(asked, times):
+    found = asked({"t": times}, "--time", "t", suffix=".parquet").times
+    np.testing.assert_array_equal(seconds(found), 3600.0 * np.arange(N))
+
+
+NAMES = [
+    ("007", "7"),
+    ("1.1", "1.10"),
+    ("1e5", "100000"),
+    ("123456789012345678901", "123456789012345678902"),
+]
+
+
+@pytest.mark.parametrize("names", NAMES)
+def test_names_are_texts(asked, names):
+    cells = np.resize(names, N)
+    found = asked({"who": cells}, "--label", "who:classes", "--group", "who")
+    assert sorted(set(found.labels[0].values)) == sorted(names)
+    assert sorted(set(found.groups)) == sorted(names)
+    if "." not in names[0]:
+        found = asked({"who": cells}, "--label", "who")
+        assert sorted(set(found.labels[0].values)) == sorted(names)
+
+
+def test_whole_numbers_are_classes_in_their_order(asked):
+    (label,) = asked({"age": np.resize([10, 9, 8], N)}, "--label", "age").labels
+    assert [str(name) for name in np.unique(label.values)] == ["8", "9", "10"]
+    assert label.kind == "classes"
+
+
+@pytest.mark.parametrize("word", ["NA", "nan", "NULL", "n/a", "", " ", "<NA>"])
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_words_for_missing_are_missing(asked, word, suffix):
+    columns = {
+        "mood": np.where(np.arange(N) % 3, "up", "down").astype(object),
+        "age": (20.5 + np.arange(N)).astype(str).astype(object),
+    }
+    for cells in columns.values():
+        cells[4] = word
+    options = ["--label", "mood", "--label", "age"]
+    mood, age = asked(columns, *options, suffix=suffix).labels
+    assert set(mood.values) == {"up", "down"}
+    assert (age.kind, age.values.dtype.kind) == ("number", "f")
+    assert list(np.flatnonzero(~mood.known)) == list(np.flatnonzero(~age.known)) == [4]
+    with pytest.raises(
+        ValueError, match=r"--group: 1 of 24 frames have no 'mood' .*w 4"
+    ):
+        asked(columns, "--group", "mood", suffix=suffix)
+
+
+def test_none_is_a_class(asked):
+    cells = np.resize(["none", "round"], N)
+    (label,) = asked({"glasses": cells}, "--label", "glasses").labels
+    assert set(label.values) == {"none", "round"}
+
+
+def test_dollar_signs_are_shown_as_they_are(tmp_path, capsys):
+    path, name = tmp_path / "table.csv", "$0_$50k"
+    write_landmarks(path)
+    table = pd.read_csv(path)
+    table[name] = np.resize(["$0_$50k", "$50k_$", "$"], len(table))
+    table.to_csv(path, index=False)
+    assert fit(path, tmp_path / "out", 0, "--label", name) == 0
+    assert "was not drawn" not in capsys.readouterr().err
+    for figure in ("label_1.png", "label_1_shapes.png"):
+        assert (tmp_path / "out" / figure).exists()
+
+
+def test_texts_of_tables_are_no_mathematics():
+    plt = pytest.importorskip("matplotlib.pyplot")
+    from isa_nrsfm.plotting import CoefficientsDisplay
+
+    alpha, y = np.arange(8.0).reshape(4, 2), ["$a_$b", "$a_$b", "c", "c"]
+    shown = CoefficientsDisplay(alpha=alpha, y=y).plot()
+    shown.figure_.canvas.draw()
+    ticks = shown.axes_[-1].get_xticklabels()
+    assert [(tick.get_text(), tick.get_parse_math()) for tick in ticks] == [
+        ("$a_$b", False),
+        ("c", False),
+    ]
+    plt.close(shown.figure_)
