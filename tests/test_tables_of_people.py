@@ -141,6 +141,54 @@ def test_times_of_parquet_files_keep_their_type(asked, times):
     np.testing.assert_array_equal(seconds(found), 3600.0 * np.arange(N))
 
 
+ROWS = np.arange(N)
+FACES = {"face": np.where(ROWS % 2, "right", "left")}
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "numbers"),
+    [
+        ({}, [], ROWS),
+        (FACES | {"frame": ROWS // 2 + 1}, ["--group", "face"], ROWS // 2),
+        (FACES | {"image_id": ROWS // 2 * 7}, ["--group", "face"], ROWS // 2),
+        (FACES | {"frame": ROWS // 2}, ["--skip-rows", "face=right"], ROWS[: N // 2]),
+        (FACES | {"image": ROWS // 2}, ["--skip-rows", "face=right"], ROWS[: N // 2]),
+        ({" Frame": ROWS * 5}, [], ROWS * 5),
+        ({"frame": [f"i{i}.png" for i in ROWS]}, [], ROWS),
+        ({"video": ROWS // 12, "frame": ROWS % 12}, ["--group", "video"], ROWS % 12),
+        ({"video": ROWS // 12}, ["--group", "video"], ROWS),
+        ({"file": ["a.mp4"] * N}, [], ROWS),
+        ({"code": ROWS % 8}, ["--skip-rows", "code=7"], ROWS[ROWS % 8 < 7]),
+    ],
+)
+def test_fps_counts_images(asked, columns, options, numbers):
+    found = asked(pd.DataFrame(columns, index=ROWS), "--fps", 25, *options).times
+    np.testing.assert_allclose(seconds(found), numbers / 25, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("columns", "options", "message"),
+    [
+        (
+            FACES | {"frame": ROWS // 2},
+            [],
+            "12 of 24 .* same image .*frame, first: row 1",
+        ),
+        (
+            FACES | {"image": ROWS // 2},
+            [],
+            "12 of 24 .* same image .*image, first: row",
+        ),
+        ({"frame": ROWS % 12}, [], "12 of 24 .*frame, first: row 12.*--group"),
+        (FACES, ["--group", "face"], "rows .* are 2 rows apart: .* column frame"),
+        (FACES, ["--skip-rows", "face=left"], "rows .* are 2 rows apart"),
+    ],
+)
+def test_fps_of_several_faces_is_refused(asked, columns, options, message):
+    with pytest.raises(ValueError, match=f"^--fps.*{message}"):
+        asked(columns, "--fps", 25, *options)
+
+
 NAMES = [
     ("007", "7"),
     ("1.1", "1.10"),

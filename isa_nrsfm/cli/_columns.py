@@ -24,7 +24,7 @@ from isa_nrsfm.analysis._dynamics import sequences_of
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import read_times
+from isa_nrsfm.cli._times import read_times, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -57,6 +57,7 @@ class Columns(NamedTuple):
 
 def asked_columns(args: Namespace, frames: Frames) -> Columns:
     """Return the columns that the options name; raise if they cannot be used."""
+    pd = import_optional("pandas", extra="io")
     table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
@@ -70,14 +71,17 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
         except ValueError as error:
             raise ValueError(f"--time {args.time}: {error}") from error
     elif args.fps is not None:
-        times = np.asarray(table.index) / args.fps
+        images, name = frames.images
+        numbers = pd.Series(images, frames.other.index)[frames.usable]
+        times = video_times(numbers, name, groups) / args.fps
     if times is not None:
         try:
             times_in_seconds = checked_times(times, len(table))
             sequences_of(times_in_seconds, group_numbers(groups, len(table)), 1)
         except ValueError as error:
             hint = " (--group: the rows that belong together)" * (groups is None)
-            raise ValueError(f"--time {args.time}: {error}{hint}") from error
+            option = "--fps" if args.time is None else f"--time {args.time}"
+            raise ValueError(f"{option}: {error}{hint}") from error
     distances = [_numbered(pair, names, "--distance") for pair in args.distance]
     unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
     if unit is not None and not distances:

@@ -289,7 +289,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "how the cells of --time are written, if that is ambiguous: %%d/%%m/%%Y (day "
         "first), %%M:%%S (minutes and seconds), or other codes of strptime",
     ),
-    "fps": _option("NUMBER", "instead of --time, the frames per second of a video"),
+    "fps": _option(
+        "NUMBER",
+        "instead of --time, the frames per second of a video; frames "
+        "have the numbers of the column frame, or of the rows",
+    ),
     # The method.
     "n_components": _option(
         "K",

@@ -22,6 +22,7 @@ from isa_nrsfm._tables.tracks import (
     tracks_to_table,
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
+from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
@@ -53,7 +54,8 @@ class Frames(NamedTuple):
     ``points`` and ``other`` are the landmarks and the other columns of the rows that
     are not skipped, by the number of the row in the table. ``usable`` marks the rows
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
-    request, ``not_used`` the sizes of unused sets of coordinates.
+    request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
+    numbers of the images that rows show, and the column that has them, if any.
     """
 
     points: "pd.DataFrame"
@@ -64,6 +66,7 @@ class Frames(NamedTuple):
     n_rows: int
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
+    images: tuple[NDArray, str | None]
 
     @property
     def X(self) -> "pd.DataFrame":
@@ -195,6 +198,7 @@ def _frames(
             f"({n_points} in all). If these points are missing, use --zeros-missing"
         )
     # A format knows which of its columns are landmarks.
+    images, numbered_by = image_numbers(table)
     not_used = {} if failed is not None else _sets_not_used(table, columns)
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
@@ -205,6 +209,7 @@ def _frames(
         n_rows=len(table),
         left_out=[out for out in left_out if len(out[1])],
         skeleton=skeleton,
+        images=(images[rows], numbered_by),
     )
 
 

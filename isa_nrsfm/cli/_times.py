@@ -1,5 +1,6 @@
 """Times of frames: numbers, dates and durations, each in one reading for all rows."""
 
+import re
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,9 @@ _DATES = (
 )
 _OF_DAY = ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f", "%I:%M %p", "%I:%M:%S %p")
 _ZONE = r":\d\d.*(?:Z|[+-]\d\d:?\d*)"
+# Columns with the number of a frame, and others that name an image.
+_NUMBER = r"(?:video|image)?[ _.]?frame(?:[ _.]?(?:id|idx|index|no|nr|num|number))?"
+_IMAGE = r"(?:image|img|photo|frame)(?:[ _.]?(?:id|name|path|file))?"
 
 
 def read_times(column: "pd.Series", format: str | None) -> NDArray:
@@ -74,6 +78,53 @@ def read_times(column: "pd.Series", format: str | None) -> NDArray:
             "row decides it: choose one with --time-format"
         )
     return np.asarray(first.reindex(column.index))
+
+
+def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
+    """Return the number of the image of each row, and the column that tells it.
+
+    It is the number of the frame, or of the image among all. Otherwise rows count.
+    """
+    pd = import_optional("pandas", extra="io")
+    for expression in (_NUMBER, _IMAGE):
+        for name in table.columns:
+            if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
+                continue
+            numbers = pd.to_numeric(table[name], errors="coerce")
+            if expression == _NUMBER and np.isfinite(numbers).all():
+                return np.asarray(numbers, dtype=float), str(name).strip()
+            codes = pd.factorize(table[name])[0]
+            if expression == _IMAGE and (codes >= 0).all():
+                return codes, str(name).strip()
+    return np.arange(len(table)), None
+
+
+def video_times(
+    numbers: "pd.Series", name: str | None, groups: NDArray | None
+) -> NDArray:
+    """Return the numbers of images, which must be a sequence within each group.
+
+    `name` is the column that has them. Without one they are those of rows, which must
+    follow one another.
+    """
+    pd = import_optional("pandas", extra="io")
+    found = pd.DataFrame({"image": numbers, "group": 0 if groups is None else groups})
+    again = found.duplicated()
+    if again.any():
+        raise ValueError(
+            f"--fps: {again.sum()} of {len(again)} frames show the same image as an "
+            f"earlier row (column {name}, first: row {again.idxmax()}): the table has "
+            "several faces or videos. Name the column that tells them apart with "
+            "--group, or leave the others out with --skip-rows"
+        )
+    steps = found.groupby("group")["image"].diff()
+    if name is None and steps.median() > 1:
+        raise ValueError(
+            "--fps counts the rows of the table, but most rows that follow one another "
+            f"are {steps.median():g} rows apart: the table seems to have several rows "
+            "an image. Add a column frame with the number of the frame, or use --time"
+        )
+    return np.asarray(numbers)
 
 
 def _formats() -> list[str]:
