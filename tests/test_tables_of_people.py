@@ -10,6 +10,7 @@ from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
 from isa_nrsfm.cli._options import build_parser  # noqa: E402
 from isa_nrsfm.cli._reading import read_frames  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
+from isa_nrsfm.io import open_table, read_landmarks  # noqa: E402
 
 N = 24
 POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
@@ -265,3 +266,23 @@ def test_texts_of_tables_are_no_mathematics():
         ("c", False),
     ]
     plt.close(shown.figure_)
+
+
+def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
+    names = [f"frame{i}" for i in (0, 1, 2, 9, 10, 11, 100)] + ["frame100b2", "g"]
+    for i, name in enumerate(reversed(names)):
+        points = np.full((8, 2), len(names) - 1.0 - i)
+        lines = [f"{x} {y}" for x, y in points]
+        text = "\n".join(["version: 1", "n_points: 8", "{", *lines, "}"])
+        for kind in ("pts", "npy", "parquet"):
+            (tmp_path / kind).mkdir(exist_ok=True)
+        (tmp_path / "pts" / f"{name}.pts").write_text(text)
+        np.save(tmp_path / "npy" / f"{name}.npy", points.reshape(1, -1))
+        table = pd.DataFrame(points.reshape(1, -1), columns=POINTS[:16])
+        table.to_parquet(tmp_path / "parquet" / f"{name}.parquet")
+    order = np.arange(len(names))
+    found = read_landmarks(tmp_path / "pts")
+    assert list(found.frames["file"]) == [f"{name}.pts" for name in names]
+    np.testing.assert_array_equal(found.points["x_0"], order)
+    for kind in ("npy", "parquet"):
+        np.testing.assert_array_equal(open_table(tmp_path / kind)[:][:, 0], order)

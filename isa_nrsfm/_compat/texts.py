@@ -1,4 +1,20 @@
-"""Texts that UTF-8 cannot hold: names of files that are not UTF-8."""
+"""Names of files: their order, and those that UTF-8 cannot hold."""
+
+import re
+from pathlib import Path
+
+
+def by_number(path: Path) -> tuple[list[str | int], str]:
+    """
+    Return a key that sorts files by name, and numbers in names by size.
+
+    >>> from pathlib import Path
+    >>> from isa_nrsfm._compat.texts import by_number
+    >>> [file.name for file in sorted(map(Path, ["f10", "f9", "f1"]), key=by_number)]
+    ['f1', 'f9', 'f10']
+    """
+    parts = re.split("([0-9]+)", path.name)
+    return [int(each) if i % 2 else each for i, each in enumerate(parts)], path.name
 
 
 def as_utf8(text: str) -> str:

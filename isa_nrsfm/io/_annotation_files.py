@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.texts import as_utf8
+from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm.io._landmarks import Landmarks, assemble
 from isa_nrsfm.io._separated_values import first_lines
 
@@ -32,7 +32,7 @@ def is_pts(path: Path) -> bool:
 
 
 def read_pts(path: Path) -> Landmarks:
-    """Read a .pts file, or all of a folder in the order of their names.
+    """Read a .pts file, or all of a folder in the order of their names and numbers.
 
     A file has the points of one image: ``version: 1``, ``n_points: 68`` and, between
     braces, a line ``x y`` for each point. Other files of the folder are ignored.
@@ -40,7 +40,7 @@ def read_pts(path: Path) -> Landmarks:
     """
     files = [path]
     if path.is_dir():
-        files = sorted(file for file in path.iterdir() if _is_pts_name(file))
+        files = sorted(filter(_is_pts_name, path.iterdir()), key=by_number)
         if not files:
             raise ValueError("there are no .pts files in the folder")
     tracks = []

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat.texts import by_number
 from isa_nrsfm._tables.blocks import read_rows
 from isa_nrsfm._tables.sources import StoredTable
 
@@ -28,8 +29,8 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
     path : str or path-like
         A ``.npy`` file with an array (n_frames, 2 * n_points), a ``.parquet`` file with
         these columns and no others, or a folder of files of one of these kinds, which
-        are put below each other in the order of their names. Other files in the folder
-        are refused, but for hidden ones.
+        are put below each other in the order of their names, numbers by size (part2
+        before part10). Other files in the folder are refused, but for hidden ones.
 
     Returns
     -------
@@ -59,7 +60,8 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
     """
     path = Path(path)
     if path.is_dir():
-        files = sorted(p for p in path.iterdir() if not p.name.startswith((".", "_")))
+        shown = (p for p in path.iterdir() if not p.name.startswith((".", "_")))
+        files = sorted(shown, key=by_number)
     else:
         files = [path]
     if not files:
