@@ -152,8 +152,10 @@ def test_zeros_are_missing_only_on_request_and_only_in_pairs(frame):
     missing = np.zeros(points.shape, dtype=bool)
     missing[0, 2:4] = True
     assert_array_equal(points.isna(), missing)
-    with pytest.raises(ValueError, match='None or "zeros"; got 0'):
-        landmark_table(frame, missing=0)
+    pd.testing.assert_frame_equal(landmark_table(frame, missing=0).points, points)
+    for wrong in (True, np.inf, "nan"):
+        with pytest.raises(ValueError, match=r'"zeros" or a finite number; got'):
+            landmark_table(frame, missing=wrong)
 
 
 def test_numbers_of_all_kinds_become_floats(frame):

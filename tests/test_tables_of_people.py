@@ -1,5 +1,8 @@
 """Tables as people write them: CONTRIBUTING lists each way and what happens."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 from fit_runs import fit, write_landmarks
@@ -10,7 +13,7 @@ from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
 from isa_nrsfm.cli._options import build_parser  # noqa: E402
 from isa_nrsfm.cli._reading import read_frames  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
-from isa_nrsfm.io import open_table, read_landmarks  # noqa: E402
+from isa_nrsfm.io import landmark_table, open_table, read_landmarks  # noqa: E402
 
 N = 24
 POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
@@ -286,3 +289,71 @@ def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
     np.testing.assert_array_equal(found.points["x_0"], order)
     for kind in ("npy", "parquet"):
         np.testing.assert_array_equal(open_table(tmp_path / kind)[:][:, 0], order)
+
+
+@pytest.fixture
+def tracks_read(tmp_path):
+    """Return a function that reads tracks as the command fit does, with warnings."""
+
+    def read(tracks, *options):
+        path = tmp_path / "table.csv"
+        values = tracks.reshape(len(tracks), -1)
+        pd.DataFrame(values, columns=POINTS).to_csv(path, index=False)
+        args = build_parser().parse_args(["fit", str(path), "-o", "out", *options])
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            frames = read_frames(args)
+        return frames.points.to_numpy(), [str(each.message) for each in caught]
+
+    return read
+
+
+@pytest.mark.parametrize("code", [-1.0, -9999.0, 999.0, 0.0])
+@pytest.mark.parametrize("digits", [3, 0])
+def test_codes_of_missing_points_cause_a_warning(tracks_read, code, digits):
+    tracks = landmarks(200).to_numpy().reshape(200, -1, 2)
+    tracks = (500 + 40 * tracks).round(digits)
+    _, warned = tracks_read(tracks)
+    assert warned == []
+    hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.1
+    hidden[:, :8] = False  # these are seen in all rows
+    tracks[hidden] = code
+    n_rows, n_points = hidden.any(axis=1).sum(), hidden.sum()
+    option = f"--missing-value={code:g}" if code else "--zeros-missing"
+    points, (warning,) = tracks_read(tracks)
+    np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
+    shown = rf"in {n_rows} of 200 rows points are at exactly \({code:g}, {code:g}\)"
+    assert re.match(rf"{shown} \({n_points} in all\)", warning)
+    assert warning.endswith(f"use {option.replace('=', ' ')}")
+    points, warned = tracks_read(tracks, option)
+    assert warned == []
+    expected = np.where(hidden[..., None], np.nan, tracks)
+    np.testing.assert_array_equal(points.reshape(tracks.shape), expected)
+
+
+def test_pixels_of_a_face_that_hardly_moves_are_no_code(tracks_read):
+    """Whole pixels repeat in many rows, also those with equal coordinates."""
+    shape = np.stack([np.arange(300, 324, 2)] * 2, axis=1) + [[0, 0], [9, 0]] * 6
+    noise = np.random.default_rng(0).normal(size=(600, 12, 2))
+    tracks = np.round(shape + noise)
+    assert (tracks[:, 0] == 300).all(axis=1).mean() > 0.1
+    assert tracks_read(tracks)[1] == []
+
+
+def test_several_codes_are_missing_together(tracks_read):
+    tracks = landmarks().to_numpy().reshape(N, -1, 2) + 50
+    tracks[3, 2], tracks[4, 5], tracks[5, 1] = -1, 999, [-1, 3]
+    points, _ = tracks_read(tracks, "--missing-value", "-1", "--missing-value", "999")
+    tracks[3, 2] = tracks[4, 5] = np.nan
+    np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
+    found = landmark_table(
+        pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16]), missing=-1
+    )
+    assert found.points.isna().to_numpy().tolist() == [[True, True, False, False] * 4]
+
+
+@pytest.mark.parametrize("number", ["nan", "inf", "x"])
+def test_codes_are_finite_numbers(number, capsys):
+    with pytest.raises(SystemExit):
+        build_parser().parse_args(["fit", "t", "-o", "f", "--missing-value", number])
+    assert "--missing-value: expected a number, such as -1" in capsys.readouterr().err

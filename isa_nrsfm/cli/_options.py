@@ -5,6 +5,7 @@ compares the defaults with those of `AffineNRSfM` and its strategies.
 """
 
 import argparse
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -106,6 +107,14 @@ def _positive_number(text: str) -> float:
     return number
 
 
+def _finite_number(text: str) -> float:
+    """Read a finite number."""
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError
+    return number
+
+
 def _image_size(text: str) -> tuple[int, int]:
     """Read WIDTHxHEIGHT."""
     match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
@@ -165,6 +174,7 @@ TYPES: dict[str, Callable[[str], Any]] = {
     ),
     "SEED": _whole_number(0, 2**32 - 1),
     "STARTS": _whole_number(1),
+    "VALUE": _reader("a number, such as -1", _finite_number),
     "WIDTHxHEIGHT": _reader("WIDTHxHEIGHT, such as 1920x1080", _image_size),
 }
 
@@ -219,6 +229,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "leave out rows whose column matches the expression, such as 'name=^ir'",
     ),
     "zeros_missing": _flag("treat points at exactly (0, 0) as missing"),
+    "missing_value": _list(
+        "VALUE", "treat points whose x and y are this number, such as -1, as missing"
+    ),
     "min_confidence": _option(
         "CONFIDENCE", "treat points with a lower confidence as missing"
     ),
@@ -387,8 +400,8 @@ DIFFERENT: dict[tuple[str, str], dict[str, Any]] = {
     },
 }
 TABLE_OPTIONS = (
-    *("format", "columns", "skip_rows", "zeros_missing", "min_confidence"),
-    "image_size",
+    *("format", "columns", "skip_rows", "zeros_missing", "missing_value"),
+    *("min_confidence", "image_size"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 

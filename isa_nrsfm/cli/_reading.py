@@ -190,14 +190,7 @@ def _frames(
     _, report = centred_frames(tracks)
     reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
-    at_origin = (tracks[report.usable] == 0).all(axis=2)
-    if at_origin.any():
-        n_points, n_rows = at_origin.sum(), at_origin.any(axis=1).sum()
-        warn_caller(
-            f"in {n_rows} of {len(at_origin)} rows points are at exactly (0, 0) "
-            f"({n_points} in all). If these points are missing, use --zeros-missing"
-        )
-    # A format knows which of its columns are landmarks.
+    _warn_of_code(tracks[report.usable])
     images, numbered_by = image_numbers(table)
     not_used = {} if failed is not None else _sets_not_used(table, columns)
     return Frames(
@@ -237,9 +230,40 @@ def _tracks(
     kept: NDArray,
 ) -> NDArray:
     """Return the points of all rows of the table, NaN where missing or not kept."""
+    codes = [*args.missing_value, *[0.0] * args.zeros_missing]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    tracks[kept] = tracks_in(table[kept], columns.interleaved, args.zeros_missing)
+    tracks[kept] = tracks_in(table[kept], columns.interleaved, codes)
     return tracks
+
+
+def _warn_of_code(tracks: NDArray) -> None:
+    """Warn if points of tracks (n_frames, n_points, 2) may be missing, such as (0, 0).
+
+    The coordinates of other points are equal, exactly and in three frames, only by
+    chance. Then the point has other places as often, or others are further out.
+    """
+    x, y = np.moveaxis(tracks, 2, 0)
+    values, counts = np.unique(x[x == y], return_counts=True)
+    if not len(values):
+        return
+    for value in {*values[[0, int(counts.argmax()), -1]], *values[values == 0]}:
+        there = (x == value) & (y == value)
+        point = there.sum(axis=0).argmax()
+        places = tracks[~there[:, point] & ~np.isnan(x[:, point]), point]
+        often = np.unique(places, axis=0, return_counts=True)[1].max(initial=0)
+        others = tracks[~there]
+        is_outside = value < np.nanmin(others) or value > np.nanmax(others)
+        n_rows = there.any(axis=1).sum()
+        enough = n_rows > 2 and (is_outside or there[:, point].sum() > 3 * often)
+        if value and not enough:
+            continue
+        number = f"{value:.15g}"
+        option = f"--missing-value {number}" if value else "--zeros-missing"
+        warn_caller(
+            f"in {n_rows} of {len(there)} rows points are at exactly ({number}, "
+            f"{number}) ({there.sum()} in all). If these points are missing, use "
+            f"{option}"
+        )
 
 
 def _reasons(report: FrameReport, failed: NDArray | None) -> dict[str, NDArray]:

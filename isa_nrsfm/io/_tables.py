@@ -135,7 +135,7 @@ def landmark_table(
     frame: "pd.DataFrame",
     *,
     columns: str | Sequence[str] | None = None,
-    missing: Literal["zeros"] | None = None,
+    missing: Literal["zeros"] | float | None = None,
 ) -> LandmarkTable:
     """
     Take the landmark columns out of a table, in the order x0, y0, x1, y1, ....
@@ -152,8 +152,9 @@ def landmark_table(
         The landmark columns, if their names are ambiguous: patterns of x and
         y columns in turn, such as ``"x_#,y_#"``, with ``#`` for a number and ``*`` for
         any text.
-    missing : {"zeros"}, optional
-        With "zeros", points at exactly (0, 0) are missing and become NaN.
+    missing : {"zeros"} or float, optional
+        The x and y of missing points, such as -1, exactly; they become NaN. "zeros" is
+        the number 0.
 
     Returns
     -------
@@ -186,12 +187,18 @@ def landmark_table(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
             "(polars tables have a method to_pandas)"
         )
-    if missing not in (None, "zeros"):
-        raise ValueError(f'missing must be None or "zeros"; got {missing!r}')
+    code = 0.0 if missing == "zeros" else missing
+    if code is not None and (
+        isinstance(code, bool | str) or not np.isfinite(np.float64(code))
+    ):
+        raise ValueError(
+            f'missing must be None, "zeros" or a finite number; got {missing!r}'
+        )
+    codes = [] if code is None else [float(code)]
     found = find_landmark_columns(frame.columns, columns)
     names = found.interleaved
     refuse_same_names([str(name) for name in frame.columns])
-    values = tracks_in(frame, names, missing == "zeros").reshape(len(frame), len(names))
+    values = tracks_in(frame, names, codes).reshape(len(frame), len(names))
     return LandmarkTable(
         pd.DataFrame(values, index=frame.index, columns=[n.strip() for n in names]),
         frame.drop(columns=names),
@@ -199,13 +206,16 @@ def landmark_table(
 
 
 def tracks_in(
-    frame: "pd.DataFrame", names: Sequence[str], zeros_missing: bool
+    frame: "pd.DataFrame", names: Sequence[str], missing: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ...."""
+    """Return the points (n_frames, n_points, 2) in columns x0, y0, x1, y1, ....
+
+    Those with one of the numbers in `missing` as x and y become NaN.
+    """
     values = np.stack([_as_numbers(frame[name]) for name in names], axis=1)
     tracks = values.reshape(len(frame), len(names) // 2, 2)
-    if zeros_missing:
-        tracks[(tracks == 0).all(axis=2)] = np.nan
+    for number in missing:
+        tracks[(tracks == number).all(axis=2)] = np.nan
     return tracks
 
 
@@ -215,7 +225,9 @@ def is_named_columns(_path: Path) -> bool:
 
 
 def read_named_columns(
-    path: Path, columns: str | None = None, missing: Literal["zeros"] | None = None
+    path: Path,
+    columns: str | None = None,
+    missing: Literal["zeros"] | float | None = None,
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
     points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
