@@ -558,7 +558,8 @@ def test_a_figure_that_fails_costs_no_results(run, fitted, table, tmp_path):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ModeCovarianceDisplay, "from_estimator", fail)
-        code, out, err = run("fit", table, "-o", folder, *QUICK, "--refinement", "none")
+        quick = ["--force", *QUICK, "--refinement", "none"]
+        code, out, err = run("fit", table, "-o", folder, *quick)
     warning = "mode_covariance.png was not drawn: no axes"
     assert (code, err) == (0, f"isa-nrsfm: warning: {warning}\n")
     # All results were there, and only they, when figures began.

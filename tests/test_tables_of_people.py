@@ -1,5 +1,6 @@
 """Tables as people write them: CONTRIBUTING lists each way and what happens."""
 
+import json
 import re
 import warnings
 
@@ -357,3 +358,27 @@ def test_codes_are_finite_numbers(number, capsys):
     with pytest.raises(SystemExit):
         build_parser().parse_args(["fit", "t", "-o", "f", "--missing-value", number])
     assert "--missing-value: expected a number, such as -1" in capsys.readouterr().err
+
+
+def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
+    path, folder = tmp_path / "table.csv", tmp_path / "out"
+    write_landmarks(path)
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    assert fit(path, folder, 0, "--no-figures") == 0  # other names are no matter
+    assert fit(path, folder, 0) == 0  # figures are new
+    capsys.readouterr()
+    for name in ("cameras.csv", "report.html", "report.json", "basis_shapes.png"):
+        other = tmp_path / f"of {name}"
+        other.mkdir()
+        text = json.dumps({"sha256": {}, "mine": [1]})
+        (other / name).write_text(text)
+        options = [] if name.endswith("png") else ["--no-figures"]
+        assert fit(path, other, 0, *options) == 1
+        message = f"would be replaced: {name}. Choose another --output, or .* --force"
+        assert re.search(message, capsys.readouterr().err)
+        assert [file.name for file in other.iterdir()] == [name]
+        assert (other / name).read_text() == text
+        assert fit(path, other, 0, *options, "--force") == 0
+        assert fit(path, other, 0, *options) == 0
+    assert (folder / "notes.txt").read_text() == "mine"

@@ -32,6 +32,7 @@ def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
     options = [
         *("fit", str(folder / "tracks.csv"), "--n-components", tried),
         *("--camera", "weak_perspective", "--output", str(folder)),
+        *["--force"] * args.force,
         *["--no-figures"] * args.no_figures,
         *drawing_options(args),
     ]

@@ -34,6 +34,7 @@ from isa_nrsfm.cli._outputs import (
     digests_of,
     entry_of_report,
     refuse_overwriting,
+    refuse_replacing,
     write_alpha,
     write_results,
 )
@@ -92,6 +93,8 @@ def fit_table(
         refuse_overwriting(inputs, [folder / name for name in files])
         for name in files:
             check_replaceable(folder / name)
+        if not args.force:
+            refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
         estimator, search = _fitted(args, X, asked.groups, clock)

@@ -248,6 +248,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "output": _option(
         "DIR", "folder for the results, created if absent", required=True
     ),
+    "force": _flag("replace files in the folder that are of no earlier run"),
     "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
     "std": _flag(
         "add the standard deviation of each coefficient, in columns such as alpha_1_std"
@@ -445,7 +446,7 @@ Cells of missing points are empty. Rows with too few points are counted and have
 coefficients. The results replace those of an earlier run in the output folder.""",
         {
             "table": ("table", *TABLE_OPTIONS, "points"),
-            "output": ("output", "no_figures", "std", *DRAWING),
+            "output": ("output", "force", "no_figures", "std", *DRAWING),
             "other columns": (
                 *("label", "group", "distance", "unit", "length", ("time", "fps")),
                 "time_format",
@@ -507,7 +508,7 @@ example:
   isa-nrsfm demo --output faces
 
 The folder has the files of 'isa-nrsfm fit', and the table as tracks.csv.""",
-        {"output": ("output", "no_figures", *DRAWING)},
+        {"output": ("output", "force", "no_figures", *DRAWING)},
     ),
 }
 

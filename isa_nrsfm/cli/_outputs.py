@@ -54,6 +54,19 @@ def refuse_overwriting(sources: Iterable[str], targets: Iterable[Path]) -> None:
             )
 
 
+def refuse_replacing(folder: Path, names: Iterable[str]) -> None:
+    """Raise if files would be replaced that the report of a run does not list."""
+    earlier = entry_of_report(folder, "sha256")
+    own = {*earlier, REPORT} if earlier else {}
+    others = [name for name in names if name not in own and (folder / name).exists()]
+    if others:
+        raise ValueError(
+            f"{folder} has files that are of no complete earlier run and would be "
+            f"replaced: {', '.join(others)}. Choose another --output, or replace them "
+            "with --force"
+        )
+
+
 def write_alpha(
     path: Path,
     frames: Frames,
