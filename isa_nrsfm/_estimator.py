@@ -22,7 +22,6 @@ from isa_nrsfm._parameters.choices import (
     LOSSES,
     REFINEMENTS,
 )
-from isa_nrsfm._prepare.checks import check_names
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.kept_arrays import kept_arrays
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
@@ -420,7 +419,6 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
                 "camera='weak_perspective' or camera='orthographic'"
             )
         source = self._opened(X, reset=True)
-        check_names(getattr(self, "feature_names_in_", None), self.layout)
         self.isa_ = self._strategy()
         self.frames_scaled_ = self.scale_frames and self.camera != "orthographic"
         return source

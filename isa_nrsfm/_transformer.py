@@ -23,6 +23,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._prepare.checks import check_table, validated_table
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -565,10 +566,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         if not reset:
             check_is_fitted(self)
         if is_read_later(X):
+            check_table(X, self.layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
         else:
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-            X = validate_data(self, unmasked(X), reset=reset, **CHECKS, **least)
+            X = validated_table(self, X, reset=reset, **CHECKS, **least)
             checked_range(X)
         return open_table(X, self.n_jobs, self.working_memory)
 

@@ -10,6 +10,7 @@ from isa_nrsfm._prepare import checks
 from isa_nrsfm._prepare.checks import (
     check_names,
     check_points,
+    check_table,
     largest_n_components,
     most_components,
     smallest_n_frames,
@@ -174,7 +175,7 @@ class TestSize:
 class TestNames:
     @pytest.mark.parametrize("layout", ["interleaved", "planar"])
     def test_no_names_and_names_that_say_nothing(self, layout):
-        check_names(None, layout)
+        check_table(np.zeros((3, 4)), layout)
         check_names(np.array(["a", "b", "c", "d"]), layout)
 
     def test_matching_names(self):

@@ -10,6 +10,10 @@ from fit_runs import fit, write_landmarks
 
 pd = pytest.importorskip("pandas")
 
+from sklearn.base import clone  # noqa: E402
+
+from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
+from isa_nrsfm.baselines import PseudoInverseNRSfM  # noqa: E402
 from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
 from isa_nrsfm.cli._options import build_parser  # noqa: E402
 from isa_nrsfm.cli._reading import read_frames  # noqa: E402
@@ -382,3 +386,56 @@ def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
         assert fit(path, other, 0, *options, "--force") == 0
         assert fit(path, other, 0, *options) == 0
     assert (folder / "notes.txt").read_text() == "mine"
+
+
+def of_estimators(test):
+    quick = {"n_components": 1, "isa": FastISA(n_init=1), "random_state": 0}
+    all_of_them = [AffineNRSfM(**quick, refinement=None), PseudoInverseNRSfM(1)]
+    names = [type(each).__name__ for each in all_of_them]
+    return pytest.mark.parametrize("estimator", all_of_them, ids=names)(test)
+
+
+@of_estimators
+@pytest.mark.parametrize(
+    ("further", "number", "first"),
+    [
+        ({"frame": ROWS, "person": 1}, "2 of the 26", "frame"),
+        ({"frame": ROWS, "person": "Ann"}, "2 of the 26", "frame"),
+        ({"day": pd.date_range("2024", periods=N)}, "1 of the 25", "day"),
+        ({f"likelihood{j}": 1.0 for j in range(12)}, "12 of the 36", "likelihood0"),
+        ({f"z{j}": 1.0 for j in range(12)}, "12 of the 36", "z0"),
+    ],
+)
+def test_whole_tables_are_no_tables_of_points(estimator, further, number, first):
+    table = pd.concat([pd.DataFrame(further, index=ROWS), landmarks()], axis=1)
+    message = (
+        f"{number} .*'{first}'.* Give only the columns of points: .*landmark_table"
+    )
+    with pytest.raises(ValueError, match=message):
+        estimator.fit(table)
+    columns = [tuple(f"DLC {name}".split()) for name in table]
+    with pytest.raises(ValueError, match=message.replace(first, f"DLC_{first}")):
+        estimator.fit(table.set_axis(pd.MultiIndex.from_tuples(columns), axis=1))
+    fitted = estimator.fit(landmarks().to_numpy())
+    with pytest.raises(ValueError, match=message):
+        fitted.transform(table)
+    unnamed = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
+    with pytest.raises(ValueError, match=r"X has texts: .*'Ann'.*landmark_table"):
+        estimator.fit(unnamed.assign(c24="Ann", c25="Bob"))
+
+
+@of_estimators
+@pytest.mark.parametrize("layout", ["interleaved", "planar"])
+def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
+    tracks = landmarks().to_numpy().reshape(N, 12, 2)
+    expected = tracks.swapaxes(1, 2) if layout == "planar" else tracks
+    estimator = clone(estimator).set_params(layout=layout)
+    for X in (tracks, tracks.swapaxes(1, 2)):
+        with pytest.raises(ValueError, match=r"reshape\(len\(X\), -1\)") as error:
+            estimator.fit(X)
+        way = str(error.value).rpartition("give ")[2]
+        table = eval(way, {"X": X})
+        np.testing.assert_array_equal(table, expected.reshape(N, -1))
+    for X in (tracks[None], np.zeros((30, 12, 3))):
+        with pytest.raises(ValueError, match=r"one row a frame .* got the shape .*\)$"):
+            estimator.fit(X)

@@ -1,13 +1,18 @@
 """Checks of a table before it is factorised, and their messages."""
 
+from collections.abc import Hashable, Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.utils.validation import validate_data
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.column_names import names_layout, parse_coordinate
+from isa_nrsfm._tables.sources import unmasked
 from isa_nrsfm._tables.tracks import (
     FEWEST_POINTS,
     LAYOUTS,
@@ -20,19 +25,55 @@ from isa_nrsfm._tables.tracks import (
 
 # With fewer frames or points than this the layouts are not compared.
 FEWEST_COMPARED = 10
+ONLY_POINTS = (
+    "Give only the columns of points: isa_nrsfm.io.landmark_table(X).points has them"
+)
 
 
-def check_names(names: NDArray | None, layout: Layout) -> None:
+def check_table(X: Any, layout: Layout) -> None:
+    """Raise if an array has more than two dimensions, or columns that are no points.
+
+    Names of several levels, as DeepLabCut has them, are read as one.
+    """
+    shape: tuple[int, ...] = getattr(X, "shape", ())
+    if isinstance(X, list | tuple):
+        shape = np.shape(X)
+    if len(shape) > 2:
+        order = ".swapaxes(1, 2)" * ((layout == "planar") != (shape[-1] != 2))
+        way = f": give X{order}.reshape(len(X), -1)"
+        raise ValueError(
+            "X must be a table with one row a frame and two columns a point; got the "
+            f"shape {shape}{way if len(shape) == 3 and 2 in shape[1:] else ''}"
+        )
+    names = getattr(X, "columns", None)
+    if names is not None:
+        check_names(
+            ["_".join(map(str, n)) if isinstance(n, tuple) else n for n in names],
+            layout,
+        )
+
+
+def validated_table(estimator: Any, X: Any, **options: Any) -> NDArray:
+    """Return a table as an array of numbers, checked by scikit-learn and by name."""
+    check_table(X, estimator.layout)
+    try:
+        return np.asarray(validate_data(estimator, unmasked(X), **options))
+    except ValueError as error:
+        if "could not convert" in str(error):
+            raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
+        raise
+
+
+def check_names(names: Sequence[Hashable], layout: Layout) -> None:
     """Raise an error if column names contradict the layout or are not of points."""
-    said = None if names is None else names_layout(names)
-    if names is None or said in (None, layout):
+    said = names_layout(names)
+    if said in (None, layout):
         return
     others = [str(name) for name in names if not _is_x_or_y(name)]
     if others:
         raise ValueError(
             f"{len(others)} of the {len(names)} columns are not named as the x or "
-            f"y of a point (first: {others[0]!r}). Give only the columns of points: "
-            "isa_nrsfm.io.landmark_table(X).points has them"
+            f"y of a point (first: {others[0]!r}). {ONLY_POINTS}"
         )
     shown = ", ".join(map(str, names[:4]))
     order = (
@@ -47,7 +88,7 @@ def check_names(names: NDArray | None, layout: Layout) -> None:
     )
 
 
-def _is_x_or_y(name: str) -> bool:
+def _is_x_or_y(name: Hashable) -> bool:
     """Return whether a column is named as the x or y of a point."""
     coordinate = parse_coordinate(name)
     return coordinate is not None and coordinate.axis < 2

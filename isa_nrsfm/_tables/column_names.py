@@ -12,6 +12,7 @@ sets, ``thumb_#_x`` and ``*_x``.
 
 import re
 from collections.abc import Hashable, Iterable
+from itertools import pairwise, zip_longest
 from typing import Any, Literal, NamedTuple
 
 _SEPARATORS = r"[ _.\-]"
@@ -89,10 +90,13 @@ def names_layout(
         (before, _, after), key = coordinate.memberships[0]
         axes.append(coordinate.axis)
         points.append((before, after, key))
+    pairs = [a == b for a, b in zip_longest(rest[0::2], rest[1::2])]
     if 0 not in axes or 1 not in axes:
-        return None
+        # lx1, ly1 beside columns that are no pairs
+        alike = any(a == b for a, b in pairwise(rest))
+        return "other" if not axes and alike and not all(pairs) else None
     if rest:
-        return None if rest[0::2] == rest[1::2] else "other"
+        return None if all(pairs) else "other"
     n_points = len(set(points))
     if axes == [0, 1] * n_points and points[0::2] == points[1::2]:
         return "interleaved"

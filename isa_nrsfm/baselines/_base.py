@@ -15,7 +15,7 @@ from sklearn.base import (
     ClassNamePrefixFeaturesOutMixin,
     TransformerMixin,
 )
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.scikit_learn import (
     Interval,
@@ -26,9 +26,9 @@ from isa_nrsfm._compat.scikit_learn import (
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
-from isa_nrsfm._prepare.checks import check_names
+from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import checked_range, open_table, unmasked
+from isa_nrsfm._tables.sources import checked_range, open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -124,7 +124,6 @@ class ShapeSequenceNRSfM(
         """
         X = self._checked(X, reset=True)
         names = getattr(self, "feature_names_in_", None)
-        check_names(names, self.layout)
         table = scaled_table(
             open_table(X),
             self.n_components,
@@ -270,9 +269,9 @@ class ShapeSequenceNRSfM(
     def _checked(self, X: Any, reset: bool) -> NDArray:
         """Return a valid table without missing points."""
         fewest = 2 if reset else 1
-        X = validate_data(
+        X = validated_table(
             self,
-            unmasked(X),
+            X,
             dtype=[np.float64, np.float32],
             ensure_all_finite="allow-nan",
             ensure_min_samples=fewest,
