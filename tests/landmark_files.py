@@ -69,6 +69,17 @@ def write_openface(
     return path
 
 
+def saved_again(path, suffix):
+    """Save a csv file as another kind of table, as people do with pandas."""
+    frame, new = pd.read_csv(path), path.with_suffix(suffix)
+    path.unlink()
+    if suffix == ".parquet":
+        frame.to_parquet(new)
+    else:
+        frame.to_csv(new, sep="\t", index=False)
+    return new
+
+
 def write_pyfeat(path, tracks, *, detector="Detector"):
     """Write a table as Fex.to_csv does."""
     n_frames, n_points, _ = tracks.shape
@@ -261,10 +272,20 @@ WRITERS = {
     "openface": lambda d: write_openface(d / "a.csv", TRACKS),
     "openface-1": lambda d: write_openface(d / "a.csv", TRACKS, separator=", "),
     "openface-image": lambda d: write_openface(d / "a.csv", TRACKS, video=False),
+    "openface-tsv": lambda d: saved_again(write_openface(d / "a.csv", TRACKS), ".tsv"),
+    "openface-parquet": lambda d: saved_again(
+        write_openface(d / "a.csv", TRACKS, separator=", "), ".parquet"
+    ),
     "pyfeat": lambda d: write_pyfeat(d / "a.csv", TRACKS),
     "pyfeat-v2": lambda d: write_pyfeat(d / "a.csv", TRACKS, detector="Detectorv2"),
     "pyfeat-mp": lambda d: write_pyfeat(d / "a.csv", MESH, detector="MPDetector"),
+    "pyfeat-parquet": lambda d: saved_again(
+        write_pyfeat(d / "a.csv", MESH, detector="MPDetector"), ".parquet"
+    ),
     "mediapipe-pixels": lambda d: write_mesh(d / "a.csv", MESH, shares=False),
+    "mediapipe-tsv": lambda d: saved_again(
+        write_mesh(d / "a.csv", MESH, sizes=True), ".tsv"
+    ),
     "mediapipe-sizes": lambda d: write_mesh(d / "a.csv", MESH, sizes=True),
     "pts": lambda d: write_pts(d / "a", TRACKS),
     "pts-file": lambda d: write_pts(d / "a", TRACKS[:1]) / "image_000.pts",
@@ -277,10 +298,20 @@ WRITERS = {
     "sleap-csv": lambda d: write_sleap_csv(
         d / "a.csv", TRACKS[:, None], np.ones((12, 1, 8)), names=["a"]
     ),
+    "sleap-parquet": lambda d: saved_again(WRITERS["sleap-csv"](d), ".parquet"),
     "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
     "coco-results": lambda d: write_json(d / "a.json", RESULTS),
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
-EXPECTED = dict.fromkeys(["pyfeat-mp", "mediapipe-pixels", "mediapipe-sizes"], MESH)
+EXPECTED = dict.fromkeys(
+    [
+        "pyfeat-mp",
+        "pyfeat-parquet",
+        "mediapipe-pixels",
+        "mediapipe-sizes",
+        "mediapipe-tsv",
+    ],
+    MESH,
+)
 EXPECTED |= {"pts-file": TRACKS[:1], "wflw": WFLW, "wflw-test": WFLW}

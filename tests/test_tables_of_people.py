@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 from fit_runs import fit, write_landmarks
+from landmark_files import scene, write_openface
 
 pd = pytest.importorskip("pandas")
 
@@ -439,3 +440,31 @@ def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
     for X in (tracks[None], np.zeros((30, 12, 3))):
         with pytest.raises(ValueError, match=r"one row a frame .* got the shape .*\)$"):
             estimator.fit(X)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet"])
+@pytest.mark.parametrize("typed", [True, False])
+def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
+    tmp_path, suffix, typed
+):
+    path = write_openface(
+        tmp_path / "a.csv", scene(), success=np.minimum(np.arange(12) % 3, 1)
+    )
+    further = pd.DataFrame({"subject": "007", "age": 30, "mood": "NA"}, index=range(12))
+    table = pd.concat([pd.read_csv(path), further], axis=1)
+    if not typed:
+        table = table.astype(str)
+    path = path.with_suffix(suffix)
+    if suffix == ".parquet":
+        table.to_parquet(path)
+    else:
+        table.to_csv(path, sep={".csv": ",", ".tsv": "\t"}[suffix], index=False)
+    found = read_landmarks(path)
+    assert found.format == "openface"
+    np.testing.assert_array_equal(found.failed, np.arange(12) % 3 == 0)
+    assert set(found.frames["subject"]) == {"007"}
+    assert set(found.frames["age"]) == {30}
+    args = build_parser().parse_args(["fit", str(path), "-o", "out"])
+    frames = read_frames(args)
+    assert [reason for reason, *_ in frames.left_out] == ["tracking failed"]
+    assert len(frames.X) == 8

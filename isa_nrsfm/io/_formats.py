@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 TABLE = "table"
 # Stands for a folder where others have the suffix of a file.
 _FOLDER = "/"
+_TABLES = (".csv", ".tsv", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -279,7 +280,7 @@ _ALL = (
         "OpenFace",
         "the columns frame, timestamp, confidence, success (face, confidence for an "
         "image), x_0, ... and y_0, ...",
-        (".csv",),
+        _TABLES,
         "_face_tables.openface",
     ),
     LandmarkFormat(
@@ -287,14 +288,14 @@ _ALL = (
         "py-feat",
         "the columns FaceRectX, FaceRectY, FaceRectWidth, FaceRectHeight, x_0, ... and "
         "y_0, ...",
-        (".csv",),
+        _TABLES,
         "_face_tables.pyfeat",
     ),
     LandmarkFormat(
         "mediapipe",
         "MediaPipe",
         "named columns x and y of each point (468 or 478, where it is recognised)",
-        (".csv",),
+        _TABLES,
         "_face_tables.mediapipe",
         ("image_size",),
     ),
@@ -324,7 +325,7 @@ _ALL = (
         "SLEAP analysis",
         "the datasets tracks, node_names and track_names, or the columns track, "
         "frame_idx, instance.score, nose.x, nose.y, nose.score, ...",
-        (".h5", ".hdf5", ".csv"),
+        (".h5", ".hdf5", *_TABLES),
         "_sleap.sleap",
     ),
     LandmarkFormat(
@@ -339,7 +340,7 @@ _ALL = (
         TABLE,
         "a table with named columns",
         "a line of names such as x_0, y_0 or nose_x, nose_y, and rows of as many cells",
-        (".csv", ".tsv", ".parquet"),
+        _TABLES,
         "_tables.named_columns",
         ("columns", "missing"),
     ),

@@ -25,27 +25,28 @@ _NEEDED = frozenset({"tracks", "node_names", "track_names"})
 
 
 def is_sleap(path: Path) -> bool:
-    """Return whether a file has the datasets (h5) or the header (csv) of SLEAP."""
-    if path.suffix.lower() == ".csv":
-        return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
-    return is_hdf5(path) and _NEEDED <= root_groups(path)
+    """Return whether a file has the datasets (h5) or the header of SLEAP."""
+    if is_hdf5(path):
+        return _NEEDED <= root_groups(path)
+    return header_names(path)[: len(_CSV_COLUMNS)] == _CSV_COLUMNS
 
 
 def read_sleap(path: Path) -> Landmarks:
-    """Read an analysis h5 or csv file of SLEAP, or of sleap-io and movement.
+    """Read an analysis h5 file or table of SLEAP, or of sleap-io and movement.
 
     In an h5 file, ``tracks`` has the points, in the order of axes of its attribute
     ``dims``, by default (track, xy, node, frame). ``point_scores`` and
     ``instance_scores`` have confidences, ``edge_names`` the pairs of nodes that the
-    skeleton joins. A csv file has a row for each instance, ``track, frame_idx,
+    skeleton joins. A table has a row for each instance, ``track, frame_idx,
     instance.score`` and ``x``, ``y`` and ``score`` of each node. Frames are counted
     from 0.
     """
-    return _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+    is_h5 = path.suffix.lower() in (".h5", ".hdf5")
+    return _read_h5(path) if is_h5 else _read_table(path)
 
 
-def _read_csv(path: Path) -> Landmarks:
-    """Read a csv file, which has no rows for frames without instances."""
+def _read_table(path: Path) -> Landmarks:
+    """Read a table, which has no rows for frames without instances."""
     if not is_sleap(path):
         raise ValueError(f"its first columns are not {', '.join(_CSV_COLUMNS)}")
     names = header_names(path)

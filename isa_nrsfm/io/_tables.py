@@ -13,15 +13,14 @@ from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.io._separated_values import checked_rows
+from isa_nrsfm.io._separated_values import SEPARATORS, checked_rows, read_parquet
 
 if TYPE_CHECKING:
     import os
 
     import pandas as pd
 
-_SEPARATORS = {".csv": ",", ".tsv": "\t"}
-TABLE_SUFFIXES = (*_SEPARATORS, ".parquet")
+TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = ("", "na", "nan", "n/a", "null", "none")
 
 
@@ -97,8 +96,8 @@ def parse_table(path: Path) -> "pd.DataFrame":
     """Read a table as `read_table` does; errors do not name the file."""
     suffix = table_suffix(path)
     if suffix == ".parquet":
-        return _read_parquet(path)
-    return _read_text(path, _SEPARATORS[suffix])
+        return read_parquet(path)
+    return _read_text(path, SEPARATORS[suffix])
 
 
 def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
@@ -128,7 +127,7 @@ def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
         if suffix == ".parquet":
             frame.to_parquet(file, index=False)
         else:
-            frame.to_csv(file, sep=_SEPARATORS[suffix], index=False)
+            frame.to_csv(file, sep=SEPARATORS[suffix], index=False)
 
 
 def landmark_table(
@@ -281,23 +280,6 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
             if values is not None:
                 frame[name] = values
     return frame
-
-
-def _read_parquet(path: Path) -> "pd.DataFrame":
-    """Read a parquet file."""
-    pd = import_optional("pandas", extra="io")
-    import_optional("pyarrow", extra="parquet")
-    with path.open("rb"):  # opening errors as for text files
-        pass
-    frame = pd.read_parquet(path)
-    if frame.empty:
-        raise ValueError("it has no rows")
-    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
-    if len(unnamed) == frame.index.nlevels:
-        return frame.reset_index(drop=True)
-    index = frame.index.droplevel(unnamed)
-    refuse_same_names([str(name) for name in (*index.names, *frame)])
-    return frame.set_axis(index).reset_index()
 
 
 def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
