@@ -20,6 +20,7 @@ from isa_nrsfm.cli._options import build_parser  # noqa: E402
 from isa_nrsfm.cli._reading import read_frames  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
 from isa_nrsfm.io import landmark_table, open_table, read_landmarks  # noqa: E402
+from isa_nrsfm.skeletons import read_skeleton  # noqa: E402
 
 N = 24
 POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
@@ -468,3 +469,40 @@ def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     frames = read_frames(args)
     assert [reason for reason, *_ in frames.left_out] == ["tracking failed"]
     assert len(frames.X) == 8
+
+
+NO_PAIRS = r"config\.yaml .* no list of pairs of bodyparts .* such as \[\[nose, chin\]"
+
+
+@pytest.mark.parametrize(
+    ("skeleton", "message"),
+    [
+        ("[[[x, y], z]]", NO_PAIRS),
+        ("[[[[x]]]]", NO_PAIRS),
+        ("[x, y]", NO_PAIRS),
+        ("{x: y}", NO_PAIRS),
+        ("&all [*all]", r"config\.yaml .* "),
+        ("[&one [*one, NO]]", r"config\.yaml .* "),
+        (
+            "[[NO, 7]]",
+            r"config\.yaml .* points NO, 1, x; got \('NO', '7'\)",
+        ),
+        ("[" * 3000 + "]" * 3000, r"config\.yaml .* RecursionError"),
+    ],
+)
+def test_skeletons_with_a_list_too_many_are_refused(tmp_path, skeleton, message):
+    path = tmp_path / "config.yaml"
+    path.write_text(f"Task: a\nskeleton: {skeleton}\n")
+    with pytest.raises(ValueError, match=f"^[^\n]*{message}[^\n]*$"):
+        read_skeleton(path, ["NO", "1", "x"])
+
+
+def test_skeletons_are_read_in_bounded_time(tmp_path):
+    """Each key is merged nine times into the next one: 9^12 in all."""
+    lines = ["a0: &a0 {x: 1}"]
+    for i in range(1, 13):
+        lines.append(f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}")
+    path = tmp_path / "config.yaml"
+    path.write_text("\n".join([*lines, "skeleton: [[NO, 1, x]]"]))
+    found = read_skeleton(path, ["NO", "1", "x"])
+    assert found.curves == ((0, 1), (1, 2))

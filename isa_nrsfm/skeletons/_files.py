@@ -106,11 +106,18 @@ def read_skeleton(path: str | os.PathLike[str], point_names: Sequence[str]) -> S
     """
     yaml = import_optional("yaml", extra="yaml")
     with reading(path, "a configuration of DeepLabCut"):
-        # YAML tells UTF-8 and UTF-16 apart itself.
-        content = yaml.safe_load(Path(path).read_bytes())
+        # YAML tells UTF-8 and UTF-16 apart itself. All values stay texts, also NO and
+        # 1, and merge keys, which can take exponential time, are names as others.
+        content = yaml.load(Path(path).read_bytes(), Loader=yaml.BaseLoader)
         edges = content.get("skeleton") if isinstance(content, dict) else None
-        if not isinstance(edges, list) or not all(isinstance(e, list) for e in edges):
-            raise ValueError("it has no list of pairs of bodyparts called skeleton")
+        if not isinstance(edges, list) or not all(
+            isinstance(edge, list) and all(isinstance(part, str) for part in edge)
+            for edge in edges
+        ):
+            raise ValueError(
+                "it has no list of pairs of bodyparts called skeleton, such as [[nose, "
+                "chin], [chin, neck]]"
+            )
         # A curve may be written as more than two bodyparts in turn.
         return skeleton_of_names(
             [pair for edge in edges for pair in pairwise(edge)],
