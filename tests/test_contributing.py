@@ -22,6 +22,15 @@ def test_files_and_names_exist():
         assert re.search(rf"\b{name}\b", code), (name, file)
 
 
+def test_ways_of_writing_tables_are_those_that_are_tested():
+    section = TEXT.partition("## Tables as people write them")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| .+ \| .+ \| (`.+`) \|$", section, re.MULTILINE)
+    listed = re.findall(r"`(\w+)`", " ".join(rows))
+    file = ROOT / "tests" / "test_tables_of_people.py"
+    tests = re.findall(r"^def test_(\w+)", file.read_text("utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(tests)
+
+
 def test_commands_exist():
     sessions = re.findall(r"def (\w+)\(session", (ROOT / "noxfile.py").read_text())
     listed = TEXT.partition("`nox -s lint`")[2].partition("in fresh")[0]
