@@ -137,17 +137,24 @@ def test_where_y_is_zero_is_said(run, tmp_path):
     path = write(scene, tmp_path / "points.csv")
     fitted, new = tmp_path / "fit", tmp_path / "new.html"
     lower = ["--origin", "lower"]
-    options = ["--camera", "weak_perspective", "-k", "1", "--no-figures"]
+    options = ["--camera", "weak_perspective", "-k", "1", "--no-figures", "--std"]
     assert run("fit", path, "-o", fitted, *options, *lower)[0] == 0
     model = fitted / MODEL
     exported = {name: tmp_path / f"{name}.html" for name in ("upper", "lower")}
     for name, page in exported.items():
         run("export", model, path, "-o", page, "--origin", name)
-    run("transform", model, path, "-o", tmp_path / "a.csv", "--viewer", new, *lower)
+    transform = ["transform", model, path, "-o", tmp_path / "a.csv", "--viewer", new]
+    run(*transform, *lower, "--std")
     shapes = content_of(fitted / "viewer.html")["shapes"]
     assert shapes == content_of(exported["lower"])["shapes"]
     assert shapes == content_of(new)["shapes"]
     assert shapes != content_of(exported["upper"])["shapes"]
+    # Error bars are those that are asked for.
+    bars = content_of(fitted / "viewer.html")["deviations"]
+    assert bars
+    assert bars == content_of(new)["deviations"]
+    run(*transform, *lower)
+    assert content_of(new)["deviations"] == ""
     cameras, estimator = pd.read_csv(fitted / "cameras.csv"), load_model(model)
     poses = {name: frame_poses(estimator, origin=name) for name in exported}
     np.testing.assert_allclose(cameras["yaw"], poses["lower"].yaw, atol=1e-6)

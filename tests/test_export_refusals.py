@@ -4,7 +4,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-from export_models import N_FRAMES, blob_model, face_model, faces
+from export_models import (
+    N_FRAMES,
+    blob_model,
+    calibrated_model,
+    face_model,
+    faces,
+)
 from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
 
@@ -34,6 +40,7 @@ CASES = [
     (write_viewer, {"n_frames": 2.5}, "n_frames must be a whole number .*; got 2.5"),
     (write_viewer, {"names": ["jaw"]}, "names must hold 3 names"),
     (write_viewer, {"edges": [[0, 99]]}, POINTS),
+    (write_viewer, {"depth_std": np.ones(68)}, "depth_std needs a model with calibr"),
     (write_viewer, {"origin": "left"}, "origin must be"),
     (frame_poses, {"camera": None}, "angles need calibrated cameras"),
     (distances, {"camera": None}, "distances need calibrated cameras"),
@@ -57,6 +64,22 @@ def test_bad_options(tmp_path, function, options, message):
     path = [] if suffix is None else [tmp_path / f"model{suffix}"]
     with pytest.raises(ValueError, match=message):
         function(face_model(), *path, **options)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("depth_std", "message"),
+    [
+        (np.ones(67), r"depth_std must have shape \(150, 68\) or \(68,\); got \(67,\)"),
+        (np.ones((149, 68)), r"must have shape .*; got \(149, 68\)"),
+        (np.full(68, -0.5), "must not be negative; its least value is -0.5"),
+        (np.full(68, np.inf), "depth_std contains infinity"),
+        ("wide", "could not convert string to float"),
+    ],
+)
+def test_bad_deviations(tmp_path, depth_std, message):
+    with pytest.raises(ValueError, match=message):
+        write_viewer(calibrated_model(), tmp_path / "a.html", depth_std=depth_std)
     assert not any(tmp_path.iterdir())
 
 

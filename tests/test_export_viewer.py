@@ -91,6 +91,29 @@ def test_rotations_show_the_shapes_as_the_images_do(written, camera):
     assert np.sum(error**2) < 1e-3 * np.sum(images**2)
 
 
+def test_deviations_have_the_size_of_the_shapes(written):
+    model, X = calibrated_model("orthographic"), faces(camera="orthographic").data
+    shapes, std = model.reconstruct(X, return_std=True)
+    data = written(model, X=X, depth_std=std, n_frames=4)
+    found = numbers(data["deviations"]).reshape(4, 68)
+    size = np.linalg.norm(shapes[0, 0] - shapes[0, 16])
+    alpha = numbers(data["alpha"]).reshape(4, -1)[0]
+    drawn = numbers(data["shapes"]).reshape(1 + N_COMPONENTS, 68, 3)
+    drawn = drawn[0] + np.tensordot(alpha, drawn[1:], 1)
+    unit = np.linalg.norm(drawn[0] - drawn[16]) / size
+    assert_allclose(found, unit * std[[0, 49, 99, 149]], rtol=1e-4)
+    assert written(model)["deviations"] == ""
+
+
+def test_deviations_of_points_are_those_of_all_frames(written):
+    model, deviations = calibrated_model(), np.linspace(0.0, 1.0, 68)
+    deviations[3] = np.nan
+    data = written(model, depth_std=deviations)
+    found = numbers(data["deviations"]).reshape(N_FRAMES, 68)
+    assert_allclose(found, np.tile(deviations * found[0, -1], (N_FRAMES, 1)), rtol=1e-5)
+    assert np.isnan(found[:, 3]).all()
+
+
 def test_few_frames_are_spread_over_the_rows(written):
     data = written(face_model(), n_frames=4)
     assert data["rows"] == ["0", "49", "99", "149"]

@@ -8,6 +8,7 @@ from export_models import (
     LABELS,
     N_FRAMES,
     blob_model,
+    calibrated_model,
     face_model,
     faces,
 )
@@ -231,6 +232,38 @@ def test_one_basis_shape_and_no_face(browser, tmp_path):
     browser.wait("viewer.state().frame >= 1")
     assert browser.complaints() == []
     assert browser.run("document.getElementById('posed').hidden")
+
+
+def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
+    path, deviations = tmp_path / "viewer.html", np.linspace(0.0, 1.0, 68)
+    write_viewer(calibrated_model(), path, depth_std=deviations, n_frames=10)
+    browser.open(path.as_uri())
+    assert browser.run("viewer.state().frame") == 0
+    assert not browser.run("document.getElementById('barred').hidden")
+    for frame in (0, 7):
+        browser.run(
+            f"(() => {{ const slider = document.getElementById('frame'); slider.value ="
+            f" {frame}; slider.dispatchEvent(new Event('input')); }})()"
+        )
+        browser.run("document.getElementById('pose').checked = true")
+        browser.run("document.getElementById('front').click()")
+        # In the view of its camera a bar is a point, but for the perspective.
+        size = np.ptp(browser.array("viewer.projected()")[:, :2])
+        lengths = []
+        for _ in range(2):
+            far, near = browser.array("viewer.bars()").reshape(2, 68, 3)[..., :2]
+            lengths.append(np.linalg.norm(near - far, axis=1))
+            browser.run("document.getElementById('scene').focus()")
+            for _ in range(16):  # to the side
+                browser.press("ArrowRight", 39)
+        assert lengths[0].max() < 0.3 * lengths[1].max()
+        assert_allclose(lengths[1], deviations * lengths[1][-1], atol=0.1 * size)
+        assert np.corrcoef(lengths[1], deviations)[0, 1] > 0.99
+    browser.run(DRAWN)
+    assert browser.complaints() == []
+    write_viewer(calibrated_model(), path, n_frames=10)
+    browser.open(path.as_uri())
+    assert browser.run("document.getElementById('barred').hidden")
 
 
 INK = """

@@ -107,6 +107,8 @@ def fit_table(
             std = estimator.alpha_std_ if args.std else None
             write_alpha(new / "alpha.csv", frames, estimator.alpha_, std, columns)
             shown = {"labels": _first_classes(asked, X), "times": asked.times}
+            if args.std and estimator.camera_ != "affine":
+                shown["depth_std"] = estimator.reconstruct(X, return_std=True)[1]
             write_results(new, estimator, frames, drawn, **shown)
             report = {
                 "command": "fit",

@@ -251,7 +251,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "force": _flag("replace files in the folder that are of no earlier run"),
     "no_figures": _flag("write no figures (png), and remove those of an earlier run"),
     "std": _flag(
-        "add the standard deviation of each coefficient, in columns such as alpha_1_std"
+        "add the standard deviation of each coefficient, in columns such as "
+        "alpha_1_std; with calibrated cameras the viewer has error bars of the depths"
     ),
     "viewer": _option("FILE", "write a page that shows the new frames in 3D (.html)"),
     "edges": _option(

@@ -46,6 +46,8 @@ def run(args: Namespace, warned: list[str]) -> str:
         motion, translation, alpha, std = estimator.decompose(X)
         explained = estimator.inverse_transform(alpha, motion, translation)
         quality = quality_section(quality_report(estimator, X, explained))
+        if args.std and args.viewer is not None and estimator.camera_ != "affine":
+            drawn["depth_std"] = estimator.reconstruct(X, return_std=True)[1]
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
         _write_viewer(outputs[1], estimator, X=X, **drawn)

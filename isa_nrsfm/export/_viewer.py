@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import check_array
 
 from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
@@ -46,6 +47,7 @@ def write_viewer(
     X: Any = None,
     labels: ArrayLike | None = None,
     times: ArrayLike | None = None,
+    depth_std: ArrayLike | None = None,
     n_frames: int = 1000,
     edges: Links = "auto",
     names: Sequence[str] | None = None,
@@ -78,6 +80,11 @@ def write_viewer(
         Seconds at which the rows were taken, or dates. The page plays them at true
         speed; a row that is not later than the one before follows after the median
         time between rows.
+    depth_std : array-like of shape (n_rows, n_points) or (n_points,), default=None
+        Standard deviations of the depths, for a model with calibrated cameras, as of
+        ``reconstruct(X, return_std=True)``. Points get error bars along the viewing
+        direction of their frame. NaN is no bar. Deviations (n_points,) are those of all
+        rows.
     n_frames : int, default=1000
         Maximum number of frames of the page, spread evenly over the table.
     edges : "auto", Skeleton, str, None or array-like, default="auto"
@@ -104,8 +111,8 @@ def write_viewer(
     ------
     ValueError
         If the model has kept no frames, if the cameras see fewer than three directions
-        of space, if there is not one label per row, or if a parameter is not of the
-        kind given above.
+        of space, if there is not one label per row, if deviations are negative or
+        those of affine cameras, or if a parameter is not of the kind given above.
     OSError
         If the file cannot be written.
 
@@ -133,6 +140,7 @@ def write_viewer(
     components = names_of_components(names, len(model.basis_))
     n_rows = len(model.alpha_) if X is None else number_of_rows(X)
     codes, categories = _codes(labels, n_rows)
+    deviations = _deviations(depth_std, n_rows, model)
     # The first and the last row are among those shown.
     rows = np.linspace(0, max(n_rows - 1, 0), min(n_rows, n_frames)).astype(np.intp)
     if X is None or not len(rows):
@@ -148,7 +156,7 @@ def write_viewer(
     links, sides = choose_drawing(edges, space.layout, len(mean))
     centre = mean.mean(axis=0)
     shapes = np.concatenate([(mean - centre)[None], basis]) @ UPSIDE_DOWN
-    shapes /= np.linalg.norm(shapes[0], axis=1).max()
+    size = np.linalg.norm(shapes[0], axis=1).max()
     rotations = np.empty((0, 3, 3))
     if space.camera is not None and len(motion):
         rotations = upright_frames(space, model, motion, alpha).rotations
@@ -163,11 +171,12 @@ def write_viewer(
         "rows": [str(name) for name in (X.index[rows] if labelled else rows)],
         "labels": codes[rows].tolist() if categories else [],
         "count": _count(n_rows, len(seen), len(rows)),
-        "shapes": _encoded(shapes, "<f4"),
+        "shapes": _encoded(shapes / size, "<f4"),
         "edges": _encoded(edges_of(links), "<u4"),
         "sides": sides.tolist() if sides.any() else [],
         "alpha": _encoded(alpha, "<f4"),
         "rotations": _encoded(rotations, "<f4"),
+        "deviations": _encoded(deviations[rows] / size, "<f4"),
         "times": _encoded(seconds - seconds[:1], "<f8"),
     }
     write_whole(path, _page(content).encode("utf-8"))
@@ -179,6 +188,34 @@ def _seconds(times: ArrayLike, n_rows: int) -> NDArray:
     later = steps > 0
     typical = np.median(steps[later]) if later.any() else 1.0
     return np.cumsum(np.insert(np.where(later, steps, typical), 0, 0.0))
+
+
+def _deviations(values: Any, n_rows: int, model: Any) -> NDArray:
+    """Return deviations of depths (n_rows, n_points), or (n_rows, 0) for None."""
+    if values is None:
+        return np.empty((n_rows, 0))
+    if model.camera_ == "affine":
+        raise ValueError(
+            "depth_std needs a model with calibrated cameras; this one was fitted with "
+            'camera="affine"'
+        )
+    found = check_array(
+        values,
+        dtype=np.float64,
+        ensure_2d=False,
+        ensure_all_finite="allow-nan",
+        input_name="depth_std",
+    )
+    shape = (n_rows, len(model.mean_shape_))
+    if found.shape not in (shape, shape[1:]):
+        raise ValueError(
+            f"depth_std must have shape {shape} or {shape[1:]}; got {found.shape}"
+        )
+    if (found < 0).any():
+        raise ValueError(
+            f"depth_std must not be negative; its least value is {np.nanmin(found):.3g}"
+        )
+    return np.broadcast_to(found, shape)
 
 
 def _page(content: dict[str, Any]) -> str:

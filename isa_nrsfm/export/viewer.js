@@ -8,6 +8,7 @@
   const sides = model.sides; // of the points: 0 middle, 1 left, 2 right; or none
   const alpha = new Float32Array(bytes(model.alpha));
   const poses = new Float32Array(bytes(model.rotations));
+  const deviations = new Float32Array(bytes(model.deviations)); // of depths; or none
   const times = new Float64Array(bytes(model.times)); // seconds from the first; or none
   const nPoints = model.points.length;
   const nWeights = model.components.length;
@@ -16,6 +17,7 @@
 
   const RANGE = 4; // standard deviations on either side of a slider
   const SWING = { amplitude: 2, seconds: 3 };
+  const BAR = 2; // standard deviations on either side of a point
   const EYE = 6; // distance of the viewer, in radii of the mean shape
   const LEVELS = 12; // of depth, far ones drawn first and paler
   const TRUE_SPEED = "true";
@@ -170,13 +172,38 @@
     pen.globalAlpha = 1;
   }
 
+  // Ends of the error bars of a frame, along the viewing direction of its camera.
+  function endsOfBars(shape) {
+    const axis = poses.subarray(9 * state.frame + 6, 9 * state.frame + 9);
+    const own = deviations.subarray(nPoints * state.frame);
+    const end = (length) =>
+      project(shape.map((x, i) => x + length * own[Math.floor(i / 3)] * axis[i % 3]));
+    return [end(-BAR), end(BAR)];
+  }
+
+  function drawBars(pen, [far, near]) {
+    pen.strokeStyle = colour("--focus");
+    pen.lineWidth = nPoints <= 400 ? 3.5 : 1;
+    pen.globalAlpha = 0.75;
+    pen.beginPath();
+    for (let i = 0; i < size; i += 3) {
+      pen.moveTo(far[i], far[i + 1]);
+      pen.lineTo(near[i], near[i + 1]);
+    }
+    pen.stroke();
+    pen.globalAlpha = 1;
+  }
+
   function drawScene() {
     const pen = cleared(scene);
     if (byId("ghost").checked) drawShape(pen, project(shapes), [colour("--mean")], 0.7);
     const code = state.frame >= 0 && model.labels.length ? model.labels[state.frame] : -1;
-    latest = project(shapeOf(state.weights));
+    const shape = shapeOf(state.weights);
+    latest = project(shape);
     const inks = [code < 0 ? colour("--shape") : labelColour(code)];
     if (sides.length) inks.push(colour("--left"), colour("--right"));
+    if (deviations.length && state.frame >= 0 && byId("bars").checked)
+      drawBars(pen, endsOfBars(shape));
     drawShape(pen, latest, inks, 1);
     const row = state.frame < 0 ? "" : `frame ${model.rows[state.frame]}`;
     byId("seen").textContent = code < 0 ? row : `${row}: ${model.categories[code]}`;
@@ -410,7 +437,7 @@
     actions[event.key]();
   });
   byId("front").addEventListener("click", frontView);
-  for (const id of ["ghost", "mirror", "over", "pose", "across", "upwards"])
+  for (const id of ["ghost", "mirror", "over", "bars", "pose", "across", "upwards"])
     byId(id).addEventListener("change", redraw);
 
   function nameNearest(x, y) {
@@ -431,6 +458,7 @@
   byId("frames").hidden = !nFrames;
   byId("sides").hidden = !sides.length;
   byId("posed").hidden = !poses.length;
+  for (const id of ["barred", "certainty"]) byId(id).hidden = !deviations.length;
   byId("frame").max = Math.max(nFrames - 1, 0);
   for (const [id, chosen] of [["across", nWeights > 1 ? 0 : -1], ["upwards", nWeights > 1 ? 1 : 0]]) {
     const names = [["order of rows", -1], ...model.components.map((name, k) => [name, k])];
@@ -452,8 +480,10 @@
   window.viewer = {
     points: () => Array.from(shapeOf(state.weights)),
     projected: () => Array.from(project(shapeOf(state.weights))),
+    bars: () => endsOfBars(shapeOf(state.weights)).flatMap((end) => Array.from(end)),
     state: () => ({ ...state, weights: Array.from(state.weights) }),
   };
   showButtons();
   showWeights();
+  if (deviations.length) showFrame(0);
 })();

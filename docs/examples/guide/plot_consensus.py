@@ -11,11 +11,16 @@ their depths. `AffineNRSfM.reconstruct` returns standard deviations of these dep
 """
 
 # sphinx_gallery_thumbnail_number = 2
+import html
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.export import write_viewer
 from isa_nrsfm.metrics import mean_shape_error_3d
 
 # %%
@@ -117,8 +122,9 @@ for name, z in off.items():
 
 # %%
 # After a consensus, the variance of a point contains the mean square change of its
-# depth. The change is usually larger than the error that remains. The deviations
-# distinguish uncertain points from others, but hardly uncertain frames.
+# depth. The change is usually larger than the error that remains. Frames with large
+# coefficients have larger variances. The deviations distinguish uncertain points well,
+# uncertain frames less clearly.
 #
 # Each mark is a point of the body, with root mean squares over all frames. Marks below
 # the line have smaller errors than stated.
@@ -135,3 +141,26 @@ axis.legend()
 # %%
 # The least certain points are those at the two ends of the chain. Set
 # ``n_components="auto"`` to keep all principal components that exceed the noise.
+#
+# The body in 3D
+# --------------
+#
+# `write_viewer` writes a page of the shapes. With ``depth_std`` uncertain points have
+# long bars. Drag to turn the body, and select or play frames.
+
+edges = [(6 * i + a, 6 * i + b) for i in range(n_limbs) for a, b in sides]
+with TemporaryDirectory() as folder:
+    path, std = Path(folder, "body.html"), deviations["consensus"]
+    write_viewer(models["consensus"], path, X=X, depth_std=std, edges=edges)
+    page = path.read_text(encoding="utf-8")
+
+
+class Framed:
+    """A page in a frame of a notebook or of this documentation."""
+
+    def _repr_html_(self):
+        style = "width: 100%; height: 44rem; border: 1px solid #8888"
+        return f'<iframe style="{style}" srcdoc="{html.escape(page)}"></iframe>'
+
+
+Framed()
