@@ -47,6 +47,21 @@ def in_camera(model, X):
     return shapes, scales[:, None] * deviations
 
 
+def standardised(shapes, deviations, truth, scale=False):
+    """Return errors over deviations, and rank correlations over points and frames.
+
+    The truth may have another scale.
+    """
+    z, d = (S[:, :, 2] - S[:, :, 2].mean(1)[:, None] for S in (truth, shapes))
+    size = np.sum(np.abs(z * d)) / np.sum(d * d) if scale else 1.0
+    off, std = size * np.sign(np.sum(z * d)) * d - z, size * deviations
+    ranks = [
+        spearmanr(*(np.mean(each**2, axis=axis) for each in (off, std)))[0]
+        for axis in (0, 1)
+    ]
+    return np.sqrt(np.mean((off / std) ** 2)), *ranks
+
+
 def report(title, X, truth, cases, scale=False, n_jobs=None):
     """Print a row for each case (refinement, K, camera) of a table of known shapes."""
     _, unit = fitted(X, "joint", min(12, X.shape[1] // 2 - 4), cases[0][2])
@@ -61,14 +76,9 @@ def report(title, X, truth, cases, scale=False, n_jobs=None):
             for convention in CONVENTIONS
             for scaled in [{"scale": scale} if convention == "sequence" else {}]
         ]
-        z, d = (
-            S[known, :, 2] - S[known, :, 2].mean(1)[:, None] for S in (truth, shapes)
+        ratio, rank, _ = standardised(
+            shapes[known], deviations[known], truth[known], scale
         )
-        size = np.sum(np.abs(z * d)) / np.sum(d * d) if scale else 1.0
-        off = size * np.sign(np.sum(z * d)) * d - z
-        std = size * deviations[known]
-        ratio = np.sqrt(np.mean((off / std) ** 2))
-        rank = spearmanr(*(np.mean(each**2, axis=0) for each in (off, std)))[0]
         name = f"{title}, {refinement} {n_components}, {camera}"
         print(
             f"{name:52}{len(model.basis_):4}"
@@ -134,6 +144,24 @@ def spoiled(options):
         report(f"{name} 15 joints", few, truth[:, JOINTS], cases, n_jobs=options.jobs)
 
 
+def new_frames(options):
+    """Deviations of depths of frames that are not in the fit: a random half."""
+    print(f"{'table':20}   e/std  points  frames")
+    for name in filter(is_present, CAPTURED):
+        tracks, truth = load(name).X, shapes_in_camera(name)
+        n_frames, half = len(tracks), len(tracks) // 2
+        order = np.random.default_rng(0).permutation(n_frames)
+        old, new = np.sort(order[:half]), np.sort(order[half:])
+        # Successive frames are similar: at most 300 are enough.
+        old = old[:: -(-half // 300)]
+        for points in (range(truth.shape[1]), JOINTS):
+            X = tracks.reshape(n_frames, -1, 2)[:, points].reshape(n_frames, -1)
+            model, _ = fitted(X[old], "consensus", "auto", "orthographic", options.jobs)
+            found = standardised(*in_camera(model, X[new]), truth[new][:, points])
+            title = f"{name}, {len(points)} points"
+            print(f"{title:20}" + "".join(f"{each:8.2f}" for each in found), flush=True)
+
+
 def synthetic(options):
     """Affine errors of synthetic tables with the true K and 2 % noise."""
     for seed in range(options.seeds):
@@ -151,7 +179,12 @@ def synthetic(options):
         )
 
 
-SECTIONS = {"complete": complete, "spoiled": spoiled, "synthetic": synthetic}
+SECTIONS = {
+    "complete": complete,
+    "spoiled": spoiled,
+    "new": new_frames,
+    "synthetic": synthetic,
+}
 
 if __name__ == "__main__":
     jobs = {"type": int, "default": None, "help": "processes of the groups"}

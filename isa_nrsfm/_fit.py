@@ -29,6 +29,7 @@ from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._diagnostics import LEAST_RELIABILITY, reliabilities
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import nearest_calibrated, reference_camera
+from isa_nrsfm._frames.depth import leverages
 from isa_nrsfm._frames.models import (
     Decomposition,
     FrameMap,
@@ -430,7 +431,10 @@ def _joint_frames(
         estimator.camera,
         float(table.sizes[0]) if estimator.camera == "orthographic" else None,
     )
-    frames = replace(frames, gauge=frame_map)
+    certainty = frames.certainty
+    if estimator.refinement == "consensus":
+        certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
+    frames = replace(frames, gauge=frame_map, certainty=certainty)
     share = table.n_seen / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
+from scipy.stats import spearmanr
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
 from isa_nrsfm._frames.camera_models import full_rotations
@@ -422,6 +423,15 @@ class TestEstimator:
         _, std = body.reconstruct(X, return_std=True)
         off = np.sign(np.sum(z * d)) * d - z
         assert 0.5 < np.sqrt(np.mean((off / std) ** 2)) < 2.0
+
+    def test_deviations_are_larger_in_frames_with_larger_errors(self, body):
+        """Errors and deviations of frames, also of new ones, have similar ranks."""
+        for table, truth in ((X, SHAPES), articulated(160)):
+            z, d = (centred(each[:, :, 2]) for each in (truth, in_camera(body, table)))
+            off = np.sign(np.sum(z * d)) * d - z
+            _, std = body.reconstruct(table, return_std=True)
+            ranks = spearmanr(np.mean(off**2, axis=1), np.mean(std**2, axis=1))
+            assert ranks[0] > 0.4
 
     @pytest.mark.slow
     def test_number_of_processes_does_not_matter(self, body):

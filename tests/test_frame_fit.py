@@ -256,6 +256,19 @@ class TestDepthDeviations:
         found = frames.depth_deviations(tracks, sizes)
         assert_allclose(found**2, expected, rtol=1e-9)
 
+    def test_variances_of_points_grow_with_the_leverage_of_the_frame(self):
+        frames, tracks = posterior_frames(0)
+        frames, sizes = replace(frames, camera="weak_perspective"), np.ones(len(tracks))
+        alone = frames.depth_deviations(tracks, sizes)
+        certainty = DepthCertainty(points=np.linspace(0.0, 1e-2, 20), leverage=3.0)
+        frames = replace(frames, certainty=certainty)
+        alpha = frames.posterior(tracks).alpha
+        leverage = 1.0 + np.sum(alpha**2, axis=1)
+        expected = alone**2 + np.outer(leverage / 3.0, certainty.points)
+        found = frames.depth_deviations(tracks, sizes)
+        assert_allclose(found**2, expected, rtol=1e-9)
+        assert np.ptp(leverage) > 1.0
+
 
 def posteriors(camera):
     """Return random fits of frames, their model, and the covariance of a point."""

@@ -26,13 +26,17 @@ class DepthCertainty(NamedTuple):
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None
-        Variance of the depths of the points, for frames of size one.
+        Mean variance of the depths of the points, for frames of size one.
+    leverage : float or None
+        Mean of 1 + |alpha|^2 of the frames, if variances are proportional to it, as for
+        equal errors of all shapes. None if all frames have the mean variance.
     """
 
     total: float = np.nan
     turning: float = np.nan
     turns: NDArray | None = None
     points: NDArray | None = None
+    leverage: float | None = None
 
     @property
     def turning_deviation(self) -> float:
@@ -46,6 +50,13 @@ class DepthCertainty(NamedTuple):
         """Whether the table determines depths and rotations; True if not estimated."""
         return not self.turning_deviation > LARGEST_SHARE * self.turning
 
+    def variances(self, alpha: NDArray) -> NDArray:
+        """Return variances of depths (n, n_points) of frames of size one."""
+        points = np.zeros(1) if self.points is None else self.points
+        if self.leverage is None:
+            return np.tile(points, (len(alpha), 1))
+        return np.outer(leverages(alpha) / self.leverage, points)
+
     @property
     def advice(self) -> str:
         """Reason and remedy for depths that are not determined."""
@@ -58,6 +69,11 @@ class DepthCertainty(NamedTuple):
             "and transform this one with that model; or use affine cameras "
             '(camera="affine"). See "How reliable is the depth?" in the documentation'
         )
+
+
+def leverages(alpha: NDArray) -> NDArray:
+    """Return 1 + |alpha|^2 of frames (n, K)."""
+    return np.asarray(1.0 + np.vecdot(alpha, alpha))
 
 
 NOT_ESTIMATED = DepthCertainty()

@@ -252,10 +252,9 @@ class PosteriorFrames:
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """Compute the standard deviations (n, J) of depths with calibrated cameras.
 
-        The variance of a depth is the sum of the jackknife variance and that of its
-        frame, ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of
-        image and depths by rotation vector, logarithm of the scale (if free) and
-        coefficients.
+        The variance of a depth is the sum of that of the shapes and that of the frame,
+        ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
+        depths by rotation vector, logarithm of the scale (if free) and coefficients.
         """
         found = self.posterior(tracks / sizes[:, None, None], covariances=False)
         seen, free = seen_points(tracks), CAMERAS[self.camera].scaled
@@ -274,8 +273,8 @@ class PosteriorFrames:
             covariance = np.linalg.pinv(information, hermitian=True)
             Z = changes[:, 2]
             variances[i] = np.einsum("pj,pq,qj->j", Z, covariance, Z)
-        points = 0.0 if self.certainty.points is None else self.certainty.points
-        return sizes[:, None] * np.sqrt(variances + points)
+        variances += self.certainty.variances(found.alpha)
+        return sizes[:, None] * np.sqrt(variances)
 
     def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
         """Return the fit of tracks of frames of size one, before the gauge.

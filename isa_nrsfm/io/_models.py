@@ -255,6 +255,7 @@ def _check_shapes(values: dict[str, Any]) -> None:
         "certainty": (2,),
         "turns": (3, 3),
         "depth_variances": (P,),
+        "leverage": (),
     }
     single = ("noise_variance", "unit", "n_features_in_", "n_iter_", "inverse_snr_")
     shapes |= dict.fromkeys(single, ())
@@ -291,6 +292,7 @@ def _frame_entries(estimator: AffineNRSfM) -> dict[str, Any]:
         "certainty": np.array(frames.certainty[:2]),
         "turns": frames.certainty.turns,
         "depth_variances": frames.certainty.points,
+        "leverage": frames.certainty.leverage,
     }
 
 
@@ -311,5 +313,6 @@ def _frame_model(entries: dict[str, Any]) -> RigidFrames | PosteriorFrames:
             turning,
             entries["turns"],
             entries["depth_variances"],
+            entries.get("leverage"),
         ),
     )
