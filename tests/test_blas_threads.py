@@ -1,12 +1,17 @@
 """One BLAS thread inside of decorated functions, and as many as before after them."""
 
+import signal
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 
@@ -43,6 +48,61 @@ def test_threads_are_set_back():
     with pytest.raises(KeyError):
         threads_of_blas(fail)
     assert numbers_of_threads() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("first_to_leave", [0, 1])
+def test_the_last_thread_to_leave_sets_threads_back(first_to_leave):
+    inside, left = Barrier(2), Barrier(2)
+    numbers = []
+
+    @one_blas_thread
+    def leave(first):
+        inside.wait()  # both threads are inside
+        if first:
+            return
+        left.wait()
+        numbers.append(numbers_of_threads())
+
+    def run(number):
+        leave(number == first_to_leave)
+        if number == first_to_leave:
+            left.wait()
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(run, range(2)))
+    assert numbers == [{1}]
+    assert numbers_of_threads() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("error", [KeyError, KeyboardInterrupt])
+def test_fits_in_four_threads_leave_the_process_as_it_was(error):
+    X = make_nonrigid_tracks(60, 12, 1, noise=0.02, random_state=0).data
+
+    def state():
+        handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+        random = np.random.mtrand._rand.get_state(legacy=False)["state"]
+        return handlers, list(warnings.filters), random["key"].tolist(), random["pos"]
+
+    def work(number):
+        model = AffineNRSfM(1, random_state=0, max_iter=5).fit(X)
+        if number == 2:
+            with pytest.raises(error), one_blas_thread:
+                raise error
+        return model.transform(X), model.score(X)
+
+    before = state()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        alone = work(0)
+        with ThreadPoolExecutor(4) as pool:
+            found = list(pool.map(work, range(4)))
+    for alpha, score in found:
+        assert_array_equal(alpha, alone[0])
+        assert score == alone[1]
+    assert numbers_of_threads() == {2}
+    assert state() == before
 
 
 @pytest.mark.usefixtures("two_threads")

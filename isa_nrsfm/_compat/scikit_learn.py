@@ -12,7 +12,7 @@ from sklearn.utils._param_validation import (
     StrOptions,
     validate_params,
 )
-from sklearn.utils.parallel import _threadpool_controller_decorator
+from sklearn.utils.parallel import _get_threadpool_controller as threadpool_controller
 from sklearn.utils.validation import _num_samples as number_of_rows
 
 __all__ = [
@@ -24,18 +24,11 @@ __all__ = [
     "fit_context",
     "is_pandas_na",
     "number_of_rows",
-    "one_blas_thread",
     "taken_rows",
+    "threadpool_controller",
 ]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-
-# For functions of small matrices, where threads of BLAS mostly wait for each other.
-# Without it they take 2 to 12 times as long while another program runs. Blocks of
-# frames run in parallel instead.
-one_blas_thread: Callable[[Function], Function] = _threadpool_controller_decorator(
-    limits=1, user_api="blas"
-)
 
 
 class Interval(_Interval):

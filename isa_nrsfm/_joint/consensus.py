@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from sklearn.utils.parallel import Parallel, delayed
 
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, full_rotations
 from isa_nrsfm._frames.models import PosteriorFrames
 from isa_nrsfm._joint.frames import JointFrames

@@ -14,8 +14,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.scikit_learn import one_blas_thread
 
 # Frames that are worked on at a time, so that their small matrices stay in the cache.
 BLOCK_FRAMES = 2048

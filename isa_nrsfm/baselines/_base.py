@@ -17,11 +17,11 @@ from sklearn.base import (
 )
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._compat.scikit_learn import (
     Interval,
     StrOptions,
     fit_context,
-    one_blas_thread,
 )
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._frames.projection import compose, project

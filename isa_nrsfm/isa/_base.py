@@ -13,7 +13,8 @@ from sklearn.base import (
 )
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from isa_nrsfm._compat.scikit_learn import Interval, one_blas_thread
+from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._compat.scikit_learn import Interval
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._tables.sources import unmasked
 
