@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from isa_nrsfm._frames.search import FrameSearch, State
+from isa_nrsfm._frames.search import FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import LANES
 
 
@@ -36,9 +36,9 @@ class Wells(FrameSearch):
         return State(x, value, slope / 2, np.ones_like(x), hessian / 2)
 
 
-def ended(wells, start, max_steps=60, limit=None):
+def ended(wells, start, max_steps=60, known=None):
     start = wells.evaluate(wells.problem, np.array([start], dtype=float))
-    found, converged = wells.descend(wells.problem, start, max_steps, limit)
+    found, converged = wells.descend(wells.problem, start, max_steps, known)
     return found[0], converged
 
 
@@ -106,14 +106,23 @@ class TestEnds:
         assert 1e-9 < abs(rough[0] - 1.0) < 0.1
         assert abs(exact[0] - 1.0) < 1e-12
 
-    def test_search_is_given_up_where_the_limit_is_out_of_reach(self):
+    def test_search_is_given_up_where_the_known_minimum_is_out_of_reach(self):
         # The minimum of both is -1/4.
-        limit = np.array([-10.0, -0.2])
+        known = Minimum(np.zeros((1, 2)), np.array([-10.0, -0.2]), np.zeros(2))
         problem = Wells([1.0, 1.0])
-        found, converged = ended(problem, [1.1, 1.1], limit=limit)
+        found, converged = ended(problem, [1.1, 1.1], known=known)
         assert_array_equal(converged, [False, True])
         assert found[0] == 1.1
         assert_allclose(found[1], 1.0, rtol=1e-7)
+
+    def test_search_is_given_up_in_the_well_of_the_known_minimum(self):
+        known = Minimum(np.ones((1, 2)), np.full(2, -0.3), np.array([0.2, 0.01]))
+        found, converged = ended(Wells([1.0, 1.0]), [1.5, 1.5], 3, known)
+        steps = [ended(Wells([1.0]), [1.5], n)[0][0] for n in range(4)]
+        first = next(x for x in steps if abs(x - 1.0) < 0.2)
+        assert found[0] == first
+        assert abs(found[1] - 1.0) < abs(found[0] - 1.0)
+        assert not converged[0]
 
     def test_largest_damping_ends_the_search(self):
         # A value that is always higher than at the start: no step is taken.

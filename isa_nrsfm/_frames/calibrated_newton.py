@@ -31,7 +31,7 @@ from isa_nrsfm._frames.point_sums import (
     seen_changes,
     with_one,
 )
-from isa_nrsfm._frames.search import FrameProblem, FrameSearch, State
+from isa_nrsfm._frames.search import FrameProblem, FrameSearch, Minimum, State
 from isa_nrsfm._linalg.small_matrices import (
     frames_first,
     frames_last,
@@ -44,6 +44,10 @@ from isa_nrsfm._linalg.small_matrices import (
 # flat object at its plane does not change its images. The thinner an
 # object is, the less its images change (Necker reversal).
 REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
+# A search from a reversed camera that comes nearer than this share of its first
+# distance returns to where it came from. With 0.1 none of 80,000 frames of faces,
+# hands and bodies ended in a higher minimum, with 0.5 seven. Saves a fifth of the time.
+SAME_WELL = 0.1
 
 
 class CalibratedSearch(FrameSearch):
@@ -98,8 +102,13 @@ class CalibratedSearch(FrameSearch):
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
-        (products, noise), M = problem, position
-        posterior = _posterior(problem, M)
+        return self._derivatives(problem, position, _posterior(problem, position))[0]
+
+    def _derivatives(
+        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
+    ) -> tuple[State, NDArray]:
+        """Return the state at M (2, 3, n), and ``Q C`` (K, p, n) of `_coupling`."""
+        products, noise = problem
         A = products.gram.moments(posterior.second_moments(noise))
         G = np.einsum("rbi,bai->rai", M, unpack3(A))
         G -= np.einsum("ki,kari->rai", posterior.c, products.cross)
@@ -117,7 +126,7 @@ class CalibratedSearch(FrameSearch):
         hessian = definite + bent[rows, columns]
         hessian -= np.einsum("kpi,kpi->pi", through[:, rows], coupling[:, columns])
         value = _value(problem, posterior)
-        return State(M, value, -gradient, definite, hessian)
+        return State(M, value, -gradient, definite, hessian), through
 
     def solution(
         self, problem: FrameProblem, position: NDArray
@@ -134,11 +143,11 @@ class CalibratedSearch(FrameSearch):
         They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
         coupling, Y the Hessian by the camera with the coefficients eliminated.
         """
-        M, noise = position, problem.noise
-        posterior = _posterior(problem, M)
-        _, through = self._coupling(problem, M, posterior)
-        inverse = self.evaluate(problem, M).inverse()
-        covariance = np.einsum("kci,cdi,ldi->kli", through, inverse, through)
+        noise, posterior = problem.noise, _posterior(problem, position)
+        state, through = self._derivatives(problem, position, posterior)
+        inverse = state.inverse()
+        widened = np.einsum("kci,cdi->kdi", through, inverse)
+        covariance = np.einsum("kdi,ldi->kli", widened, through)
         covariance -= unpacked(posterior.inverse)[1:, 1:]
         covariance = 0.5 * (covariance + covariance.swapaxes(0, 1))
         return noise * covariance, noise * inverse[:3, :3]
@@ -171,7 +180,10 @@ class CalibratedSearch(FrameSearch):
         value = _value(problem, _posterior(problem, M))
         limit = value - 1e-10 * problem.energy
         start = self.evaluate(problem, M * REVERSED)
-        other, converged = self.descend(problem, start, max_steps, limit)
+        # The reversed camera and M differ in the third column.
+        radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
+        known = Minimum(M, limit, radius)
+        other, converged = self.descend(problem, start, max_steps, known)
         better = _value(problem, _posterior(problem, other)) < limit
         return np.where(better, other, M), better, converged
 

@@ -125,6 +125,28 @@ class State(NamedTuple):
         return unpacked(inverse)
 
 
+class Minimum(NamedTuple):
+    """Known minima of frames, below which others are searched.
+
+    position (..., n): their positions. value (n,): objectives to fall below. radius
+    (n,): distance within which a search is in the same well.
+    """
+
+    position: NDArray
+    value: NDArray
+    radius: NDArray
+
+    def excludes(self, state: State, gain: NDArray) -> NDArray:
+        """Return a mask (n,) of searches that are not expected to end below."""
+        square = (state.position - self.position) ** 2
+        near = square.sum(axis=tuple(range(square.ndim - 1))) < self.radius**2
+        return near | (state.value - 10.0 * gain > self.value)
+
+    def take(self, frames: NDArray) -> Self:
+        """Return the minima of some of the frames."""
+        return type(self)(*(of_frames(each, frames) for each in self))
+
+
 class FrameSearch:
     """A search for cameras of one model that see given shapes, frame by frame.
 
@@ -322,16 +344,15 @@ class FrameSearch:
         problem: FrameProblem,
         state: State,
         max_steps: int,
-        limit: NDArray | None = None,
+        known: Minimum | None = None,
     ) -> tuple[NDArray, NDArray]:
         """Minimise the objectives; return iterates (..., n) and convergence (n,).
 
-        Gives up a frame if its objective is not expected to fall below its limit (n,).
+        Gives up a frame that is not expected to end below its known minimum.
         """
         n_frames = len(state.value)
         found, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
         running, damping = np.arange(n_frames), np.zeros(n_frames)
-        limit = np.full(n_frames, np.inf) if limit is None else limit
         for n_left in range(max_steps, -1, -1):
             # Next step, and convergence test by its predicted decrease. Convergence is
             # quadratic: the step after it would gain far less.
@@ -339,7 +360,8 @@ class FrameSearch:
             gain = np.einsum("pi,pi->i", state.slope, step)
             small = (damping == 0) & (gain <= 1e-12 * problem.energy)
             leaving = small | (damping >= LARGEST_DAMPING)
-            leaving |= state.value - 10.0 * gain > limit
+            if known is not None:
+                leaving |= known.excludes(state, gain)
             # Remove frames that have ended; converged ones take a last step.
             if leaving.any():
                 last = self.moved(state.position, np.where(small, step, 0.0))
@@ -348,9 +370,9 @@ class FrameSearch:
                 if leaving.all():
                     return found, converged
                 left = in_lanes(np.flatnonzero(~leaving))
-                running, limit, damping = running[left], limit[left], damping[left]
+                running, damping, state = running[left], damping[left], state.take(left)
                 step, problem = of_frames(step, left), problem.take(left)
-                state = state.take(left)
+                known = known and known.take(left)
             if not n_left:
                 break
             # Trial step, refused where the objective rises. Less damping after a good

@@ -22,6 +22,10 @@ ROWS, COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 UNPACKED = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 DIAGONAL = [0, 3, 5]
 
+# Up to this number of matrices calls cost more than numbers: sweeping all rows at once
+# takes half the time for 16 matrices, 0.7 for 256 and as long for 512.
+FEW = 256
+
 
 def unpack3(packed: NDArray) -> NDArray:
     """Return packed symmetric matrices (..., 6, n) as (..., 3, 3, n)."""
@@ -53,6 +57,12 @@ def inverse3(packed: NDArray) -> NDArray:
 def pair_indices(k: int) -> tuple[NDArray, NDArray]:
     """Return row and column of the entries of packed symmetric k x k matrices."""
     return np.triu_indices(k)
+
+
+@cache
+def _places(k: int) -> NDArray:
+    """Return the places (k, k) of entries in packed symmetric k x k matrices."""
+    return unpacked(np.arange(k * (k + 1) // 2))
 
 
 def packed_rows(packed: NDArray) -> list[NDArray]:
@@ -97,7 +107,7 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
     positive.
     """
     k, n = b.shape
-    diagonal, positive = A[diagonal_of(A)], np.ones(n, dtype=bool)
+    least, positive = OF_STEPS * A[diagonal_of(A)], np.ones(n, dtype=bool)
     # D L and, in the last column, L^-T b, for A = L^T D L with L unit upper triangular
     rows, inverses = np.empty((k, k + 1, n)), np.empty((k, n))
     for i, row in enumerate(packed_rows(A)):
@@ -106,7 +116,7 @@ def solve_positive(A: NDArray, b: NDArray) -> tuple[NDArray, NDArray]:
         if i:
             # The sum over all rows before at once: one pass over the numbers.
             rest -= np.einsum("jn,jcn->cn", rows[:i, i] * inverses[:i], rows[:i, i:])
-        inverses[i] = _inverse_pivot(rest[0], diagonal[i], positive)
+        inverses[i] = _inverse_pivot(rest[0], least[i], positive)
     # Back substitution, column by column
     x = rows[:, k].copy()
     for i in range(k - 1, -1, -1):
@@ -130,36 +140,38 @@ def sweep(packed: NDArray, first: int = 0) -> tuple[NDArray, NDArray]:
     SWEEP operator", The American Statistician 33, 1979). Returns ``log det A`` (n,) of
     the positive pivots, and whether all pivots are positive (n,).
     """
-    rows = packed_rows(packed)
-    k, n = len(rows), packed.shape[1]
-    diagonal = [row[0].copy() for row in rows]
+    rows, n = packed_rows(packed), packed.shape[1]
+    k = len(rows)
+    places, (first_of, second_of) = _places(k), pair_indices(k)
+    least = OF_STEPS * packed[diagonal_of(packed)]
     inverses = np.empty((k - first, n))
     positive = np.ones(n, dtype=bool)
-    column, scaled, room = np.empty((3, k, n))
+    room = np.empty((k, n))
     for i in range(first, k):
-        inverse = _inverse_pivot(rows[i][0], diagonal[i], positive)
+        inverse = _inverse_pivot(rows[i][0], least[i], positive)
         inverses[i - first] = inverse
-        for j in range(i):
-            column[j] = rows[j][i - j]
-        column[i:] = rows[i]
-        np.multiply(column, inverse, out=scaled)
-        for j in range(k):
-            if j != i:
+        column = packed[places[i]]
+        scaled = column * inverse
+        if n <= FEW:  # calls cost more than numbers
+            packed -= scaled[second_of] * column[first_of]
+        else:
+            for j in range(k):
                 rows[j] -= np.multiply(scaled[j:], column[j], out=room[: k - j])
-        for j in range(i):
-            rows[j][i - j] = scaled[j]
-        rows[i][1:] = scaled[i + 1 :]
+        packed[places[i]] = scaled
         np.negative(inverse, out=rows[i][0])
     # With where=... NumPy rounds differently next to entries that are left out.
     logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
     return -logarithms.sum(axis=0), positive
 
 
-def _inverse_pivot(pivot: NDArray, diagonal: NDArray, positive: NDArray) -> NDArray:
-    """Return inverse pivots (n,), zero where left out; clear `positive` there."""
-    # Smaller pivots, relative to the entry before elimination, are rounding errors.
-    kept = pivot > OF_STEPS * diagonal
-    if kept.all():
+def _inverse_pivot(pivot: NDArray, least: NDArray, positive: NDArray) -> NDArray:
+    """Return inverse pivots (n,), zero where left out; clear `positive` there.
+
+    Smaller pivots than the least ones, relative to the entry before elimination, are
+    rounding errors.
+    """
+    kept = pivot > least
+    if np.count_nonzero(kept) == len(kept):
         return 1.0 / pivot
     positive &= kept
     return kept / np.where(kept, pivot, 1.0)
