@@ -65,12 +65,19 @@ class TableModel(NamedTuple):
         A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
         its camera, as orthographic cameras need.
         """
-        motion, _, alpha, _ = self.decompose(rows, deviations=False)
+        return self.shapes(self.decompose(rows, deviations=False), metric, scaled)
+
+    def shapes(
+        self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
+    ) -> NDArray:
+        """Return the shapes (n, n_points, 3) of frames that are fitted."""
         if metric is None:
-            return compose(self.mean_shape, self.basis, alpha)
-        found = euclidean_frames(metric, motion, alpha, self.mean_shape, self.basis)
+            return compose(self.mean_shape, self.basis, fit.alpha)
+        found = euclidean_frames(
+            metric, fit.motion, fit.alpha, self.mean_shape, self.basis
+        )
         sizes = found.scales[:, None, None] if scaled else 1.0
-        return (sizes * found.shapes).astype(rows.dtype, copy=False)
+        return (sizes * found.shapes).astype(fit.alpha.dtype, copy=False)
 
     def depth_deviations(self, rows: NDArray) -> NDArray:
         """Return standard deviations of the depths of points (n, n_points)."""

@@ -312,8 +312,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (n_frames, 2 * n_points)
-            A table with the points of the fitted one.
+        X : array-like of shape (n_frames, 2 * n_points), or Decomposition
+            A table with the points of the fitted one, or the result of `decompose`,
+            whose frames are not fitted again.
         camera : {"orthographic", "weak_perspective"} or None, default=None
             Calibrated camera model of the images, for a model that was fitted with
             affine cameras. None returns affine shapes, in the space of `mean_shape_`:
@@ -343,7 +344,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ValueError
             If `camera` is none of these, if the cameras of the fitted table see fewer
             than three directions of space, or if the model was fitted with calibrated
-            cameras other than `camera`.
+            cameras other than `camera`. If `return_std` is given with a decomposition,
+            or the decomposition has another number of coefficients.
 
         Warns
         -----
@@ -367,9 +369,20 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             raise ValueError(
                 f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
             )
-        table = self._opened(X)
+        check_is_fitted(self)
+        decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
+        if decomposed and X.alpha.shape[1:] != (n_components,):
+            raise ValueError(
+                f"the decomposition must be that of a model with {n_components} basis "
+                f"shapes; got alpha of shape {X.alpha.shape}"
+            )
         if return_std:
             self._jointly_fitted("return_std", calibrated=True)
+            if decomposed:
+                raise ValueError(
+                    "return_std needs the table, not the result of decompose, which "
+                    "has no covariances"
+                )
         fitted, metric = self.camera_, None
         if fitted != "affine" and camera not in (None, fitted):
             raise ValueError(
@@ -380,6 +393,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             check_frames_kept(self, "reconstruct with a camera")
             metric = deformation_metric(self.motion_, self.alpha_)
         scaled = metric is not None and camera == "orthographic"
+        if decomposed:
+            return self._model.shapes(X, metric, scaled)
+        table = self._opened(X)
         shapes = table.collect(
             partial(self._model.reconstruct, metric=metric, scaled=scaled)
         )

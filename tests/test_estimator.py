@@ -1069,6 +1069,23 @@ def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
         model.reconstruct(truth.data, camera=other)
 
 
+@pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
+def test_shapes_of_fitted_frames(camera):
+    model, truth = calibrated(camera)
+    X = truth.data[:5].copy()
+    X[2] = np.nan
+    frames = model.decompose(X)
+    assert_array_equal(model.reconstruct(frames), model.reconstruct(X))
+    wanted = "orthographic" if camera == "affine" else camera
+    found = model.reconstruct(frames, wanted)
+    assert_array_equal(found, model.reconstruct(X, wanted))
+    with pytest.raises(ValueError, match="the decomposition must be that of a model"):
+        model.reconstruct(frames._replace(alpha=frames.alpha[:, 1:]))
+    if camera != "affine":
+        with pytest.raises(ValueError, match="return_std needs the table"):
+            model.reconstruct(frames, return_std=True)
+
+
 @pytest.mark.parametrize("camera", slow_after(1, [*CALIBRATED, "affine"]))
 def test_the_number_of_components_is_found(camera):
     truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)

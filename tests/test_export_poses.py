@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from export_models import N_FRAMES, calibrated_model, face_model, faces
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._frames.camera_models import full_rotations
@@ -70,6 +70,16 @@ class TestFramePoses:
             frame_poses(model)[:4], frame_poses(model, truth.data)[:4], atol=1e-4
         )
         assert np.isnan(frame_poses(model).yaw_std).all()
+
+
+    def test_of_fitted_frames(self, fitted):
+        truth, model = fitted
+        X = truth.data[:20]
+        frames = model.decompose(X)
+        assert_array_equal(frame_poses(model, frames)[:4], frame_poses(model, X)[:4])
+        assert np.isnan(frame_poses(model, frames).yaw_std).all()
+        found, pair = point_distances(model, [MOUTH], frames, unit=EYES), [MOUTH]
+        assert_array_equal(found, point_distances(model, pair, X, unit=EYES))
 
 
 class TestAngleDeviations:

@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._tables.column_names import checked_names
 
 
@@ -27,8 +28,11 @@ def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
 
 
 def frames_of_table(model: Any, X: Any) -> tuple[NDArray, NDArray]:
-    """Return cameras and coefficients of a table, None for the fitted one."""
+    """Return cameras and coefficients of a table or of frames that are fitted.
+
+    None is the fitted table.
+    """
     if X is None:
         return model.motion_, model.alpha_
-    motion, _, alpha, _ = model.decompose(X)
+    motion, _, alpha, _ = X if isinstance(X, Decomposition) else model.decompose(X)
     return motion, alpha

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.column_names import names_of_points
@@ -36,7 +37,7 @@ class FramePoses(NamedTuple):
     scale : ndarray of shape (n_frames,)
         Pixels, or units of the table, per unit of the shapes.
     yaw_std : ndarray of shape (n_frames,)
-        Posterior standard deviation of yaw in degrees. NaN without a table `X`, and for
+        Posterior standard deviation of yaw in degrees. NaN if `X` is no table, and for
         models with affine cameras, which have no rotations.
     pitch_std : ndarray of shape (n_frames,)
         That of pitch.
@@ -73,8 +74,9 @@ def frame_poses(
     ----------
     model : AffineNRSfM
         A fitted model that has kept its frames.
-    X : array-like of shape (n_frames, 2 * n_points), default=None
-        A table with the points of the fitted one. By default the fitted table.
+    X : array-like of shape (n_frames, 2 * n_points), or Decomposition, default=None
+        A table with the points of the fitted one, or the result of ``model.decompose``,
+        whose frames are not fitted again. By default the fitted table.
     camera : {"weak_perspective"}, default="weak_perspective"
         Camera model for a model with affine cameras. Calibrated cameras have their own.
     edges : "auto", str, Skeleton or None, default="auto"
@@ -123,7 +125,8 @@ def frame_poses(
         rotations = np.full_like(rotations, np.nan)
     angles = view_angles(rotations)
     deviations = np.full((3, len(scales)), np.nan)
-    if X is not None and space.metric is None and model.refinement in JOINT_REFINEMENTS:
+    is_table = not (X is None or isinstance(X, Decomposition))
+    if is_table and space.metric is None and model.refinement in JOINT_REFINEMENTS:
         covariance = model.rotation_covariance(X)
         turned = space.transform @ covariance @ space.transform.T
         deviations = np.array(angle_deviations(angles, turned))
@@ -148,8 +151,9 @@ def point_distances(
         A fitted model that has kept its frames.
     pairs : sequence of (int or str, int or str)
         Pairs of points, by their numbers from zero or by the names of their columns.
-    X : array-like of shape (n_frames, 2 * n_points), default=None
-        A table with the points of the fitted one. By default the fitted table.
+    X : array-like of shape (n_frames, 2 * n_points), or Decomposition, default=None
+        A table with the points of the fitted one, or the result of ``model.decompose``,
+        whose frames are not fitted again. By default the fitted table.
     unit : (int or str, int or str), default=None
         Two points whose distance in the mean shape is `length`. By default the outer
         corners of the eyes, if the points are the 68 of a face in the order of iBUG.
