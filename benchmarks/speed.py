@@ -37,6 +37,7 @@ from isa_nrsfm._tables.tracks import (
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.export import pose_function
 from isa_nrsfm.io import save_model, write_table
 
 # Random starts against which the fit of a frame is held, and how far they are spread,
@@ -56,6 +57,14 @@ def seconds(function, repeats=1):
     for _ in range(repeats):
         function()
     return (time.perf_counter() - start) / repeats
+
+
+def processor_seconds(function, repeats=1):
+    """Return the mean seconds of processor time of a call."""
+    start = time.process_time()
+    for _ in range(repeats):
+        function()
+    return (time.process_time() - start) / repeats
 
 
 def process_seconds(arguments, repeats=1):
@@ -221,14 +230,6 @@ def frames(options):
     are held against one.
     """
     n_pairs = max(options.pairs, FRAME_PAIRS)
-    truth = make_nonrigid_tracks(
-        N_FRAMES, 68, n_components=9, noise=0.02, random_state=0
-    )
-    X = truth.data
-    tables = {"complete": X, "20 % missing": with_holes(X, 0.2)}
-    model = AffineNRSfM(9, random_state=0).fit(X[:3000])
-    two = copy.copy(model).set_params(n_jobs=2)
-    svd = partial(np.linalg.svd, measured(X, True), full_matrices=False)
 
     def line(title, candidate, reference, unit):
         least, median, most, own, other = paired_ratio(candidate, reference, n_pairs)
@@ -239,10 +240,18 @@ def frames(options):
         )
 
     heading(f"{N_FRAMES:<26}", "ms", "ms of")
-    for title, table in tables.items():
-        transform = partial(model.transform, table)
-        line(title, transform, svd, "SVD")
-        line(f"{title}, 2 jobs", partial(two.transform, table), transform, "1 job")
+    for camera in ("weak_perspective", "affine"):
+        X = make_nonrigid_tracks(
+            N_FRAMES, 68, n_components=9, noise=0.02, camera=camera, random_state=0
+        ).data
+        tables = {"complete": X, "20 % missing": with_holes(X, 0.2)}
+        model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:3000])
+        two = copy.copy(model).set_params(n_jobs=2)
+        svd = partial(np.linalg.svd, measured(X, True), full_matrices=False)
+        for title, table in tables.items():
+            title, transform = f"{camera[:6]} {title}", partial(model.transform, table)
+            line(title, transform, svd, "SVD")
+            line(f"{title}, 2 jobs", partial(two.transform, table), transform, "1 job")
     for title, table in tables.items():
         rows = [table[i : i + 1] for i in range(SINGLE)]
         singles = partial(each, model.transform, rows)
@@ -251,6 +260,50 @@ def frames(options):
     print(
         f"stream of {STREAM} frames: {growth} bytes kept, {peak / 1e3:.0f} kB at most"
     )
+
+
+def live(options):
+    """One complete frame, relative to the search without checks, and to transform.
+
+    68 points and 9 basis shapes. The search in plain NumPy includes centre, scale and
+    change to the public coefficients. Seconds of processor time, for 200 frames.
+    """
+    heading("", "ms", "ms of")
+    for camera in ("affine", "weak_perspective"):
+        X = make_nonrigid_tracks(
+            1500, 68, n_components=9, noise=0.02, camera=camera, random_state=0
+        ).data
+        model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:1000])
+        rows = [X[i : i + 1] for i in range(1000, 1000 + 2 * SINGLE)]
+        frames, pose = frames_of(model), pose_function(model, edges=None)
+        alone, mixing = frames._single_search, frames.gauge.mixing
+
+        def bare(row, alone=alone, mixing=mixing, noise=frames.noise_variance):
+            points = row.reshape(-1, 2)
+            points = points - points.mean(axis=0)
+            size = np.sqrt(np.vdot(points, points) / points.size)
+            fit = alone.fit(points.T / size, noise, np.inf)
+            mixed = mixing @ np.append(1.0, fit.alpha)
+            return mixed[1:] / mixed[0]
+
+        def everything(row, model=model, pose=pose):
+            frame = model.decompose(row)
+            return frame.alpha, model.reconstruct(frame), pose(frame)
+
+        transform = partial(each, model.transform, rows)
+        for title, candidate, reference, what in (
+            ("transform", transform, partial(each, bare, rows), "bare"),
+            ("pose and shape", partial(each, everything, rows), transform, "transform"),
+        ):
+            least, median, most, own, other = paired_ratio(
+                candidate, reference, options.pairs, measure=processor_seconds
+            )
+            own, other = 1e3 * own / len(rows), 1e3 * other / len(rows)
+            print(
+                f"{camera[:9]:10}{title:16}{least:4.2f}{median:8.2f}{most:8.2f}"
+                f"{own:10.2f}{other:9.2f}  {what}",
+                flush=True,
+            )
 
 
 def new_frames(options):
@@ -414,6 +467,7 @@ SECTIONS = {
     "frames": frames,
     "fits": fits,
     "large": large,
+    "live": live,
     "new_frames": new_frames,
     "optima": optima,
     "fastisa": fastisa_iteration,

@@ -71,7 +71,6 @@ class TestFramePoses:
         )
         assert np.isnan(frame_poses(model).yaw_std).all()
 
-
     def test_of_fitted_frames(self, fitted):
         truth, model = fitted
         X = truth.data[:20]

@@ -19,7 +19,12 @@ from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations, rigid_camer
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.projection import distances
-from isa_nrsfm._frames.search import FramePosterior, FrameSearch
+from isa_nrsfm._frames.search import (
+    FramePosterior,
+    FrameSearch,
+    largest_objective,
+)
+from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
@@ -208,6 +213,14 @@ class PosteriorFrames:
         """The search for frames, shared by all tables."""
         return frame_search(self.camera, self.shapes)
 
+    @cached_property
+    def _single_search(self) -> SingleSearch:
+        """The search for one complete frame."""
+        n_parameters = CAMERAS[self.camera].n_parameters
+        calibrated = CAMERAS[self.camera].calibrated
+        shapes = self._search.shared.shapes
+        return SingleSearch(shapes, n_parameters if calibrated else 0)
+
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
@@ -288,7 +301,8 @@ class PosteriorFrames:
             self._search.fit_tracks, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
-            return fitted(tracks, starts=self.starts)
+            alone = self._alone(tracks[0]) if len(tracks) == 1 else None
+            return fitted(tracks, starts=self.starts) if alone is None else alone
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)
@@ -322,6 +336,19 @@ class PosteriorFrames:
             changing = changing[kept]
             fit.put(changing, refit.take(kept))
         return fit
+
+    def _alone(self, points: NDArray) -> FramePosterior | None:
+        """Return the fit of a frame (J, 2), if it is complete and regular."""
+        centre, space = points.mean(axis=0), self._search.space
+        if not np.isfinite(centre).all():
+            return None
+        largest = largest_objective(len(points), self.noise_variance)
+        fit = self._single_search.fit((points - centre).T, self.noise_variance, largest)
+        if fit is None:
+            return None
+        motion, turns = fit.motion @ space, space.T @ fit.turns @ space
+        found = motion, centre, fit.alpha, fit.covariance, turns, fit.objective, True
+        return FramePosterior(*(np.array(each)[None] for each in found))
 
 
 def spread_starts(alpha: NDArray, n_starts: int) -> NDArray:

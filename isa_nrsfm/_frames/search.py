@@ -81,6 +81,16 @@ class FramePosterior(NamedTuple):
             each[frames] = other
 
 
+def largest_objective(n_points: Any, noise: Any) -> Any:
+    """Return the objectives beyond which the minimum may not be the lowest one.
+
+    At the minimum, f / s2 is the squared Mahalanobis distance of a frame from the
+    model. It is chi-squared distributed, with two degrees of freedom per point minus
+    the eight of camera and position. The threshold is three times its expectation.
+    """
+    return 3.0 * noise * np.maximum(2.0 * n_points - 8.0, 1.0)
+
+
 class FrameProblem(NamedTuple):
     """Frames, given by their sums for the shapes, and their noise variances (n,)."""
 
@@ -233,13 +243,8 @@ class FrameSearch:
         slow = np.flatnonzero(~fits.converged & np.isfinite(fits.objective))
         if len(slow):
             fits.put(slow, fit(slow, fits.alpha[slow], MAX_STEPS))
-        # Further starts for badly fitted frames, all starts at once. At the minimum, f
-        # / s2 is the squared Mahalanobis distance of a frame from the model. It is
-        # chi-squared distributed, with two degrees of freedom per point minus the eight
-        # of camera and position. Beyond three times its expectation the minimum may not
-        # be the lowest one.
-        freedom = np.maximum(2.0 * frames.weight - 8.0, 1.0)
-        poor = np.flatnonzero(fits.objective > 3.0 * noise * freedom)
+        # Further starts for badly fitted frames, all starts at once
+        poor = np.flatnonzero(fits.objective > largest_objective(frames.weight, noise))
         if starts is not None and len(starts) and len(poor):
             number = np.repeat(np.arange(len(starts)), len(poor))
             others = fit(np.tile(poor, len(starts)), starts[number], MAX_STEPS)

@@ -55,8 +55,7 @@ class FrameBlocks:
     @classmethod
     def of_array(cls, array: NDArray, block_frames: int, n_threads: int = 1) -> Self:
         """Return the blocks of an array (n_frames, ...), block_frames frames each."""
-        starts = range(0, len(array), block_frames)
-        blocks = [array[start : start + block_frames] for start in starts]
+        blocks = [array[part] for part in block_slices(len(array), block_frames)]
         return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
 
     @classmethod
@@ -69,8 +68,7 @@ class FrameBlocks:
         cls, rows: Callable[[slice], Any], n_frames: int, block_frames: int
     ) -> Self:
         """Return blocks that a function of a slice of rows reads."""
-        starts = range(0, n_frames, block_frames)
-        parts = [slice(s, min(s + block_frames, n_frames)) for s in starts]
+        parts = block_slices(n_frames, block_frames)
         lengths = [part.stop - part.start for part in parts]
         return cls(lambda number: rows(parts[number]), lengths, False)
 
@@ -102,7 +100,7 @@ class FrameBlocks:
 
     def subset(self, frames: NDArray) -> Self:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
-        length = max(self.lengths)
+        length = max(self.lengths[:-1] or self.lengths)
         if self.cached:
             array = self.joined(chosen_rows, frames)
             return self.of_array(array, length, self.n_threads)
@@ -229,6 +227,15 @@ class DaskBlocks(FrameBlocks):
             # Cameras and coefficients of the frames of a block go with each task.
             warnings.filterwarnings("ignore", "Sending large graph")
             return getattr(import_optional("dask", extra="dask"), how)(*tasks)
+
+
+def block_slices(n_frames: int, block_frames: int) -> list[slice]:
+    """Return slices of block_frames frames; the last one may have one more, or fewer.
+
+    A block of one frame would be fitted in another way.
+    """
+    starts = list(range(0, max(n_frames - 1, min(n_frames, 1)), block_frames))
+    return list(map(slice, starts, [*starts[1:], n_frames]))
 
 
 def chosen_rows(block: NDArray, kept: NDArray) -> NDArray:

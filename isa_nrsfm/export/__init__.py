@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         FramePoses as FramePoses,
         frame_poses as frame_poses,
         point_distances as point_distances,
+        pose_function as pose_function,
     )
     from isa_nrsfm.export._shape_arrays import (
         ShapeArrays as ShapeArrays,
@@ -43,6 +44,7 @@ else:
                 "FramePoses",
                 "frame_poses",
                 "point_distances",
+                "pose_function",
             ],
             "isa_nrsfm.export._shape_arrays": [
                 "ShapeArrays",

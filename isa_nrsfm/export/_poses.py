@@ -1,6 +1,7 @@
 """Head pose of frames, and distances between points."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (
     Camera,
+    UprightSpace,
     upright_frames,
     upright_space,
 )
@@ -112,9 +114,64 @@ def frame_poses(
     >>> frame_poses(model.fit(faces.data)).yaw.shape
     (100,)
     """
+    return pose_function(
+        model, camera=camera, edges=edges, origin=origin, mirrored=mirrored
+    )(X)
+
+
+def pose_function(
+    model: Any,
+    *,
+    camera: Camera = "weak_perspective",
+    edges: Any = "auto",
+    origin: Origin = "auto",
+    mirrored: bool = False,
+) -> Callable[[Any], FramePoses]:
+    """
+    Return a function that computes the poses of frames of a model.
+
+    The upright space of the model is computed once, for many calls with few frames.
+
+    Parameters
+    ----------
+    model : AffineNRSfM
+        A fitted model that has kept its frames.
+    camera, edges, origin, mirrored
+        As in `frame_poses`.
+
+    Returns
+    -------
+    callable
+        Function of `X`, a table or the result of ``model.decompose``, or None for the
+        fitted table. It returns `FramePoses`.
+
+    Raises
+    ------
+    ValueError
+        For the reasons given in `frame_poses`.
+
+    Examples
+    --------
+    >>> from isa_nrsfm import AffineNRSfM
+    >>> from isa_nrsfm.datasets import make_face_tracks
+    >>> from isa_nrsfm.export import pose_function
+    >>> faces = make_face_tracks(100, camera="weak_perspective", random_state=0)
+    >>> model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
+    >>> poses = pose_function(model.fit(faces.data))
+    >>> for row in faces.data[:2]:
+    ...     frame = model.decompose(row[None])
+    ...     shape, pose = model.reconstruct(frame), poses(frame)
+    >>> shape.shape, pose.yaw.shape
+    ((1, 68, 3), (1,))
+    """
     if camera is None:
         raise ValueError("angles need calibrated cameras; got camera=None")
     space = upright_space(model, camera, origin, mirrored, edges)
+    return partial(_poses, space, model)
+
+
+def _poses(space: UprightSpace, model: Any, X: Any) -> FramePoses:
+    """Return the poses of frames in an upright space."""
     motion, alpha = frames_of_table(model, X)
     _, rotations, scales = upright_frames(space, model, motion, alpha)
     # The fitted table must determine the depth.

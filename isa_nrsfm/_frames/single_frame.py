@@ -1,0 +1,222 @@
+"""The search for the most probable camera and coefficients of one complete frame.
+
+The algebra of `affine_newton` and `calibrated_newton` with LAPACK. The search for many
+frames takes as long for one frame as for sixteen: 4 to 7 times as long as this one.
+Frames that are not regular are left to it.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from isa_nrsfm._frames.calibrated_newton import REVERSED, SAME_WELL
+from isa_nrsfm._frames.search import LARGEST_DAMPING
+
+# Rotations of affine cameras
+UNKNOWN = np.full((3, 3), np.nan)
+# Largest number of steps; frames that need more are left to the other search.
+MAX_STEPS = 30
+
+
+class SingleFit(NamedTuple):
+    """Fit of a frame: camera (2, 3), alpha (K,), covariances of alpha and rotation."""
+
+    motion: NDArray
+    alpha: NDArray
+    covariance: NDArray
+    turns: NDArray
+    objective: float
+
+
+class _Camera(NamedTuple):
+    """A calibrated camera M (2, 3), its objective, and the coefficients' posterior."""
+
+    M: NDArray
+    value: float
+    alpha: NDArray
+    Q: NDArray
+    log_determinant: float
+
+
+class SingleSearch:
+    """The search for shapes (K + 1, 3, J), rows centred, in coordinates of the search.
+
+    Calibrated cameras have 4 (weak perspective) or 3 parameters, affine ones are given
+    as 0.
+    """
+
+    def __init__(self, shapes: NDArray, n_parameters: int):
+        n_shapes, _, n_points = shapes.shape
+        self.n_parameters, self.K = n_parameters, n_shapes - 1
+        self.rows = shapes.reshape(-1, n_points)
+        gram = np.einsum("kaj,lbj->klab", shapes, shapes, optimize=True)
+        gram = 0.5 * (gram + gram.swapaxes(2, 3))
+        self.pairs = gram.reshape(-1, 9)
+        # 2 G_kl (9 n_shapes, n_shapes): rows (k, a, b), columns l
+        self.sums = 2.0 * gram.transpose(0, 2, 3, 1).reshape(-1, n_shapes)
+
+    def fit(self, W: NDArray, noise: float, largest: float) -> SingleFit | None:
+        """Fit a centred frame (2, J); None without a regular minimum below `largest`.
+
+        Objectives are ``||W - M S(a)||^2 + noise |a|^2``.
+        """
+        energy = float(np.vdot(W, W))
+        P = (self.rows @ W.T).reshape(-1, 3, 2).swapaxes(1, 2)
+        noise = max(noise, 1e-13 * energy)
+        search = self._calibrated if self.n_parameters else self._affine
+        try:
+            with np.errstate(all="ignore"):
+                fit = search(P, energy, noise)
+        except np.linalg.LinAlgError:
+            return None
+        return fit if fit is not None and fit.objective <= largest else None
+
+    def _affine(self, P: NDArray, energy: float, noise: float) -> SingleFit | None:
+        """Minimise over the coefficients, with the best camera for them."""
+        K, alpha, before, ended = self.K, np.zeros(self.K), np.inf, False
+        tol = 1e-12 * (energy + noise)
+        for n_steps in range(MAX_STEPS):
+            c = np.append(1.0, alpha)
+            T = (self.sums @ c).reshape(-1, 3, 3)
+            inverse = np.linalg.inv(0.5 * np.tensordot(c, T, 1))
+            Y = np.tensordot(c, P, 1)
+            M = Y @ inverse
+            Q = (M.T @ M).ravel()
+            held = (self.pairs @ Q).reshape(K + 1, K + 1)[1:, 1:].copy()
+            held.flat[:: K + 1] += noise
+            slope = P[1:].reshape(K, 6) @ M.ravel() - noise * alpha
+            slope -= 0.5 * (T[1:].reshape(K, 9) @ Q)
+            if n_steps == 0:
+                alpha = np.linalg.solve(held, slope)
+                continue
+            F = M @ T[1:] - P[1:]
+            hessian = held - (F @ inverse).reshape(K, 6) @ F.reshape(K, 6).T
+            np.linalg.cholesky(hessian)  # raises an error unless it is definite
+            value = energy - np.vdot(M, Y) + noise * (alpha @ alpha)
+            if ended:
+                covariance = noise * np.linalg.inv(hessian)
+                return SingleFit(M, alpha, covariance, UNKNOWN, max(value, 0.0))
+            if not value <= before + tol:
+                return None
+            step = np.linalg.solve(hessian, slope)
+            before, alpha, ended = value, alpha + step, slope @ step <= tol
+        return None
+
+    def _calibrated(self, P: NDArray, energy: float, noise: float) -> SingleFit | None:
+        """Minimise over cameras, with the coefficients integrated out."""
+        affine = P[0] @ np.linalg.inv(0.5 * self.sums[:9, 0].reshape(3, 3))
+        start = min(
+            (self._camera(M, P, energy, noise) for M in self._starts(affine)),
+            key=lambda camera: camera.value,
+        )
+        found = self._minimum(start, P, energy, noise)
+        if found is None:
+            return None
+        # A lower minimum from the reversed camera is left to the other search.
+        reversed_camera = self._camera(found.M * REVERSED.T, P, energy, noise)
+        limit = found.value - 1e-10 * (energy + noise)
+        if self._minimum(reversed_camera, P, energy, noise, found, limit) is not None:
+            return None
+        _, hessian, _, through = self._derivatives(found, P, noise)
+        turns = np.linalg.inv(hessian)
+        covariance = noise * (found.Q + through @ turns @ through.T)
+        objective = max(found.value - noise * found.log_determinant, 0.0)
+        turns = noise * turns[:3, :3]
+        return SingleFit(found.M, found.alpha, covariance, turns, objective)
+
+    def _starts(self, M: NDArray) -> Iterator[NDArray]:
+        """Yield the calibrated camera nearest to M, and that of its first columns."""
+        scaled = self.n_parameters == 4
+        U, values, Vt = np.linalg.svd(M, full_matrices=False)
+        yield (values.mean() if scaled else 1.0) * U @ Vt
+        U, values, Vt = np.linalg.svd(M[:, :2])
+        cosine = values[1] / values[0]
+        depth = np.sqrt(max(1.0 - cosine**2, 0.0)) * U[:, 1]
+        depth = -depth if depth @ M[:, 2] < 0 else depth
+        rows = np.column_stack([U * [1.0, cosine] @ Vt, depth])
+        yield (values[0] if scaled else 1.0) * rows
+
+    def _camera(self, M: NDArray, P: NDArray, energy: float, noise: float) -> _Camera:
+        """Return a camera with the posterior of the coefficients."""
+        H = (self.pairs @ (M.T @ M).ravel()).reshape(self.K + 1, -1)
+        seen = P.reshape(-1, 6) @ M.ravel()
+        damped = H[1:, 1:].copy()
+        damped.flat[:: self.K + 1] += noise
+        Q, right = np.linalg.inv(damped), seen[1:] - H[1:, 0]
+        alpha = Q @ right
+        log_determinant = np.linalg.slogdet(damped)[1] - self.K * np.log(noise)
+        square = energy - 2.0 * seen[0] + H[0, 0] - right @ alpha
+        value = square + noise * log_determinant
+        return _Camera(M, value, alpha, Q, log_determinant)
+
+    def _derivatives(
+        self, camera: _Camera, P: NDArray, noise: float
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return gradient, Hessian, its definite part, and Q times the coupling."""
+        M, c, n = camera.M, np.append(1.0, camera.alpha), self.n_parameters
+        E = np.outer(c, c)
+        E[1:, 1:] += noise * camera.Q
+        A = (E.ravel() @ self.pairs).reshape(3, 3)
+        G = M @ A - np.tensordot(c, P, 1)
+        D = np.zeros((n, 2, 3))
+        x, y, z = M.T
+        D[0, :, 1], D[1, :, 0] = z, -z
+        D[0, :, 2], D[2, :, 0] = -y, y
+        D[1, :, 2], D[2, :, 1] = x, -x
+        D[3:] = M
+        flat = D.reshape(n, 6)
+        gradient, definite = flat @ G.ravel(), (D @ A).reshape(n, 6) @ flat.T
+        mixed = G.T @ M
+        bent = np.empty((n, n))
+        bent[3:], bent[:, 3:] = gradient, gradient[:, None]
+        bent[:3, :3] = 0.5 * (mixed + mixed.T) - np.trace(mixed) * np.eye(3)
+        T = (self.sums @ c).reshape(-1, 3, 3)
+        coupling = (M @ T[1:] - P[1:]).reshape(-1, 6) @ flat.T
+        through = camera.Q @ coupling
+        return gradient, definite + bent - coupling.T @ through, definite, through
+
+    def _minimum(
+        self,
+        camera: _Camera,
+        P: NDArray,
+        energy: float,
+        noise: float,
+        known: _Camera | None = None,
+        limit: float = np.inf,
+    ) -> _Camera | None:
+        """Return a minimum; None if not found, or if it will not be below the limit."""
+        tol, damping = 1e-12 * (energy + noise), 0.0
+        radius = SAME_WELL * np.linalg.norm(camera.M - known.M) if known else 0.0
+        for _ in range(MAX_STEPS):
+            gradient, hessian, definite, _ = self._derivatives(camera, P, noise)
+            while np.linalg.eigvalsh(hessian + damping * definite)[0] <= 0:
+                damping = max(8.0 * damping, 0.1)
+                if damping > LARGEST_DAMPING:
+                    return None
+            step = -np.linalg.solve(hessian + damping * definite, gradient)
+            gain = -gradient @ step
+            if known is not None and (
+                camera.value - 10.0 * gain > limit
+                or np.linalg.norm(camera.M - known.M) < radius
+            ):
+                return None
+            step /= max(1.0, np.linalg.norm(step[:3]), *np.abs(step[3:]))
+            moved = self._camera(self._moved(camera.M, step), P, energy, noise)
+            if damping == 0 and gain <= tol:
+                return moved if moved.value < limit else None
+            if moved.value <= camera.value + tol:
+                camera, damping = moved, 0.1 * damping if damping > 0.01 else 0.0
+            else:
+                damping = max(8.0 * damping, 0.1)
+        return None
+
+    def _moved(self, M: NDArray, step: NDArray) -> NDArray:
+        """Return ``exp(l) M exp(hat(w))`` for a step w (3,), or w and l (4,)."""
+        w = step[:3]
+        angle = np.sqrt(w @ w)
+        first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+        hat = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+        turned = np.cos(angle) * M + first * M @ hat + second * np.outer(M @ w, w)
+        return turned * np.exp(step[3]) if self.n_parameters == 4 else turned
