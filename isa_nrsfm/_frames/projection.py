@@ -25,12 +25,25 @@ def reprojection_error(
     return float(noise / signal)
 
 
-def _energies(rows: NDArray, *fit: NDArray, shapes: NDArray) -> tuple[float, float]:
+def _energies(
+    rows: NDArray,
+    motion: NDArray,
+    position: NDArray,
+    alpha: NDArray,
+    shapes: NDArray,
+) -> tuple[float, float]:
     """Return the energies of the residuals of a block, and of its centred frames."""
-    tracks = rows.transpose(0, 2, 1).astype(np.float64)
-    centred = tracks - np.nanmean(tracks, axis=1, keepdims=True)
-    rest = distances(tracks, shapes, *fit)
-    return float(np.nansum(rest**2)), float(np.nansum(centred**2))
+    rows = rows.astype(np.float64, copy=False)
+    centred = rows - np.nanmean(rows, axis=2, keepdims=True)
+    model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
+    rest = rows - model.reshape(rows.shape) - position[:, :, None]
+    return _sum_of_squares(rest), _sum_of_squares(centred)
+
+
+def _sum_of_squares(values: NDArray) -> float:
+    """Return the sum of the squares of all values that are not NaN."""
+    total = float(np.vdot(values, values))
+    return float(np.nansum(values**2)) if np.isnan(total) else total
 
 
 def distances(

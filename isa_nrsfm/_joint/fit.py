@@ -146,17 +146,21 @@ def _problems(
     n_shapes, _, n_points = paper_shapes.shape
     options, outliers = settings.options, table.outliers
     complete = bool((table.n_seen == n_points).all())
-    if outliers is None or not outliers.any():
-        frames = JointFrames.from_points(table.rows, complete)
-    else:
-        rows = table.rows.derive(WeightedRows.without, outliers)
-        frames = JointFrames.from_weighted(rows)
+    many = n_points > max(24 * n_shapes, options.many_points)
     seen = None
-    if n_points > max(24 * n_shapes, options.many_points):
-        seen = frames if not complete or outliers is not None else None
+    if not (many and complete and outliers is None):
+        if outliers is None or not outliers.any():
+            seen = JointFrames.from_points(table.rows, complete)
+        else:
+            rows = table.rows.derive(WeightedRows.without, outliers)
+            seen = JointFrames.from_weighted(rows)
+    if many:
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
+    else:
+        assert seen is not None
+        frames, seen = seen, None
     thorough = frames.n_frames <= options.few_frames
     penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)

@@ -182,10 +182,10 @@ def check_points(
     per frame that shows it. A frame of n points has 2 n equations, and 8 + K unknowns
     of its own.
     """
+    if (visible == np.packbits(np.ones(n_points, dtype=bool))).all():
+        return
     patterns, counts = np.unique(visible, axis=0, return_counts=True)
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
-    if seen.all():
-        return
     n_frames, n_shapes = counts @ seen, n_components + 1
     least = -(-3 * n_shapes // 2)
     few = n_frames < least
