@@ -76,6 +76,15 @@ def test_flat_shapes(camera):
         assert_same(model.posterior(tracks[[i]]), together.take([i]))
 
 
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_single_precision(camera):
+    model, tracks = model_and_tracks(camera)
+    tracks = tracks.astype(np.float32)
+    together = model.posterior(tracks)
+    for i in range(3):
+        assert_same(model.posterior(tracks[[i]]), together.take([i]))
+
+
 def test_covariances_can_be_left_out():
     model, tracks = model_and_tracks("weak_perspective")
     with_them, without = (model.posterior(tracks[:1], which) for which in (True, False))

@@ -339,6 +339,7 @@ class PosteriorFrames:
 
     def _alone(self, points: NDArray) -> FramePosterior | None:
         """Return the fit of a frame (J, 2), if it is complete and regular."""
+        points = points.astype(np.float64, copy=False)
         centre, space = points.mean(axis=0), self._search.space
         if not np.isfinite(centre).all():
             return None
