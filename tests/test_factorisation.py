@@ -182,6 +182,14 @@ class TestLargeBothWays:
         assert_allclose(leading.rest, whole.rest, rtol=1e-6, atol=1e-14 * kept)
         assert_allclose(leading.values, whole.values, rtol=1e-3)
 
+    def test_energies_that_hardly_fall_converge_too(self):
+        rng = np.random.default_rng(0)
+        U, V = np.linalg.qr(rng.normal(size=(2, 150, 150)))[0]
+        values = 0.97 ** np.arange(150)
+        found = leading_triplets((U * values) @ V.T, 9, KRYLOV)
+        rest = np.sum(values[9:] ** 2)
+        assert abs(found.rest - rest) < 1e-6 * rest
+
     @pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
     def test_units(self, unit):
         W = low_rank(0, 8, 60, 70) + 1e-2 * centred_matrix(1, 60, 70)
