@@ -1,5 +1,6 @@
 """Private names of scikit-learn, and where warnings point to."""
 
+import io
 import warnings
 from numbers import Integral, Real
 from pathlib import Path
@@ -18,6 +19,7 @@ from isa_nrsfm._compat.scikit_learn import (
     number_of_rows,
     taken_rows,
 )
+from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm.datasets import make_face_tracks
 
 
@@ -56,3 +58,29 @@ def test_warnings_point_to_the_line_of_the_user(n_jobs, piped):
         about = [each for each in caught if "only one of" in str(each.message)]
         assert about
         assert {Path(each.filename) for each in about} == {Path(__file__)}
+
+
+class TestStoredArrays:
+    def stored(self, array, version=None):
+        """Return the bytes of an array in NumPy's format."""
+        content = io.BytesIO()
+        np.lib.format.write_array(content, array, version, allow_pickle=True)
+        return content.getvalue()
+
+    @pytest.mark.parametrize("version", [(1, 0), (2, 0)])
+    def test_come_back(self, version):
+        array = np.arange(6.0).reshape(2, 3)
+        assert_array_equal(array_in(self.stored(array, version)), array)
+
+    def test_of_another_size_are_refused(self):
+        content = self.stored(np.arange(6.0))
+        for changed, n_bytes in ((content[:-1], 47), (content + b"0", 49)):
+            with pytest.raises(ValueError, match=f"48 bytes; got {n_bytes}"):
+                array_in(changed)
+
+    def test_of_objects_are_refused_whatever_their_size(self):
+        content = self.stored(np.array([None, None]))
+        head = content[: content.index(b"\n") + 1]
+        for size in (0, 8, 16, 24):
+            with pytest.raises(ValueError, match="type object should have 16 bytes"):
+                array_in(head + bytes(size))

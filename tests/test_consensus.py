@@ -270,6 +270,50 @@ class TestGroupFit:
         assert group_fit(scene, 2, SETTINGS) is None
 
 
+class TestFittedGroups:
+    """The groups of a table, without any fit."""
+
+    def test_each_group_has_its_points(self, monkeypatch):
+        """Groups have up to three quarters of the points, and those with a fit stay."""
+        rng = np.random.default_rng(0)
+        scene = scene_of(rng.standard_normal((8, 3, 30)))
+        distances = neighbour_distances(scene.first)
+        steps, tasks = [], []
+
+        def fit(part, n_components, settings):
+            tasks.append(part)
+            assert n_components == 5
+            assert settings.on_step is None
+            n_points = part.rows.shape[2]
+            return None if n_points == 20 else (np.arange(8), part.first, 1e-3)
+
+        monkeypatch.setattr(consensus_module, "group_fit", fit)
+        settings = SETTINGS._replace(on_step=lambda: steps.append(1))
+        groups = consensus_module.fitted_groups(scene, distances, 5, settings, None)
+        expected = [neighbourhoods(distances, size) for size in (12, 20)]
+        assert len(tasks) == len(steps) == sum(map(len, expected))
+        assert len(groups) == len(expected[0])
+        for group, (points, count) in zip(groups, expected[0], strict=True):
+            assert_array_equal(group.points, points)
+            assert_array_equal(group.frames, np.arange(8))
+            assert_array_equal(group.coordinates, scene.first[:, :, points])
+            assert (group.noise, group.weight) == (1e-3, count)
+        for part, (points, _) in zip(tasks, [*expected[0], *expected[1]], strict=True):
+            assert_array_equal(part.rows, scene.rows[:, :, points])
+
+    def test_few_points_are_one_group(self, monkeypatch):
+        """Tables with fewer points than the smallest group have one of all points."""
+        scene = scene_of(np.random.default_rng(0).standard_normal((8, 3, 9)))
+        monkeypatch.setattr(
+            consensus_module,
+            "group_fit",
+            lambda part, *others: (np.arange(8), part.first, 1e-3),
+        )
+        distances = neighbour_distances(scene.first)
+        (group,) = consensus_module.fitted_groups(scene, distances, 2, SETTINGS, None)
+        assert_array_equal(group.points, np.arange(9))
+
+
 class TestConsensus:
     """Scene of the groups, and the model from their merge, without any fit."""
 

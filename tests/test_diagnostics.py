@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._diagnostics import (
     gross_residuals,
+    outlier_advice,
     pose_share,
     reliabilities,
     weak_information,
@@ -297,6 +299,24 @@ class TestOutliers:
         model = AffineNRSfM(2, random_state=0).fit(table)
         (message,) = model.diagnostics(table).messages
         assert re.search(r"rows image9, .* points 7,", message)
+
+
+@pytest.mark.parametrize("share", [5e-4, 6e-4])
+def test_outliers_are_named_by_rows_and_most_frequent_points(share):
+    found = SimpleNamespace(
+        outlier_share=share, outliers=np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
+    )
+    advice = outlier_advice(found, np.arange(10, 20), ["a", "b", "c"])
+    if share == 5e-4:
+        assert advice == ""
+    else:
+        assert advice.startswith(
+            "the table has outliers: 4 points (0.06 %) in 3 frames"
+        )
+        assert advice.endswith(
+            "more than 8 standard deviations from the model, in the rows 10, 13, 17, "
+            "most often the points c, a, b"
+        )
 
 
 def test_a_few_frames_that_determine_a_coefficient_are_named():

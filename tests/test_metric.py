@@ -78,6 +78,8 @@ class TestMetricQuadric:
         same = np.repeat(rng.standard_normal((1, 2, 3)), 10, axis=0)
         assert metric_quadric(same) is None
         assert metric_quadric(weak_perspective(rng, 2)) is None
+        flat = rng.standard_normal((10, 2, 3)) * [1.0, 1.0, 0.0]
+        assert metric_quadric(flat @ affinity(rng)) is None
 
     def test_indefinite_solutions_are_refused(self):
         assert metric_quadric(lorentz_cameras(np.random.default_rng(7))) is None

@@ -15,6 +15,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
 )
 from isa_nrsfm._metric_upgrade.refinement import (
     STRETCH_OF_START,
+    MetricFit,
     _linearised,
     _normal_equations,
     exponential,
@@ -259,3 +260,13 @@ class TestRefineMetric:
         fit = refined(turns, np.eye(3), camera)
         assert fit.condition_number == pytest.approx(1, abs=0.1)
         assert refined(turns[:2], np.eye(3), camera).condition_number == np.inf
+
+    @pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
+    def test_condition_number_of_any_unit(self, unit):
+        curvature = np.diag([1.0, 2.0, 3.0, 4.0, 9.0, *[1e3] * 5])
+        fit = MetricFit(
+            np.eye(3), np.zeros((1, 3, 3)), 4, 0.0, unit * curvature, np.zeros(10)
+        )
+        assert fit.condition_number == pytest.approx(3.0)
+        curvature[0, 0] = 1e-17
+        assert fit._replace(curvature=unit * curvature).condition_number == np.inf

@@ -7,7 +7,7 @@ from scenes import measurements, permute_frames
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.sample import rigid_energy, sample_frames
 from isa_nrsfm._tables.blocks import FrameBlocks
-from isa_nrsfm._tables.ordering import spread
+from isa_nrsfm._tables.ordering import representative_frames, spread
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 FEW = {"small_table": 1000, "first": 40}
@@ -68,3 +68,37 @@ def test_the_same_frames_in_any_order_and_blocks():
     permuted, order = permute_frames(W, 1)
     expected = sample(W).parts[0]
     assert_array_equal(np.sort(order[sample(permuted, 7).parts[0]]), expected)
+
+
+class TestRepresentativeFrames:
+    def rows(self):
+        """Return frames of known shares of x, in no order, and that order."""
+        order = np.random.default_rng(0).permutation(300)
+        rows = np.ones((300, 2, 4))
+        rows[order, 0] = np.linspace(0.1, 2.0, 300)[:, None]
+        return rows, order
+
+    def test_are_spread_over_the_shares_of_x(self):
+        rows, order = self.rows()
+        found = representative_frames(FrameBlocks.of_array(rows, 64), 50)
+        assert_array_equal(found, np.sort(spread(order, 50)))
+
+    def test_show_rare_points_as_often_as_they_can(self):
+        rows, order = self.rows()
+        rows[:, :, 1:3] = np.nan
+        rows[order[::7], :, 1] = 1.0  # in 43 frames, and in 5 of those that are spread
+        rows[order[3:6], :, 2] = 1.0  # in three frames
+        blocks = FrameBlocks.of_array(rows, 64)
+        # The order of the shares has changed little: compare by it.
+        halves = np.nansum(rows[:, 0] ** 2, axis=1) / np.nansum(rows**2, axis=(1, 2))
+        order = np.argsort(halves, kind="stable")
+        chosen = set(spread(order, 50).tolist())
+        for point, n in ((1, 10), (2, 3)):
+            seen = ~np.isnan(rows[order, 0, point])
+            assert sum(not np.isnan(rows[i, 0, point]) for i in chosen) < n
+            chosen |= set(spread(order[seen], n).tolist())
+        assert_array_equal(representative_frames(blocks, 50), sorted(chosen))
+
+    def test_of_few_frames_are_all(self):
+        rows = FrameBlocks.of_array(self.rows()[0], 64)
+        assert_array_equal(representative_frames(rows, 300), np.arange(300))
