@@ -17,6 +17,7 @@ from isa_nrsfm._prepare.checks import (
     visible_points,
 )
 from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.sources import LARGEST, SMALLEST, checked_range
 from isa_nrsfm._tables.tracks import LAYOUTS, clean_tracks, tracks_to_table
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 
@@ -65,6 +66,21 @@ class TestHalfPoints:
     def test_pairs_of_missing_coordinates_are_no_matter(self, rng):
         tracks, _ = with_missing(rng.normal(size=(6, 9, 2)), 0.5)
         assert clean_tracks(tracks) is tracks
+
+
+class TestRange:
+    @pytest.mark.parametrize("sign", [-1.0, 1.0])
+    @pytest.mark.parametrize("size", [2 * LARGEST, SMALLEST / 2])
+    def test_squares_stay_finite_and_above_zero(self, size, sign):
+        X = np.ones((5, 4))
+        X[3] = 0.0
+        X[3, 1:3] = sign * size, np.nan
+        with pytest.raises(ValueError, match=r"in row 3\. Give"):
+            checked_range(X)
+
+    def test_ends_and_rows_of_zeros(self):
+        X = np.diag([LARGEST, SMALLEST, -LARGEST, -SMALLEST, 0.0, np.nan])
+        assert checked_range(X) is X
 
 
 def checked(tracks, *options):
