@@ -1,6 +1,7 @@
 """The joint refinement: a minimum of the objective, reached and recognised."""
 
 from functools import cache
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,12 @@ from scenes import likelihood_of
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointState, refine_joint
+from isa_nrsfm._joint.quasi_newton import (
+    NOISE_FLOOR,
+    JointState,
+    _line_search,
+    refine_joint,
+)
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
 
 DEVIATION = 0.03
@@ -352,7 +358,44 @@ class TestWithoutNoise:
         assert state.noise == pytest.approx(NOISE_FLOOR * mean_square)
 
 
+class Parabola:
+    """An iterate on the line ``a t^2 / 2 - t``, whose noise has the floor 1/2."""
+
+    gradient, n = np.array([-1.0, 0.0]), 0
+    cameras = SimpleNamespace(largest_length=lambda step: np.inf)
+
+    def __init__(self, a, t=0.0, noise=1.0):
+        self.a, self.t, self.value = a, t, a * t**2 / 2 - t
+        self.state = SimpleNamespace(noise=noise)
+
+    def split(self, step):
+        return None, step[:1], step[1]
+
+    def moved(self, step):
+        return Parabola(self.a, step[0], max(np.exp(step[1]), 0.5))
+
+
 class TestLineSearch:
+    @pytest.mark.parametrize(
+        ("a", "expected"),
+        [(1.0, 1.0), (1.99, 1.0), (2.0, 0.5), (4.0, 0.25), (40, 1 / 40)],
+    )
+    def test_takes_the_whole_step_or_the_minimum_of_the_parabola(self, a, expected):
+        reached, step = _line_search(Parabola(a), np.array([1.0, 0.0]))
+        assert reached.t == pytest.approx(expected)
+        assert_allclose(step, [expected, 0.0])
+
+    def test_noise_changes_by_a_limited_factor_and_not_below_its_floor(self):
+        reached, step = _line_search(Parabola(0.5), np.array([1.0, -3.0]))
+        assert reached.t == pytest.approx(0.5)
+        assert_allclose(step, [0.5, np.log(0.5)])
+
+    def test_no_step_where_the_objective_rises(self):
+        direction = np.array([-1.0, 0.0])
+        reached, step = _line_search(Parabola(1.0), direction)
+        assert reached is None
+        assert step is direction
+
     @pytest.mark.parametrize(("noise", "most"), [(0.0, 2.5), (DEVIATION, 1.5)])
     def test_mostly_takes_the_first_step(self, noise, most):
         scene = random_scene(noise=noise)
