@@ -269,6 +269,12 @@ def test_what_cannot_be_tried_is_refused(parameters, message):
         AffineNRSfMCV(**parameters).fit(X)
 
 
+def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
+    monkeypatch.delattr("isa_nrsfm._selection.estimator.walk")
+    with pytest.raises(ValueError, match="n_components=500"):
+        AffineNRSfMCV((1, 500)).fit(X)
+
+
 def test_the_limit_of_the_parts_is_named():
     few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
     with pytest.raises(
