@@ -140,6 +140,14 @@ class TestParts:
         scale = np.abs(whole.curvature).max()
         assert_allclose(whole.curvature, turned.curvature, atol=1e-12 * scale)
         assert_allclose(whole.gradient, turned.gradient, atol=1e-12 * scale)
+        first, rest = (
+            fit_at(motion[part], alpha[part], np.eye(3), strain, camera)
+            for part in (slice(BLOCK_FRAMES), slice(BLOCK_FRAMES, None))
+        )
+        assert whole.cost == pytest.approx(first.cost + rest.cost, rel=1e-12)
+        both = first.curvature + rest.curvature, first.gradient + rest.gradient
+        assert_allclose(whole.curvature, both[0], atol=1e-12 * scale)
+        assert_allclose(whole.gradient, both[1], atol=1e-12 * scale)
 
     def test_exponential(self):
         roots = np.random.default_rng(0).standard_normal((4, 3, 3))
