@@ -92,8 +92,8 @@ def test_times_are_read_in_the_one_way_that_reads_all(asked, cells, steps):
     [
         (
             "{:02d}/02/2024",
-            r"'01/02/2024' in row 0 can be 2024-02-01 .*'%d/%m/%Y'\) or "
-            r"2024-01-02 .*'%m/%d/%Y'\), and no other row decides",
+            r"'01/02/2024' in row 0 can be 2024-02-01 \(.*'%d/%m/%Y'\) or "
+            r"2024-01-02 \(.*'%m/%d/%Y'\), and no other row decides",
         ),
         ("{:02d}.02.24", r"2024-02-01 .*%d\.%m\.%y.* or 2024-01-02 .* or 2001-02-24 "),
         ("0:{:02d}", r"'0:01' in row 0 can be 1 s .*'%M:%S'\) or 60 s .*'%H:%M'\)"),
@@ -223,6 +223,22 @@ def test_whole_numbers_are_classes_in_their_order(asked):
     (label,) = asked({"age": np.resize([10, 9, 8], N)}, "--label", "age").labels
     assert [str(name) for name in np.unique(label.values)] == ["8", "9", "10"]
     assert label.kind == "classes"
+
+
+def test_labels_of_parquet_files_keep_their_type(asked):
+    days = pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))
+    columns = {
+        "day": days,
+        "mood": ["1", "b"] * (N // 2),
+        "ok": [True, False] * (N // 2),
+    }
+    options = ["--label", "day", "--label", "mood", "--label", "ok"]
+    found = asked(columns, *options, suffix=".parquet").labels
+    assert [each.kind for each in found] == ["classes"] * 3
+    assert set(found[0].values) == {"2024-02-01", "2024-02-02"}
+    for name, got in (("day", "'2024-02-01' in row 0"), ("mood", "'b' in row 1")):
+        with pytest.raises(ValueError, match=f"{name}:number: .* numbers; got {got}"):
+            asked(columns, "--label", f"{name}:number", suffix=".parquet")
 
 
 @pytest.mark.parametrize("word", ["NA", "nan", "NULL", "n/a", "", " ", "<NA>"])

@@ -168,8 +168,12 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
     numbers = pd.to_numeric(names, errors="coerce")
     if kind == "auto" and numbers.notna().all() and (numbers % 1 != 0).any():
         kind = "number"
-    values = numbers if kind == "number" and numbers.notna().all() else names
-    values = values.to_numpy()
+    if kind == "number" and numbers.isna().any():
+        row = numbers.isna().idxmax()
+        raise ValueError(
+            f"--label {text}: labels must be numbers; got {names[row]!r} in row {row}"
+        )
+    values = (numbers if kind == "number" else names).to_numpy()
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
     refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
@@ -196,6 +200,8 @@ def _groups(table: "pd.DataFrame", name: str) -> NDArray:
 def _names(known: "pd.Series") -> "pd.Series":
     """Return texts as they are, or as numbers if these are written the same."""
     pd = import_optional("pandas", extra="io")
+    if known.dtype.kind in "mM":  # dates
+        return known.astype(str)
     numbers = pd.to_numeric(known, errors="coerce")
     return numbers if numbers.astype(str).equals(known.astype(str)) else known
 

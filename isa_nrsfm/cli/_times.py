@@ -156,7 +156,11 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
 
 def _shown(time: object) -> str:
     """Return a date, or seconds, as they are read by people."""
-    return f"{time:g} s" if isinstance(time, float) else str(time)
+    return (
+        f"{time:g} s"
+        if isinstance(time, float)
+        else str(time).removesuffix(" 00:00:00")
+    )
 
 
 def _cell(cells: "pd.Series", which: "pd.Series") -> str:
