@@ -522,3 +522,41 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
     path.write_text("\n".join([*lines, "skeleton: [[NO, 1, x]]"]))
     found = read_skeleton(path, ["NO", "1", "x"])
     assert found.curves == ((0, 1), (1, 2))
+
+
+WIDE = landmarks(2).round(1)
+LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in range(16))
+
+
+@pytest.mark.parametrize(
+    ("name", "contents", "message"),
+    [
+        ("a.csv", LONG, r"one row for each point, .* table\.pivot\("),
+        ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
+        ("a.csv", WIDE.to_csv(index=False, sep=";"), "separated by semicolons; commas"),
+        ("a.tsv", WIDE.to_csv(index=False, sep="\t", decimal=","), "with a point$"),
+        ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
+        ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
+    ],
+)
+def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, message):
+    path = tmp_path / name
+    if isinstance(contents, str):
+        contents = contents.encode()
+    path.write_bytes(contents)
+    with pytest.raises(ValueError, match=message):
+        read_frames(build_parser().parse_args(["fit", str(path), "-o", "out"]))
+
+
+def test_the_way_from_one_row_a_point_is_right(tmp_path):
+    (tmp_path / "a.csv").write_text(LONG)
+    table = pd.read_csv(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match="In pandas: ") as error:
+        landmark_table(table)
+    code = str(error.value).partition("In pandas: ")[2].split(", and ")
+    scope = {"table": table}
+    for line in code:
+        exec(line, scope)
+    points = landmark_table(scope["wide"]).points
+    np.testing.assert_array_equal(points["x_3"], [3, 11])
+    np.testing.assert_array_equal(points["y_3"], [-3, -11])

@@ -25,7 +25,8 @@ def reading(
             raise
         said = str(error).strip().partition("\n")[0]
         if isinstance(error, UnicodeDecodeError):
-            said = f"its text is not in {error.encoding.upper()} ({said})"
+            encoding = error.encoding.upper()
+            said = f"its text is not in {encoding} ({said}). Save it as {encoding}"
         elif not isinstance(error, ValueError | OSError):
             said = f"{type(error).__name__}: {said}"
         raise ValueError(

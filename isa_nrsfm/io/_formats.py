@@ -247,6 +247,8 @@ def find_format(path: "str | os.PathLike[str]") -> str:
         return matching[0]
     if any(found.name == TABLE for found in possible):
         return TABLE
+    if _suffix(path) in (".xlsx", ".xls", ".ods"):
+        raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
     raise ValueError(
         f"{path} is of no known format. Expected "
         + "; ".join(

@@ -66,6 +66,13 @@ def find_landmark_columns(
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
     if not candidates:
+        if {"x", "y"} <= {str(name).strip().lower() for name in names}:
+            raise ValueError(
+                "the table has one row for each point, with columns x and y; one row "
+                "for each frame is needed. In pandas: wide = table.pivot("
+                "index='frame', columns='point', values=['x', 'y']), and wide.columns "
+                "= [f'{axis}_{j}' for axis, j in wide.columns]"
+            )
         small = "; ".join(f"{pattern!r} ({n})" for pattern, n in sets.items())
         small = f" (fewer than {MIN_POINTS} points: {small})" if small else ""
         raise ValueError(

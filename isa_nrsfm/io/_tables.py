@@ -262,6 +262,11 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
                 f"its columns are separated by {word}; commas are needed in a .csv "
                 "file and tabs in a .tsv file"
             )
+    if _parsed(pd.Series(header)) is not None:
+        raise ValueError(
+            "its first line has numbers; a first line with column names is needed, "
+            "such as x0, y0, x1, y1"
+        )
     for _ in rows:  # checks them
         pass
     refuse_same_names(header)
@@ -314,6 +319,8 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
             raise ValueError(
                 f"column {column.name!r} should hold coordinates, but in row "
                 f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}"
+                + "; decimals are written with a point"
+                * ("," in text.iloc[bad])
             )
         values = found
     if np.isinf(values).any():
