@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scenes import measurements
 
 from isa_nrsfm._linalg.small_matrices import orientations
+from isa_nrsfm._paper import svd
 from isa_nrsfm._paper.factors import factorise
 from isa_nrsfm._paper.svd import block_triplets, leading_triplets
 from isa_nrsfm._tables.blocks import FrameBlocks
@@ -182,13 +183,27 @@ class TestLargeBothWays:
         assert_allclose(leading.rest, whole.rest, rtol=1e-6, atol=1e-14 * kept)
         assert_allclose(leading.values, whole.values, rtol=1e-3)
 
-    def test_energies_that_hardly_fall_converge_too(self):
+    @pytest.mark.parametrize(
+        ("first", "ratio", "most"), [(1, 0.95, 3), (1, 0.97, 4), (1e3, 0.97, 4)]
+    )
+    def test_few_passes_where_energies_hardly_fall(
+        self, first, ratio, most, monkeypatch
+    ):
+        passes, squared = [], svd._squared
+
+        def counted(block, V):
+            passes.append(V.shape)
+            return squared(block, V)
+
+        monkeypatch.setattr(svd, "_squared", counted)
         rng = np.random.default_rng(0)
         U, V = np.linalg.qr(rng.normal(size=(2, 150, 150)))[0]
-        values = 0.97 ** np.arange(150)
+        values = ratio ** np.arange(150)
+        values[:5] *= first
         found = leading_triplets((U * values) @ V.T, 9, KRYLOV)
         rest = np.sum(values[9:] ** 2)
         assert abs(found.rest - rest) < 1e-6 * rest
+        assert len(passes) <= most
 
     @pytest.mark.parametrize("unit", [2.0**-30, 2.0**30])
     def test_units(self, unit):
