@@ -110,13 +110,20 @@ def _places(node: ast.AST, in_function: bool, lines: tuple = ()) -> Iterator[tup
 
 
 def _expressions(tree: ast.Module) -> Iterator[ast.expr]:
-    """Yield the expressions that compute something: no types, no messages."""
+    """Yield the expressions that compute something: no types, no messages.
+
+    Neither ``strict`` of `zip` nor options of decorators change a result.
+    """
     left_out = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Raise | ast.JoinedStr | ast.Assert):
             left_out.append(node)
         elif isinstance(node, ast.AnnAssign | ast.arg) and node.annotation:
             left_out.append(node.annotation)
+        elif isinstance(node, ast.ClassDef):
+            left_out += node.decorator_list
+        elif isinstance(node, ast.keyword) and node.arg == "strict":
+            left_out.append(node.value)
         elif isinstance(node, ast.FunctionDef):
             left_out += [*node.decorator_list, *filter(None, [node.returns])]
         elif isinstance(node, ast.Call) and "warn" in ast.unparse(node.func):

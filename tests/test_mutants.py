@@ -13,6 +13,11 @@ def turned(x: "float | None" = None) -> list[3]:
     é = -x.T + 2.0
     return min(é, (
         x))
+
+
+@dataclass(frozen=True)
+class Pairs:
+    both = zip((), (), strict=True)
 '''
 
 
