@@ -336,7 +336,8 @@ class TestConsensus:
             if shift is None:
                 return []
             coordinates = scene.first + shift
-            return [Group(np.arange(20), np.arange(30), coordinates, 2e-4, 1.0)]
+            points = np.arange(coordinates.shape[2])
+            return [Group(points, np.arange(30), coordinates, 2e-4, 1.0)]
 
         monkeypatch.setattr(consensus_module, "fitted_groups", fitted_groups)
         blocks = FrameBlocks.of_array(rows, 30)
@@ -368,6 +369,18 @@ class TestConsensus:
         *_, passed, result = self.found(monkeypatch, noise=1e-7)
         assert not passed
         assert result.variances is None
+
+    def test_other_points_follow_those_near_them(self, monkeypatch):
+        """Changes of depths are interpolated, by distances in the mean shape."""
+        monkeypatch.setattr(consensus_module, "MOST_POINTS", 15)
+        d = centred(np.random.default_rng(1).standard_normal((30, 15)))
+        shift = np.zeros((30, 3, 15))
+        shift[:, 2] = 0.1 * d
+        model, _, (scene, *_), result = self.found(monkeypatch, shift=shift)
+        chosen = np.linspace(0, 19, 15).round().astype(int)
+        assert scene.rows.shape == (30, 2, 15)
+        expected = centred(0.1 * d @ interpolation(model.shapes[0], chosen))
+        assert_allclose(result.variances, np.mean(expected**2, axis=0), rtol=3e-3)
 
     def test_variances_are_mean_square_changes_of_depths(self, monkeypatch):
         """The noise is that of the groups."""
