@@ -71,6 +71,17 @@ class TestReliabilities:
         # The margin of chance makes it a little smaller.
         assert correlation - 0.05 < found[0] < correlation + 0.02
 
+    @pytest.mark.parametrize("gamma", [0.2, 2.0])
+    @pytest.mark.parametrize("above", [1.05, 2.0, 10.0])
+    def test_by_their_formula_from_the_limit_of_detection_on(self, gamma, above):
+        signal = above * np.sqrt(gamma)
+        y = (1 + signal) * (1 + gamma / signal)
+        share, left = 1 - 1 / y, np.full((1, 1), 1 / y)
+        caused = np.full((1, 1), gamma / y * share / 1.5)  # the margin of chance
+        (found,) = reliabilities(np.full((50, 1), np.sqrt(share)), left, caused, 1.0)
+        expected = (signal**2 - gamma) / (signal * (signal + 1))
+        assert found == pytest.approx(expected)
+
     @pytest.mark.parametrize(
         ("n_frames", "n_points", "n_components"),
         slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)], together=True),
