@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks._command import run
 from benchmarks._data import CASES, DRINK, FACES, MUCT, YOGA, halves_of, load_table
+from benchmarks._isolated import run_isolated
 from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._paper.factors import factorise
@@ -394,6 +396,79 @@ def fastisa_iteration(options):
         )
 
 
+def write_long_table(path, n_frames):
+    """Write a table of 68 points: copies of 100,000 frames, each with its own noise."""
+    X = make_nonrigid_tracks(100_000, 68, n_components=9, random_state=0).data
+    rng = np.random.default_rng(0)
+    table = np.lib.format.open_memmap(path, "w+", shape=(n_frames, X.shape[1]))
+    noise = 0.02 * X.std()
+    for first in range(0, n_frames, len(X)):
+        rows = table[first : first + len(X)]
+        rows[:] = X[: len(rows)] + noise * rng.normal(size=(len(rows), X.shape[1]))
+
+
+def fit_long_table(measured, path, how, n_jobs=1):
+    """Fit a stored table, and compute the coefficients of all its frames."""
+    with ExitStack() as stack:
+        table = np.load(path, mmap_mode=None if how == "memory" else "r")
+        if how == "dask":
+            import dask.array
+            import distributed
+            from distributed.deploy.subprocess import SubprocessCluster
+
+            cluster = SubprocessCluster(
+                n_workers=2, threads_per_worker=1, dashboard_address=None
+            )
+            client = distributed.Client(stack.enter_context(cluster))
+            stack.enter_context(client).wait_for_workers(2)
+            read = partial(np.load, mmap_mode="r")
+            rows = [slice(s, s + 50_000) for s in range(0, len(table), 50_000)]
+            parts = [
+                dask.array.from_delayed(
+                    dask.delayed(lambda part: np.array(read(path)[part]))(part),
+                    (min(part.stop, len(table)) - part.start, table.shape[1]),
+                    table.dtype,
+                )
+                for part in rows
+            ]
+            table = dask.array.concatenate(parts)
+        model = AffineNRSfM(9, random_state=0, keep_frames=False, n_jobs=n_jobs)
+        with measured():
+            model.fit(table)
+            alpha = model.transform(table)
+            if how == "dask":
+                alpha = alpha.compute()
+        return model.noise_variance_, float(np.abs(alpha).mean())
+
+
+def long(options):
+    """Fit and transform of 100,000 and a million frames: in memory, from disk, on dask.
+
+    Seconds, megabytes that the process of the fit took more, and the noise variance,
+    which must be the same for all ways.
+    """
+    print(f"{'':28}{'s':>8}{'MB':>8}{'ratio':>8}  noise variance")
+    ways = [("memory", 1), ("memory", 2), ("disk", 1), ("dask", 1)]
+    with TemporaryDirectory() as folder:
+        before = {}
+        for n_frames in (100_000, 1_000_000):
+            path = Path(folder, f"{n_frames}.npy")
+            write_long_table(path, n_frames)
+            for how, n_jobs in ways:
+                arguments = {"path": path, "how": how, "n_jobs": n_jobs}
+                found = run_isolated(fit_long_table, arguments, time_limit=1800)
+                if found.status != "ok":
+                    print(f"{n_frames:>9} {how}: {found.status} {found.message}")
+                    continue
+                seconds = found.seconds
+                ratio = seconds / before.setdefault((how, n_jobs), seconds)
+                print(
+                    f"{n_frames:>9} {how:8} {n_jobs} job(s) {seconds:8.1f}"
+                    f"{found.memory:8.0f}{ratio:8.2f}  {found.values[0]:.6g}",
+                    flush=True,
+                )
+
+
 def start(options):
     """Processor time of whole commands, relative to Python and to what they import.
 
@@ -467,6 +542,7 @@ SECTIONS = {
     "frames": frames,
     "fits": fits,
     "large": large,
+    "long": long,
     "live": live,
     "new_frames": new_frames,
     "optima": optima,
