@@ -278,7 +278,7 @@ def live(options):
         model = AffineNRSfM(9, camera=camera, random_state=0).fit(X[:1000])
         rows = [X[i : i + 1] for i in range(1000, 1000 + 2 * SINGLE)]
         frames, pose = frames_of(model), pose_function(model, edges=None)
-        alone, mixing = frames._single_search, frames.gauge.mixing
+        alone, mixing = frames.single_search, frames.gauge.mixing
 
         def bare(row, alone=alone, mixing=mixing, noise=frames.noise_variance):
             points = row.reshape(-1, 2)

@@ -14,6 +14,7 @@ from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._joint import consensus as consensus_module
 from isa_nrsfm._joint.consensus import (
     COVER,
+    MOST_POINTS,
     Group,
     Scene,
     centred,
@@ -317,14 +318,14 @@ class TestFittedGroups:
 class TestConsensus:
     """Scene of the groups, and the model from their merge, without any fit."""
 
-    def found(self, monkeypatch, noise=1e-4, shift=None):
+    def found(self, monkeypatch, noise=1e-4, shift=None, n_points=20):
         """Return the model, its frames, what groups are fitted to, and the result."""
         rng = np.random.default_rng(0)
-        shapes = centred(rng.standard_normal((3, 3, 20)))
+        shapes = centred(rng.standard_normal((3, 3, n_points)))
         shapes[1:] *= 0.3
         motion = Rotation.random(30, rng).as_matrix()[:, :2]
         frames = shapes[0] + np.tensordot(rng.standard_normal((30, 2)), shapes[1:], 1)
-        rows = centred(motion @ frames + 0.01 * rng.standard_normal((30, 2, 20)))
+        rows = centred(motion @ frames + 0.01 * rng.standard_normal((30, 2, n_points)))
         model = PosteriorFrames(
             shapes, noise, np.zeros((0, 2)), "linear", FrameMap.identity(2)
         )
@@ -372,13 +373,15 @@ class TestConsensus:
 
     def test_other_points_follow_those_near_them(self, monkeypatch):
         """Changes of depths are interpolated, by distances in the mean shape."""
-        monkeypatch.setattr(consensus_module, "MOST_POINTS", 15)
-        d = centred(np.random.default_rng(1).standard_normal((30, 15)))
-        shift = np.zeros((30, 3, 15))
+        n_points = MOST_POINTS + 20
+        d = centred(np.random.default_rng(1).standard_normal((30, MOST_POINTS)))
+        shift = np.zeros((30, 3, MOST_POINTS))
         shift[:, 2] = 0.1 * d
-        model, _, (scene, *_), result = self.found(monkeypatch, shift=shift)
-        chosen = np.linspace(0, 19, 15).round().astype(int)
-        assert scene.rows.shape == (30, 2, 15)
+        model, _, (scene, *_), result = self.found(
+            monkeypatch, shift=shift, n_points=n_points
+        )
+        chosen = np.linspace(0, n_points - 1, MOST_POINTS).round().astype(int)
+        assert scene.rows.shape == (30, 2, MOST_POINTS)
         expected = centred(0.1 * d @ interpolation(model.shapes[0], chosen))
         assert_allclose(result.variances, np.mean(expected**2, axis=0), rtol=3e-3)
 

@@ -1,10 +1,13 @@
 """One BLAS thread, in all functions of small matrices."""
 
+from collections.abc import Callable
 from contextlib import ContextDecorator
 from threading import Lock, local
-from typing import Any
+from typing import Any, TypeVar
 
 from isa_nrsfm._compat.scikit_learn import threadpool_controller
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class OneBlasThread(ContextDecorator):
@@ -24,6 +27,7 @@ class OneBlasThread(ContextDecorator):
         self._of_thread = local()
 
     def __enter__(self) -> None:
+        """Remember the number of threads, and set it to one."""
         pools = _pools()
         with self._lock:
             numbers = [pool.num_threads for pool in pools]
@@ -35,6 +39,7 @@ class OneBlasThread(ContextDecorator):
                 _set_threads(pool, 1)
 
     def __exit__(self, *error: object) -> None:
+        """Restore the number of threads, if no Python thread is inside any more."""
         pools = _pools()
         with self._lock:
             *self._of_thread.entered, numbers = self._entered()
@@ -50,7 +55,13 @@ class OneBlasThread(ContextDecorator):
         return getattr(self._of_thread, "entered", [])
 
 
-one_blas_thread = OneBlasThread()
+# The number of threads is a state of the process, so this count of its users is one.
+LIMIT = OneBlasThread()
+
+
+def one_blas_thread(function: Function) -> Function:
+    """Return a function that runs with one BLAS thread."""
+    return LIMIT(function)
 
 
 def _pools() -> list[Any]:

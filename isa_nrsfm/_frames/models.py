@@ -214,7 +214,7 @@ class PosteriorFrames:
         return frame_search(self.camera, self.shapes)
 
     @cached_property
-    def _single_search(self) -> SingleSearch:
+    def single_search(self) -> SingleSearch:
         """The search for one complete frame."""
         n_parameters = CAMERAS[self.camera].n_parameters
         calibrated = CAMERAS[self.camera].calibrated
@@ -344,7 +344,7 @@ class PosteriorFrames:
         if not np.isfinite(centre).all():
             return None
         largest = largest_objective(len(points), self.noise_variance)
-        fit = self._single_search.fit((points - centre).T, self.noise_variance, largest)
+        fit = self.single_search.fit((points - centre).T, self.noise_variance, largest)
         if fit is None:
             return None
         motion, turns = fit.motion @ space, space.T @ fit.turns @ space

@@ -136,7 +136,13 @@ def pose_function(
     ----------
     model : AffineNRSfM
         A fitted model that has kept its frames.
-    camera, edges, origin, mirrored
+    camera : {"weak_perspective"}, default="weak_perspective"
+        As in `frame_poses`.
+    edges : "auto", str, Skeleton or None, default="auto"
+        As in `frame_poses`.
+    origin : {"auto", "upper", "lower"}, default="auto"
+        As in `frame_poses`.
+    mirrored : bool, default=False
         As in `frame_poses`.
 
     Returns
