@@ -323,7 +323,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         self.verbose = verbose
 
     @fit_context(nested=True)
-    def fit(self, X: Any, y: Any = None) -> Self:
+    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
         """
         Factorise a table.
 
@@ -335,6 +335,11 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             array stays where it is.
         y : None
             Ignored.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, such as the confidences of a tracker, for the joint
+            refinement with ``loss="linear"`` and tables in memory. A point of weight w
+            counts as w observations. A point of weight zero is missing; weights of
+            missing points have no effect. None for weights of one.
 
         Returns
         -------
@@ -348,7 +353,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             for `n_components`, or column names that contradict `layout`; if a frame
             shows one to three points, or points on one line only; if a point is visible
             in too few frames; if parameters or tables need the joint refinement; or if
-            `frames_folder` is an empty text.
+            `frames_folder` is an empty text. If weights are negative or not finite,
+            have another shape, or are not supported by parameters or table.
         OSError
             If `frames_folder` cannot be made or written to, before the fit; if the disk
             is full, after it.
@@ -365,8 +371,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         with kept_arrays(self.frames_folder) as keep:
             progress = FitProgress(self, stages, stepwise=STEPWISE, X=X, y=y)
             fitted = copy.copy(self)
-            source = fitted._checked(X)
-            frames = fit_table(fitted, source, progress)
+            source, weights = fitted._checked(X, point_weight)
+            frames = fit_table(fitted, source, progress, *weights)
             if self.keep_frames:
                 kept = keep(frames._asdict())
                 fitted._set_frames(*map(source.as_collected, kept.values()))
@@ -377,7 +383,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         progress.end()
         return self
 
-    def fit_transform(self, X: Any, y: Any = None) -> NDArray:
+    def fit_transform(
+        self, X: Any, y: Any = None, *, point_weight: Any = None
+    ) -> NDArray:
         """
         Factorise a table and return the coefficients of its frames.
 
@@ -387,17 +395,26 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
             The table, one frame a row, in the order of `layout`.
         y : None
             Ignored.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
         ndarray of shape (n_frames, n_components)
             `alpha_`.
         """
-        self.fit(X)
-        return self.alpha_.copy() if self.keep_frames else self.transform(X)
+        self.fit(X, point_weight=point_weight)
+        if self.keep_frames:
+            return self.alpha_.copy()
+        return self.transform(X, point_weight=point_weight)
 
-    def _checked(self, X: Any) -> FrameBlocks:
-        """Check parameters and a table, and set the attributes that a fit needs."""
+    def _checked(
+        self, X: Any, point_weight: Any = None
+    ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
+        """Check parameters and a table, and set the attributes that a fit needs.
+
+        Returns the table in blocks, and the weights of its points, if any.
+        """
         only_joint = {
             "n_components": self.n_components == "auto",
             "loss": self.loss != "linear",
@@ -418,10 +435,16 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
                 "groups of points with affine cameras have no common unit. Set "
                 "camera='weak_perspective' or camera='orthographic'"
             )
-        source = self._opened(X, reset=True)
+        if self.refinement == "consensus" and point_weight is not None:
+            raise ValueError(
+                "point_weight is not supported by the fit with refinement='consensus', "
+                "whose groups of points are fitted without weights. Set "
+                "refinement='joint', or give no point_weight"
+            )
+        source, weights = self._weighted(X, point_weight, reset=True)
         self.isa_ = self._strategy()
         self.frames_scaled_ = self.scale_frames and self.camera != "orthographic"
-        return source
+        return source, weights
 
     def _strategy(self) -> Any:
         """Return the unfitted strategy, with parameters inherited where not set."""

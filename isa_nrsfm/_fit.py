@@ -108,17 +108,20 @@ def stages_of(refinement: str | None) -> list[str]:
 
 
 def fit_table(
-    estimator: TableTransformer, source: FrameBlocks, progress: FitProgress
+    estimator: TableTransformer,
+    source: FrameBlocks,
+    progress: FitProgress,
+    weights: NDArray | None = None,
 ) -> Decomposition:
     """Fit a table, and set the attributes of an estimator.
 
-    Its parameters are checked, and its `isa_` is the unfitted strategy. Returns the fit
-    of all rows, NaN for rows without visible points.
+    Its parameters are checked, and its `isa_` is the unfitted strategy. Weights are
+    (n_rows, J). Returns the fit of all rows, NaN for rows without visible points.
     """
     n_components = estimator.n_components
     if n_components == "auto":
-        n_components = _count_components(estimator, source)
-    table = ready_table(estimator, source, n_components)
+        n_components = _count_components(estimator, source, weights)
+    table = ready_table(estimator, source, n_components, weights)
     return fit_ready_table(estimator, table, n_components, progress, errors=True)
 
 
@@ -151,7 +154,8 @@ def fit_ready_table(
         model = _frame_model(estimator, fitted.state.shapes, fitted.state.noise, alpha)
         progress(JOINT_STAGE)
         if errors and estimator.camera != "affine":
-            model = replace(model, certainty=depth_certainty(model, table.rows))
+            certainty = depth_certainty(model, table.rows, table.weights)
+            model = replace(model, certainty=certainty)
             estimator.depth_uncertainty_ = model.certainty.total
         if estimator.refinement == "consensus":
             model = _consensus_model(estimator, table, model, settings, wanted)
@@ -206,11 +210,13 @@ def fit_ready_table(
 
 
 @one_blas_thread
-def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
+def _count_components(
+    estimator: TableTransformer, source: FrameBlocks, weights: NDArray | None
+) -> int:
     """Return the number of basis shapes that a table supports, of at most twelve."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the fit itself warns again
-        table = ready_table(estimator, source, 1)
+        table = ready_table(estimator, source, 1, weights)
     possible = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(12, possible)
     trial = copy.copy(estimator)
@@ -239,7 +245,10 @@ def _count_components(estimator: TableTransformer, source: FrameBlocks) -> int:
 
 @one_blas_thread
 def ready_table(
-    estimator: TableTransformer, source: FrameBlocks, n_components: int
+    estimator: TableTransformer,
+    source: FrameBlocks,
+    n_components: int,
+    weights: NDArray | None = None,
 ) -> ScaledTable:
     """Return a table centred, scaled and checked for fits of at most K basis shapes."""
     return scaled_table(
@@ -250,6 +259,7 @@ def ready_table(
         scale_frames=estimator.frames_scaled_,
         robust=estimator.loss != "linear",
         camera=joint_camera(estimator),
+        weights=weights,
     )
 
 
@@ -306,9 +316,8 @@ def _factorised(
         sample = Sample(completed.whole().reshape(shape), [])
     factors = factorise(sample.W, n_components, table.precision, triplets)
     report("factorisation")
-    return FactorisedTable(
-        table.rows, completed, table.n_seen, outliers, triplets, sample, factors
-    )
+    found = completed, table.n_seen, outliers, triplets, sample, factors
+    return FactorisedTable(table.rows, *found, table.weights)
 
 
 def _paper_result(
@@ -435,11 +444,12 @@ def _joint_frames(
     if estimator.refinement == "consensus":
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     frames = replace(frames, gauge=frame_map, certainty=certainty)
-    share = table.n_seen / table.n_points
+    weight = table.weight
+    share = weight / table.n_points
     uncertainty = shape_uncertainty(motion, alpha, covariance, share, posteriors.slices)
     last_pass = partial(shown_frames, frames=frames, uncertainty=uncertainty)
     parts, *chance = zip(
-        *posteriors.map(last_pass, table.sizes, table.n_seen), strict=True
+        *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True
     )
     shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
     estimator._model = _table_model(

@@ -18,6 +18,7 @@ from isa_nrsfm._tables.tracks import (
     seen_points,
     table_to_tracks,
     tracks_to_table,
+    weighted_sizes,
     without_half_points,
 )
 
@@ -37,11 +38,19 @@ class TableModel(NamedTuple):
     unit: float | None
 
     def decompose(
-        self, rows: NDArray, deviations: bool = True, dtype: Any = None
+        self,
+        rows: NDArray,
+        weights: NDArray | None = None,
+        deviations: bool = True,
+        dtype: Any = None,
     ) -> Decomposition:
-        """Return cameras, positions and coefficients, in the dtype of the rows."""
-        usable, centred, translation, sizes = self._ready(self._tracks(rows))
-        fit = self.frames.fit(centred, sizes, deviations)
+        """Return cameras, positions and coefficients, in the dtype of the rows.
+
+        Weights (n, n_points) are zero where points are missing, by default one.
+        """
+        usable, centred, translation, sizes = self._ready(self._tracks(rows), weights)
+        weights = None if weights is None else weights[usable]
+        fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
         return Decomposition(*(of_all_rows(each, usable).astype(dtype) for each in fit))
@@ -100,19 +109,23 @@ class TableModel(NamedTuple):
         off = centred - project(shapes, fit.motion, fit.translation)
         return of_all_rows(np.linalg.norm(off, axis=2) / sizes[:, None], usable)
 
-    def held_out(self, rows: NDArray) -> NDArray:
+    def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of `held_out_energies`."""
         tracks = self._tracks(rows)
-        usable, _, _, sizes = self._ready(tracks)
-        return np.array([self.held_out_energies(tracks[usable], sizes)])
+        usable, _, _, sizes = self._ready(tracks, weights)
+        weights = None if weights is None else weights[usable]
+        return np.array([self.held_out_energies(tracks[usable], sizes, weights)])
 
-    def held_out_energies(self, tracks: NDArray, sizes: NDArray) -> tuple[float, float]:
+    def held_out_energies(
+        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+    ) -> tuple[float, float]:
         """Return the energies of the error and of the signal of held-out points.
 
         The points are divided into five parts, the same for all tables. Each part is
         predicted from the others: camera, position and coefficients of each frame are
         fitted without it. The energies are ``sum ||m - m_hat||^2`` and ``sum ||m -
-        centroid_i||^2`` over the points, divided by the squared sizes (I,) of frames.
+        centroid_i||^2`` over the points, divided by the squared sizes (I,) of frames,
+        and multiplied by weights (I, J), if given.
 
         A point is left out if the other points of its frame do not determine the fit.
         In frames with missing points it is also left out if the affine camera of the
@@ -125,7 +138,7 @@ class TableModel(NamedTuple):
         # Complete frames are fitted without these points, others with NaN instead.
         frames = self.frames
         complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
-        complete = complete and bool(seen.all())
+        complete = complete and weights is None and bool(seen.all())
         noise = signal = 0.0
         for fold in range(5):
             held = folds == fold
@@ -143,7 +156,8 @@ class TableModel(NamedTuple):
                 mean = mean - self.mean_shape[~held].mean(axis=0)
                 others = others - self.basis[:, ~held].mean(axis=1, keepdims=True)
             else:
-                fit = frames.fit(visible[usable], sizes[usable], False)
+                own = None if weights is None else weights[usable]
+                fit = frames.fit(visible[usable], sizes[usable], False, own)
             # Prediction of the held-out points, and its error
             predicted = project(
                 compose(mean, others, fit.alpha), fit.motion, fit.translation
@@ -151,6 +165,8 @@ class TableModel(NamedTuple):
             part = tracks[usable]
             centre = np.nanmean(part, axis=1, keepdims=True)
             weight = sizes[usable, None, None] ** -2.0
+            if weights is not None:
+                weight = weight * weights[np.ix_(usable, held)][..., None]
             counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: in 12 scenes of 120 frames, two frames that
@@ -173,7 +189,9 @@ class TableModel(NamedTuple):
             )
         return tracks
 
-    def _ready(self, tracks: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    def _ready(
+        self, tracks: NDArray, weights: NDArray | None = None
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return a mask of usable tracks; these centred, their centres and sizes."""
         centred, report = centred_frames(tracks)
         usable = report.usable
@@ -185,6 +203,8 @@ class TableModel(NamedTuple):
         if robust and len(centred):
             centred, translation = robustly_centred(tracks[usable])
             sizes = robust_sizes(centred)
+        if weights is not None:
+            sizes = weighted_sizes(centred, weights[usable])
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes

@@ -34,7 +34,16 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import Layout, tracks_to_table
+from isa_nrsfm._tables.tracks import (
+    Layout,
+    refuse_odd,
+    seen_points,
+    table_to_tracks,
+    tracks_to_table,
+)
+
+# Largest weight of a point: sums of weighted squares stay far from overflow.
+LARGEST_WEIGHT = 1e100
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -152,7 +161,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         picture = estimator_html_repr(self)
         return picture + summary_html(self) if hasattr(self, "basis_") else picture
 
-    def transform(self, X: Any) -> NDArray:
+    def transform(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
         Return the coefficients of the frames of a table.
 
@@ -162,6 +171,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -169,11 +180,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             Coefficients; those of the fitted table are `alpha_`. NaN for rows with too
             few visible points.
         """
-        table = self._opened(X)
-        found = table.collect(partial(self._model.decompose, deviations=False))
-        return found.alpha
+        table, weights = self._weighted(X, point_weight)
+        coefficients = partial(self._model.decompose, deviations=False)
+        return table.collect(coefficients, *weights).alpha
 
-    def decompose(self, X: Any) -> Decomposition:
+    def decompose(self, X: Any, *, point_weight: Any = None) -> Decomposition:
         """
         Return camera and coefficients of each frame of a table.
 
@@ -181,6 +192,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -188,7 +201,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             Named tuple of motion (n_frames, 2, 3), translation (n_frames, 2), alpha and
             alpha_std (n_frames, n_components).
         """
-        return self._opened(X).collect(self._model.decompose)
+        table, weights = self._weighted(X, point_weight)
+        return table.collect(self._model.decompose, *weights)
 
     def smooth(
         self,
@@ -502,7 +516,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         shapes = compose(self.mean_shape_, self.basis_, alpha)
         return tracks_to_table(project(shapes, motion, translation), self._model.layout)
 
-    def score(self, X: Any, y: Any = None) -> float:
+    def score(self, X: Any, y: Any = None, *, point_weight: Any = None) -> float:
         """
         Return minus the inverse SNR of points held out of the fit of their frame.
 
@@ -517,6 +531,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             A table with the points of the fitted one.
         y : None
             Ignored.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`. They also multiply the terms of the
+            sums.
 
         Returns
         -------
@@ -527,7 +544,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             points it is also left out if the camera of the others adds more than
             twice the noise variance to its prediction.
         """
-        noise, signal = self._opened(X).joined(self._model.held_out).sum(axis=0)
+        table, weights = self._weighted(X, point_weight)
+        noise, signal = table.joined(self._model.held_out, *weights).sum(axis=0)
         return -float(noise / signal) if signal > 0 else float("nan")
 
     def diagnostics(self, X: Any = None) -> Diagnostics:
@@ -577,6 +595,48 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             )
         return frames
 
+    def _weighted(
+        self, X: Any, point_weight: Any, reset: bool = False
+    ) -> tuple[FrameBlocks, tuple[NDArray, ...]]:
+        """Return a table, as `_opened`, and the weights (n, J) of its points.
+
+        There are none if all visible points have weight one. Points of weight zero are
+        missing.
+        """
+        if point_weight is None:
+            return self._opened(X, reset), ()
+        if not reset:
+            check_is_fitted(self)
+        if not self._is_joint:
+            raise ValueError(
+                "point_weight needs refinement='joint', because the refinement of the "
+                "paper has no weights; got "
+                f"refinement={self.refinement!r}. Set refinement='joint', or set "
+                "points of low weight to NaN"
+            )
+        if self.loss != "linear":
+            raise ValueError(
+                "point_weight needs loss='linear', because robust losses find weights "
+                f"of their own; got loss={self.loss!r}. Set loss='linear', or set "
+                "points of low weight to NaN"
+            )
+        if is_read_later(X):
+            raise ValueError(
+                "point_weight needs a table in memory, because weights are not read "
+                f"block by block; got a {type(X).__name__}. Give a NumPy array or a "
+                "dataframe, or no point_weight"
+            )
+        table = self._opened(X, reset)
+        refuse_odd(table.empty.shape[1])
+        layout = self.layout if reset else self._model.layout
+        shape = table.n_frames, table.empty.shape[1] // 2
+        weights = checked_weights(point_weight, shape)
+        visible = table.derive(partial(visible_rows, layout=layout), weights)
+        visible.empty = table.empty
+        seen = visible.joined(partial(visible_in, layout=layout))
+        weights = np.where(seen, weights, 0.0)
+        return visible, () if (weights == seen).all() else (weights,)
+
     def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
         """Return a table in checked blocks; unless `reset`, it must match the fit."""
         if not reset:
@@ -609,6 +669,45 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
+
+
+def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
+    """Return the weights of points as an array of a given shape, or raise."""
+    weights = check_array(
+        unmasked(point_weight),
+        dtype=np.float64,
+        input_name="point_weight",
+        ensure_min_samples=0,
+    )
+    if weights.shape != shape:
+        raise ValueError(
+            f"point_weight must have a row for each frame and a column for each point, "
+            f"the shape {shape}; got {weights.shape}"
+        )
+    wrong = (weights < 0) | (weights > LARGEST_WEIGHT)
+    if wrong.any():
+        row, point = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"point_weight must be between 0 and {LARGEST_WEIGHT:g}, because a weight "
+            f"is a number of observations; got {weights[row, point]:g} in row {row}, "
+            f"point {point}. Give points without information the weight 0"
+        )
+    return weights
+
+
+def visible_rows(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
+    """Return rows of a table with NaN for points whose weight (n, J) is zero."""
+    hidden = weights == 0
+    if not hidden.any():
+        return rows
+    tracks = table_to_tracks(rows, layout)
+    nan = rows.dtype.type(np.nan)
+    return tracks_to_table(np.where(hidden[..., None], nan, tracks), layout)
+
+
+def visible_in(rows: NDArray, layout: Layout) -> NDArray:
+    """Return a mask (n, n_points) of the visible points of rows of a table."""
+    return seen_points(table_to_tracks(rows, layout))
 
 
 def check_frames_kept(estimator: Any, what: str) -> None:

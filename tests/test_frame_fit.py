@@ -351,7 +351,9 @@ class TestSamplePosterior:
             shift = n_seen[i] * noises[i] * posterior.covariance[i] @ own
             moments += np.outer(a, shift)
         sizes = np.ones(12)
-        _, found, total = shown_frames(posterior, sizes, n_seen, frames, uncertainty)
+        _, found, total = shown_frames(
+            posterior, sizes, n_seen, n_seen, frames, uncertainty
+        )
         assert_allclose(found, moments, rtol=1e-9)
         assert_allclose(total, sum(noises), rtol=1e-9)
 

@@ -123,7 +123,11 @@ class RigidFrames(NamedTuple):
         )
 
     def fit(
-        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+        self,
+        tracks: NDArray,
+        sizes: NDArray,
+        deviations: bool = True,
+        weights: NDArray | None = None,
     ) -> Decomposition:
         """Return the camera of the rigid fit and the coefficients of least squares.
 
@@ -236,14 +240,18 @@ class PosteriorFrames:
         return replace(self, shapes=shapes - shapes.mean(axis=2, keepdims=True))
 
     def fit(
-        self, tracks: NDArray, sizes: NDArray, deviations: bool = True
+        self,
+        tracks: NDArray,
+        sizes: NDArray,
+        deviations: bool = True,
+        weights: NDArray | None = None,
     ) -> Decomposition:
         """Return the fit of tracks (n, J, 2), NaN where missing, of sizes (n,).
 
         With a robust loss the weights follow from the residuals of the fit.
         """
         unit = tracks / sizes[:, None, None]
-        return self.shown(self.posterior(unit, covariances=deviations), sizes)
+        return self.shown(self.posterior(unit, deviations, weights), sizes)
 
     def shown(self, posterior: FramePosterior, sizes: NDArray) -> Decomposition:
         """Return a fit of frames of size one in units of the table and the gauge."""
@@ -289,11 +297,16 @@ class PosteriorFrames:
         variances += self.certainty.variances(found.alpha)
         return sizes[:, None] * np.sqrt(variances)
 
-    def posterior(self, tracks: NDArray, covariances: bool = True) -> FramePosterior:
+    def posterior(
+        self,
+        tracks: NDArray,
+        covariances: bool = True,
+        weights: NDArray | None = None,
+    ) -> FramePosterior:
         """Return the fit of tracks of frames of size one, before the gauge.
 
-        With a robust loss the weights follow from the residuals, as long as the points
-        with positive weights determine a camera.
+        Weights (n, J) are by default 1. With a robust loss they follow from the
+        residuals, as long as the points with positive weights determine a camera.
         """
         # Rounding depends on the strides: use the same for all callers.
         tracks = np.ascontiguousarray(tracks)
@@ -301,8 +314,12 @@ class PosteriorFrames:
             self._search.fit_tracks, noise=self.noise_variance, covariances=covariances
         )
         if self.loss == "linear":
-            alone = self._alone(tracks[0]) if len(tracks) == 1 else None
-            return fitted(tracks, starts=self.starts) if alone is None else alone
+            alone = None
+            if len(tracks) == 1 and weights is None:
+                alone = self._alone(tracks[0])
+            if alone is not None:
+                return alone
+            return fitted(tracks, weights=weights, starts=self.starts)
         # Robust loss: first without gross outliers
         weights = np.where(distant_points(tracks), 0.0, 1.0)
         fit = fitted(tracks, weights=weights, starts=self.starts)

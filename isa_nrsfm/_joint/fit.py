@@ -141,14 +141,17 @@ def _problems(
     """Return the problems of growing samples and of all frames.
 
     With many points, frames are completed and represented by directions. If points are
-    missing or left out, the second result has the frames by their visible points.
+    missing, left out or weighted, the second result has the frames by their visible
+    points.
     """
     n_shapes, _, n_points = paper_shapes.shape
     options, outliers = settings.options, table.outliers
     complete = bool((table.n_seen == n_points).all())
     many = n_points > max(24 * n_shapes, options.many_points)
     seen = None
-    if not (many and complete and outliers is None):
+    if table.weights is not None:
+        seen = JointFrames.from_repeated(table.rows, table.weights)
+    elif not (many and complete and outliers is None):
         if outliers is None or not outliers.any():
             seen = JointFrames.from_points(table.rows, complete)
         else:

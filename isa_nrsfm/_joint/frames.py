@@ -4,7 +4,7 @@ If no point is missing, the objective depends on a frame only through its energy
 products with directions that span the shapes: cheap for any number of points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple, Self
 
@@ -35,11 +35,13 @@ class JointFrames:
     """Frames of a table, ready for passes over them.
 
     All blocks of FrameTracks have weights, or none has. Directions (n_directions, J)
-    are orthonormal rows, None if frames are given by their points.
+    are orthonormal rows, None if frames are given by their points. `repeated`: a weight
+    is the number of observations of its point, otherwise each point is one.
     """
 
     blocks: FrameBlocks
     directions: NDArray | None = None
+    repeated: bool = False
 
     @property
     def n_frames(self) -> int:
@@ -48,8 +50,9 @@ class JointFrames:
 
     @cached_property
     def totals(self) -> tuple[float, float]:
-        """Number of coordinates of positive weight, and weighted energy."""
-        n_seen, square = np.sum(list(self.blocks.map(_totals)), axis=0)
+        """Number of observed coordinates of positive weight, and weighted energy."""
+        totals = partial(_totals, repeated=self.repeated)
+        n_seen, square = np.sum(list(self.blocks.map(totals)), axis=0)
         return float(n_seen), float(square)
 
     def basis_penalty(self, basis_std: float) -> float:
@@ -72,6 +75,12 @@ class JointFrames:
         return cls(weighted.derive(_weighted_frames))
 
     @classmethod
+    def from_repeated(cls, rows: FrameBlocks, weights: NDArray) -> Self:
+        """Return frames by points, from rows (n, 2, J) and observations (I, J)."""
+        weighted = cls.from_weighted(rows.derive(WeightedRows, weights))
+        return replace(weighted, repeated=True)
+
+    @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
         """Return complete rows (I, 2, J) by products with directions of sum zero."""
         blocks = rows.derive(partial(_compressed_frames, directions=directions))
@@ -91,15 +100,15 @@ class JointFrames:
         chosen[frames] = True
         taken = [part for part in self.blocks.map(_taken, chosen) if len(part.weight)]
         blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
-        return type(self)(
-            blocks.regrouped(joined_frames, BLOCK_FRAMES), self.directions
-        )
+        return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
 
 
-def _totals(block: FrameTracks) -> tuple[float, float]:
-    """Return the number of visible coordinates of a block, and its energy."""
+def _totals(block: FrameTracks, repeated: bool) -> tuple[float, float]:
+    """Return the number of observed coordinates of a block, and its energy."""
     weights = block.weights
-    points = block.weight.sum() if weights is None else np.count_nonzero(weights)
+    if repeated or weights is None:
+        return 2.0 * block.weight.sum(), block.energy.sum()
+    points = np.count_nonzero(weights)
     return 2.0 * points, block.energy.sum()
 
 

@@ -47,12 +47,18 @@ MOST_FRAMES, MOST_POINTS = 200, 200
 LEAST_NOISE = 1e-6
 
 
-def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertainty:
-    """Estimate the errors of a fit from some of its frames (I, 2, J), if enough."""
+def depth_certainty(
+    frames: PosteriorFrames, rows: FrameBlocks, weights: NDArray | None = None
+) -> DepthCertainty:
+    """Estimate the errors of a fit from some of its frames (I, 2, J), if enough.
+
+    Weights (I, J) are numbers of observations, by default one.
+    """
     n_frames, n_points = rows.n_frames, frames.shapes.shape[2]
     chosen = np.linspace(0, n_frames - 1, min(n_frames, MOST_FRAMES)).astype(int)
     part = np.asarray(rows.take(chosen), dtype=np.float64)
-    part, found = inlying_rows(frames, part)
+    w = None if weights is None else weights[chosen]
+    part, found = inlying_rows(frames, part, w)
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
     left_out = [neighbours(mean_shape) == group for group in range(N_GROUPS)]
@@ -61,9 +67,9 @@ def depth_certainty(frames: PosteriorFrames, rows: FrameBlocks) -> DepthCertaint
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
-    fit = partial(
-        _Refit, frames, part[known], frames.shapes[:, :, points], found.motion[known]
-    )
+    w = None if w is None else w[np.ix_(known, points)]
+    shapes, motion = frames.shapes[:, :, points], found.motion[known]
+    fit = partial(_Refit, frames, part[known], w, shapes, motion)
     whole = fit(np.ones(len(points), dtype=bool))
     errors = [fit(~group).errors(whole) for group in left_out]
     total, turns, variances = (
@@ -107,14 +113,18 @@ class _Refit:
         self,
         frames: PosteriorFrames,
         rows: NDArray,
+        weights: NDArray | None,
         shapes: NDArray,
         motion: NDArray,
         kept: NDArray,
     ):
         rows, self.kept = rows[:, :, kept], kept
         shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
-        complete = bool(np.isfinite(rows).all())
-        part = JointFrames.from_points(FrameBlocks.of_array(rows, len(rows)), complete)
+        blocks = FrameBlocks.of_array(rows, len(rows))
+        if weights is None:
+            part = JointFrames.from_points(blocks, bool(np.isfinite(rows).all()))
+        else:
+            part = JointFrames.from_repeated(blocks, weights[:, kept])
         n_numbers, energy = part.totals
         penalty = part.basis_penalty(JOINT_OPTIONS.basis_std)
         likelihood = MarginalLikelihood(part, penalty, EXTENT_WEIGHT * kept.all())

@@ -30,6 +30,7 @@ class FactorisedTable(NamedTuple):
     rows: centred frames (I, 2, J) of size one, NaN where a point is missing.
     completed: the same with missing points and outliers filled in.
     n_seen (I,): number of visible points.
+    weights (I, J): numbers of observations of the points; None where each has one.
     outliers (I, J): points that a robust loss leaves out at first; None for other
     losses.
     triplets: the 3K + 3 largest singular values of the completed table, and the rest.
@@ -43,6 +44,7 @@ class FactorisedTable(NamedTuple):
     triplets: Triplets
     sample: Sample
     factors: Factorisation
+    weights: NDArray | None = None
 
 
 class JointSettings(NamedTuple):

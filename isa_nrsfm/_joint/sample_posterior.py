@@ -20,11 +20,11 @@ OUTLYING = 4.0
 
 
 def inlying_rows(
-    model: PosteriorFrames, rows: NDArray
+    model: PosteriorFrames, rows: NDArray, weights: NDArray | None = None
 ) -> tuple[NDArray, FramePosterior]:
     """Return frames (n, 2, J) of size one with outliers as NaN, and their fit."""
     tracks = rows.transpose(0, 2, 1)
-    found = model.posterior(tracks, covariances=False)
+    found = model.posterior(tracks, covariances=False, weights=weights)
     if model.loss != "linear":
         off = distances(tracks, model.shapes, *found[:3])
         outlying = off > OUTLYING * np.sqrt(model.noise_variance)
@@ -64,8 +64,8 @@ def shape_uncertainty(
     """Return the covariance of a point of the shapes for noise of variance one.
 
     The inverse of ``sum_i share_i E_i (x) M_i^T M_i``, with the second moments E_i of
-    (1, alpha) and the share of visible points of frame i. The sum is over slices of
-    frames.
+    (1, alpha) and the mean weight of the points of frame i, zero for missing ones. The
+    sum is over slices of frames.
     """
     seen = np.einsum("i,ira,irb->ab", share, motion, motion, optimize=True)
     information = np.kron(np.pad(covariance, ((1, 0), (1, 0))), seen)
@@ -79,15 +79,17 @@ def shown_frames(
     posterior: FramePosterior,
     sizes: NDArray,
     n_seen: NDArray,
+    weight: NDArray,
     frames: PosteriorFrames,
     uncertainty: NDArray,
 ) -> tuple[Decomposition, NDArray, float]:
     """Return fits in the gauge, and the effect of their noise on their coefficients.
 
     The noise of frame i changes the shapes by ``N^-1 X_i^T``, ``X_i = (1, alpha_i) (x)
-    M_i``. This shifts the coefficients of the frame by ``n_i s2_i Sigma_i / s2 tr(M_i
-    (N^-1 X_i^T)_k)`` on average. The second result (K, K) is the sum over the frames of
-    ``alpha_i`` times that shift times s2, the third the sum of s2_i.
+    M_i``. This shifts the coefficients of the frame by ``w_i s2_i Sigma_i / s2 tr(M_i
+    (N^-1 X_i^T)_k)`` on average, with the sum w_i of the weights of its points. The
+    second result (K, K) is the sum over the frames of ``alpha_i`` times that shift
+    times s2, the third the sum of s2_i.
     """
     motion, alpha = posterior.motion, posterior.alpha
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
@@ -95,9 +97,11 @@ def shown_frames(
     # Degrees of freedom of the residual, minus those of the shapes
     leverage = np.einsum("irp,irp->i", X, Z)
     n_pose = 2 + CAMERAS[frames.camera].n_parameters
-    noise = posterior.objective / np.maximum(n_seen * (2.0 - leverage) - n_pose, 1.0)
+    mean = weight / n_seen
+    freedom = np.maximum(n_seen * (2.0 - mean * leverage) - n_pose, 1.0)
+    noise = posterior.objective / mean / freedom
     own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
-    shift = np.einsum("i,ikl,il->ik", n_seen * noise, posterior.covariance, own)
+    shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, own)
     return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
 
 

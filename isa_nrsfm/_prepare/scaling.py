@@ -10,6 +10,7 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
     check_points,
     check_size,
+    check_weights,
     visible_points,
     warn_if_other_layout,
 )
@@ -23,6 +24,7 @@ from isa_nrsfm._tables.tracks import (
     refuse_odd,
     table_to_tracks,
     warn_of_half_points,
+    weighted_sizes,
     without_half_points,
 )
 
@@ -37,6 +39,8 @@ class ScaledTable(NamedTuple):
     translation (I, 2): centroids of visible points, or medians with a robust loss.
     precision: rounding error of the coordinates of the table, relative to its frames.
     dtype: number type of the given table.
+    weights (I, J): numbers of observations of the points, zero where not seen; None
+    where each has one.
     """
 
     shown: NDArray
@@ -48,6 +52,12 @@ class ScaledTable(NamedTuple):
     n_points: int
     precision: float
     dtype: Any
+    weights: NDArray | None = None
+
+    @property
+    def weight(self) -> NDArray:
+        """Numbers of observations (I,) of the frames."""
+        return self.n_seen if self.weights is None else self.weights.sum(axis=1)
 
     @property
     def complete(self) -> bool:
@@ -64,6 +74,7 @@ class ScaledTable(NamedTuple):
             sizes=self.sizes[kept],
             translation=self.translation[kept],
             n_seen=self.n_seen[kept],
+            weights=None if self.weights is None else self.weights[kept],
         )
 
 
@@ -76,8 +87,12 @@ def scaled_table(
     scale_frames: bool,
     robust: bool,
     camera: str | None = None,
+    weights: NDArray | None = None,
 ) -> ScaledTable:
-    """Check a table, centre and scale its frames, robustly if `robust`."""
+    """Check a table, centre and scale its frames, robustly if `robust`.
+
+    Weights (n_rows, J) are zero where points are missing, None where all are one.
+    """
     n_columns, dtype = blocks.empty.shape[1], blocks.empty.dtype
     n_points = n_columns // 2
     refuse_odd(n_columns)
@@ -103,9 +118,14 @@ def scaled_table(
         check_size(int(shown.sum()), n_points, n_components, camera)
         blocks, report = blocks.subset(shown), report.of_frames(shown)
         visible, largest = visible[shown], largest[shown]
+        weights = None if weights is None else weights[shown]
     check_points(visible, n_points, n_components, layout, names)
+    if weights is not None:
+        check_weights(weights, n_components, camera)
     warn_if_other_layout(blocks, n_columns, layout, scale_frames)
     translation, size, n_seen = report[:3]
+    if weights is not None:
+        size = blocks.joined(partial(_weighted_sizes, layout=layout), weights)
     if robust:
         # Outliers must not reduce the precision of other points.
         reach = np.abs(translation).max(axis=1) + DISTANT * size
@@ -130,6 +150,7 @@ def scaled_table(
         n_points,
         float(np.sqrt(np.mean((spacing / size) ** 2))),
         dtype,
+        weights,
     )
 
 
@@ -144,6 +165,12 @@ def _examine(rows: NDArray, layout: Layout, robust: bool) -> tuple[NDArray, ...]
         report.size[shown] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(tracks), axis=(1, 2), initial=0.0)
     return n_half, first, visible_points(tracks), largest, *report
+
+
+def _weighted_sizes(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
+    """Return the sizes (n,) of rows of a table with weights (n, J)."""
+    tracks, *_ = without_half_points(table_to_tracks(rows, layout))
+    return weighted_sizes(centred_frames(tracks)[0], weights)
 
 
 def _unit_rows(

@@ -72,7 +72,7 @@ def ready_part(estimator: AffineNRSfM, X: Any, n_components: int) -> Part:
     estimator = clone(estimator)
     if estimator.refinement == "consensus":  # only of the chosen K
         estimator.refinement = "joint"
-    source = estimator._checked(X)
+    source, _ = estimator._checked(X)
     return Part(estimator, X, ready_table(estimator, source, n_components))
 
 

@@ -238,6 +238,21 @@ def weighting_sizes(centred: NDArray, scale_frames: bool) -> NDArray:
     return np.sqrt(square if scale_frames else np.full_like(square, square.mean()))
 
 
+def weighted_sizes(centred: NDArray, weights: NDArray) -> NDArray:
+    """Return the weighted RMS (I,) of centred tracks (I, J, 2), weights (I, J).
+
+    Weights of missing points are zero. If all of the weight is in one place, the RMS is
+    not weighted.
+    """
+    tracks, total = np.nan_to_num(centred), weights.sum(axis=1)
+    place = np.einsum("ij,ijc->ic", weights / total[:, None], tracks)
+    off = np.where(weights[..., None] > 0, tracks - place[:, None], 0.0)
+    square = np.einsum("ij,ijc,ijc->i", weights, off, off) / (2 * total)
+    plain = weighting_sizes(centred, True)
+    eps = 4 * np.finfo(float).eps
+    return np.where(square > (eps * plain) ** 2, np.sqrt(square), plain)
+
+
 def measurement_matrix(centred: NDArray) -> NDArray:
     """Return W (2 * n_frames, n_points): for each frame the row of x, then of y."""
     return np.ascontiguousarray(centred.transpose(0, 2, 1)).reshape(

@@ -39,7 +39,7 @@ from isa_nrsfm.cli._outputs import (
     write_results,
 )
 from isa_nrsfm.cli._progress import show_stage
-from isa_nrsfm.cli._reading import drawing, drawing_files, read_frames
+from isa_nrsfm.cli._reading import Frames, drawing, drawing_files, read_frames
 from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.export._viewer import MOST_LABELS
@@ -97,7 +97,7 @@ def fit_table(
             refuse_replacing(folder, files)
         removed = {*_old_figures(folder, files), *figures}
         clock["read"] = time.perf_counter()
-        estimator, search = _fitted(args, X, asked.groups, clock)
+        estimator, search = _fitted(args, frames, asked.groups, clock)
         show_stage("answers")
         answers, columns, smooth = column_results(args, asked, estimator, X)
         show_stage("tables")
@@ -153,6 +153,11 @@ def _check_options(args: Namespace) -> None:
                 f"{option} needs --refinement joint or consensus; got --refinement "
                 f"{args.refinement}"
             )
+    if args.weights is not None and len(args.n_components) > 1:
+        raise ValueError(
+            "--weights needs one number of basis shapes, because numbers are compared "
+            "without weights; give it with --n-components, or auto"
+        )
 
 
 def _seconds(clock: dict[str, float]) -> dict[str, float]:
@@ -163,7 +168,7 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 def _fitted(
     args: Namespace,
-    X: "pd.DataFrame",
+    frames: Frames,
     groups: NDArray | None,
     clock: dict[str, float],
 ) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
@@ -184,7 +189,7 @@ def _fitted(
         random_state=args.random_state,
         n_jobs=args.n_jobs,
     )
-    search = None
+    search, X = None, frames.X
     if len(args.n_components) > 1:
         show_stage("choice of the number of basis shapes")
         search = choose_n_components(estimator, X, args.n_components, groups)
@@ -192,7 +197,7 @@ def _fitted(
         clock["choose"] = time.perf_counter() - search.refit_time_
     else:
         # For `shown_progress`; the model that is written does not have it.
-        estimator.set_params(verbose=2).fit(X)
+        estimator.set_params(verbose=2).fit(X, **frames.weighting)
         estimator.set_params(verbose=0)
     clock["fit"] = time.perf_counter()
     return estimator, search

@@ -235,6 +235,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "min_confidence": _option(
         "CONFIDENCE", "treat points with a lower confidence as missing"
     ),
+    "weights": _option(
+        "WEIGHTS",
+        "weight the points of the joint refinement by their confidences in the file "
+        "(confidence); points of confidence zero are missing",
+        choices=["confidence"],
+    ),
     "image_size": _option(
         "WIDTHxHEIGHT", "size of the images for MediaPipe, in pixels, such as 1920x1080"
     ),
@@ -446,7 +452,7 @@ examples:
 Cells of missing points are empty. Rows with too few points are counted and have empty
 coefficients. The results replace those of an earlier run in the output folder.""",
         {
-            "table": ("table", *TABLE_OPTIONS, "points"),
+            "table": ("table", *TABLE_OPTIONS, "weights", "points"),
             "output": ("output", "force", "no_figures", "std", *DRAWING),
             "other columns": (
                 *("label", "group", "distance", "unit", "length", ("time", "fps")),
@@ -470,7 +476,7 @@ The table must have the landmark columns of the fitted table. The output has a r
 every row of the table; rows with too few points have empty coefficients.""",
         {
             "model": ("model",),
-            "table": ("table", *TABLE_OPTIONS),
+            "table": ("table", *TABLE_OPTIONS, "weights"),
             "output": ("output", "std", "viewer", *DRAWING),
         },
     ),

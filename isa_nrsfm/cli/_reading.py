@@ -30,6 +30,7 @@ from isa_nrsfm.io._landmark_columns import (
     find_landmark_columns,
     landmark_sets,
 )
+from isa_nrsfm.io._landmarks import Landmarks
 from isa_nrsfm.io._tables import tracks_in
 from isa_nrsfm.skeletons import (
     SKELETONS,
@@ -56,6 +57,7 @@ class Frames(NamedTuple):
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
     numbers of the images that rows show, and the column that has them, if any.
+    ``confidence`` has the confidences of the points if they are asked for as weights.
     """
 
     points: "pd.DataFrame"
@@ -67,11 +69,20 @@ class Frames(NamedTuple):
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
     images: tuple[NDArray, str | None]
+    confidence: "pd.DataFrame | None" = None
 
     @property
     def X(self) -> "pd.DataFrame":
         """The landmarks of the usable rows."""
         return self.points[self.usable]
+
+    @property
+    def weighting(self) -> dict[str, NDArray]:
+        """The weights of the points of X as an argument of `fit`, if asked for."""
+        if self.confidence is None:
+            return {}
+        weights = self.confidence.to_numpy(dtype=np.float64)
+        return {"point_weight": weights[self.usable]}
 
 
 def read_frames(
@@ -83,7 +94,7 @@ def read_frames(
 
     The format in the options becomes the one found.
     """
-    chosen = failed = layout = None
+    chosen = failed = layout = confidence = None
     args.format = _format(args) if table is None else TABLE
     if args.format != TABLE:
         pd = import_optional("pandas", extra="io")
@@ -95,6 +106,7 @@ def read_frames(
         x, y = tuple(found.points)[::2], tuple(found.points)[1::2]
         chosen = LandmarkColumns(f"those of {args.format}", found.point_names, x, y)
         failed, layout = found.failed, found.skeleton
+        confidence = _confidence(args, found)
     elif table is None:
         table = read_table(args.table)
         if args.columns is not None:
@@ -104,10 +116,10 @@ def read_frames(
         if chosen is not None:
             kept = [chosen.x.index(name) for name in columns.x]
             layout = _part_of_layout(layout, kept)
-        return _frames(args, table, columns, failed, layout)
+        return _frames(args, table, columns, failed, layout, confidence)
     columns = chosen or find_landmark_columns(table.columns)
     if args.points is None:
-        return _frames(args, table, columns, failed, layout)
+        return _frames(args, table, columns, failed, layout, confidence)
     layout = _layout(args, table, columns, layout)
     left = _kept_points(args.points, columns.points, layout)
     names, x, y = (
@@ -116,7 +128,8 @@ def read_frames(
     dropped = [name for name in columns.interleaved if name not in {*x, *y}]
     columns = columns._replace(points=names, x=x, y=y)
     layout = _part_of_layout(layout, left)
-    frames = _frames(args, table.drop(columns=dropped), columns, failed, layout)
+    table = table.drop(columns=dropped)
+    frames = _frames(args, table, columns, failed, layout, confidence)
     frames.not_used[f"--points {args.points}"] = len(dropped) // 2
     return frames
 
@@ -170,7 +183,33 @@ def _format(args: Namespace) -> str:
         raise ValueError(
             f"--min-confidence: {args.table} has format table, which has no confidences"
         )
+    if _weights_asked(args) and found == TABLE:
+        raise ValueError(
+            f"--weights: {args.table} has format table, which has no confidences. "
+            "Read a file of a tracker, or leave out --weights"
+        )
     return found
+
+
+def _weights_asked(args: Namespace) -> bool:
+    """Return whether confidences are weights; some commands have no such option."""
+    return getattr(args, "weights", None) is not None
+
+
+def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":
+    """Return the confidences of points as weights, by the names of x; None unasked.
+
+    Points without a confidence have weight one.
+    """
+    if not _weights_asked(args):
+        return None
+    if found.confidence is None:
+        raise ValueError(
+            f"--weights: {args.table} ({found.format}) has no confidences. Leave out "
+            "--weights"
+        )
+    x = list(found.points)[::2]
+    return found.confidence.set_axis(x, axis=1).fillna(1.0)
 
 
 def _frames(
@@ -179,6 +218,7 @@ def _frames(
     columns: LandmarkColumns,
     failed: NDArray | None,
     skeleton: Skeleton | None,
+    confidence: "pd.DataFrame | None",
 ) -> Frames:
     """Take the frames of a table; failed marks rows in which tracking failed."""
     pd = import_optional("pandas", extra="io")
@@ -187,6 +227,9 @@ def _frames(
     stripped = [name.strip() for name in names]
     tracks = _tracks(args, table, columns, kept)
     tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
+    if confidence is not None:
+        confidence = confidence[list(columns.x)].iloc[rows]
+        tracks[confidence.to_numpy() == 0] = np.nan
     _, report = centred_frames(tracks)
     reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
@@ -203,6 +246,7 @@ def _frames(
         left_out=[out for out in left_out if len(out[1])],
         skeleton=skeleton,
         images=(images[rows], numbered_by),
+        confidence=confidence,
     )
 
 

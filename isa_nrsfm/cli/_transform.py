@@ -43,7 +43,8 @@ def run(args: Namespace, warned: list[str]) -> str:
     alpha = std = np.empty((0, n_components))
     quality: Any = ["no frame was fitted"]
     if len(X):
-        motion, translation, alpha, std = estimator.decompose(X)
+        fit = estimator.decompose(X, **frames.weighting)
+        motion, translation, alpha, std = fit
         explained = estimator.inverse_transform(alpha, motion, translation)
         quality = quality_section(quality_report(estimator, X, explained))
         if args.std and args.viewer is not None and estimator.camera_ != "affine":

@@ -1,0 +1,461 @@
+"""Weights of points: numbers of observations, such as confidences of a tracker."""
+
+import json
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+import sklearn
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scenes import random_scene
+from sklearn.base import clone
+from sklearn.exceptions import UnsetMetadataPassedError
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.tracks import weighted_sizes
+from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.io import open_table, read_landmarks
+from isa_nrsfm.metrics import affine_shape_error
+
+# Of the start, which the joint refinement does not say.
+pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
+
+CAMERAS = pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
+N_FRAMES, N_POINTS, K = 60, 20, 2
+
+
+class Noisy(NamedTuple):
+    """A table whose points have different noise, with the weights of the points."""
+
+    X: NDArray
+    weights: NDArray
+    shapes: NDArray
+
+
+@cache
+def noisy(seed=0):
+    """Return a table with 1 percent noise, and 30 percent at two of five points."""
+    scene = make_nonrigid_tracks(N_FRAMES, N_POINTS, K, random_state=seed)
+    rng = np.random.default_rng(seed)
+    tracks = scene.tracks
+    centred = tracks - tracks.mean(axis=1, keepdims=True)
+    size = np.sqrt(np.mean(centred**2, axis=(1, 2)))
+    deviation = np.where(rng.random(tracks.shape[:2]) < 0.4, 0.3, 0.01)
+    noise = (size[:, None] * deviation)[..., None] * rng.normal(size=tracks.shape)
+    X = (tracks + noise).reshape(N_FRAMES, -1)
+    return Noisy(X, (0.01 / deviation) ** 2, scene.shapes)
+
+
+def estimator(**params):
+    return AffineNRSfM(**({"n_components": K, "random_state": 0} | params))
+
+
+@cache
+def fitted(camera="affine"):
+    """Return the weighted fit of `noisy`."""
+    table = noisy()
+    return estimator(camera=camera).fit(table.X, point_weight=table.weights)
+
+
+def assert_same_fit(found, expected):
+    """Compare all numbers of two fitted models to the last bit."""
+    names = [name for name in vars(expected) if name.endswith("_") and name != "isa_"]
+    assert {"alpha_", "basis_", "noise_variance_", "reliability_"} <= {*names}
+    for name in names:
+        assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+class TestMeaning:
+    @CAMERAS
+    def test_weights_of_one_change_no_bit(self, camera):
+        X, ones = noisy().X, np.ones((N_FRAMES, N_POINTS))
+        expected = estimator(camera=camera).fit(X)
+        found = estimator(camera=camera).fit(X, point_weight=ones)
+        assert_same_fit(found, expected)
+        for method in ("transform", "score"):
+            with_ones = getattr(found, method)(X, point_weight=ones)
+            assert_array_equal(with_ones, getattr(expected, method)(X))
+
+    @pytest.mark.parametrize("layout", ["interleaved", "planar"])
+    def test_points_of_weight_zero_are_missing(self, layout):
+        X, weights = noisy().X.copy(), np.ones((N_FRAMES, N_POINTS))
+        weights[np.random.default_rng(1).random(weights.shape) < 0.1] = 0.0
+        tracks = X.reshape(N_FRAMES, -1, 2)
+        gaps = np.where(weights[..., None] == 0, np.nan, tracks)
+        if layout == "planar":
+            tracks, gaps = tracks.swapaxes(1, 2), gaps.swapaxes(1, 2)
+        X, holed = (each.reshape(N_FRAMES, -1) for each in (tracks, gaps))
+        expected = estimator(layout=layout).fit(holed)
+        assert_same_fit(estimator(layout=layout).fit(X, point_weight=weights), expected)
+        assert expected.score(X, point_weight=weights) == expected.score(holed)
+        assert_array_equal(
+            expected.transform(X, point_weight=weights), expected.transform(holed)
+        )
+
+    def test_weights_of_missing_points_have_no_effect(self):
+        table = noisy()
+        X = table.X.copy()
+        X[3, 8], X[5, 10:12] = np.nan, np.nan  # a half point, a missing one
+        weights = table.weights.copy()
+        weights[3, 4], weights[5, 5] = 1.0, 1.0
+        with pytest.warns(UserWarning, match="only one of"):
+            expected = fitted().transform(X, point_weight=weights)
+        weights[3, 4], weights[5, 5] = 9.0, 1e50
+        with pytest.warns(UserWarning, match="only one of"):
+            assert_array_equal(fitted().transform(X, point_weight=weights), expected)
+
+    @CAMERAS
+    def test_weights_of_two_are_two_columns_of_each_point(self, camera):
+        X = make_nonrigid_tracks(
+            N_FRAMES, N_POINTS, K, noise=0.02, random_state=3
+        ).tracks
+        twice = np.concatenate([X, X], axis=1).reshape(N_FRAMES, -1)
+        expected = estimator(camera=camera, tol=1e-8).fit(twice)
+        weights = np.full((N_FRAMES, N_POINTS), 2.0)
+        X = X.reshape(N_FRAMES, -1)
+        found = estimator(camera=camera, tol=1e-8).fit(X, point_weight=weights)
+        # The noise variances, 4e-4, have different corrections for unknowns. They move
+        # the coefficients by less than a hundredth of their deviations.
+        assert_allclose(found.mean_shape_, expected.mean_shape_[:N_POINTS], atol=1e-4)
+        assert_allclose(found.basis_, expected.basis_[:, :N_POINTS], atol=1e-4)
+        assert_allclose(found.alpha_, expected.alpha_, atol=1e-3)
+        once = estimator(camera=camera).fit(X)
+        assert_allclose(found.noise_variance_, once.noise_variance_, rtol=0.05)
+        ratio = found.alpha_std_ / once.alpha_std_
+        assert_allclose(ratio, np.sqrt(0.5), rtol=0.1)
+
+    def test_a_row_of_zeros_is_a_row_without_points(self):
+        weights = noisy().weights.copy()
+        weights[7] = 0.0
+        with pytest.warns(UserWarning, match="no point is visible in 1 of 60 rows"):
+            model = estimator().fit(noisy().X, point_weight=weights)
+        assert_array_equal(np.isnan(model.alpha_).any(axis=1), np.arange(60) == 7)
+        found = model.transform(noisy().X, point_weight=weights)
+        assert_allclose(found, model.alpha_, atol=1e-9)
+
+    def test_single_precision_and_scale(self):
+        X = noisy().X.astype(np.float32)
+        model = estimator().fit(X, point_weight=noisy().weights.astype(np.float32))
+        assert model.alpha_.dtype == np.float32
+        assert_allclose(model.alpha_, fitted().alpha_, atol=1e-3)
+
+
+class TestAccuracy:
+    @CAMERAS
+    @pytest.mark.parametrize("seed", range(2))
+    def test_weighted_fits_have_less_error(self, camera, seed):
+        X, weights, shapes = noisy(seed)
+        plain = estimator(camera=camera).fit(X)
+        model = estimator(camera=camera).fit(X, point_weight=weights)
+        found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
+        # Errors of 0.4 to 1 % with weights, and 5 to 8 % without them
+        error = affine_shape_error(shapes, found)
+        assert error < 0.3 * affine_shape_error(shapes, plain.reconstruct(X))
+
+    def test_noise_hardly_depends_on_the_unit_of_the_weights(self):
+        model = estimator().fit(noisy().X, point_weight=0.5 * noisy().weights)
+        expected = fitted().noise_variance_
+        assert model.noise_variance_ == pytest.approx(expected, rel=0.1)
+        assert (model.alpha_std_ > 1.2 * fitted().alpha_std_).all()
+        assert (model.alpha_std_ < 1.8 * fitted().alpha_std_).all()
+
+    def test_many_points_are_refined_with_weights(self):
+        scene = make_nonrigid_tracks(N_FRAMES, 320, K, random_state=0)
+        rng = np.random.default_rng(0)
+        deviation = np.where(rng.random((N_FRAMES, 320)) < 0.4, 0.3, 0.01)
+        noise = deviation[..., None] * rng.normal(size=scene.tracks.shape)
+        X = (scene.tracks + noise).reshape(N_FRAMES, -1)
+        weights = (0.01 / deviation) ** 2
+        model = estimator().fit(X, point_weight=weights)
+        assert_allclose(
+            model.transform(X, point_weight=weights), model.alpha_, atol=1e-9
+        )
+        found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
+        plain = estimator().fit(X).reconstruct(X)
+        error = affine_shape_error(scene.shapes, found)
+        assert error < 0.5 * affine_shape_error(scene.shapes, plain)
+
+    @pytest.mark.slow
+    def test_number_of_basis_shapes(self):
+        model = estimator(n_components="auto")
+        assert len(model.fit(noisy().X, point_weight=noisy().weights).basis_) == K
+
+
+class TestMethods:
+    @CAMERAS
+    def test_agree_with_the_fit(self, camera):
+        model, (X, weights, _) = fitted(camera), noisy()
+        alpha = model.transform(X, point_weight=weights)
+        assert_allclose(alpha, model.alpha_, atol=1e-9)
+        found = model.decompose(X, point_weight=weights)
+        assert_allclose(found.motion, model.motion_, atol=1e-9)
+        assert_allclose(found.translation, model.translation_, atol=1e-9)
+        assert_allclose(found.alpha_std, model.alpha_std_, rtol=1e-6)
+        alone = model.transform(X[4:5], point_weight=weights[4:5])
+        assert_allclose(alone[0], alpha[4], atol=1e-9)
+        assert np.abs(model.transform(X) - alpha).max() > 0.1
+        fresh = clone(model).fit_transform(X, point_weight=weights)
+        assert_array_equal(fresh, model.alpha_)
+        unkept = clone(model).set_params(keep_frames=False)
+        assert_array_equal(unkept.fit_transform(X, point_weight=weights), alpha)
+
+    def test_score_counts_points_by_weight(self):
+        model, (X, weights, _) = fitted(), noisy()
+        # 1e-4 of the noise plus that of the predictions; 0.04 without weights
+        assert -1e-3 < model.score(X, point_weight=weights) < -1e-4
+        assert model.score(X) < -0.01
+        rng = np.random.default_rng(0)
+        assert model.score(X, point_weight=rng.permuted(weights, axis=1)) < -0.01
+
+    def test_orthographic_cameras_have_one_weighted_size(self):
+        X, weights, _ = noisy()
+        model = estimator(camera="orthographic").fit(X, point_weight=weights)
+        alpha = model.transform(X, point_weight=weights)
+        assert_allclose(alpha, model.alpha_, atol=1e-8)
+
+    def test_dataframes_and_lists(self):
+        X, weights, _ = noisy()
+        found = fitted().transform(X, point_weight=pd.DataFrame(weights))
+        assert_array_equal(found, fitted().transform(X, point_weight=weights.tolist()))
+
+
+class TestFrames:
+    """Frames with numbers of observations, in the likelihood."""
+
+    def test_gradient(self):
+        scene = random_scene(noise=0.05, kind="missing")
+        rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
+        weights = 3.0 * scene.weights
+        likelihood = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
+        assert likelihood.n_seen == pytest.approx(2 * weights.sum())
+        at = likelihood(scene.shapes, scene.motion, 0.01)
+        rng = np.random.default_rng(0)
+        turn, step = rng.normal(size=scene.shapes.shape), 1e-6
+        values = [
+            likelihood(scene.shapes + s * turn, scene.motion, 0.01).value
+            for s in (step, -step)
+        ]
+        slope = (values[0] - values[1]) / (2 * step)
+        assert slope == pytest.approx(np.vdot(at.shape_gradient, turn), rel=1e-5)
+        noises = 0.01 * np.exp([step, -step])
+        values = [likelihood(scene.shapes, scene.motion, s).value for s in noises]
+        slope = (values[0] - values[1]) / (2 * step)
+        assert slope == pytest.approx(at.noise_gradient, rel=1e-5)
+
+    def test_whole_numbers_are_repeated_points(self):
+        scene = random_scene(noise=0.05)
+        counts = np.arange(20) % 3 + 1
+        rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
+        weights = np.broadcast_to(counts, scene.tracks.shape[:2]).astype(float)
+        found = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
+        many = np.repeat(np.arange(20), counts)
+        repeated = FrameBlocks.of_array(
+            scene.centred[:, many].transpose(0, 2, 1), 7
+        ).derive(np.ascontiguousarray)
+        # Frames with weights are centred by the likelihood, others have to be.
+        frames = JointFrames.from_points(repeated, False)
+        expected = MarginalLikelihood(frames, 0.1)
+        assert found.n_seen == expected.n_seen
+        assert found.square == pytest.approx(expected.square)
+        value = found(scene.shapes, scene.motion, 0.01).value
+        value_of_many = expected(scene.shapes[:, :, many], scene.motion, 0.01).value
+        assert value == pytest.approx(value_of_many, rel=1e-12)
+
+    def test_parts_keep_the_numbers(self):
+        scene = random_scene(kind="weighted")
+        rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
+        part = JointFrames.from_repeated(rows, scene.weights).take(np.arange(5))
+        assert part.totals[0] == pytest.approx(2 * scene.weights[:5].sum())
+
+    def test_sizes(self):
+        rng = np.random.default_rng(0)
+        tracks, weights = rng.normal(size=(3, 6, 2)), rng.integers(0, 4, (3, 6))
+        expected = []
+        for points, w in zip(tracks, weights, strict=True):
+            many = np.repeat(points, w, axis=0)
+            expected.append(np.sqrt(np.mean((many - many.mean(axis=0)) ** 2)))
+        tracks[weights == 0] = np.nan
+        assert_allclose(weighted_sizes(tracks, weights * 1.0), expected)
+        # All of the weight in one place
+        size = weighted_sizes(np.eye(2)[None], np.array([[1.0, 1e-40]]))
+        assert_allclose(size, 0.5 * np.sqrt(2.0))
+
+
+class TestRouting:
+    """Metadata routing of scikit-learn."""
+
+    @pytest.fixture(autouse=True)
+    def routing(self):
+        with sklearn.config_context(enable_metadata_routing=True):
+            yield
+
+    def test_pipeline(self):
+        X, weights, _ = noisy()
+        model = estimator().set_fit_request(point_weight=True)
+        model.set_transform_request(point_weight=True)
+        pipeline = make_pipeline(model, StandardScaler())
+        found = pipeline.fit_transform(X, point_weight=weights)
+        assert_allclose(found, StandardScaler().fit_transform(fitted().alpha_))
+        again = pipeline.transform(X, point_weight=weights)
+        assert_allclose(again, found, atol=1e-9)
+
+    def test_grid_search(self):
+        X, weights, _ = noisy()
+        model = estimator().set_fit_request(point_weight=True)
+        model.set_score_request(point_weight=True)
+        search = GridSearchCV(model, {"n_components": [1, 2]}, cv=2)
+        search.fit(X, point_weight=weights)
+        assert search.best_params_ == {"n_components": K}
+        assert_array_equal(search.best_estimator_.alpha_, fitted().alpha_)
+        first, second = slice(0, 30), slice(30, 60)
+        part = estimator().fit(X[second], point_weight=weights[second])
+        expected = part.score(X[first], point_weight=weights[first])
+        assert search.cv_results_["split0_test_score"][1] == expected
+
+    def test_weights_that_are_not_requested(self):
+        X, weights, _ = noisy()
+        search = GridSearchCV(estimator(), {"n_components": [1, 2]}, cv=2)
+        with pytest.raises(UnsetMetadataPassedError, match="point_weight"):
+            search.fit(X, point_weight=weights)
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("value", "message"),
+        [
+            (-0.5, "between 0 and 1e.100, because .* got -0.5 in row 2, point 3"),
+            (1e101, "got 1e.101 in row 2"),
+            (np.nan, "point_weight contains NaN"),
+            (np.inf, "point_weight contains infinity"),
+        ],
+    )
+    @pytest.mark.parametrize("method", ["fit", "transform", "decompose", "score"])
+    def test_values(self, method, value, message):
+        weights = noisy().weights.copy()
+        weights[2, 3] = value
+        model = estimator() if method == "fit" else fitted()
+        with pytest.raises(ValueError, match=message):
+            getattr(model, method)(noisy().X, point_weight=weights)
+
+    @pytest.mark.parametrize("shape", [(60, 40), (59, 20), (1, 20)])
+    def test_shape(self, shape):
+        message = r"a column for each point, the shape \(60, 20\); got "
+        with pytest.raises(ValueError, match=message):
+            estimator().fit(noisy().X, point_weight=np.ones(shape))
+        with pytest.raises(ValueError, match=message):
+            fitted().transform(noisy().X, point_weight=np.ones(shape))
+
+    @pytest.mark.parametrize(
+        ("params", "message"),
+        [
+            ({"refinement": "alternating"}, "got refinement='alternating'. Set"),
+            ({"refinement": None}, "needs refinement='joint'.* got refinement=None"),
+            ({"loss": "cauchy"}, "needs loss='linear'.* got loss='cauchy'. Set"),
+            (
+                {"refinement": "consensus", "camera": "weak_perspective"},
+                "not supported by the fit with refinement='consensus'",
+            ),
+        ],
+    )
+    def test_parameters(self, params, message):
+        with pytest.raises(ValueError, match=message):
+            estimator(**params).fit(noisy().X, point_weight=noisy().weights)
+
+    def test_tables_that_are_not_in_memory(self, tmp_path):
+        np.save(tmp_path / "table.npy", noisy().X)
+        mapped = np.load(tmp_path / "table.npy", mmap_mode="r")
+        with pytest.raises(ValueError, match=r"table in memory.* got a memmap. Give"):
+            estimator().fit(mapped, point_weight=noisy().weights)
+        names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
+        frame = pd.DataFrame(noisy().X, columns=names)
+        frame.to_csv(tmp_path / "table.csv", index=False)
+        stored = open_table(tmp_path / "table.csv")
+        with pytest.raises(ValueError, match="got a StoredTable"):
+            fitted().transform(stored, point_weight=noisy().weights)
+
+    @pytest.mark.parametrize(("camera", "least"), [("affine", 5), ("orthographic", 4)])
+    def test_fewer_observations_than_unknowns(self, camera, least):
+        weights = noisy().weights * (0.99 * least * N_FRAMES / noisy().weights.sum())
+        message = f"fewer than the {least} that .* Multiply point_weight by a number"
+        with pytest.raises(ValueError, match=message):
+            estimator(camera=camera).fit(noisy().X, point_weight=weights)
+
+    def test_models_without_a_fit(self):
+        with pytest.raises(ValueError, match="not fitted"):
+            estimator().transform(noisy().X, point_weight=noisy().weights)
+
+
+class TestCommandLine:
+    QUICK = ("-k", "2", "--no-figures")
+
+    @pytest.fixture
+    def results(self, tmp_path):
+        """Return a file of keypoints with their confidences."""
+        X, weights, _ = noisy()
+        points = np.dstack([100 * X.reshape(N_FRAMES, -1, 2) + 300, weights])
+        points[4, 3, 2] = 0.0
+        path = tmp_path / "results.json"
+        rows = [
+            {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
+            for i, row in enumerate(points)
+        ]
+        path.write_text(json.dumps(rows))
+        return path
+
+    @staticmethod
+    def coefficients(path):
+        table = pd.read_csv(path)
+        return table.filter(like="alpha_").to_numpy()
+
+    def test_fit_and_transform(self, results, tmp_path, run):
+        options = ["--weights", "confidence"]
+        code, _, err = run(
+            "fit", results, *options, "-o", tmp_path / "out", *self.QUICK
+        )
+        assert code == 0, err
+        found = read_landmarks(results)
+        model = estimator().fit(found.points, point_weight=found.confidence)
+        alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
+        assert_allclose(alpha, model.alpha_, atol=1e-6)
+        assert np.abs(alpha - estimator().fit(found.points).alpha_).max() > 0.1
+        new = tmp_path / "new.csv"
+        saved = tmp_path / "out" / "model.npz"
+        code, _, err = run("transform", saved, results, *options, "-o", new)
+        assert code == 0, err
+        assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
+
+    def test_some_points(self, results, tmp_path, run):
+        options = ["--weights", "confidence", "--points", "without:3,7"]
+        code, _, err = run(
+            "fit", results, *options, "-o", tmp_path / "out", *self.QUICK
+        )
+        assert code == 0, err
+        left = np.delete(np.arange(N_POINTS), [3, 7])
+        found = read_landmarks(results)
+        X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
+        model = estimator().fit(
+            X.reshape(N_FRAMES, -1), point_weight=found.confidence.to_numpy()[:, left]
+        )
+        alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
+        assert_allclose(alpha, model.alpha_, atol=1e-6)
+
+    def test_refusals(self, results, tmp_path, run):
+        options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]
+        code, _, err = run("fit", results, *options, "-k", "1-2")
+        assert code != 0
+        assert "--weights needs one number of basis shapes" in err
+        table = tmp_path / "table.csv"
+        names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
+        pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
+        code, _, err = run("fit", table, *options, "-k", "2")
+        assert code != 0
+        assert "has format table, which has no confidences" in err
