@@ -375,10 +375,10 @@ class TestRefusals:
         mapped = np.load(tmp_path / "table.npy", mmap_mode="r")
         with pytest.raises(ValueError, match=r"table in memory.* got a memmap. Give"):
             estimator().fit(mapped, point_weight=noisy().weights)
-        names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
-        frame = pd.DataFrame(noisy().X, columns=names)
-        frame.to_csv(tmp_path / "table.csv", index=False)
-        stored = open_table(tmp_path / "table.csv")
+        (tmp_path / "parts").mkdir()
+        for name, part in zip("ab", np.split(noisy().X, 2), strict=True):
+            np.save(tmp_path / "parts" / f"{name}.npy", part)
+        stored = open_table(tmp_path / "parts")
         with pytest.raises(ValueError, match="got a StoredTable"):
             fitted().transform(stored, point_weight=noisy().weights)
 
