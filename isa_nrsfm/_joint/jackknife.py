@@ -67,9 +67,9 @@ def depth_certainty(
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
-    w = None if w is None else w[np.ix_(known, points)]
+    given = {} if w is None else {"weights": w[np.ix_(known, points)]}
     shapes, motion = frames.shapes[:, :, points], found.motion[known]
-    fit = partial(_Refit, frames, part[known], w, shapes, motion)
+    fit = partial(_Refit, frames, part[known], shapes, motion, **given)
     whole = fit(np.ones(len(points), dtype=bool))
     errors = [fit(~group).errors(whole) for group in left_out]
     total, turns, variances = (
@@ -113,10 +113,10 @@ class _Refit:
         self,
         frames: PosteriorFrames,
         rows: NDArray,
-        weights: NDArray | None,
         shapes: NDArray,
         motion: NDArray,
         kept: NDArray,
+        weights: NDArray | None = None,
     ):
         rows, self.kept = rows[:, :, kept], kept
         shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
