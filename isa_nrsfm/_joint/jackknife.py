@@ -11,7 +11,9 @@ neighbouring points the variance of an estimate t is ::
 These fits do not have the prior of the extents, which would hide uncertain depths.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,9 +69,13 @@ def depth_certainty(
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
-    given = {} if w is None else {"weights": w[np.ix_(known, points)]}
+    given: dict[str, Any] = {}
+    if w is not None:
+        given["weights"] = w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], found.motion[known]
-    fit = partial(_Refit, frames, part[known], shapes, motion, **given)
+    fit: Callable[[NDArray], _Refit] = partial(
+        _Refit, frames, part[known], shapes, motion, **given
+    )
     whole = fit(np.ones(len(points), dtype=bool))
     errors = [fit(~group).errors(whole) for group in left_out]
     total, turns, variances = (
