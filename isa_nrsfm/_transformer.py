@@ -607,18 +607,20 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
             return self._opened(X, reset), ()
         if not reset:
             check_is_fitted(self)
-        if not self._is_joint:
+        # Parameters that are set after a fit have no effect on its model.
+        frames = None if reset else self._model.frames
+        if not (self._is_joint if reset else isinstance(frames, PosteriorFrames)):
             raise ValueError(
-                "point_weight needs refinement='joint', because the refinement of the "
-                "paper has no weights; got "
-                f"refinement={self.refinement!r}. Set refinement='joint', or set "
-                "points of low weight to NaN"
+                "point_weight needs a fit with refinement='joint', because the "
+                "refinement of the paper has no weights. Set refinement='joint', or "
+                "set points of low weight to NaN"
             )
-        if self.loss != "linear":
+        loss = self.loss if reset else getattr(frames, "loss", "linear")
+        if loss != "linear":
             raise ValueError(
                 "point_weight needs loss='linear', because robust losses find weights "
-                f"of their own; got loss={self.loss!r}. Set loss='linear', or set "
-                "points of low weight to NaN"
+                f"of their own; got loss={loss!r}. Set loss='linear', or set points of "
+                "low weight to NaN"
             )
         if is_read_later(X):
             raise ValueError(
@@ -641,12 +643,13 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
         """Return a table in checked blocks; unless `reset`, it must match the fit."""
         if not reset:
             check_is_fitted(self)
+        layout = self.layout if reset else self._model.layout
         if is_read_later(X):
-            check_table(X, self.layout)
+            check_table(X, layout)
             validate_data(self, column_sample(X), reset=reset, skip_check_array=True)
         else:
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
-            X = validated_table(self, X, reset=reset, **CHECKS, **least)
+            X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
             checked_range(X)
         return open_table(X, self.n_jobs, self.working_memory)
 

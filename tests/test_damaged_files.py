@@ -136,8 +136,9 @@ def read_format(name):
             find_format(path)
         found = read_landmarks(path, format)
         check_landmarks(found)
-        if format in ("openface", "pyfeat"):
-            check_cells(found.points, found.failed, path)
+        separator = {".csv": ",", ".tsv": "\t"}.get(path.suffix)
+        if format in ("openface", "pyfeat") and separator is not None:
+            check_cells(found.points, found.failed, path, separator)
 
     return read
 

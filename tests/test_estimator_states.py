@@ -232,12 +232,16 @@ class Estimator(RuleBasedStateMachine):
         ),
     )
     def interrupt(self, kind_and_seed, lines):
-        X = table(*kind_and_seed)
+        X, before = table(*kind_and_seed), vars(self.model).get("_model")
         try:
             with only_own_warnings(), interrupted_after(*lines):
                 self.model.fit(X)
         except KeyboardInterrupt:
-            # Before the fit has begun, what was found earlier stays as it was.
+            # Before the fit has begun, what was found earlier stays as it was. After
+            # its results have been set, it is whole.
+            found = vars(self.model).get("_model")
+            if found is not None and found is not before:
+                self.note_fit(X)
             self.fitted &= is_fitted(self.model)
         except np.linalg.LinAlgError:
             raise

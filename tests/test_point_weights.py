@@ -357,8 +357,8 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("params", "message"),
         [
-            ({"refinement": "alternating"}, "got refinement='alternating'. Set"),
-            ({"refinement": None}, "needs refinement='joint'.* got refinement=None"),
+            ({"refinement": "alternating"}, "of the paper has no weights. Set"),
+            ({"refinement": None}, "needs a fit with refinement='joint'"),
             ({"loss": "cauchy"}, "needs loss='linear'.* got loss='cauchy'. Set"),
             (
                 {"refinement": "consensus", "camera": "weak_perspective"},

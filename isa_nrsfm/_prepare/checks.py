@@ -53,9 +53,9 @@ def check_table(X: Any, layout: Layout) -> None:
         )
 
 
-def validated_table(estimator: Any, X: Any, **options: Any) -> NDArray:
+def validated_table(estimator: Any, X: Any, layout: Layout, **options: Any) -> NDArray:
     """Return a table as an array of numbers, checked by scikit-learn and by name."""
-    check_table(X, estimator.layout)
+    check_table(X, layout)
     try:
         return np.asarray(validate_data(estimator, unmasked(X), **options))
     except ValueError as error:

@@ -272,6 +272,7 @@ class ShapeSequenceNRSfM(
         X = validated_table(
             self,
             X,
+            self.layout,
             dtype=[np.float64, np.float32],
             ensure_all_finite="allow-nan",
             ensure_min_samples=fewest,
