@@ -121,7 +121,9 @@ def interrupted_after(n_lines, files):
 
     def trace(frame, event, arg):
         nonlocal left
-        if not frame.f_code.co_filename.startswith(files):
+        name = frame.f_code.co_filename
+        # Python cannot shield the few lines that count the users of BLAS.
+        if not name.startswith(files) or name.endswith("blas_threads.py"):
             return None
         if event == "line":
             left -= 1
