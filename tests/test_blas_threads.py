@@ -1,8 +1,12 @@
 """One BLAS thread inside of decorated functions, and as many as before after them."""
 
+import contextlib
 import signal
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
+from linecache import getline
 from threading import Barrier
 
 import numpy as np
@@ -13,6 +17,9 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm.datasets import make_nonrigid_tracks
+
+# Python does not interrupt between the last call of a block and the release of a lock.
+WITH = "with self._lock:"
 
 
 @one_blas_thread
@@ -121,3 +128,31 @@ def test_results_are_the_same_to_the_bit():
             )
     for one, two in zip(*fits, strict=True):
         assert_array_equal(one, two)
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("method", ["__enter__", "__exit__"])
+def test_an_interrupt_at_any_line_of_the_limit_leaves_no_user(method):
+    file = sys.modules[one_blas_thread.__module__].__file__
+    for n_lines in count():
+        left = n_lines
+
+        def trace(frame, event, arg):
+            nonlocal left
+            if frame.f_code.co_filename != file or frame.f_code.co_name != method:
+                return None
+            if event == "line" and getline(file, frame.f_lineno).strip() != WITH:
+                left -= 1
+                if left < 0:
+                    raise KeyboardInterrupt
+            return trace
+
+        sys.settrace(trace)
+        with contextlib.suppress(KeyboardInterrupt):
+            threads_of_blas()
+        sys.settrace(None)
+        assert threads_of_blas() == {1}
+        assert numbers_of_threads() == {2}
+        if left >= 0:
+            break
+    assert n_lines > 5

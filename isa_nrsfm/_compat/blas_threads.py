@@ -1,17 +1,18 @@
 """One BLAS thread, in all functions of small matrices."""
 
 from collections.abc import Callable
-from contextlib import ContextDecorator
-from threading import Lock, local
-from typing import Any, TypeVar
+from functools import wraps
+from threading import Lock
+from typing import Any, ClassVar, TypeVar, cast
+from weakref import WeakSet
 
 from isa_nrsfm._compat.scikit_learn import threadpool_controller
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class OneBlasThread(ContextDecorator):
-    """Limit BLAS to one thread inside of a function or block.
+class OneBlasThread:
+    """Limit BLAS to one thread inside of a block.
 
     Threads of BLAS mostly wait for each other if matrices are small. Functions take 2
     to 12 times as long with them while another program runs. Blocks of frames run in
@@ -19,22 +20,24 @@ class OneBlasThread(ContextDecorator):
 
     Most BLAS libraries have one number of threads for the whole process. So the last
     Python thread that leaves restores it. With OpenMP each Python thread has its own.
+
+    The users are held by weak references: an interrupt while a block is entered or left
+    does not leave a user behind.
     """
 
-    def __init__(self) -> None:
-        self._lock, self._inside = Lock(), 0
-        self._of_process: list[int] = []
-        self._of_thread = local()
+    _lock = Lock()
+    _users: ClassVar["WeakSet[OneBlasThread]"] = WeakSet()
+    # Numbers of threads before the first user; empty if they are restored.
+    _of_process: ClassVar[list[int]] = []
 
     def __enter__(self) -> None:
         """Remember the number of threads, and set it to one."""
         pools = _pools()
         with self._lock:
-            numbers = [pool.num_threads for pool in pools]
-            if not self._inside:
-                self._of_process = numbers
-            self._inside += 1
-            self._of_thread.entered = [*self._entered(), numbers]
+            self._before = [pool.num_threads for pool in pools]
+            if not self._of_process:
+                self._of_process[:] = self._before
+            self._users.add(self)
             for pool in pools:
                 _set_threads(pool, 1)
 
@@ -42,26 +45,28 @@ class OneBlasThread(ContextDecorator):
         """Restore the number of threads, if no Python thread is inside any more."""
         pools = _pools()
         with self._lock:
-            *self._of_thread.entered, numbers = self._entered()
-            self._inside -= 1
-            for pool, own, first in zip(pools, numbers, self._of_process, strict=True):
+            self._users.discard(self)
+            last = not len(self._users)
+            for pool, own, first in zip(
+                pools, self._before, self._of_process, strict=True
+            ):
                 if getattr(pool, "threading_layer", None) == "openmp":
                     _set_threads(pool, own)
-                elif not self._inside:
+                elif last:
                     _set_threads(pool, first)
-
-    def _entered(self) -> list[list[int]]:
-        """Return the numbers of threads before each block that this thread is in."""
-        return getattr(self._of_thread, "entered", [])
-
-
-# The number of threads is a state of the process, so this count of its users is one.
-LIMIT = OneBlasThread()
+            if last:
+                self._of_process.clear()
 
 
 def one_blas_thread(function: Function) -> Function:
     """Return a function that runs with one BLAS thread."""
-    return LIMIT(function)
+
+    @wraps(function)
+    def limited(*args: Any, **kwargs: Any) -> Any:
+        with OneBlasThread():
+            return function(*args, **kwargs)
+
+    return cast(Function, limited)
 
 
 def _pools() -> list[Any]:
