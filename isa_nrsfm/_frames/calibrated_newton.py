@@ -22,7 +22,11 @@ derivative is replaced by the bound that A contains. Steps are damped by
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CalibratedCameras, nearest_calibrated
+from isa_nrsfm._frames.camera_models import (
+    CalibratedCameras,
+    CameraModel,
+    nearest_calibrated,
+)
 from isa_nrsfm._frames.coefficients import CoefficientPosterior, coefficient_posterior
 from isa_nrsfm._frames.point_sums import (
     FLAT,
@@ -85,10 +89,7 @@ class CalibratedSearch(FrameSearch):
         The better one of the nearest camera and that of `_completed` is taken.
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
-        starts = []
-        for rows, scales in nearest_calibrated(frames_first(M)), _completed(M):
-            scales = scales if self.model.scaled else np.ones_like(scales)
-            starts.append(frames_last(scales[:, None, None] * rows))
+        starts = calibrated_starts(self.model, M)
         values = [_value(problem, _posterior(problem, each)) for each in starts]
         return np.where(values[1] < values[0], *starts[::-1])
 
@@ -186,6 +187,15 @@ class CalibratedSearch(FrameSearch):
         other, converged = self.descend(problem, start, max_steps, known)
         better = _value(problem, _posterior(problem, other)) < limit
         return np.where(better, other, M), better, converged
+
+
+def calibrated_starts(model: CameraModel, M: NDArray) -> list[NDArray]:
+    """Return the nearest cameras and those of `_completed`, of affine M (2, 3, n)."""
+    starts = []
+    for rows, scales in nearest_calibrated(frames_first(M)), _completed(M):
+        scales = scales if model.scaled else np.ones_like(scales)
+        starts.append(frames_last(scales[:, None, None] * rows))
+    return starts
 
 
 def _completed(M: NDArray) -> tuple[NDArray, NDArray]:

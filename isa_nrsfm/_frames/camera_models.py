@@ -77,6 +77,10 @@ class AffineCameras:
         """Return the largest step length, one for all cameras, along a direction."""
         return np.inf
 
+    def limited(self, step: NDArray) -> NDArray:
+        """Return steps, which have no largest length."""
+        return step
+
     def nearest(self, motion: NDArray) -> NDArray:
         """Return the cameras of this model that are nearest to any (n, 2, 3)."""
         return motion
@@ -151,7 +155,7 @@ class CalibratedCameras:
 
     def _sizes(self, step: NDArray) -> NDArray:
         """Return the angles of steps, or the changes of log scale where larger."""
-        angle = np.sqrt(np.einsum("an,an->n", step[:3], step[:3]))
+        angle = np.sqrt(np.einsum("a...,a...->...", step[:3], step[:3]))
         return np.maximum(angle, np.abs(step[3])) if self.scaled else angle
 
 
@@ -163,7 +167,7 @@ CAMERAS: dict[str, CameraModel] = {
 
 
 def turning(M: NDArray) -> NDArray:
-    """Return ``M hat(e_c)`` (3, 2, 3, n), whose rows are ``m x e_c``."""
+    """Return ``M hat(e_c)`` (3, 2, 3, ...), whose rows are ``m x e_c``."""
     x, y, z = M[:, 0], M[:, 1], M[:, 2]
     D = np.zeros((3, *M.shape))
     D[0, :, 1], D[1, :, 0] = z, -z
@@ -173,16 +177,18 @@ def turning(M: NDArray) -> NDArray:
 
 
 def rotated(M: NDArray, turns: NDArray) -> NDArray:
-    """Return cameras (2, 3, n) times rotations by vectors w (3, n), ``M exp(hat(w))``.
+    """Return cameras (2, 3, ...) times rotations w (3, ...), ``M exp(hat(w))``.
 
     Rows are ``m cos t + (m x w) sin(t) / t + w (w . m) (1 - cos t) / t^2``, t = |w|.
     """
-    angle = np.sqrt(np.einsum("an,an->n", turns, turns))
-    along = np.einsum("ran,an->rn", M, turns)[:, None]
+    angle = np.sqrt(np.einsum("a...,a...->...", turns, turns))
+    along = np.einsum("ra...,a...->r...", M, turns)[:, None]
     # sin(t) / t and (1 - cos(t)) / t^2 = 2 (sin(t/2) / t)^2, also for t = 0.
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    moved = np.cos(angle) * M + first * np.einsum("crai,ci->rai", turning(M), turns)
+    moved = np.cos(angle) * M + first * np.einsum(
+        "cra...,c...->ra...", turning(M), turns
+    )
     return moved + second * along * turns
 
 

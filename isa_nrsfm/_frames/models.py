@@ -220,10 +220,7 @@ class PosteriorFrames:
     @cached_property
     def single_search(self) -> SingleSearch:
         """The search for one complete frame."""
-        n_parameters = CAMERAS[self.camera].n_parameters
-        calibrated = CAMERAS[self.camera].calibrated
-        shapes = self._search.shared.shapes
-        return SingleSearch(shapes, n_parameters if calibrated else 0)
+        return SingleSearch(self._search.shared.shapes, CAMERAS[self.camera])
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes without cached values."""

@@ -5,19 +5,21 @@ frames takes as long for one frame as for sixteen: 4 to 7 times as long as this 
 Frames that are not regular are left to it.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import REVERSED, SAME_WELL
-from isa_nrsfm._frames.search import LARGEST_DAMPING
+from isa_nrsfm._frames.calibrated_newton import (
+    REVERSED,
+    SAME_WELL,
+    calibrated_starts,
+)
+from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.search import LARGEST_DAMPING, MAX_STEPS
 
 # Rotations of affine cameras
 UNKNOWN = np.full((3, 3), np.nan)
-# Largest number of steps; frames that need more are left to the other search.
-MAX_STEPS = 30
 
 
 class SingleFit(NamedTuple):
@@ -41,15 +43,11 @@ class _Camera(NamedTuple):
 
 
 class SingleSearch:
-    """The search for shapes (K + 1, 3, J), rows centred, in coordinates of the search.
+    """The search for shapes (K + 1, 3, J), rows centred, in the axes of a search."""
 
-    Calibrated cameras have 4 (weak perspective) or 3 parameters, affine ones are given
-    as 0.
-    """
-
-    def __init__(self, shapes: NDArray, n_parameters: int):
+    def __init__(self, shapes: NDArray, model: CameraModel):
         n_shapes, _, n_points = shapes.shape
-        self.n_parameters, self.K = n_parameters, n_shapes - 1
+        self.model, self.K = model, n_shapes - 1
         self.rows = shapes.reshape(-1, n_points)
         gram = np.einsum("kaj,lbj->klab", shapes, shapes, optimize=True)
         gram = 0.5 * (gram + gram.swapaxes(2, 3))
@@ -65,7 +63,7 @@ class SingleSearch:
         energy = float(np.vdot(W, W))
         P = (self.rows @ W.T).reshape(-1, 3, 2).swapaxes(1, 2)
         noise = max(noise, 1e-13 * energy)
-        search = self._calibrated if self.n_parameters else self._affine
+        search = self._calibrated if self.model.calibrated else self._affine
         try:
             with np.errstate(all="ignore"):
                 fit = search(P, energy, noise)
@@ -107,10 +105,9 @@ class SingleSearch:
     def _calibrated(self, P: NDArray, energy: float, noise: float) -> SingleFit | None:
         """Minimise over cameras, with the coefficients integrated out."""
         affine = P[0] @ np.linalg.inv(0.5 * self.sums[:9, 0].reshape(3, 3))
-        start = min(
-            (self._camera(M, P, energy, noise) for M in self._starts(affine)),
-            key=lambda camera: camera.value,
-        )
+        starts = calibrated_starts(self.model, affine[..., None])
+        cameras = [self._camera(M[..., 0], P, energy, noise) for M in starts]
+        start = min(cameras, key=lambda camera: camera.value)
         found = self._minimum(start, P, energy, noise)
         if found is None:
             return None
@@ -125,18 +122,6 @@ class SingleSearch:
         objective = max(found.value - noise * found.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
         return SingleFit(found.M, found.alpha, covariance, turns, objective)
-
-    def _starts(self, M: NDArray) -> Iterator[NDArray]:
-        """Yield the calibrated camera nearest to M, and that of its first columns."""
-        scaled = self.n_parameters == 4
-        U, values, Vt = np.linalg.svd(M, full_matrices=False)
-        yield (values.mean() if scaled else 1.0) * U @ Vt
-        U, values, Vt = np.linalg.svd(M[:, :2])
-        cosine = values[1] / values[0]
-        depth = np.sqrt(max(1.0 - cosine**2, 0.0)) * U[:, 1]
-        depth = -depth if depth @ M[:, 2] < 0 else depth
-        rows = np.column_stack([U * [1.0, cosine] @ Vt, depth])
-        yield (values[0] if scaled else 1.0) * rows
 
     def _camera(self, M: NDArray, P: NDArray, energy: float, noise: float) -> _Camera:
         """Return a camera with the posterior of the coefficients."""
@@ -155,17 +140,12 @@ class SingleSearch:
         self, camera: _Camera, P: NDArray, noise: float
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return gradient, Hessian, its definite part, and Q times the coupling."""
-        M, c, n = camera.M, np.append(1.0, camera.alpha), self.n_parameters
+        M, c, n = camera.M, np.append(1.0, camera.alpha), self.model.n_parameters
         E = np.outer(c, c)
         E[1:, 1:] += noise * camera.Q
         A = (E.ravel() @ self.pairs).reshape(3, 3)
         G = M @ A - np.tensordot(c, P, 1)
-        D = np.zeros((n, 2, 3))
-        x, y, z = M.T
-        D[0, :, 1], D[1, :, 0] = z, -z
-        D[0, :, 2], D[2, :, 0] = -y, y
-        D[1, :, 2], D[2, :, 1] = x, -x
-        D[3:] = M
+        D = self.model.tangents(M)
         flat = D.reshape(n, 6)
         gradient, definite = flat @ G.ravel(), (D @ A).reshape(n, 6) @ flat.T
         mixed = G.T @ M
@@ -202,8 +182,8 @@ class SingleSearch:
                 or np.linalg.norm(camera.M - known.M) < radius
             ):
                 return None
-            step /= max(1.0, np.linalg.norm(step[:3]), *np.abs(step[3:]))
-            moved = self._camera(self._moved(camera.M, step), P, energy, noise)
+            M = self.model.moved(camera.M, self.model.limited(step))
+            moved = self._camera(M, P, energy, noise)
             if damping == 0 and gain <= tol:
                 return moved if moved.value < limit else None
             if moved.value <= camera.value + tol:
@@ -211,12 +191,3 @@ class SingleSearch:
             else:
                 damping = max(8.0 * damping, 0.1)
         return None
-
-    def _moved(self, M: NDArray, step: NDArray) -> NDArray:
-        """Return ``exp(l) M exp(hat(w))`` for a step w (3,), or w and l (4,)."""
-        w = step[:3]
-        angle = np.sqrt(w @ w)
-        first, second = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-        hat = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-        turned = np.cos(angle) * M + first * M @ hat + second * np.outer(M @ w, w)
-        return turned * np.exp(step[3]) if self.n_parameters == 4 else turned
