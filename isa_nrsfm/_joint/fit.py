@@ -145,25 +145,16 @@ def _problems(
     points.
     """
     n_shapes, _, n_points = paper_shapes.shape
-    options, outliers = settings.options, table.outliers
+    options, seen = settings.options, None
     complete = bool((table.n_seen == n_points).all())
-    many = n_points > max(24 * n_shapes, options.many_points)
-    seen = None
-    if table.weights is not None:
-        seen = JointFrames.from_repeated(table.rows, table.weights)
-    elif not (many and complete and outliers is None):
-        if outliers is None or not outliers.any():
-            seen = JointFrames.from_points(table.rows, complete)
-        else:
-            rows = table.rows.derive(WeightedRows.without, outliers)
-            seen = JointFrames.from_weighted(rows)
-    if many:
+    if n_points > max(24 * n_shapes, options.many_points):
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
+        if not complete or table.outliers is not None or table.weights is not None:
+            seen = _visible_frames(table, complete)
     else:
-        assert seen is not None
-        frames, seen = seen, None
+        frames = _visible_frames(table, complete)
     thorough = frames.n_frames <= options.few_frames
     penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
@@ -175,6 +166,16 @@ def _problems(
         for part in table.sample.parts
     ]
     return [*problems, problem], seen
+
+
+def _visible_frames(table: FactorisedTable, complete: bool) -> JointFrames:
+    """Return the frames by their visible points, without outliers, weighted."""
+    if table.weights is not None:
+        return JointFrames.from_repeated(table.rows, table.weights)
+    if table.outliers is not None and table.outliers.any():
+        rows = table.rows.derive(WeightedRows.without, table.outliers)
+        return JointFrames.from_weighted(rows)
+    return JointFrames.from_points(table.rows, complete)
 
 
 def _first_fit(
