@@ -275,7 +275,7 @@ class TestJackknife:
         alpha, number = rng.normal(size=(30, 2)), iter(range(6))
 
         class Refit:
-            def __init__(self, frames, rows, shapes, motion, kept):
+            def __init__(self, frames, rows, weights, shapes, motion, kept):
                 self.number, self.kept, self.alpha = next(number), kept, alpha
                 self.rotations = rotations.as_matrix()
 

@@ -11,9 +11,7 @@ neighbouring points the variance of an estimate t is ::
 These fits do not have the prior of the extents, which would hide uncertain depths.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,13 +67,9 @@ def depth_certainty(
     known = np.isfinite(found.motion).all(axis=(1, 2)) & (least >= FEWEST_POINTS)
     if known.sum() < 2:
         return NOT_ESTIMATED
-    given: dict[str, Any] = {}
-    if w is not None:
-        given["weights"] = w[np.ix_(known, points)]
+    w = None if w is None else w[np.ix_(known, points)]
     shapes, motion = frames.shapes[:, :, points], found.motion[known]
-    fit: Callable[[NDArray], _Refit] = partial(
-        _Refit, frames, part[known], shapes, motion, **given
-    )
+    fit = partial(_Refit, frames, part[known], w, shapes, motion)
     whole = fit(np.ones(len(points), dtype=bool))
     errors = [fit(~group).errors(whole) for group in left_out]
     total, turns, variances = (
@@ -119,10 +113,10 @@ class _Refit:
         self,
         frames: PosteriorFrames,
         rows: NDArray,
+        weights: NDArray | None,
         shapes: NDArray,
         motion: NDArray,
         kept: NDArray,
-        weights: NDArray | None = None,
     ):
         rows, self.kept = rows[:, :, kept], kept
         shapes = shapes[:, :, kept] - shapes[:, :, kept].mean(axis=2, keepdims=True)
