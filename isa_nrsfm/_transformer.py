@@ -24,6 +24,7 @@ from isa_nrsfm._metric_upgrade.deforming import deformation_metric
 from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import check_table, validated_table
+from isa_nrsfm._prepare.point_weights import weighted_table
 from isa_nrsfm._summary import summary_html
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.sources import (
@@ -34,16 +35,7 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import (
-    Layout,
-    refuse_odd,
-    seen_points,
-    table_to_tracks,
-    tracks_to_table,
-)
-
-# Largest weight of a point: sums of weighted squares stay far from overflow.
-LARGEST_WEIGHT = 1e100
+from isa_nrsfm._tables.tracks import Layout, tracks_to_table
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -629,15 +621,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
                 "dataframe, or no point_weight"
             )
         table = self._opened(X, reset)
-        refuse_odd(table.empty.shape[1])
         layout = self.layout if reset else self._model.layout
-        shape = table.n_frames, table.empty.shape[1] // 2
-        weights = checked_weights(point_weight, shape)
-        visible = table.derive(partial(visible_rows, layout=layout), weights)
-        visible.empty = table.empty
-        seen = visible.joined(partial(visible_in, layout=layout))
-        weights = np.where(seen, weights, 0.0)
-        return visible, () if (weights == seen).all() else (weights,)
+        visible, weights = weighted_table(table, point_weight, layout)
+        return visible, () if weights is None else (weights,)
 
     def _opened(self, X: Any, reset: bool = False) -> FrameBlocks:
         """Return a table in checked blocks; unless `reset`, it must match the fit."""
@@ -672,45 +658,6 @@ def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
     return array
-
-
-def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
-    """Return the weights of points as an array of a given shape, or raise."""
-    weights = check_array(
-        unmasked(point_weight),
-        dtype=np.float64,
-        input_name="point_weight",
-        ensure_min_samples=0,
-    )
-    if weights.shape != shape:
-        raise ValueError(
-            f"point_weight must have a row for each frame and a column for each point, "
-            f"the shape {shape}; got {weights.shape}"
-        )
-    wrong = (weights < 0) | (weights > LARGEST_WEIGHT)
-    if wrong.any():
-        row, point = np.argwhere(wrong)[0]
-        raise ValueError(
-            f"point_weight must be between 0 and {LARGEST_WEIGHT:g}, because a weight "
-            f"is a number of observations; got {weights[row, point]:g} in row {row}, "
-            f"point {point}. Give points without information the weight 0"
-        )
-    return weights
-
-
-def visible_rows(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
-    """Return rows of a table with NaN for points whose weight (n, J) is zero."""
-    hidden = weights == 0
-    if not hidden.any():
-        return rows
-    tracks = table_to_tracks(rows, layout)
-    nan = rows.dtype.type(np.nan)
-    return tracks_to_table(np.where(hidden[..., None], nan, tracks), layout)
-
-
-def visible_in(rows: NDArray, layout: Layout) -> NDArray:
-    """Return a mask (n, n_points) of the visible points of rows of a table."""
-    return seen_points(table_to_tracks(rows, layout))
 
 
 def check_frames_kept(estimator: Any, what: str) -> None:

@@ -217,24 +217,6 @@ def check_points(
         )
 
 
-def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:
-    """Refuse weights (I, J) that are fewer observations than frames have unknowns.
-
-    The unknowns are camera, position and coefficients. Measured for 20 points and K =
-    2: the error of the shapes is 0.75 % if the weights of a frame are 49 coordinates,
-    0.89 % for 7, and 17 % for 5.
-    """
-    n_unknowns = n_components + (8 if camera == "affine" else 6)
-    mean = float(weights.sum(axis=1).mean())
-    if 2.0 * mean < n_unknowns:
-        raise ValueError(
-            f"the weights of a frame add up to {mean:.3g} observations on average, "
-            f"fewer than the {n_unknowns / 2:g} that its camera and n_components="
-            f"{n_components} coefficients need. Multiply point_weight by a number, so "
-            "that points with the least noise have weights of about one"
-        )
-
-
 def _groups(seen: NDArray) -> NDArray:
     """Return group numbers of points (J,) that frames (I, J) connect."""
     group = np.full(seen.shape[1], -1)

@@ -10,10 +10,10 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._prepare.checks import (
     check_points,
     check_size,
-    check_weights,
     visible_points,
     warn_if_other_layout,
 )
+from isa_nrsfm._prepare.point_weights import check_weights
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import (

@@ -1,0 +1,95 @@
+"""Weights of points: numbers of observations, zero where points are missing."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils import check_array
+
+from isa_nrsfm._tables.blocks import FrameBlocks
+from isa_nrsfm._tables.sources import unmasked
+from isa_nrsfm._tables.tracks import (
+    Layout,
+    refuse_odd,
+    seen_points,
+    table_to_tracks,
+    tracks_to_table,
+)
+
+# Largest weight of a point: sums of weighted squares stay far from overflow.
+LARGEST_WEIGHT = 1e100
+
+
+def weighted_table(
+    table: FrameBlocks, point_weight: Any, layout: Layout
+) -> tuple[FrameBlocks, NDArray | None]:
+    """Return a table with NaN for points of weight zero, and the weights (n, J).
+
+    Weights of missing points are zero. None if all visible points have weight one.
+    """
+    n_columns = table.empty.shape[1]
+    refuse_odd(n_columns)
+    weights = checked_weights(point_weight, (table.n_frames, n_columns // 2))
+    visible = table.derive(partial(_visible_rows, layout=layout), weights)
+    visible.empty = table.empty
+    seen = visible.joined(partial(_seen, layout=layout))
+    weights = np.where(seen, weights, 0.0)
+    return visible, None if (weights == seen).all() else weights
+
+
+def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
+    """Return the weights of points as an array of a given shape, or raise."""
+    weights = check_array(
+        unmasked(point_weight),
+        dtype=np.float64,
+        input_name="point_weight",
+        ensure_min_samples=0,
+    )
+    if weights.shape != shape:
+        raise ValueError(
+            f"point_weight must have a row for each frame and a column for each point, "
+            f"the shape {shape}; got {weights.shape}"
+        )
+    wrong = (weights < 0) | (weights > LARGEST_WEIGHT)
+    if wrong.any():
+        row, point = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"point_weight must be between 0 and {LARGEST_WEIGHT:g}, because a weight "
+            f"is a number of observations; got {weights[row, point]:g} in row {row}, "
+            f"point {point}. Give points without information the weight 0"
+        )
+    return weights
+
+
+def _visible_rows(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
+    """Return rows of a table with NaN for points whose weight (n, J) is zero."""
+    hidden = weights == 0
+    if not hidden.any():
+        return rows
+    tracks = table_to_tracks(rows, layout)
+    nan = rows.dtype.type(np.nan)
+    return tracks_to_table(np.where(hidden[..., None], nan, tracks), layout)
+
+
+def _seen(rows: NDArray, layout: Layout) -> NDArray:
+    """Return a mask (n, n_points) of the visible points of rows of a table."""
+    return seen_points(table_to_tracks(rows, layout))
+
+
+def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:
+    """Refuse weights (I, J) that are fewer observations than frames have unknowns.
+
+    The unknowns are camera, position and coefficients. Measured for 20 points and K =
+    2: the error of the shapes is 0.75 % if the weights of a frame are 49 coordinates,
+    0.89 % for 7, and 17 % for 5.
+    """
+    n_unknowns = n_components + (8 if camera == "affine" else 6)
+    mean = float(weights.sum(axis=1).mean())
+    if 2.0 * mean < n_unknowns:
+        raise ValueError(
+            f"the weights of a frame add up to {mean:.3g} observations on average, "
+            f"fewer than the {n_unknowns / 2:g} that its camera and n_components="
+            f"{n_components} coefficients need. Multiply point_weight by a number, so "
+            "that points with the least noise have weights of about one"
+        )
