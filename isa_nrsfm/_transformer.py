@@ -7,14 +7,11 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import (
-    BaseEstimator,
-    ClassNamePrefixFeaturesOutMixin,
-    TransformerMixin,
-)
+from sklearn.base import ClassNamePrefixFeaturesOutMixin, TransformerMixin
 from sklearn.utils import check_array, check_scalar, estimator_html_repr
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from isa_nrsfm._compat.scikit_learn import ShownEstimator
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.camera_models import full_rotations
@@ -82,7 +79,7 @@ class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
         return np.array(names, dtype=object)
 
 
-class TableTransformer(CoefficientNamesMixin, TransformerMixin, BaseEstimator):
+class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
     """The methods of `AffineNRSfM` that need a fit: its attributes and `_model`."""
 
     n_components: Any

@@ -5,6 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
+from sklearn.utils import shuffle
 
 from isa_nrsfm.analysis import (
     AlignedFrames,
@@ -229,6 +230,7 @@ class TestPredictability:
         person = np.repeat(np.arange(12), 10)
         y = (np.arange(12) % 2)[person]
         alpha = 10.0 * rng.normal(size=(12, 8))[person] + rng.normal(size=(120, 8))
+        alpha, y, person = shuffle(alpha, y, person, random_state=0)
         alone = predictability(alpha, y, random_state=0).mean()
         grouped = predictability(alpha, y, person, random_state=0).mean()
         assert alone > grouped + 0.15

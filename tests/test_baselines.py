@@ -86,7 +86,6 @@ class TestContract:
         expected_failed_checks=lambda estimator: {
             "check_estimators_nan_inf": "feeds tables that are not widened"
         },
-        xfail_strict=True,
     )
     def test_on_landmark_tables(self, estimator, check, landmark_tables):
         check(estimator)

@@ -315,7 +315,7 @@ class TestJackknife:
         w[100:] = -w[:100]  # their mean is no common rotation
         rotations = Rotation.random(100, rng)
         rotations = Rotation.concatenate([rotations, rotations])
-        common = Rotation.random(rng=rng)
+        common = Rotation.random(None, rng)
         turned = (Rotation.from_rotvec(w) * rotations * common).as_matrix()
         mirror = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
         fit = SimpleNamespace(

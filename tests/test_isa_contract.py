@@ -195,7 +195,6 @@ class TestParameters:
     expected_failed_checks=lambda estimator: {
         "check_array_api_input": "feeds signals that depend on each other",
     },
-    xfail_strict=True,
 )
 def test_scikit_learn_checks(estimator, check):
     check(estimator)

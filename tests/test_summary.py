@@ -23,6 +23,7 @@ def estimator(**params):
 def summary(model):
     """Return the rows of the summary, without tags."""
     shown = model._repr_html_()
+    assert model._repr_mimebundle_()["text/html"].count("isa-nrsfm-summary") == 1
     rows = re.findall(r"<tr><th[^>]*>(.*?)</th><td[^>]*>(.*?)</td></tr>", shown)
     return dict(rows)
 

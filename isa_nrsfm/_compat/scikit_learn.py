@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from sklearn.base import _fit_context
+from sklearn.base import BaseEstimator, _fit_context
 from sklearn.utils import _safe_indexing as taken_rows
 from sklearn.utils._missing import is_pandas_na
 from sklearn.utils._param_validation import (
@@ -18,6 +18,7 @@ from sklearn.utils.validation import _num_samples as number_of_rows
 __all__ = [
     "HasMethods",
     "Interval",
+    "ShownEstimator",
     "StrOptions",
     "check_parameters",
     "checked_parameters",
@@ -37,6 +38,19 @@ class Interval(_Interval):
     def is_satisfied_by(self, value: Any) -> bool:
         """Return whether a value is in the interval."""
         return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
+
+
+class ShownEstimator(BaseEstimator):
+    """Estimators that notebooks show by `_html_repr`, also with scikit-learn 1.6."""
+
+    def _repr_html_inner(self) -> str:
+        """Return what `_repr_html_` returns."""
+        return self._html_repr()
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+        """Return the texts of which a notebook shows one."""
+        texts: dict[str, str] = super()._repr_mimebundle_(**kwargs)
+        return texts | {kind: self._html_repr() for kind in texts if "html" in kind}
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:

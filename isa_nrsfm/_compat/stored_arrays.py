@@ -1,10 +1,21 @@
-"""Arrays in NumPy's format, checked against the size of their file."""
+"""Arrays in NumPy's format: many in a file, and one of the size of its file."""
 
 import io
 import math
+from collections.abc import Mapping
+from typing import IO
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+
+
+def write_arrays(file: IO[bytes], arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays as `numpy.savez`, which in numpy 2.0 leaves a broken file open."""
+    with ZipFile(file, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
 
 
 def array_in(content: bytes) -> NDArray:

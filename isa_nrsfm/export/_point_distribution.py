@@ -14,7 +14,7 @@ from sklearn.decomposition import PCA
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.scikit_learn import Interval, checked_parameters
-from isa_nrsfm._compat.stored_arrays import array_in
+from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm.export._names import suffix_of
@@ -203,13 +203,14 @@ def write_pdm(pdm: PointDistributionModel, path: str | os.PathLike[str]) -> None
     (for doubles), and its rows. In MATLAB M is 3n x 1, V 3n x m and E m x 1.
     """
     suffix = suffix_of(path, SUFFIXES)
-    mean, modes, eigenvalues = map(np.asarray, pdm)
-    _check_shapes(PointDistributionModel(mean, modes, eigenvalues))
+    checked = PointDistributionModel(*map(np.asarray, pdm))
+    _check_shapes(checked)
+    mean, modes, eigenvalues = checked
     M = mean.T.reshape(-1, 1)
     V = modes.transpose(2, 1, 0).reshape(mean.size, len(eigenvalues))
     with whole_file(path) as file:
         if suffix == ".npz":
-            np.savez(file, mean=mean, modes=modes, eigenvalues=eigenvalues)
+            write_arrays(file, checked._asdict())
         elif suffix == ".mat":
             savemat(file, {"M": M, "V": V, "E": eigenvalues[:, None]})
         else:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.stored_arrays import write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import check_class
 from isa_nrsfm._tables.column_names import names_of_points
@@ -131,7 +132,7 @@ def write_shapes(model: Any, path: str | os.PathLike[str]) -> None:
     arrays = shape_arrays(model)._asdict()
     with whole_file(path) as file:
         if suffix == ".npz":
-            np.savez(file, **arrays)
+            write_arrays(file, arrays)
         else:
             for name in ("point_names", "component_names"):
                 arrays[name] = arrays[name].astype(object)

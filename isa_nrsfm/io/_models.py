@@ -17,7 +17,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm import __version__
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.stored_arrays import array_in
+from isa_nrsfm._compat.stored_arrays import array_in, write_arrays
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._estimator import AffineNRSfM
 from isa_nrsfm._fitted_model import TableModel
@@ -115,9 +115,8 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     }
     header["digest"] = _digest(header, arrays)
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    stored: dict[str, Any] = {HEADER: text, **arrays}
     with whole_file(path) as file:
-        np.savez(file, **stored)
+        write_arrays(file, {HEADER: text, **arrays})
 
 
 def load_model(path: str | os.PathLike[str]) -> AffineNRSfM:
