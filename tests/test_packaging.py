@@ -1,11 +1,31 @@
-"""What users get: types, and an import that brings nothing they did not ask for."""
+"""What users install: its files, its version, and the packages that it needs."""
 
+import re
 import subprocess
 import sys
-from importlib import resources
+import tarfile
+import tomllib
+from importlib import metadata, resources
+from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
+import yaml
+from packaging.requirements import Requirement
 
+from isa_nrsfm import __version__
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+CORE = {"numpy", "scipy", "scikit-learn", "joblib"}
+# Files of the package that are no Python code.
+DATA = {
+    "isa_nrsfm/py.typed",
+    "isa_nrsfm/cli/report.html",
+    "isa_nrsfm/datasets/face_model.csv",
+    "isa_nrsfm/export/viewer.html",
+    "isa_nrsfm/export/viewer.js",
+}
 FOUND_AT_IMPORT = """
 import sys, sklearn.decomposition
 before = set(sys.modules)
@@ -13,6 +33,49 @@ from isa_nrsfm import AffineNRSfM
 print(*(set(sys.modules) - before))
 """
 OWN_PARTS = ("baselines", "calibration", "cli", "datasets", "io", "metrics", "plotting")
+FIT_OF_AN_ARRAY = """
+import sys
+
+class Blocked:
+    def find_spec(name, path=None, target=None):
+        if name.partition(".")[0] in {blocked}:
+            raise ModuleNotFoundError(name, name=name)
+
+sys.meta_path.insert(0, Blocked)
+import numpy as np
+from isa_nrsfm import AffineNRSfM
+
+X = np.random.default_rng(0).normal(size=(40, 24))
+model = AffineNRSfM(1, refinement={refinement!r}, max_iter=3, random_state=0).fit(X)
+assert model.transform(X[:3]).shape == (3, 1)
+assert model._repr_html_()
+"""
+
+
+def lowest_versions(requirements):
+    """Return the lowest version of each required package."""
+    pairs = map(Requirement, requirements)
+    return {each.name: str(each.specifier).removeprefix(">=") for each in pairs}
+
+
+def installed_besides(packages):
+    """Return the top modules of all packages that these do not require."""
+    found, left = set(), set(packages)
+    while left:
+        package = left.pop()
+        found.add(package)
+        required = map(Requirement, metadata.requires(package) or ())
+        left |= {each.name for each in required if not each.marker} - found
+    tops = metadata.packages_distributions()
+    return {top for top, names in tops.items() if not found & {*map(str.lower, names)}}
+
+
+def built(kind, folder, monkeypatch):
+    """Return the path of a new wheel or sdist."""
+    from hatchling import build
+
+    monkeypatch.chdir(ROOT)
+    return folder / getattr(build, f"build_{kind}")(str(folder))
 
 
 @pytest.mark.subprocess
@@ -27,5 +90,70 @@ def test_estimator_brings_only_what_every_fit_needs():
     assert not modules & {f"isa_nrsfm.{part}" for part in OWN_PARTS}
 
 
+@pytest.mark.subprocess
+@pytest.mark.parametrize("refinement", [None, "joint"])
+def test_arrays_are_fitted_with_the_core_dependencies_alone(refinement):
+    assert {*lowest_versions(PROJECT["project"]["dependencies"])} == CORE
+    blocked = installed_besides(CORE) - {"isa_nrsfm"}
+    assert {"pandas", "matplotlib", "yaml", "pytest"} <= blocked
+    code = FIT_OF_AN_ARRAY.format(blocked=blocked, refinement=refinement)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_package_says_that_it_has_types():
     assert resources.files("isa_nrsfm").joinpath("py.typed").is_file()
+
+
+@pytest.mark.slow
+def test_wheel_has_the_package_and_its_licence(tmp_path, monkeypatch):
+    with ZipFile(built("wheel", tmp_path, monkeypatch)) as wheel:
+        sizes = {each.filename: each.file_size for each in wheel.infolist()}
+    about = f"isa_nrsfm-{__version__}.dist-info"
+    assert {f"{about}/licenses/LICENSE", f"{about}/entry_points.txt"} <= set(sizes)
+    package = {name for name in sizes if not name.startswith(about)}
+    code = {str(file.relative_to(ROOT)) for file in ROOT.glob("isa_nrsfm/**/*.py")}
+    assert package == DATA | code
+    assert max(sizes.values()) < 100_000
+
+
+@pytest.mark.slow
+def test_sdist_has_code_tests_and_pages_without_large_data(tmp_path, monkeypatch):
+    with tarfile.open(built("sdist", tmp_path, monkeypatch)) as sdist:
+        sizes = {each.name.partition("/")[2]: each.size for each in sdist}
+    assert DATA <= set(sizes)
+    files = "CHANGELOG.md CITATION.cff LICENSE README.md pyproject.toml noxfile.py"
+    files += " tests/conftest.py docs/conf.py benchmarks/__main__.py"
+    assert set(files.split()) <= set(sizes)
+    tests = {name: size for name, size in sizes.items() if name.startswith("tests/")}
+    assert max(tests.values()) < 100_000
+    assert max(sizes.values()) < 500_000
+
+
+def test_version_is_the_same_everywhere():
+    assert PROJECT["tool"]["hatch"]["version"]["path"] == "isa_nrsfm/__init__.py"
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == __version__
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    headings = r"^## \[(.+)\] - (?:\d{4}-\d\d-\d\d|unreleased)$"
+    versions = re.findall(headings, changes, re.MULTILINE)
+    assert versions[0] == __version__
+    assert re.findall(r"^\[(\d.+)\]: .*/v\1$", changes, re.MULTILINE) == versions
+
+
+def test_the_recipe_has_the_bounds_and_the_version_of_the_package():
+    file = ROOT / ".github" / "conda-forge" / "recipe.yaml"
+    if not file.exists():
+        pytest.skip("the sdist has no recipe")
+    recipe = yaml.safe_load(file.read_text(encoding="utf-8"))
+    assert recipe["context"]["version"] == __version__
+    python = ">=" + recipe["context"]["python_min"]
+    assert python == PROJECT["project"]["requires-python"]
+    run = recipe["requirements"]["run"][1:]
+    assert [each.replace(" ", "") for each in run] == PROJECT["project"]["dependencies"]
+    extras = PROJECT["project"]["optional-dependencies"]
+    bounds = lowest_versions(sum(extras.values(), PROJECT["build-system"]["requires"]))
+    optional = recipe["requirements"]["run_constraints"]
+    for requirement in [recipe["requirements"]["host"][-1], *optional]:
+        name, bound = requirement.replace("-base", "").split(" >=")
+        assert bounds[name] == bound, name
