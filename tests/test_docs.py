@@ -74,6 +74,38 @@ def test_links_of_the_readme_lead_somewhere():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
+def test_figures_of_the_readme_are_those_of_the_benchmarks():
+    page = text("docs/benchmarks/truth.md").partition("convention='frame'")[2]
+    printed = [line.split(" | ") for line in page.splitlines() if line[:2] == "| "]
+    order = {"faces": "ICT-68", "drink": "drink", "pickup": "pickup"}
+    order |= {"yoga": "yoga", "shark": "Shark", "flag": "flag"}
+    columns = [
+        next(k for k, name in enumerate(printed[0]) if name.startswith(title))
+        for title in order.values()
+    ]
+    methods = ["rigid mean shape", "BMM", "Kong-Lucey"]
+    methods += ["ISA2, paper's refinement", "ISA, weak perspective"]
+    lines = text("README.md").partition("## How accurate")[2].partition("\n## ")[0]
+    table = [
+        re.split(r" \| ", x.strip("| ")) for x in lines.splitlines() if x[:1] == "|"
+    ]
+    assert table[0][1:] == list(order)
+    for method, row in zip(methods, table[2:], strict=True):
+        cells = next(line for line in printed if line[0] == f"| {method}")
+        expected = [100 * float(cells[k].split()[0]) for k in columns]
+        found = [float(cell.strip("*")) for cell in row[1:]]
+        np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=method)
+
+
+def test_each_picture_is_shown_and_has_its_script():
+    pages = text("README.md") + text("docs/index.md")
+    pictures = sorted((ROOT / "docs" / "figures").glob("*.png"))
+    assert pictures
+    for picture in pictures:
+        assert picture.with_suffix(".py").is_file(), picture
+        assert f"figures/{picture.name}" in pages, picture
+
+
 def test_the_api_page_lists_all_public_modules():
     modules = {m.name for m in iter_modules(isa_nrsfm.__path__)}
     public = {name for name in modules - {"cli"} if not name.startswith("_")}
@@ -84,7 +116,7 @@ def test_the_api_page_lists_all_public_modules():
 @pytest.mark.usefixtures("tables")
 def test_the_readme_runs():
     names = run("README.md")
-    assert names["model"].alpha_.shape == (120, 9)
+    assert names["model"].alpha_.shape == (120, 4)
 
 
 @pytest.mark.usefixtures("tables")
