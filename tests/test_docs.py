@@ -1,15 +1,19 @@
 """The code in the pages runs, and the pages name what there is."""
 
+import os
 import re
+import shlex
 from pathlib import Path
 from pkgutil import iter_modules
 
 import numpy as np
 import pandas as pd
 import pytest
+from landmark_files import write_openface
 from scipy.io import savemat
 
 import isa_nrsfm
+from isa_nrsfm.cli import main
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.skeletons import SKELETONS
 
@@ -38,6 +42,21 @@ def tables(tmp_path, monkeypatch):
     frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 40))
     frame.to_csv("faces.csv", index=False)
     frame[:5].to_csv("new_faces.csv", index=False)
+
+
+@pytest.fixture
+def video(tmp_path, monkeypatch):
+    """Write a video of three people in two conditions, and a file with confidences."""
+    monkeypatch.chdir(tmp_path)
+    faces = make_face_tracks(n_frames=60, random_state=0)
+    frame = pd.DataFrame(faces.data, columns=faces.feature_names)
+    frame.insert(0, "person", np.repeat(["Ada", "Ben", "Cyd"], 20))
+    frame.insert(1, "condition", np.tile(["before", "after"], 30))
+    frame.insert(2, "seconds", np.tile(np.arange(20) / 25, 3))
+    frame.to_csv("faces.csv", index=False)
+    frame[:5].to_csv("new_faces.csv", index=False)
+    confidence = np.linspace(0.7, 1, 60)
+    write_openface(tmp_path / "openface.csv", faces.tracks, confidence=confidence)
 
 
 @pytest.fixture
@@ -149,6 +168,47 @@ def test_the_page_of_questions_runs():
     )
     assert Path("time.png").stat().st_size
     assert Path("gestures.png").stat().st_size
+
+
+def codes_of_calls(column):
+    """Return the codes in a column of the tables of calls, in their order."""
+    lines = text("docs/which_call.md").splitlines()
+    rows = [line.split(" | ") for line in lines if line.startswith("| ")]
+    return [code for row in rows for code in re.findall(r"`([^`]+)`", row[column])]
+
+
+@pytest.mark.usefixtures("video")
+def test_python_calls_for_questions_run():
+    names = run("docs/which_call.md")
+    names["weights"] = names["read_landmarks"]("openface.csv").confidence
+    codes = codes_of_calls(1)
+    assert len(codes) > 20
+    results = {code: eval(code, names) for code in codes}
+    assert results["model.reconstruct(points)"].shape == (60, 68, 3)
+    assert results["model.transform(new_points)"].shape == (5, 4)
+    assert {"pdm.txt", "faces.glb", "faces.mat"} <= set(os.listdir())
+
+
+@pytest.mark.usefixtures("video")
+def test_commands_for_questions_run():
+    fit = "fit --n-components 4 --camera weak_perspective --no-figures"
+    codes = codes_of_calls(2)
+    options = [code for code in codes if code.startswith("--")]
+    commands = [code for code in codes if code.startswith("isa-nrsfm ")]
+    assert len(options) > 8
+    assert len(commands) > 4
+    assert main([*fit.split(), "faces.csv", "--output", "out"]) == 0
+    written = {code for code in codes if code.count(".") == 1 and " " not in code}
+    assert written == {"viewer.html", "shapes.npz", "alpha.csv", "cameras.csv"}
+    assert written <= set(os.listdir("out"))
+    for code in options:
+        table = "openface.csv" if "confidence" in code else "faces.csv"
+        output = ["--output", "again", "--force"]
+        assert main([*fit.split(), table, *shlex.split(code), *output]) == 0, code
+        if code == "--group person":
+            assert "alpha_1_within" in pd.read_csv("again/alpha.csv")
+    for code in commands:
+        assert main(shlex.split(code)[1:]) == 0, code
 
 
 def test_orders_of_matlab_are_the_same_table(sequence):
