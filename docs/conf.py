@@ -75,7 +75,9 @@ html_theme_options = {
 sphinx_gallery_conf = {
     "examples_dirs": "examples",
     "gallery_dirs": "gallery",
-    "subsection_order": ExplicitOrder(["examples/guide", "examples/problems"]),
+    "subsection_order": ExplicitOrder(
+        ["examples/guide", "examples/sources", "examples/problems"]
+    ),
     "within_subsection_order": ExplicitOrder(
         [
             "plot_method.py",
@@ -86,6 +88,11 @@ sphinx_gallery_conf = {
             "plot_missing_and_outliers.py",
             "plot_pose_and_units.py",
             "plot_pca_and_fastica.py",
+            "plot_openface.py",
+            "plot_mediapipe.py",
+            "plot_dlib.py",
+            "plot_deeplabcut.py",
+            "plot_coco.py",
             "plot_expressions.py",
             "plot_labels_and_people.py",
             "plot_motion.py",
