@@ -59,8 +59,8 @@ CoefficientsDisplay(
 ReprojectionDisplay.from_estimator(model, hand.points, frames=[50, 90, 160])
 
 # %%
-# The same on the command line. It also reads the edges between body parts from the
-# ``config.yaml`` of a project::
+# The same on the command line. ``--skeleton config.yaml`` adds the edges between body
+# parts from a project::
 #
 #     isa-nrsfm fit handDLC.csv --min-confidence 0.6 --n-components 3 --fps 25 \
 #         --output out

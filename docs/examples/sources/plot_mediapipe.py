@@ -2,8 +2,9 @@
 MediaPipe: face mesh and pose
 =============================
 
-MediaPipe detects 478 points of a face and 33 points of a body. This example reads a
-csv file of face meshes, and the results of the pose landmarker in memory.
+MediaPipe detects 478 points of a face and 33 points of a body. It writes no files;
+scripts often store x and y of each point in a csv file. This example reads such a
+file of face meshes, and results of the pose landmarker in memory.
 
 The first block generates 150 face meshes and 300 bodies. All points are linear
 combinations of generated landmarks, because the package contains no mesh.
@@ -16,6 +17,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
+from scipy.interpolate import interp1d
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
@@ -39,12 +41,8 @@ mesh = np.einsum("jk,ikd->ijd", rng.dirichlet(np.full(71, 0.05), 478), faces)
 mesh_curves = get_skeleton("mediapipe-face-478").curves
 for points, along in zip(mesh_curves, CURVES, strict=True):
     place = np.linspace(0, len(along) - 1, len(points))
-    before = np.minimum(place.astype(int), len(along) - 2)
-    share = (place - before)[:, None]
-    along = faces[:, list(along)]
-    mesh[:, list(points)] = (1 - share) * along[:, before] + share * along[
-        :, before + 1
-    ]
+    curve = interp1d(np.arange(len(along)), faces[:, list(along)], axis=1)
+    mesh[:, list(points)] = curve(place)
 
 width, height = mesh.reshape(-1, 2).max(axis=0)
 names = [f"{axis}_{j}" for j in range(478) for axis in "xy"]
@@ -71,18 +69,14 @@ BasisShapeDisplay.from_estimator(model, components=[0, 1, 2], n_columns=2)
 # `from_mediapipe` reads the objects that a landmarker returns, one for each image. It
 # accepts results of faces and hands, too. The visibility of a point is its confidence.
 
-bodies = make_body_tracks(300, n_people=1, camera="orthographic", random_state=0).tracks
+people = make_body_tracks(300, n_people=1, camera="orthographic", random_state=0)
 order = [0, 1, 1, 1, 2, 2, 2, 3, 4, 0, 0, 5, 6, 7, 8, 9, 10, 9, 10, 9, 10, 9, 10]
 order += [11, 12, 13, 14, 15, 16, 15, 16, 15, 16]
-pose = bodies[:, order] + rng.normal(0, 2, (300, 33, 2))
-results = [
-    SimpleNamespace(
-        pose_landmarks=[
-            [SimpleNamespace(x=x / 1920, y=y / 1080, visibility=0.9) for x, y in body]
-        ]
-    )
-    for body in pose
-]
+pose = people.tracks[:, order] + rng.normal(0, 2, (300, 33, 2))
+results = []
+for body in pose / (1920, 1080):
+    landmarks = [SimpleNamespace(x=x, y=y, visibility=0.9) for x, y in body]
+    results.append(SimpleNamespace(pose_landmarks=[landmarks]))
 people = from_mediapipe(results, image_sizes=(1920, 1080))
 model = AffineNRSfM(10, camera="orthographic", random_state=0)
 model.fit(people.points, point_weight=people.confidence)
