@@ -3,7 +3,7 @@ Measurements: ``python -m benchmarks`` and single ones.
 
 ``python -m benchmarks`` measures all methods side by side and writes tables and
 pictures; docs/benchmarks/README.md says how. Its sections are in `_fits`, `_recovered`,
-`_unseen`, `_classification`, `_agreement` and `_cost`.
+`_unseen`, `_classification`, `_agreement`, `_cost` and `_paper`.
 
 `asv_suite`, with asv.conf.json, is a suite for airspeed velocity.
 

@@ -103,13 +103,7 @@ def measure_fit(measured, name, method, seed):
         "inverse_snr": inverse_snr(X, result.X, scale_frames=scale_frames),
         "n_iter": getattr(model, "n_iter_", None),
     }
-    if chosen.truth and result.affine is not None:
-        truth = true_shapes(name, seed)
-        if chosen.truth == "object":
-            error = affine_shape_error(truth, result.affine)
-            values["affine_shape_error"] = error
-        if chosen.camera != "affine":
-            values |= errors_3d(chosen, shapes_in_camera(name, seed), result)
+    values |= truth_errors(name, seed, result)
     frames = (np.array(SHOWN) * len(X)).astype(int)
     shown = {
         "frames": frames,
@@ -117,6 +111,19 @@ def measure_fit(measured, name, method, seed):
         "reprojected": result.X[frames].reshape(len(frames), -1, 2),
     }
     return values, shown
+
+
+def truth_errors(name, seed, result):
+    """Return the errors in 3D of what was found, by name; none without a truth."""
+    chosen, values = SETS[name], {}
+    if not chosen.truth or result.affine is None:
+        return values
+    if chosen.truth == "object":
+        truth = true_shapes(name, seed)
+        values["affine_shape_error"] = affine_shape_error(truth, result.affine)
+    if chosen.camera != "affine":
+        values |= errors_3d(chosen, shapes_in_camera(name, seed), result)
+    return values
 
 
 def errors_3d(chosen, truth, result):

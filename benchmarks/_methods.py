@@ -195,7 +195,13 @@ METHODS = {
     "orthographic": Method(
         "ISA, orthographic", partial(ours, camera="orthographic"), found_by_ours, True
     ),
+    "consensus": Method(
+        "ISA, consensus",
+        partial(ours, camera="weak_perspective", refinement="consensus"),
+        found_by_ours,
+        True,
+    ),
 }
 # Those that know something of the cameras.
-CALIBRATED = ("weak_perspective", "orthographic")
+CALIBRATED = ("weak_perspective", "orthographic", "consensus")
 METHOD_TITLES = {name: method.title for name, method in METHODS.items()}

@@ -8,6 +8,7 @@ from benchmarks import (
     _classification,
     _cost,
     _fits,
+    _paper,
     _recovered,
     _unseen,
 )
@@ -75,8 +76,9 @@ SECTIONS = {
             "synthetic",
             "synthetic_affine",
         ),
-        tuple(METHODS),
+        tuple(name for name in METHODS if name != "consensus"),
         ("ict_dense", "drink_k11", "pickup_k11", "yoga_k9"),
+        ("consensus",),
         draw=_fits.draw_truth,
     ),
     "recovery": Section(
@@ -119,5 +121,12 @@ SECTIONS = {
         ("joint", _cost.SVD),
         other_methods=("isa2",),
         draw=_cost.draw,
+    ),
+    "paper": Section(
+        "The paper's experiments",
+        _paper.jobs,
+        _paper.page,
+        tuple(_paper.PRINTED),
+        _paper.COMPARED,
     ),
 }

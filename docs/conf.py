@@ -29,7 +29,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx_gallery.gen_gallery",
 ]
-exclude_patterns = ["_templates", "examples"]
+exclude_patterns = ["_templates", "examples", "paper"]
 templates_path = ["_templates"]
 
 # Everything is found without a network: there is no intersphinx, and names of other

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +13,15 @@ from scenes import random_rotation
 import benchmarks.__main__ as command
 from benchmarks import (
     _fits,
+    _paper,
     questions,
     sensitivity,
 )
 from benchmarks._markdown import cell, value
 from benchmarks._methods import METHODS, Found
-from benchmarks._results import Record, Results
+from benchmarks._results import Record, Results, rounded
 from benchmarks._sections import SECTIONS
-from benchmarks._sets import SETS, Set
+from benchmarks._sets import SETS, Set, Table
 from isa_nrsfm._fit import Limits as FitLimits
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
@@ -174,6 +176,53 @@ def test_stored_results_give_every_page(name):
     stored = Results(ROOT / "docs" / "benchmarks" / "results.json").of(name)
     rows = [line for line in section.page(stored).splitlines() if line[:2] == "| "]
     assert len(rows) > 3
+
+
+def test_jobs_of_the_paper_leave_out_what_takes_too_long():
+    jobs = _paper.jobs("paper", list(_paper.PRINTED), _paper.COMPARED, 3)
+    fits = [job for job in jobs if job.parameters["part"] == "fit"]
+    dense = {job.method for job in fits if job.set == "ict_dense"}
+    assert dense == {*_paper.COMPARED} - {"pi", "bmm", "kong_lucey", "consensus"}
+    seeds = [(job.set, job.seed) for job in fits if job.method == "isa1"]
+    assert seeds.count(("shark", 2)) == 1
+    assert ("ict_dense", 1) not in seeds
+    assert not [job for job in fits if job.method == "consensus" and job.seed]
+
+
+def test_random_mixing_spoils_blocks_unless_energies_are_equal():
+    assert _paper.turned_at_random(np.ones(9)) == pytest.approx(0.0, abs=1e-12)
+    assert _paper.turned_at_random([5.0, 2.0, 1.0]) == pytest.approx(0.0, abs=1e-12)
+    # One direction alone: w w^T of a random unit vector has 2 / 3 outside its blocks
+    # where these are even, and less where they are not.
+    one = _paper.turned_at_random([1.0] + 8 * [0.0])
+    assert 0.3 < one < 2 / 3
+
+
+def test_the_page_of_the_paper_has_what_was_measured(tracks, monkeypatch):
+    monkeypatch.setattr(_paper, "load", lambda name: Table(tracks.data))
+    monkeypatch.setattr(_paper, "NUMBERS", {"flag": (1, 2)})
+    monkeypatch.setattr(_paper, "STARTS", (1, 2))
+    records = []
+    for job in _paper.jobs("paper", ["flag"], _paper.ISA, 2):
+        values = {"inverse_snr": 0.0123, "frame_error": 0.0456}
+        if job.parameters["part"] != "fit":
+            values, arrays = job.function(nullcontext, **job.arguments)
+            assert arrays == {}
+        plain = record(section="paper", set="flag", method=job.method, seed=job.seed)
+        changes = {"values": rounded(values), "parameters": job.parameters}
+        records.append(plain._replace(**changes))
+    parts = {r.parameters["part"]: r.values for r in records if r.method == "isa2"}
+    assert list(parts["numbers"]["inverse_snr"]) == ["1", "2"]
+    assert parts["numbers"]["floor"]["2"] < parts["numbers"]["inverse_snr"]["2"]
+    assert len(parts["blocks"]["outside"]) == 2
+    assert max(parts["blocks"]["outside"]) < parts["blocks"]["random"]
+
+    page = _paper.page(records)
+    assert "| flag, K=5 | Balloon | 0.12 | 1.23 | 1.23 | - | - | - | - |" in page
+    assert "| Kong-Lucey | 1.2; - |" in page
+    assert "| ISA2, paper's refinement | 0.0456 |" in page
+    for heading in ("flag: K | 1 | 2 |", "flag: starts | 1 | 2 |", "flag: blocks | "):
+        assert f"| {heading}" in page
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -125,6 +125,21 @@ def test_each_picture_is_shown_and_has_its_script():
         assert f"figures/{picture.name}" in pages, picture
 
 
+def test_the_paper_cites_its_references_and_prints_what_commands_wrote():
+    paper = text("docs/paper/paper.md").split("---", 2)[2]
+    assert 750 <= len(paper.split()) <= 1750
+    keys = re.findall(r"^@\w+\{(\w+),", text("docs/paper/paper.bib"), re.MULTILINE)
+    assert sorted(set(re.findall(r"@(\w+\d{4})", paper))) == sorted(keys)
+    pictures = re.findall(r"\]\((\S+\.png)\)", paper)
+    assert len(pictures) == 2
+    assert [p for p in pictures if not (ROOT / "docs/paper" / p).is_file()] == []
+    rows = re.findall(r"\| ([\d.]+) \| ([\d.]+) \| `python -m benchmarks (\w+)`", paper)
+    assert len(rows) == 6
+    for *figures, page in rows:
+        written = text(f"docs/benchmarks/{page}.md")
+        assert [f for f in figures if f"| {f} " not in written] == [], page
+
+
 def test_the_api_page_lists_all_public_modules():
     modules = {m.name for m in iter_modules(isa_nrsfm.__path__)}
     public = {name for name in modules - {"cli"} if not name.startswith("_")}
