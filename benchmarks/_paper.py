@@ -213,24 +213,24 @@ def blocks(measured, name, method, repeats):
     }, {}
 
 
-def by_number(measured, name, method, repeats):
+def by_number(measured, name, method, repeats, numbers=None):
     """Measure the inverse SNR and the rank floor by number of basis shapes."""
-    choices = [(K, 0, {}) for K in NUMBERS[name]]
+    choices = [(K, 0, {}) for K in numbers or NUMBERS[name]]
     models = list(fits(measured, name, method, choices))
     errors = {len(model.basis_): model.inverse_snr_ for model in models}
     floors = {len(model.basis_): model.rank_floor_ for model in models}
     return {"inverse_snr": errors, "floor": floors}, {}
 
 
-def by_starts(measured, name, method, repeats):
+def by_starts(measured, name, method, repeats, starts=STARTS):
     """Measure the inverse SNR by number of random starts of FastISA."""
     K = SETS[name].case.n_components
     choices = [
-        (K, seed, {"isa": FastISA(n_init=n)}) for n in STARTS for seed in range(repeats)
+        (K, seed, {"isa": FastISA(n_init=n)}) for n in starts for seed in range(repeats)
     ]
     errors = [model.inverse_snr_ for model in fits(measured, name, method, choices)]
-    by_start = np.reshape(errors, (len(STARTS), repeats))
-    return {"inverse_snr": dict(zip(STARTS, by_start, strict=True))}, {}
+    by_start = np.reshape(errors, (len(starts), repeats))
+    return {"inverse_snr": dict(zip(starts, by_start, strict=True))}, {}
 
 
 def by_recovery(measured, name, method, repeats):

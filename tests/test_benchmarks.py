@@ -200,13 +200,16 @@ def test_random_mixing_spoils_blocks_unless_energies_are_equal():
 
 def test_the_page_of_the_paper_has_what_was_measured(tracks, monkeypatch):
     monkeypatch.setattr(_paper, "load", lambda name: Table(tracks.data))
-    monkeypatch.setattr(_paper, "NUMBERS", {"flag": (1, 2)})
-    monkeypatch.setattr(_paper, "STARTS", (1, 2))
+    fewer = {"numbers": {"numbers": (1, 2)}, "starts": {"starts": (1, 2)}}
     records = []
-    for job in _paper.jobs("paper", ["flag"], _paper.ISA, 2):
+    for job in _paper.jobs("paper", ["flag"], _paper.ISA, 1):
         values = {"inverse_snr": 0.0123, "frame_error": 0.0456}
-        if job.parameters["part"] != "fit":
-            values, arrays = job.function(nullcontext, **job.arguments)
+        part = job.parameters["part"]
+        if (job.method, part) == ("isa1", "blocks"):
+            continue  # thirty starts
+        if part != "fit":
+            chosen = job.arguments | fewer.get(part, {})
+            values, arrays = job.function(nullcontext, **chosen)
             assert arrays == {}
         plain = record(section="paper", set="flag", method=job.method, seed=job.seed)
         changes = {"values": rounded(values), "parameters": job.parameters}
@@ -214,7 +217,6 @@ def test_the_page_of_the_paper_has_what_was_measured(tracks, monkeypatch):
     parts = {r.parameters["part"]: r.values for r in records if r.method == "isa2"}
     assert list(parts["numbers"]["inverse_snr"]) == ["1", "2"]
     assert parts["numbers"]["floor"]["2"] < parts["numbers"]["inverse_snr"]["2"]
-    assert len(parts["blocks"]["outside"]) == 2
     assert max(parts["blocks"]["outside"]) < parts["blocks"]["random"]
 
     page = _paper.page(records)
