@@ -83,8 +83,8 @@ PRINTED = {
     "ict_68": Printed(
         "no table",
         {},
-        "Landmarks of the same faces, with known shapes: the order of the methods "
-        "is the same as for dense faces, and lower errors in 3D go with it.",
+        "Landmarks of the same faces: the order of ISA1, ISA2 and the joint "
+        "refinement is that of the dense faces, also in 3D.",
     ),
 }
 BASELINES = ("pi", "bmm", "kong_lucey")
