@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
+from operator import attrgetter
 from threading import Lock
 from typing import Any, ClassVar, TypeVar, cast
 from weakref import WeakSet
@@ -34,7 +35,8 @@ class OneBlasThread:
         """Remember the number of threads, and set it to one."""
         pools = _pools()
         with self._lock:
-            self._before = [pool.num_threads for pool in pools]
+            # From Python 3.12 on, a tracer that stops a comprehension keeps the lock.
+            self._before = list(map(attrgetter("num_threads"), pools))
             if not self._of_process:
                 self._of_process[:] = self._before
             self._users.add(self)
