@@ -277,7 +277,7 @@ class TestFittedGroups:
     def test_each_group_has_its_points(self, monkeypatch):
         """Groups have up to three quarters of the points, and those with a fit stay."""
         rng = np.random.default_rng(0)
-        scene = scene_of(rng.standard_normal((8, 3, 30)))
+        scene = scene_of(rng.standard_normal((8, 3, 42)))
         distances = neighbour_distances(scene.first)
         steps, tasks = [], []
 
@@ -286,12 +286,12 @@ class TestFittedGroups:
             assert n_components == 5
             assert settings.on_step is None
             n_points = part.rows.shape[2]
-            return None if n_points == 20 else (np.arange(8), part.first, 1e-3)
+            return None if n_points == 30 else (np.arange(8), part.first, 1e-3)
 
         monkeypatch.setattr(consensus_module, "group_fit", fit)
         settings = SETTINGS._replace(on_step=lambda: steps.append(1))
         groups = consensus_module.fitted_groups(scene, distances, 5, settings, None)
-        expected = [neighbourhoods(distances, size) for size in (12, 20)]
+        expected = [neighbourhoods(distances, size) for size in (12, 30)]
         assert len(tasks) == len(steps) == sum(map(len, expected))
         assert len(groups) == len(expected[0])
         for group, (points, count) in zip(groups, expected[0], strict=True):
@@ -341,6 +341,11 @@ class TestConsensus:
             return [Group(points, np.arange(30), coordinates, 2e-4, 1.0)]
 
         monkeypatch.setattr(consensus_module, "fitted_groups", fitted_groups)
+        monkeypatch.setattr(
+            consensus_module,
+            "common_coordinates",
+            lambda images, first, groups, noise, floor: first,
+        )
         blocks = FrameBlocks.of_array(rows, 30)
         result = consensus_module.consensus(model, blocks, SETTINGS, 29, 40)
         return model, rows, passed, result
@@ -386,7 +391,7 @@ class TestConsensus:
         assert_allclose(result.variances, np.mean(expected**2, axis=0), rtol=3e-3)
 
     def test_variances_are_mean_square_changes_of_depths(self, monkeypatch):
-        """The noise is that of the groups."""
+        """The noise is that of the groups, with the last floor."""
         d = centred(np.random.default_rng(1).standard_normal((30, 20)))
         shift = np.zeros((30, 3, 20))
         shift[:, 2] = 0.1 * d
@@ -402,7 +407,7 @@ class TestConsensus:
         expected = centred(scene.first + shift)
         expected[:, :2] += share * off
         assert_allclose(centred(M @ shapes), expected, atol=2e-3)
-        assert result.noise == pytest.approx(2e-4)
+        assert result.noise == pytest.approx(2e-4 - 0.8 * scene.floor)
 
 
 def articulated(n_frames=80, noise=1e-4, seed=0):
