@@ -75,7 +75,8 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         "consensus" continues from there, with calibrated cameras: it fits overlapping
         groups of neighbouring points, with rotations of their own, and finds the
         depths that they have in common. Bodies become more accurate by a third to a
-        half, and a fit takes 5 to 30 times as long. Set ``n_components="auto"`` or about 40 with it.
+        half, and a fit takes 5 to 30 times as long. Set ``n_components="auto"`` or
+        about 40 with it.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"
