@@ -109,26 +109,10 @@ def test_expectation_is_that_of_probabilistic_components(s2):
     shapes = (rng.standard_normal((500, 2)) @ B.T).reshape(500, 3, 4)
     shapes += 0.1 * rng.standard_normal(shapes.shape)
     shapes -= shapes.mean(axis=2, keepdims=True)
-    mean, found = _principal(shapes, np.zeros((9, 4, 4)), s2)
+    mean, found = _principal(shapes, s2)
     assert_allclose(mean, shapes.mean(axis=0))
     values, vectors = np.linalg.eigh(np.cov(shapes.reshape(500, -1).T, bias=True))
     kept = values > s2
     B = vectors[:, kept] * np.sqrt(values[kept] - s2)
     expected = B @ np.linalg.solve(B.T @ B + s2 * np.eye(B.shape[1]), B.T)
     assert_allclose(found, expected, atol=1e-12)
-
-
-def test_covariances_of_coordinates_widen_the_components():
-    """Their sum is added to the scatter, as blocks, without its means over points."""
-    rng = np.random.default_rng(0)
-    shapes = rng.standard_normal((40, 3, 5))
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    factor = rng.standard_normal((15, 15))
-    sigma = factor @ factor.T
-    blocks = sigma.reshape(3, 5, 3, 5).transpose(0, 2, 1, 3).reshape(9, 5, 5)
-    _, found = _principal(shapes, blocks, 1e-3)
-    off = (shapes - shapes.mean(axis=0)).reshape(40, -1)
-    C = np.kron(np.eye(3), np.eye(5) - 0.2)
-    values, vectors = np.linalg.eigh((off.T @ off + C @ sigma @ C) / 40)
-    gain = np.maximum(1 - 1e-3 / np.maximum(values, 1e-3), 0.0)
-    assert_allclose(found, (vectors * gain) @ vectors.T, atol=1e-10)

@@ -324,6 +324,8 @@ def test_fits_that_do_not_converge_are_counted():
     assert re.match(r"not all fits .* of 1, 2 did not. Increase", first)
 
 
+# Whether FastICA converges for this table depends on the rounding of the BLAS.
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_held_out_rows_are_not_fitted_without_joint_refinement():
     table, estimator = X[:, :20], inner(n_components=1, refinement=None)
     search = AffineNRSfMCV((1,), estimator=estimator, cv=2).fit(table)
