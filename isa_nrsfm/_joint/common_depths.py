@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 # error of yoga is .0124, .0123, .0120. With the share 1 instead of 0.2 that of drink is
 # .0063 instead of .0053.
 STEPS, LAST_SHARE = 60, 0.2
-# Precision with which coordinates stay near the first ones, times the noise variance.
-# It only matters for points that no group determines.
-OF_FIRST = 1e-3
+# Weight of the first coordinates, or of the joint fit, among the groups. It only
+# matters for points that no group determines.
+WEIGHT_OF_WHOLE = 1e-3
 
 
 def common_coordinates(
@@ -47,8 +47,8 @@ def common_coordinates(
     for step in range(STEPS):
         s2 = noise - floor + floor * LAST_SHARE ** (step / (STEPS - 1))
         precisions[:] = 0.0
-        precisions[:, diagonal, diagonal] = OF_FIRST / s2
-        gradient = OF_FIRST / s2 * (first - Y)
+        precisions[:, diagonal, diagonal] = WEIGHT_OF_WHOLE / s2
+        gradient = WEIGHT_OF_WHOLE / s2 * (first - Y)
         for R, (frames, points) in zip(rotations, groups, strict=True):
             own = _of_group(Y, frames, points)
             shapes = R.transpose(0, 2, 1) @ own

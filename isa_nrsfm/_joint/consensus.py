@@ -26,7 +26,11 @@ from sklearn.utils.parallel import Parallel, delayed
 from isa_nrsfm._compat.blas_threads import one_blas_thread
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, full_rotations
 from isa_nrsfm._frames.models import PosteriorFrames
-from isa_nrsfm._joint.common_depths import LAST_SHARE, common_coordinates
+from isa_nrsfm._joint.common_depths import (
+    LAST_SHARE,
+    WEIGHT_OF_WHOLE,
+    common_coordinates,
+)
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.problem import JointSettings
@@ -56,9 +60,6 @@ FLOOR_SHARE = 0.2
 # Steps without the prior of the basis shapes, and most steps after them. Without, with
 # 10 and with 30 of the first the error of yoga, groups of 12, is .0169, .0163, .0132.
 FREE_STEPS, MOST_STEPS = 30, 300
-# Weight of the joint fit among the groups. It only matters for points that no group
-# determines.
-WEIGHT_OF_WHOLE = 1e-3
 # Largest numbers of frames and of points of the groups.
 MOST_FRAMES, MOST_POINTS = 1200, 100
 # Mean square that free numbers of components leave, as a share of the noise variance.
