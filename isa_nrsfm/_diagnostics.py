@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._frames.depth import LARGEST_SHARE
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
 from isa_nrsfm._prepare.robust import MEDIAN_DISTANCE
@@ -150,6 +151,15 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     messages = _of_coefficients(found, coefficients, rows, layout)
     if support := _of_support(found, frames.loss):
         messages.insert(0, support)
+    certainty = frames.certainty
+    if certainty.determined and certainty.total > LARGEST_SHARE:  # else fit has warned
+        messages.insert(
+            0,
+            f"the depth is uncertain: its expected error is {100 * certainty.total:.2g}"
+            " % of the depth, so proportions and side views may be wrong. Try more "
+            "basis shapes, fit a table in which the objects turn further, or use "
+            'affine cameras (camera="affine")',
+        )
     return found._replace(messages=tuple(messages))
 
 

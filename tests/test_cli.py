@@ -213,12 +213,15 @@ def test_calibrated_cameras(run, tmp_path, camera):
     assert (code, err) == (0, "")
     assert all(len(line) <= 120 for line in out.splitlines())
     assert "Choice     K = 1: determined by the table\n" in out
-    assert f"Cameras    {camera.replace('_', '-')}: shapes have true proportions" in out
+    assert f"Cameras    {camera.replace('_', '-')}: shapes are known up to " in out
+    assert "true proportions" not in out
 
     model, report = load_model(folder / MODEL), report_of(folder)["model"]
     assert (model.n_components, model.camera, len(model.basis_)) == ("auto", camera, 1)
     assert (report["n_components"], report["camera"]) == (1, camera)
     assert report["camera_noise_ratio"] == pytest.approx(model.camera_noise_ratio_)
+    error = f"{100 * model.depth_uncertainty_:.2g} % of the depth"
+    assert f"expected depth error: {error} (root mean square)" in out
     assert report["camera_meaning"][1:] in " ".join(out.split())
     noise, scaled = np.sqrt(model.noise_variance_), camera == "weak_perspective"
     shown = f"{100 * noise:.3g} % of the frame's size"

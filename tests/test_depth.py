@@ -1,3 +1,4 @@
+import copy
 import warnings
 from dataclasses import replace
 from types import SimpleNamespace
@@ -203,6 +204,15 @@ class TestTurnedFaces:
             100 * model.scales_[:, None] * deviation,
             rtol=0.02,
         )
+
+    @pytest.mark.parametrize("error", [0.88, 0.5])
+    def test_large_errors_of_depths_are_named(self, turned, error):
+        model = copy.copy(turned[3])
+        certainty = model._model.frames.certainty._replace(total=error)
+        frames = replace(model._model.frames, certainty=certainty)
+        model._model = model._model._replace(frames=frames)
+        named = "expected error is 88 % of the depth" in str(model.diagnostics())
+        assert named == (error == 0.88)
 
     def test_models_keep_their_certainty_in_files(self, turned, tmp_path):
         X, *_, model = turned

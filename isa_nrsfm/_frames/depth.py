@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 # Rotations are not determined if their standard deviation is a larger share of their
 # spread. This share is 0.2 to 0.3 for faces of known shape that turn by 10 degrees, 0.9
-# to 1.3 by 4 degrees; 0.5 for bodies that turn by 20 degrees, 1 by 10 degrees.
+# to 1.3 by 4 degrees; 0.5 for bodies that turn by 20 degrees, 1 by 10 degrees. Depth
+# errors above this share are warned of as well: they are at most 0.47 where rotations
+# are determined (mean of ten tables, ``python -m benchmarks.depth``).
 LARGEST_SHARE = 0.55
 
 

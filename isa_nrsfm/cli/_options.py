@@ -326,8 +326,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "camera": _choice(
         CAMERA_NAMES,
         "camera model: affine (no assumption), weak_perspective (a rotation and a "
-        "scale per frame), or orthographic (one scale). With the last two, shapes have "
-        "true proportions",
+        "scale per frame), or orthographic (one scale). The last two estimate "
+        "depth and proportions",
     ),
     "isa": _choice(
         ("pooled", "fast"),
@@ -497,7 +497,7 @@ examples:
 
 Shapes are upright and frontal, with the proportions that weak-perspective cameras
 determine; .npz and .mat have the arrays of the model unchanged. Models of
-'fit --camera weak_perspective' or 'orthographic' have true proportions already.""",
+'fit --camera weak_perspective' or 'orthographic' keep the proportions of the fit.""",
         {
             "model": ("model",),
             "output": (

@@ -28,10 +28,10 @@ from isa_nrsfm.io._formats import TABLE
 
 _CAMERAS = {
     "affine": "affine: shapes are known up to an affine transformation of space",
-    "weak_perspective": "weak-perspective: shapes have true proportions, up to a "
-    "mirror image",
-    "orthographic": "orthographic: shapes have true proportions, up to a mirror "
-    "image, in the units of the table",
+    "weak_perspective": "weak-perspective: shapes are known up to size and a mirror "
+    "image in depth",
+    "orthographic": "orthographic: shapes are known up to a mirror image in depth, in "
+    "the units of the table",
 }
 
 
@@ -278,7 +278,8 @@ def _cameras(model: dict[str, Any]) -> Section:
     parts = [title]
     if model["depth_determined"] and uncertainty and math.isfinite(uncertainty):
         parts.append(
-            f"depths are known to {100 * uncertainty:.2g} % (root mean square)"
+            f"expected depth error: {100 * uncertainty:.2g} % of the depth (root mean "
+            "square)"
         )
     remarks = [each for each in (meaning, model["camera_advice"]) if each]
     return [*parts, _sentence("; ".join(remarks))] if remarks else parts
