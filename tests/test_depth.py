@@ -20,6 +20,7 @@ from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses, write_viewer
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
+from isa_nrsfm.plotting import BasisShapeDisplay
 
 
 def faces_turned_by(degrees, seed=0, n_frames=150, noise=0.01, missing=0.0):
@@ -138,6 +139,11 @@ class TestFrontalFaces:
         X, model = frontal
         write_viewer(model, tmp_path / "page.html", X=X, camera=None)
         assert "The depth is not determined" in (tmp_path / "page.html").read_text()
+
+    def test_side_views_are_marked(self, frontal):
+        display = BasisShapeDisplay.from_estimator(frontal[1])
+        for axes in display.axes_[:, 1]:
+            assert axes.get_xlabel() == "depth not determined"
 
     def test_affine_angles_are_withheld_likewise(self):
         X, *_ = faces_turned_by(2)

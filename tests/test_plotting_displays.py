@@ -108,6 +108,8 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     faces = make_face_tracks(n_frames=80, n_components=2, camera=camera, random_state=0)
     model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
     display = BasisShapeDisplay.from_estimator(model)
+    error = f"depth error {100 * model.depth_uncertainty_:.2g} %"
+    assert [side.get_xlabel() for side in display.axes_[:, 1]] == 3 * [error]
     scale = np.median(model.scales_)
     for drawn, shape in zip(
         [display.mean_shape, *display.basis],
@@ -128,6 +130,8 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
 def test_points_and_arrows_are_the_shapes(estimator):
     display = BasisShapeDisplay.from_estimator(estimator, n_std=1.5)
     assert display.axes_.shape == (3, 2)
+    for side in display.axes_[:, 1]:
+        assert side.get_xlabel() == "depth up to an affinity"
     assert len(display.mean_) == 6
     assert len(display.plus_) == len(display.minus_) == len(display.arrows_) == 4
     for view, columns in enumerate(([0, 1], [2, 1])):

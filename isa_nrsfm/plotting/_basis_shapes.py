@@ -32,7 +32,7 @@ from isa_nrsfm.plotting._page import (
     new_page,
     show_view,
 )
-from isa_nrsfm.plotting._views import view_and_layout
+from isa_nrsfm.plotting._views import depth_note, view_and_layout
 
 # Arrows in the units of the points, with the same width in all axes.
 ARROW_STYLE = {
@@ -73,6 +73,9 @@ class BasisShapeDisplay:
     origin : {"auto", "upper", "lower"}, default="auto"
         Where y is zero: "upper" for images, whose y points down, "lower" for a y that
         points up. "auto" is "lower" if a face or a body would otherwise be upside down.
+    depth_note : str, default=""
+        Certainty of the depth, shown below each side view. `from_estimator` sets it,
+        for example to "depth not determined".
 
     Attributes
     ----------
@@ -90,6 +93,8 @@ class BasisShapeDisplay:
         The pairs of points that are joined.
     origin : {"upper", "lower"}
         Where y is zero.
+    depth_note : str
+        The certainty of the depth.
     components_ : ndarray of shape (n_drawn,)
         The basis shapes that are drawn.
     axes_ : ndarray of shape (1 + n_drawn, 2)
@@ -152,7 +157,9 @@ class BasisShapeDisplay:
         component_names: list[str] | None = None,
         edges: Edges = "auto",
         origin: Origin = "auto",
+        depth_note: str = "",
     ) -> None:
+        self.depth_note = depth_note
         self.mean_shape = np.asarray(mean_shape, dtype=float)
         self.basis = np.asarray(basis, dtype=float)
         shape = self.mean_shape.shape
@@ -236,6 +243,7 @@ class BasisShapeDisplay:
             component_names=component_names,
             edges=skeleton,
             origin=origin,
+            depth_note=depth_note(estimator),
         )
         return display.plot(ax, **kw)
 
@@ -343,6 +351,7 @@ class BasisShapeDisplay:
                 show_view(axis, view, limits[block], self.origin)
             title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
             pair[0].set_title(title, loc="left", fontsize="small")
+            pair[1].set_xlabel(self.depth_note, fontsize="x-small")
         if ax is None:
             self._add_legend()
         return self

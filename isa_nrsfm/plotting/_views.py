@@ -18,6 +18,7 @@ from isa_nrsfm._metric_upgrade.quadric import (
     unit_cameras,
 )
 from isa_nrsfm._tables.column_names import names_of_points
+from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.plotting._edges import Origin, choose_lines
 from isa_nrsfm.skeletons import Skeleton
 
@@ -57,6 +58,17 @@ def view_and_layout(
         view = viewing_transform(estimator.motion_, estimator.reference_motion_)
     shape, names = estimator.mean_shape_ @ view.T, names_of_points(estimator)
     return view, *choose_lines(edges, origin, shape, names)
+
+
+def depth_note(estimator: Any) -> str:
+    """Return the certainty of the depth in a few words; empty if not estimated."""
+    certainty = frames_of(estimator).certainty
+    if estimator.camera_ == "affine":
+        return "depth up to an affinity"
+    if not certainty.determined:
+        return "depth not determined"
+    known = np.isfinite(certainty.total)
+    return f"depth error {100 * certainty.total:.2g} %" if known else ""
 
 
 def euclidean_axes(estimator: Any) -> NDArray:
