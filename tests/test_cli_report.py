@@ -16,6 +16,7 @@ from fit_runs import MODEL  # noqa: E402
 from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
 from isa_nrsfm.cli import main  # noqa: E402
+from isa_nrsfm.cli._figures import Fit, reprojections  # noqa: E402
 from isa_nrsfm.cli._fit import (  # noqa: E402
     choice_report,
     choose_n_components,
@@ -172,6 +173,19 @@ def test_means_of_classes_are_of_significant_coefficients(run):
     assert line in fit_sections(report)["Labels"]
     mood["p_values"][k] = 0.2
     assert line not in fit_sections(report)["Labels"]
+
+
+def test_frames_of_median_and_largest_residual_are_drawn(run):
+    folder, table = run
+    X = table[[name for name in table if re.fullmatch(r"[xy]\d+", name)]]
+    drawn = {"edges": None, "origin": "auto"}
+    display = reprojections(Fit(load_model(folder / MODEL), X, None, None, drawn))
+    order = np.argsort(pd.read_csv(folder / "cameras.csv")["inverse_snr"])
+    rows = [*order[58:61], *order[:-4:-1]]
+    assert list(display.frames) == rows
+    for k, axes in enumerate(display.axes_):
+        title = f"{'median' if k < 3 else 'largest'} residual: frame {rows[k]}\n"
+        assert axes.get_title().startswith(title)
 
 
 def test_a_later_run_removes_figures_of_labels(tmp_path, capsys):

@@ -14,8 +14,10 @@ from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._columns import Columns, Label, class_means
+from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.export._names import names_of_components
+from isa_nrsfm.metrics._reprojection import frame_energies
 from isa_nrsfm.plotting import (
     BasisShapeDisplay,
     CoefficientsDisplay,
@@ -54,10 +56,9 @@ ALWAYS: Figures = {
         lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
-        "some frames: observed points and points of the model",
-        lambda fit: ReprojectionDisplay.from_estimator(
-            fit.estimator, fit.X, random_state=fit.estimator.random_state, **fit.drawn
-        ),
+        "frames of median and of largest residual: observed points and points of the "
+        "model",
+        lambda fit: reprojections(fit),
     ),
 }
 
@@ -106,6 +107,24 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
         except Exception as error:  # results do not depend on it
             warn_caller(f"{name} was not drawn: {error or type(error).__name__}")
     return drawn
+
+
+def reprojections(fit: Fit) -> ReprojectionDisplay:
+    """Draw up to three frames about the median residual, and as many of the largest."""
+    estimator = fit.estimator
+    energy, error, _ = frame_energies(fit.X, fitted_table(estimator), estimator.layout)
+    order = np.argsort(error / energy)
+    n_drawn = max(min(3, len(order) // 3), 1)
+    start = (len(order) - n_drawn) // 2
+    rows = [*order[start : start + n_drawn], *order[: -n_drawn - 1 : -1]]
+    display = ReprojectionDisplay.from_estimator(
+        estimator, fit.X, frames=rows, **fit.drawn
+    )
+    for number, axes in enumerate(display.axes_):
+        which = "median" if number < n_drawn else "largest"
+        title = f"{which} residual: {axes.get_title()}"
+        axes.set_title(title, fontsize="small", parse_math=False)
+    return display
 
 
 def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
