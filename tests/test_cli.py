@@ -536,8 +536,11 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
 def test_outputs_that_cannot_be_written_are_refused(
     fails, table, fitted, faces, tmp_path
 ):
-    message = fails("fit", table, "-o", table, *QUICK)
-    assert "File exists" in message or "Not a directory" in message
+    for name in (table, tmp_path / "alpha.csv", tmp_path / "model.NPZ"):
+        message = fails("fit", table, "-o", name, *QUICK)
+        assert f"--output {name}: expected a folder" in message
+        assert message.endswith("the table of coefficients is alpha.csv in it")
+    assert not any(tmp_path.iterdir())
     message = fails("fit", table, "-o", table / "results", *QUICK)
     assert "Not a directory" in message
     transform = ["transform", fitted / MODEL]

@@ -44,6 +44,7 @@ from isa_nrsfm.cli._report import model_report, table_report, versions
 from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
+from isa_nrsfm.io._tables import TABLE_SUFFIXES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -144,6 +145,12 @@ def fit_table(
 
 def _check_options(args: Namespace) -> None:
     """Raise before a long fit if options exclude each other or a library is absent."""
+    suffixes = {*TABLE_SUFFIXES, *(Path(name).suffix for name in RESULTS)}
+    if Path(args.output).suffix.lower() in suffixes and not Path(args.output).is_dir():
+        raise ValueError(
+            f"--output {args.output}: expected a folder, because fit writes several "
+            "files; the table of coefficients is alpha.csv in it"
+        )
     if not args.no_figures:
         import_optional("matplotlib", extra="plot")
     joint = {"--std": args.std, "--n-components auto": args.n_components[0] == AUTO}
