@@ -16,6 +16,7 @@ FILES = {
     MODEL,
     "report.html",
     "report.json",
+    "shapes.csv",
     "shapes.npz",
     "viewer.html",
 }

@@ -145,6 +145,13 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     shapes = arrays["mean_shape"] + np.tensordot(
         alpha[["alpha_1", "alpha_2"]].to_numpy(), arrays["basis"], 1
     )
+    points = pd.read_csv(fitted / "shapes.csv", dtype={"point": str})
+    assert list(points["point"]) == list(arrays["point_names"])
+    assert " ".join(points)[:46] == "point mean_X mean_Y mean_Z basis_1_X basis_1_Y"
+    for k, name in enumerate(["mean", "basis_1", "basis_2"]):
+        written = points.filter(regex=f"^{name}_[XYZ]$")
+        expected = [arrays["mean_shape"], *arrays["basis"]][k]
+        np.testing.assert_allclose(written, expected, rtol=1e-12)
     motion = cameras.iloc[:, 1:7].to_numpy().reshape(-1, 2, 3)
     images = shapes @ motion.swapaxes(1, 2) + cameras[["tx", "ty"]].to_numpy()[:, None]
     np.testing.assert_allclose(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from isa_nrsfm import AffineNRSfM, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
@@ -38,6 +39,8 @@ RESULTS = {
     "energy of the reprojection error relative to that of the frame; yaw, pitch and "
     "roll in degrees, zero for a frontal, upright object, if the cameras determine "
     "them",
+    "shapes.csv": "mean shape and basis shapes, a row for each point; the shape of a "
+    "frame is mean + sum_k alpha_k basis_k, in the axes X, Y, Z of cameras.csv",
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
     "a frame is mean_shape + sum_k alpha_k basis[k]",
     "viewer.html": "the shapes and the frames in 3D, for any browser",
@@ -112,7 +115,7 @@ def write_results(
     drawn: dict[str, Any],
     **shown: Any,
 ) -> None:
-    """Write the cameras, the shapes, the viewer with what it shows, and the model.
+    """Write cameras, shapes, the viewer with what it shows, and the model.
 
     The cameras have a row for each frame, empty if it could not be fitted.
     """
@@ -142,6 +145,14 @@ def write_results(
     cameras = cameras.reindex(frames.points.index)
     cameras.insert(0, "row", cameras.index)
     write_table(cameras, folder / "cameras.csv")
+    shapes = [estimator.mean_shape_, *estimator.basis_]
+    names = ["mean", *(f"basis_{k}" for k in range(1, len(shapes)))]
+    points = pd.DataFrame(
+        np.hstack(shapes),
+        columns=[f"{name}_{axis}" for name in names for axis in "XYZ"],
+    )
+    points.insert(0, "point", names_of_points(estimator))
+    write_table(points, folder / "shapes.csv")
     export.write_shapes(estimator, folder / "shapes.npz")
     export.write_viewer(estimator, folder / "viewer.html", X=X, **drawn, **shown)
     save_model(estimator, folder / "model.npz")
