@@ -130,3 +130,33 @@ def test_a_model_of_other_points_is_refused(run, tmp_path):
     code, out, _ = run("transform", folder / MODEL, openface, *output)
     assert code == 0
     assert "1  without coefficients: tracking failed" in out
+
+
+SHARES = "like shares of the width and height of an image"
+
+
+def write_shares(folder, change=lambda shares: shares):
+    """Write points of hands in shares of an image of 1920 x 1080 pixels."""
+    shares = change(tracks(21) * [2.5 / 1920, 2.5 / 1080])
+    names = [f"{axis}_{j}" for j in range(21) for axis in "xy"]
+    path = folder / "hands.csv"
+    pd.DataFrame(shares.reshape(N_FRAMES, -1), columns=names).to_csv(path, index=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "is_named"),
+    [
+        (lambda shares: shares, True),
+        (lambda shares: shares - shares.mean(axis=1, keepdims=True), False),
+        (lambda shares: (shares - shares.min()) / np.ptp(shares), False),
+        (lambda shares: shares * [1920, 1080], False),
+    ],
+    ids=["shares", "centred", "scaled", "pixels"],
+)
+def test_shares_of_an_image_in_a_plain_table_are_named(run, tmp_path, change, is_named):
+    path = write_shares(tmp_path, change)
+    code, _, err = run("fit", path, "-o", tmp_path / "results", *QUICK)
+    assert code == 0
+    assert (SHARES in err) == is_named
+    assert ("--format mediapipe --image-size" in err) == is_named

@@ -235,6 +235,8 @@ def _frames(
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
     images, numbered_by = image_numbers(table)
+    if args.format == TABLE:
+        _warn_of_shares(tracks[report.usable])
     not_used = {} if failed is not None else _sets_not_used(table, columns)
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
@@ -335,6 +337,24 @@ def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, i
     if found.z:
         not_used[f"{found.z[0].strip()}, ... (third coordinate)"] = len(found.z)
     return not_used
+
+
+def _warn_of_shares(tracks: NDArray) -> None:
+    """Warn if tracks (n_frames, n_points, 2) look like shares of the size of an image.
+
+    In a table that was scaled to [0, 1] some coordinates are exactly 0 or 1. Positions
+    in an image are between, and apart in both directions.
+    """
+    if not len(tracks):
+        return
+    low, high = np.nanmin(tracks, axis=(0, 1)), np.nanmax(tracks, axis=(0, 1))
+    if low.min() > 0 and high.max() < 1 and (high - low).min() > 0.1:
+        warn_caller(
+            f"all coordinates are between {low.min():.2g} and {high.max():.2g}, like "
+            "shares of the width and height of an image. Such shares stretch the "
+            "shapes, which changes their proportions and rotations. If these are "
+            "shares, use --format mediapipe --image-size WIDTHxHEIGHT"
+        )
 
 
 def _columns_of_model(
