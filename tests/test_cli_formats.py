@@ -160,3 +160,30 @@ def test_shares_of_an_image_in_a_plain_table_are_named(run, tmp_path, change, is
     assert code == 0
     assert (SHARES in err) == is_named
     assert ("--format mediapipe --image-size" in err) == is_named
+
+
+MEDIAPIPE = ["--format", "mediapipe", "--image-size", "1920x1080"]
+
+
+def test_points_outside_of_the_image_are_counted(run, tmp_path):
+    def change(shares):
+        shares[3, 5] = [0.5, 1.25]
+        shares[4, 6] = [-0.125, 0.5]
+        return shares
+
+    path = write_shares(tmp_path, change)
+    code, _, err = run("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
+    assert code == 0
+    expected = (
+        "warning: 2 of 840 points are outside the image, by at most 0.25 of its width "
+        "or height (point 5 in row 3)\n"
+    )
+    assert expected in err
+    assert SHARES not in err
+
+
+def test_coordinates_that_are_no_shares_are_refused(run, tmp_path):
+    path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
+    code, _, err = run("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
+    assert code == 1
+    assert "the coordinates are no shares of the width and height of an image" in err

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
     find_landmark_columns,
@@ -122,6 +123,7 @@ def read_mediapipe(
                 "image_size=(width, height) in pixels (command line: --image-size "
                 "1920x1080), or columns image_width and image_height"
             )
+        _check_inside(tracks)
         scale = (
             table[sizes].to_numpy(float) if image_size is None else np.array(image_size)
         )
@@ -135,6 +137,29 @@ def read_mediapipe(
             else "image_size is given, but there are no points"
         )
     return _assembled(table, found, "mediapipe", tracks=tracks)
+
+
+def _check_inside(shares: NDArray[np.float64]) -> None:
+    """Warn of points (n_frames, n_points, 2) outside the image; refuse if most are.
+
+    Trackers place points that the image cuts off, such as the legs of a body, beyond
+    its border. Of faces and hands centred at the origin more than half are outside.
+    """
+    beyond = np.maximum(-shares, shares - 1).max(axis=2)
+    n_outside, n_shown = np.sum(beyond > 0), np.sum(~np.isnan(beyond))
+    if not n_outside:
+        return
+    row, point = np.unravel_index(np.nanargmax(beyond), beyond.shape)
+    found = (
+        f"{n_outside} of {n_shown} points are outside the image, by at most "
+        f"{beyond[row, point]:.2g} of its width or height (point {point} in row {row})"
+    )
+    if 2 * n_outside > n_shown:
+        raise ValueError(
+            f"{found}: the coordinates are no shares of the width and height of an "
+            "image. Read them without image_size, in the format table"
+        )
+    warn_caller(found)
 
 
 def points_of(table: "pd.DataFrame", columns: list[str]) -> NDArray[np.float64]:
