@@ -387,6 +387,38 @@ def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 
 
+def test_origin_of_the_coordinates_is_not_a_missing_point(
+    run, fails, changed, tmp_path
+):
+    def change(faces):
+        nose = faces[["x_30", "y_30"]].to_numpy()
+        faces[LANDMARKS] -= np.tile(nose, 68)
+        faces.loc[1, LANDMARKS] *= -1  # the origin is (-0, -0)
+
+    path, folder = changed(change), tmp_path / "results"
+    code, _, err = run("fit", path, "-o", folder, *UNREFINED)
+    assert code == 0
+    assert "(0, 0)" not in err
+    assert "(-0" not in err
+    message = fails("fit", path, "-o", folder, *UNREFINED, "--zeros-missing")
+    assert (
+        "--zeros-missing: 1 of 68 points are missing in all rows (first: 30)" in message
+    )
+    assert "leave out --zeros-missing" in message
+    left = message.partition("--points ")[2]
+    options = ["--zeros-missing", "--points", left]
+    assert run("fit", path, "-o", folder, *UNREFINED, *options)[0] == 0
+
+
+def test_zeros_of_a_point_that_no_row_shows_cause_a_warning(run, changed, tmp_path):
+    def change(faces):
+        faces[LANDMARKS] += 1000.0
+        faces[["x_30", "y_30"]] = 0.0
+
+    _, _, err = run("fit", changed(change), "-o", tmp_path, *UNREFINED)
+    assert "in 60 of 60 rows points are at exactly (0, 0) (60 in all)" in err
+
+
 def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path):
     model = load_model(fitted / MODEL)
     new = faces.iloc[::-1].reset_index(drop=True)

@@ -226,6 +226,7 @@ def _frames(
     rows, names = np.flatnonzero(kept), columns.interleaved
     stripped = [name.strip() for name in names]
     tracks = _tracks(args, table, columns, kept)
+    _refuse_lost_points(args, table[kept], columns, tracks)
     tracks = clean_tracks(tracks, names=np.array(stripped))[rows]
     if confidence is not None:
         confidence = confidence[list(columns.x)].iloc[rows]
@@ -234,9 +235,9 @@ def _frames(
     reasons = _reasons(report, None if failed is None else failed[rows])
     left_out += [(reason, rows[which], False) for reason, which in reasons.items()]
     _warn_of_code(tracks[report.usable])
-    images, numbered_by = image_numbers(table)
     if args.format == TABLE:
         _warn_of_shares(tracks[report.usable])
+    images, numbered_by = image_numbers(table)
     not_used = {} if failed is not None else _sets_not_used(table, columns)
     return Frames(
         points=pd.DataFrame(tracks_to_table(tracks), index=rows, columns=stripped),
@@ -282,13 +283,36 @@ def _tracks(
     return tracks
 
 
+def _refuse_lost_points(
+    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, tracks: NDArray
+) -> None:
+    """Raise if a table to fit has a point that no row shows but for --zeros-missing.
+
+    tracks (n_frames, n_points, 2) are those of all rows, without missing points.
+    """
+    if "points" not in args or not (args.zeros_missing or args.missing_value):
+        return
+    absent = np.isnan(tracks).all(axis=(0, 2))
+    found = zip(columns.points, columns.x, absent, strict=True)
+    lost = [name for name, x, each in found if each and table[x].notna().any()]
+    if lost:
+        option = "--zeros-missing" if args.zeros_missing else "--missing-value"
+        raise ValueError(
+            f"{option}: {len(lost)} of {len(absent)} points are missing in all rows "
+            f"(first: {lost[0]}). If that point is the origin of the coordinates, "
+            f"leave out {option}. If no row shows it, leave out the point: --points "
+            f"without:{','.join(lost)}"
+        )
+
+
 def _warn_of_code(tracks: NDArray) -> None:
     """Warn if points of tracks (n_frames, n_points, 2) may be missing, such as (0, 0).
 
     The coordinates of other points are equal, exactly and in three frames, only by
-    chance. Then the point has other places as often, or others are further out.
+    chance. Then the point has other places as often, or others are further out. The
+    origin of the coordinates is one point in all frames, and others are around it.
     """
-    x, y = np.moveaxis(tracks, 2, 0)
+    x, y = np.moveaxis(tracks + 0.0, 2, 0)  # -0.0 + 0.0 is 0.0
     values, counts = np.unique(x[x == y], return_counts=True)
     if not len(values):
         return
@@ -300,6 +324,9 @@ def _warn_of_code(tracks: NDArray) -> None:
         others = tracks[~there]
         is_outside = value < np.nanmin(others) or value > np.nanmax(others)
         n_rows = there.any(axis=1).sum()
+        is_origin = len(there) > 2 and not is_outside and not len(places)
+        if is_origin:
+            continue
         enough = n_rows > 2 and (is_outside or there[:, point].sum() > 3 * often)
         if value and not enough:
             continue
@@ -309,6 +336,24 @@ def _warn_of_code(tracks: NDArray) -> None:
             f"in {n_rows} of {len(there)} rows points are at exactly ({number}, "
             f"{number}) ({there.sum()} in all). If these points are missing, use "
             f"{option}"
+        )
+
+
+def _warn_of_shares(tracks: NDArray) -> None:
+    """Warn if tracks (n_frames, n_points, 2) look like shares of the size of an image.
+
+    In a table that was scaled to [0, 1] some coordinates are exactly 0 or 1. Positions
+    in an image are between, and apart in both directions.
+    """
+    if not len(tracks):
+        return
+    low, high = np.nanmin(tracks, axis=(0, 1)), np.nanmax(tracks, axis=(0, 1))
+    if low.min() > 0 and high.max() < 1 and (high - low).min() > 0.1:
+        warn_caller(
+            f"all coordinates are between {low.min():.2g} and {high.max():.2g}, like "
+            "shares of the width and height of an image. Such shares stretch the "
+            "shapes, which changes their proportions and rotations. If these are "
+            "shares, use --format mediapipe --image-size WIDTHxHEIGHT"
         )
 
 
@@ -337,24 +382,6 @@ def _sets_not_used(table: "pd.DataFrame", found: LandmarkColumns) -> dict[str, i
     if found.z:
         not_used[f"{found.z[0].strip()}, ... (third coordinate)"] = len(found.z)
     return not_used
-
-
-def _warn_of_shares(tracks: NDArray) -> None:
-    """Warn if tracks (n_frames, n_points, 2) look like shares of the size of an image.
-
-    In a table that was scaled to [0, 1] some coordinates are exactly 0 or 1. Positions
-    in an image are between, and apart in both directions.
-    """
-    if not len(tracks):
-        return
-    low, high = np.nanmin(tracks, axis=(0, 1)), np.nanmax(tracks, axis=(0, 1))
-    if low.min() > 0 and high.max() < 1 and (high - low).min() > 0.1:
-        warn_caller(
-            f"all coordinates are between {low.min():.2g} and {high.max():.2g}, like "
-            "shares of the width and height of an image. Such shares stretch the "
-            "shapes, which changes their proportions and rotations. If these are "
-            "shares, use --format mediapipe --image-size WIDTHxHEIGHT"
-        )
 
 
 def _columns_of_model(
