@@ -123,8 +123,9 @@ def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cel
     return [
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}",
         f"held-out error {_percent(quality['held_out_error'])}: the same for points "
-        "predicted from the other points of their frame. If it is much larger, there "
-        "are too many basis shapes.",
+        "predicted from the other points of their frame. If it is much larger, look "
+        "first for wrong points (outliers, or missing points with coordinates such as "
+        "(0, 0)), then use fewer basis shapes.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in the units of the table)",
     ]
