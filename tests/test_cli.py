@@ -451,6 +451,33 @@ def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path)
     np.testing.assert_allclose(found[complete], model.alpha_[rows], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("number", "option"), [(0, ["--zeros-missing"]), (-1, ["--missing-value", "-1"])]
+)
+def test_transform_knows_the_missing_points_of_the_fit(
+    run, changed, tmp_path, number, option
+):
+    def change(faces):
+        faces.loc[[3, 9], ["x_5", "y_5"]] = float(number)
+
+    path, folder, output = changed(change), tmp_path / "fit", tmp_path / "alpha.csv"
+    assert run("fit", path, "-o", folder, *UNREFINED, *option)[0] == 0
+    assert report_of(folder)["table"]["missing_values"] == [number]
+    code, out, err = run("transform", folder / MODEL, path, "-o", output)
+    assert (code, err) == (0, "")
+    assert f"points at ({number}, {number}) count as missing" in out
+    alpha = pd.read_csv(output)[["alpha_1", "alpha_2"]]
+    (folder / "report.json").unlink()
+    code, out, err = run("transform", folder / MODEL, path, "-o", output)
+    assert (code, "count as missing" in out) == (0, False)
+    if number == 0:  # without the report nothing but a warning is left
+        assert "use --zeros-missing" in err
+    assert not np.allclose(pd.read_csv(output)["alpha_1"], alpha["alpha_1"])
+    assert run("transform", folder / MODEL, path, "-o", output, *option)[0] == 0
+    expected = pd.read_csv(output)[["alpha_1", "alpha_2"]]
+    pd.testing.assert_frame_equal(alpha, expected)
+
+
 def test_transform_of_no_usable_row_is_empty(run, fitted, faces, tmp_path):
     path, output = tmp_path / "new.csv", tmp_path / "alpha.tsv"
     faces.assign(**dict.fromkeys(LANDMARKS, "")).to_csv(path, index=False)

@@ -180,6 +180,19 @@ def read_model(path: str) -> AffineNRSfM:
     return estimator
 
 
+def missing_values_of_fit(path: str) -> list[float]:
+    """Return the coordinates of missing points in the table that a model was fitted to.
+
+    They are in the report beside the model. Without a report of that model there are
+    none.
+    """
+    folder, name = Path(path).parent, Path(path).name
+    recorded = entry_of_report(folder, "sha256").get(name)
+    if recorded is None or digests_of(folder, [name])[name] != recorded:
+        return []
+    return list(entry_of_report(folder, "table").get("missing_values", []))
+
+
 def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
     """Return an entry of the report in a folder, without one an empty dict."""
     try:

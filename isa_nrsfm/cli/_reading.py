@@ -57,6 +57,7 @@ class Frames(NamedTuple):
     that can be fitted. ``left_out`` has reason, rows, and whether they were skipped on
     request, ``not_used`` the sizes of unused sets of coordinates. ``images`` are the
     numbers of the images that rows show, and the column that has them, if any.
+    ``missing_values`` are the coordinates of missing points, zero for (0, 0).
     ``confidence`` has the confidences of the points if they are asked for as weights.
     """
 
@@ -69,6 +70,7 @@ class Frames(NamedTuple):
     left_out: list[tuple[str, NDArray, bool]]
     skeleton: Skeleton | None
     images: tuple[NDArray, str | None]
+    missing_values: list[float]
     confidence: "pd.DataFrame | None" = None
 
     @property
@@ -249,6 +251,7 @@ def _frames(
         left_out=[out for out in left_out if len(out[1])],
         skeleton=skeleton,
         images=(images[rows], numbered_by),
+        missing_values=_missing_values(args),
         confidence=confidence,
     )
 
@@ -270,6 +273,11 @@ def _rows_to_keep(
     return kept, skipped
 
 
+def _missing_values(args: Namespace) -> list[float]:
+    """Return the numbers that are x and y of missing points."""
+    return sorted({*args.missing_value, *[0.0] * args.zeros_missing})
+
+
 def _tracks(
     args: Namespace,
     table: "pd.DataFrame",
@@ -277,9 +285,9 @@ def _tracks(
     kept: NDArray,
 ) -> NDArray:
     """Return the points of all rows of the table, NaN where missing or not kept."""
-    codes = [*args.missing_value, *[0.0] * args.zeros_missing]
     tracks = np.full((len(table), len(columns.points), 2), np.nan)
-    tracks[kept] = tracks_in(table[kept], columns.interleaved, codes)
+    missing = _missing_values(args)
+    tracks[kept] = tracks_in(table[kept], columns.interleaved, missing)
     return tracks
 
 
@@ -290,7 +298,7 @@ def _refuse_lost_points(
 
     tracks (n_frames, n_points, 2) are those of all rows, without missing points.
     """
-    if "points" not in args or not (args.zeros_missing or args.missing_value):
+    if "points" not in args or not _missing_values(args):
         return
     absent = np.isnan(tracks).all(axis=(0, 2))
     found = zip(columns.points, columns.x, absent, strict=True)

@@ -40,6 +40,7 @@ def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
         "n_rows": frames.n_rows,
         "n_frames": len(X),
         "n_points": len(frames.columns.points),
+        "missing_values": frames.missing_values,
         "n_missing_points": missing.sum(),
         "n_frames_with_missing_points": missing.any(axis=1).sum(),
         "columns": frames.columns.pattern,

@@ -109,6 +109,8 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
         result = "left out" if out["skipped_on_request"] else unusable
         rows.append([f"{out['n_rows']}", f"{result}: {out['reason']}"])
     parts.append(Cells([], [*rows, [f"{table['n_frames']}", "used"]]))
+    for number in table["missing_values"]:
+        parts.append(f"points at ({number:.15g}, {number:.15g}) count as missing")
     if n_missing:
         share = n_missing / (table["n_frames"] * table["n_points"])
         parts.append(
