@@ -93,6 +93,13 @@ def test_links_of_the_readme_lead_somewhere():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
+def test_links_of_pages_have_a_text():
+    """Pages are also read as they are, where links without one have no name."""
+    pages = [*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")]
+    assert len(pages) > 20
+    assert [page.name for page in pages if "[](" in page.read_text("utf-8")] == []
+
+
 def test_figures_of_the_readme_are_those_of_the_benchmarks():
     page = text("docs/benchmarks/truth.md").partition("convention='frame'")[2]
     printed = [line.split(" | ") for line in page.splitlines() if line[:2] == "| "]
