@@ -23,6 +23,7 @@ from isa_nrsfm.cli._fit import (  # noqa: E402
     extrapolated,
 )
 from isa_nrsfm.cli._sections import fit_sections, fit_text, text_of  # noqa: E402
+from isa_nrsfm.cli._times import read_times, time_unit  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
 from isa_nrsfm.io import load_model  # noqa: E402
 from isa_nrsfm.plotting import ComponentChoiceDisplay  # noqa: E402
@@ -202,16 +203,35 @@ def test_a_later_run_removes_figures_of_labels(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("scales", "expected"),
     [
-        ([np.inf, np.inf, 8.24], "fade within 8.24; changes last in 2 of 3 directions"),
-        ([8.24, 3.0], "fade within 8.24, 3"),
+        (
+            [np.inf, np.inf, 8.24],
+            "within 8.24 s; changes last in 2 of 3 directions",
+        ),
+        ([8.24, 3.0], "fade within 8.24, 3 s"),
         ([np.inf], "t: changes last in 1 of 1 directions"),
         ([], "no dynamics found"),
     ],
 )
 def test_times_of_change(run, scales, expected):
-    time = {"column": "t", "time_scales": scales, "changed_by": 0.1}
+    time = {"column": "t", "time_scales": scales, "changed_by": 0.1, "unit": "s"}
     title = fit_sections(report_of(run[0]) | {"time": time})["Time"][0]
     assert expected in title
+
+
+@pytest.mark.parametrize(
+    ("name", "cells", "unit"),
+    [
+        ("frame", [1, 2], "frames"),
+        ("Frame_nr", ["1", "2"], "frames"),
+        ("day", [1.5, 2.0], "in the unit of the column day"),
+        ("time", ["0:58.2", "1:00"], "seconds"),
+        ("frame", ["2024-01-01", "2024-01-02"], "seconds"),
+        ("time", pd.to_timedelta([1, 2], unit="s"), "seconds"),
+    ],
+)
+def test_the_unit_of_times_is_that_of_the_column(name, cells, unit):
+    column = pd.Series(cells, name=name)
+    assert time_unit(column, read_times(column, None)) == unit
 
 
 @pytest.mark.parametrize(

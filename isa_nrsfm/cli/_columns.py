@@ -24,7 +24,7 @@ from isa_nrsfm.analysis._dynamics import sequences_of
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named
-from isa_nrsfm.cli._times import read_times, video_times
+from isa_nrsfm.cli._times import read_times, time_unit, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
 
@@ -51,6 +51,7 @@ class Columns(NamedTuple):
     labels: list[Label]
     groups: NDArray | None
     times: NDArray | None
+    time_unit: str
     distances: list[tuple[int, int]]
     unit: tuple[int, int] | None
 
@@ -61,13 +62,14 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
-    times = None
+    times, unit_of_times = None, "seconds"
     if args.time_format is not None and args.time is None:
         raise ValueError("--time-format needs --time")
     if args.time is not None:
         try:
             cells = cells_of(table, args.time, "--time")
             times = read_times(cells, args.time_format)
+            unit_of_times = time_unit(cells, times)
         except ValueError as error:
             raise ValueError(f"--time {args.time}: {error}") from error
     elif args.fps is not None:
@@ -86,7 +88,7 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
     if unit is not None and not distances:
         raise ValueError("--unit needs --distance")
-    return Columns(labels, groups, times, distances, unit)
+    return Columns(labels, groups, times, unit_of_times, distances, unit)
 
 
 def column_results(
@@ -116,6 +118,7 @@ def column_results(
         found = smooth.alpha
         report["time"] = {
             "column": args.time or "seconds",
+            "unit": asked.time_unit,
             "time_scales": smooth.time_scales,
             "changed_by": np.sqrt(np.nanmean((found - alpha) ** 2)),
         }

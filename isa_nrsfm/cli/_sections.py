@@ -402,7 +402,7 @@ def _time(time: dict[str, Any]) -> Section:
     found = []
     if len(fading):
         listed = _listed([f"{each:.3g}" for each in fading])
-        found.append(f"changes of the shape fade within {listed}")
+        found.append(f"changes of the shape fade within {listed} {time['unit']}")
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
     return [

@@ -80,6 +80,17 @@ def read_times(column: "pd.Series", format: str | None) -> NDArray:
     return np.asarray(first.reindex(column.index))
 
 
+def time_unit(column: "pd.Series", times: NDArray) -> str:
+    """Return the unit of the times of a column that `read_times` has read."""
+    pd = import_optional("pandas", extra="io")
+    numbers = pd.to_numeric(column.astype(str), errors="coerce")
+    if times.dtype.kind == "M" or numbers.isna().all():
+        return "seconds"
+    if re.fullmatch(_NUMBER, str(column.name).strip(), re.IGNORECASE):
+        return "frames"
+    return f"in the unit of the column {column.name}"
+
+
 def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
     """Return the number of the image of each row, and the column that tells it.
 
