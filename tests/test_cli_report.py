@@ -2,6 +2,7 @@
 
 import json
 import re
+from argparse import Namespace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from fit_runs import MODEL  # noqa: E402
 from isa_nrsfm import AffineNRSfM, FastISA  # noqa: E402
 from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa: E402
 from isa_nrsfm.cli import main  # noqa: E402
-from isa_nrsfm.cli._figures import Fit, reprojections  # noqa: E402
+from isa_nrsfm.cli._columns import Columns, Label  # noqa: E402
+from isa_nrsfm.cli._figures import Fit, figures_of  # noqa: E402
 from isa_nrsfm.cli._fit import (  # noqa: E402
     choice_report,
     choose_n_components,
@@ -170,17 +172,44 @@ def test_means_of_classes_are_of_significant_coefficients(run):
     means = {name: mean[k] for name, mean in mood["class_means"].items()}
     order = sorted(means, key=lambda name: -abs(means[name]))
     shown = ", ".join(f"{name} {means[name]:+.1f}" for name in order)
-    line = f"alpha_{k + 1}: {shown}"
+    line = f"alpha_{k + 1}: {shown}."
     assert line in fit_sections(report)["Labels"]
     mood["p_values"][k] = 0.2
     assert line not in fit_sections(report)["Labels"]
 
 
-def test_frames_of_median_and_largest_residual_are_drawn(run):
+@pytest.mark.parametrize("n_classes", [12, 13])
+def test_means_of_twelve_classes_are_listed(run, n_classes):
+    report = report_of(run[0])
+    mood = report["labels"][0]
+    mood["class_means"] = {f"class{i}": [1.0, 1.0] for i in range(n_classes)}
+    mood["p_values"] = [0.01, 1.0]
+    (line,) = (each for each in fit_sections(report)["Labels"] if "class0" in each)
+    assert line.count("+1.0") == 12
+    assert line.endswith("(all in report.json).") == (n_classes == 13)
+
+
+def figure_of(run, name):
+    """Draw a figure of the run."""
     folder, table = run
     X = table[[name for name in table if re.fullmatch(r"[xy]\d+", name)]]
+    known = table["mood"].notna().to_numpy()
+    mood = Label("mood", "classes", table["mood"][known].to_numpy(str), known)
+    asked = Columns([mood], None, None, "seconds", [], None)
     drawn = {"edges": None, "origin": "auto"}
-    display = reprojections(Fit(load_model(folder / MODEL), X, None, None, drawn))
+    fit = Fit(load_model(folder / MODEL), X, None, None, drawn)
+    return figures_of(Namespace(n_components=[2]), asked)[name][1](fit)
+
+
+def test_shapes_of_classes_have_a_legend(run):
+    (legend,) = figure_of(run, "label_1_shapes.png").figure_.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts == ["mean of all frames", "mean of the class"]
+
+
+def test_frames_of_median_and_largest_residual_are_drawn(run):
+    folder, _ = run
+    display = figure_of(run, "reprojection.png")
     order = np.argsort(pd.read_csv(folder / "cameras.csv")["inverse_snr"])
     rows = [*order[58:61], *order[:-4:-1]]
     assert list(display.frames) == rows

@@ -267,6 +267,8 @@ def test_curves_have_bands_and_stop_at_gaps_and_groups():
     assert_array_equal(line.get_ydata()[drawn], ALPHA[:, 0])
     assert len(band.get_paths()) == 3
     assert_allclose(band.get_paths()[1].get_extents().intervalx, [20, 29])
+    title = axes.get_title("right")
+    assert title == "band: one standard deviation, 0.1 (median)"
     low, high = band.get_datalim(axes.transData).intervaly
     assert low == pytest.approx(ALPHA[:, 0].min() - 0.1)
     assert high == pytest.approx(ALPHA[:, 0].max() + 0.1)
@@ -354,6 +356,8 @@ def test_colours_of_the_matrix_are_symmetric(scale):
 def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     display = ModeCovarianceDisplay.from_estimator(estimator)
     assert_array_equal(display.mode_covariance, estimator.mode_covariance_)
+    share = f"{percent(display.off_block_share)} outside the diagonal blocks"
+    assert display.ax_.get_title() == f"{share}\n(0 % if uncorrelated)"
     display = ModeCovarianceDisplay(mode_covariance=covariance(3)).plot()
     assert_array_equal(
         display.boundaries_.get_segments(),

@@ -16,6 +16,7 @@ from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm.cli._columns import Columns, Label, class_means
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._progress import show_stage
+from isa_nrsfm.cli._report import MOST_CLASSES
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics._reprojection import frame_energies
 from isa_nrsfm.plotting import (
@@ -26,7 +27,7 @@ from isa_nrsfm.plotting import (
     ReprojectionDisplay,
 )
 from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
-from isa_nrsfm.plotting._page import VIEWS, block_limits, new_page
+from isa_nrsfm.plotting._page import VIEWS, add_legend, block_limits, new_page
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,13 +53,15 @@ ALWAYS: Figures = {
         lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
     ),
     "mode_covariance.png": (
-        "covariance of the deformations in the images, 3x3 blocks",
+        "whether basis shapes occur together: covariance of the deformations in the "
+        "images, 3x3 blocks; only the diagonal blocks differ from zero if the "
+        "coefficients are uncorrelated",
         lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
     "reprojection.png": (
         "frames of median and of largest residual: observed points and points of the "
         "model",
-        lambda fit: reprojections(fit),
+        lambda fit: _reprojections(fit),
     ),
 }
 
@@ -76,14 +79,14 @@ def figures_of(args: Namespace, asked: Columns) -> Figures:
             f"coefficients by {label.name}",
             partial(_by_label, label),
         )
-        if label.is_of_classes(12):
+        if label.is_of_classes(MOST_CLASSES):
             figures[f"label_{number}_shapes.png"] = (
                 f"mean shape of each {label.name}, and of all frames in grey",
                 partial(_shapes_by_label, label),
             )
     if asked.times is not None:
         figures["time.png"] = (
-            "coefficients in time, with one standard deviation",
+            "coefficients in time, with a band of one standard deviation",
             partial(_in_time, asked),
         )
     return figures
@@ -109,7 +112,7 @@ def write_figures(folder: Path, figures: Figures, fit: Fit) -> dict[str, str]:
     return drawn
 
 
-def reprojections(fit: Fit) -> ReprojectionDisplay:
+def _reprojections(fit: Fit) -> ReprojectionDisplay:
     """Draw up to three frames about the median residual, and as many of the largest."""
     estimator = fit.estimator
     energy, error, _ = frame_energies(fit.X, fitted_table(estimator), estimator.layout)
@@ -177,4 +180,11 @@ def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
         pair[1].set_xlabel(whole.depth_note, fontsize="x-small")
         title = wrap_title(f"{name} ({count} frames)", pair)
         pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
+    line = import_optional("matplotlib.lines", extra="plot").Line2D
+    style = {"marker": "o", "markersize": 3, "linewidth": 1.5}
+    entries = [
+        line([], [], color=colour, label=f"mean of {frames}", **style)
+        for frames, colour in (("all frames", "0.8"), ("the class", MEAN_COLOUR))
+    ]
+    add_legend(display.figure_, entries, whole.skeleton)
     return display

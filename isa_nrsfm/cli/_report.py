@@ -26,8 +26,8 @@ from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.metrics import inverse_snr
 
-# Rows and points that are listed, at most.
-MOST_LISTED = 10
+# Rows and points that are listed, and classes whose means are shown, at most.
+MOST_LISTED, MOST_CLASSES = 10, 12
 
 
 def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:

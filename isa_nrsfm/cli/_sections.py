@@ -21,7 +21,7 @@ from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
-from isa_nrsfm.cli._report import MOST_LISTED
+from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
@@ -376,8 +376,10 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
         means = {each: mean[k] for each, mean in label.get("class_means", {}).items()}
         if means and p < 0.05:
             order = sorted(means, key=lambda each: -abs(means[each]))
-            shown = _listed([f"{each} {means[each]:+.1f}" for each in order])
-            lines.append(f"{name}: {shown}")
+            listed = [f"{each} {means[each]:+.1f}" for each in order]
+            shown = _listed(listed, MOST_CLASSES)
+            rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
+            lines.append(f"{name}: {shown}{rest}.")
     return lines
 
 

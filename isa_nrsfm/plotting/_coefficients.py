@@ -287,6 +287,10 @@ class CoefficientsDisplay:
         if single:
             axes.plot(time[single], alpha[single, k], ".", color=MINUS_COLOUR)
         if self.alpha_std is not None:
+            # It is narrower than the curve in tables with little noise.
+            median = np.nanmedian(self.alpha_std[rows, k])
+            title = f"band: one standard deviation, {median:.2g} (median)"
+            axes.set_title(title, loc="right", fontsize="x-small")
             deviation = np.insert(self.alpha_std[rows, k], gaps, np.nan)
             axes.fill_between(
                 times,

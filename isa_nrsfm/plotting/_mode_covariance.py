@@ -10,7 +10,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.column_names import checked_names
-from isa_nrsfm.plotting._axes import check_axes
+from isa_nrsfm.plotting._axes import check_axes, percent
 
 BLOCK = 3  # directions of space, rows and columns of one basis shape's block
 LINEAR_SHARE = 0.02  # of the largest absolute value, end of the linear colour scale
@@ -249,6 +249,9 @@ class ModeCovarianceDisplay:
             xlabel="basis shape",
             ylabel="basis shape",
         )
+        if not normalize:
+            title = f"{percent(self.off_block_share)} outside the diagonal blocks"
+            self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
         self.ax_.tick_params(length=0)
         if max(map(len, self.component_names)) > 3:
             plt.setp(self.ax_.get_xticklabels(), rotation=90)
