@@ -53,8 +53,8 @@ ALWAYS: Figures = {
         lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
     ),
     "mode_covariance.png": (
-        "whether basis shapes occur together: covariance of the deformations in the "
-        "images, 3x3 blocks; only the diagonal blocks differ from zero if the "
+        "whether basis shapes occur together; covariance of the deformations in the "
+        "images, 3x3 blocks: only the diagonal blocks differ from zero if the "
         "coefficients are uncorrelated",
         lambda fit: ModeCovarianceDisplay.from_estimator(fit.estimator),
     ),
