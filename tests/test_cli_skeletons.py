@@ -99,7 +99,15 @@ def test_edges_of_a_file(run, table, folder, tmp_path):
     own = tmp_path / "edges.csv"
     own.write_text("5,7\n7,9\n")
     fit = ["fit", table, "-o", tmp_path / "out", "--no-figures", *QUICK]
-    assert run(*fit, "--edges", own)[0] == 0
+    # Without any, the report names the options.
+    for options, is_noted in (
+        ([], True),
+        (["--edges", "none"], False),
+        (["--edges", own], False),
+    ):
+        code, report, _ = run(*fit, *options)
+        assert code == 0
+        assert ("--edges FILE or --skeleton LAYOUT" in report) == is_noted
     assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (7, 9)}
     # Of triangles the sides are drawn, each once.
     own.write_text("0,1,2\n2,1,3\n")

@@ -80,7 +80,7 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
-    _, layout, _, _ = view_and_layout(estimator, edges)
+    _, layout, lines, _ = view_and_layout(estimator, edges)
     found = (
         estimator.diagnostics(X) if estimator.refinement in JOINT_REFINEMENTS else None
     )
@@ -118,6 +118,8 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
         if ratio is None
         else camera_advice(estimator.camera_, ratio, certainty.determined),
         "skeleton": None if layout is None else layout.name,
+        # None if no lines are wanted.
+        "n_edges": None if edges is None else 0 if lines is None else len(lines.edges),
         "outliers": None if found is None else _outliers(found, estimator, X),
         "n_iter": estimator.n_iter_,
         "parameters": estimator.get_params(deep=True),

@@ -265,6 +265,11 @@ def _fit(report: dict[str, Any]) -> Section:
     parts.append(f"{sum(seconds.values()):.1f} seconds, {fit:.1f} of them for the fit")
     if model["skeleton"] is not None:
         parts.append(f"points recognised as {model['skeleton']}")
+    elif model["n_edges"] == 0:
+        parts.append(
+            "points of no known layout: figures and viewer have no lines between them; "
+            "give these with --edges FILE or --skeleton LAYOUT."
+        )
     return parts
 
 
