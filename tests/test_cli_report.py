@@ -285,6 +285,10 @@ def test_the_unit_of_times_is_that_of_the_column(name, cells, unit):
         (["--distance", "3,99"], "--distance 3,99: there is no point '99'; the 14"),
         (["--distance", "3,3"], "--distance 3,3: expected two different points"),
         (["--unit", "3,4"], "--unit needs --distance"),
+        (
+            ["--distance", "3,5"],
+            "--distance needs --unit: the 14 points are not the 68 .* --unit 0,1",
+        ),
     ],
 )
 def test_columns_are_refused_before_the_fit(tmp_path, capsys, options, message):

@@ -88,6 +88,12 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     unit = None if args.unit is None else _numbered(args.unit, names, "--unit")
     if unit is not None and not distances:
         raise ValueError("--unit needs --distance")
+    if distances and unit is None and len(names) != 68:
+        raise ValueError(
+            f"--distance needs --unit: the {len(names)} points are not the 68 of a "
+            "face, whose outer corners of the eyes are the unit. Give two points, such "
+            f"as --unit {names[0]},{names[1]}"
+        )
     return Columns(labels, groups, times, unit_of_times, distances, unit)
 
 
