@@ -186,6 +186,23 @@ def test_what_does_not_fit_is_refused_before_the_fit(
     assert not (tmp_path / "out").exists()
 
 
+def test_edges_are_numbers_of_named_points(run, bodies, tmp_path):
+    names = [f"j{j:02d}.{axis}" for j in range(17) for axis in "xy"]
+    table = write(bodies, tmp_path / "named.csv", names)
+    edges, out = tmp_path / "edges.csv", tmp_path / "out"
+    fit = ["fit", table, "-o", out, "--no-figures", *QUICK, "--edges", edges]
+    edges.write_text("5,7\n7,17\n")
+    assert "line 2: expected the names of two or three points" in run(*fit)[2]
+    edges.write_text("5,7\n7,j09\n")
+    # Of some of the points, numbers could be those of the table or of these points.
+    code, _, error = run(*fit, "--points", "without:0-4")
+    assert code == 1
+    assert "such as j05, j06 (without --points also their numbers from zero)" in error
+    assert not out.exists()
+    assert run(*fit)[0] == 0
+    assert edges_of(out / "viewer.html")[0] == {(5, 7), (7, 9)}
+
+
 @pytest.fixture(scope="module")
 def faces(tmp_path_factory):
     scene = make_face_tracks(60, n_components=1, noise=0.01, random_state=0)

@@ -263,8 +263,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "viewer": _option("FILE", "write a page that shows the new frames in 3D (.html)"),
     "edges": _option(
         "FILE",
-        "lines to draw between points: a .csv file with the names of two points per "
-        "line, or of three for a surface; 'none' draws only points",
+        "lines to draw between points: a .csv file with the names or numbers of two "
+        "points per line, or of three for a surface; 'none' draws only points",
     ),
     "skeleton": _option(
         "LAYOUT",

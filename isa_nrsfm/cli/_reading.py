@@ -543,7 +543,8 @@ def _edges(
     if args.edges == NONE:
         return None
     if args.edges is not None:
-        links = _read_edges(args.edges, names)
+        all_points = getattr(args, "points", None) is None
+        links = _read_edges(args.edges, names, numbered=all_points)
         if surfaces or links.shape[1] == 2:
             return links
         sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -564,12 +565,13 @@ def _edges(
     return stored.reordered(names) if named == sorted(names) else stored
 
 
-def _read_edges(path: str, names: Sequence[str]) -> NDArray:
-    """Read pairs or triples of points (n_edges, 2 or 3)."""
+def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
+    """Read pairs or triples of points (n_edges, 2 or 3), by name or also by number."""
     with reading(path, "a list of edges"):
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
     edges: list[list[int]] = []
-    numbers = {name: j for j, name in enumerate(names)}
+    numbers = {str(j): j for j in range(len(names))} if numbered else {}
+    numbers |= {name: j for j, name in enumerate(names)}
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
@@ -578,8 +580,8 @@ def _read_edges(path: str, names: Sequence[str]) -> NDArray:
         if sizes not in ({2}, {3}) or -1 in edges[-1]:
             raise ValueError(
                 f"{path}, line {number}: expected the names of two or three points "
-                f"with commas between them, such as {', '.join(names[:2])}; got "
-                f"{line!r}"
+                f"with commas between them, such as {', '.join(names[:2])} (without "
+                f"--points also their numbers from zero); got {line!r}"
             )
     if not edges:
         raise ValueError(f"{path} has no edges; use --edges none to draw only points")
