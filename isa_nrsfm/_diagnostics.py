@@ -142,9 +142,7 @@ def diagnose(estimator: Any, distance: NDArray | None, rows: Any) -> Diagnostics
     outliers = outlier_advice(found, rows, names)
     if frames.loss == "linear" and outliers:
         # Outliers may cause all the other messages.
-        advice = (
-            'they bend the shapes. Use loss="cauchy" (--loss cauchy), or correct them'
-        )
+        advice = 'they bend the shapes. Use loss="cauchy", or correct them'
         return found._replace(messages=(f"{outliers}: {advice}",))
     image = estimator.mean_shape_ @ estimator.reference_motion_.T
     layout = find_skeleton(len(names), names, shape=image)
@@ -324,8 +322,8 @@ def camera_advice(camera: str, ratio: float, determined: bool) -> str:
         return ""
     if camera != "affine" and not determined:
         return (
-            "next: a table in which the objects turn further (its model can transform "
-            "this one), or affine cameras"
+            "next: affine cameras for this table, or the model of a table in which the "
+            "objects turn further, which can transform this one"
         )
     if ratio >= OTHER_CAMERAS:
         return "keep these cameras" if camera == "affine" else "next: affine cameras"
@@ -333,8 +331,9 @@ def camera_advice(camera: str, ratio: float, determined: bool) -> str:
         return "next: more basis shapes, with these cameras"
     if camera == "affine":
         return (
-            "next: weak-perspective cameras, which give angles and proportions if the "
-            "objects turn enough"
+            "keep these cameras, unless angles and proportions are needed. For these, "
+            "try weak-perspective cameras, whose fit reports if the objects turn too "
+            "little for them"
         )
     return "keep these cameras"
 

@@ -256,7 +256,7 @@ def test_points_are_named(run, faces, tmp_path, points, kept):
         ("table", "3-17", "there are no points '3-17'; the 17 points are 0, 1"),
         ("faces", "nose", "there are no points 'nose'"),
         ("faces", "9-3", "there are no points '9-3'"),
-        ("faces", "0-3", "needs at least 7 points, X has 4"),
+        ("faces", "0-3", "needs at least 7 points, the table has 4"),
     ],
 )
 def test_points_that_are_none(run, request, given, tmp_path, points, message):

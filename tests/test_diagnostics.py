@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._diagnostics import (
+    camera_advice,
     gross_residuals,
     outlier_advice,
     pose_share,
@@ -283,7 +284,8 @@ class TestOutliers:
         found = model.diagnostics(table)
         (message,) = found.messages
         assert message.startswith(f"the table has outliers: {len(found.outliers)} ")
-        assert 'loss="cauchy" (--loss cauchy)' in message
+        assert message.count("cauchy") == 1
+        assert 'Use loss="cauchy", or' in message
         assert wrong[tuple(found.outliers.T)].mean() > 0.98
         assert 0.03 < found.outlier_share < wrong.mean()
         robust = AffineNRSfM(2, loss="cauchy", random_state=0).fit(table)
@@ -353,3 +355,14 @@ def test_messages_on_the_basis_come_first():
     first, second = model.diagnostics().messages
     assert first.startswith("the basis shapes are uncertain")
     assert second.startswith("a few of the 60 frames determine alpha_1")
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
+def test_advice_on_cameras_does_not_lead_back(ratio):
+    assert camera_advice("weak_perspective", ratio, determined=False).startswith(
+        "next: affine cameras for this table"
+    )
+    found = camera_advice("affine", ratio, determined=True)
+    assert found.startswith("keep these cameras") or found.endswith(
+        "with these cameras"
+    )

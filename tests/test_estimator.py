@@ -589,16 +589,16 @@ BAD_TABLES = {
         with_equal_points(5, 11),
         r"all points are equal in 2 of \d+ frames \(first: row 5\)",
     ),
-    "one point": (TABLE[:, :2], "needs at least 13 points, X has 1;"),
+    "one point": (TABLE[:, :2], "needs at least 13 points, the table has 1;"),
     "six points": (TABLE[:, :12], "at least 7 points are needed for n_components=1"),
     "too few points": (
         TABLE[:, :24],
-        "n_components=3 needs at least 13 points, X has 12; with 12 points the largest "
-        "possible n_components is 2",
+        "n_components=3 needs at least 13 points, the table has 12; with 12 points the "
+        "largest possible n_components is 2",
     ),
     "too few frames": (
         TABLE[:7],
-        r"n_components=3 needs at least 8 frames \(rows\), X has n_samples=7",
+        r"n_components=3 needs at least 8 frames \(rows\), the table has n_samples=7",
     ),
     "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
     "one dimension": (TABLE[0], "Expected 2D array, got 1D array"),

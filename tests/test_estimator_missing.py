@@ -263,7 +263,7 @@ def test_rows_are_counted_from_the_first_one_where_some_show_nothing(spoilt, mes
 
 
 def test_rows_that_show_nothing_are_no_frames():
-    few = r"at least 7 frames \(rows\), X has n_samples=6"
+    few = r"at least 7 frames \(rows\), the table has n_samples=6"
     with (
         pytest.raises(ValueError, match=few),
         pytest.warns(UserWarning, match="84 of 90"),

@@ -67,9 +67,10 @@ class DepthCertainty(NamedTuple):
             "the depth of the shapes is not determined: apart from their deformation "
             f"the objects turn by {turning:.2g} degrees (root mean square) out of the "
             "image plane, and these rotations have a standard deviation of "
-            f"{deviation:.2g} degrees. Fit a table in which the objects turn further, "
-            "and transform this one with that model; or use affine cameras "
-            '(camera="affine"). See "How reliable is the depth?" in the documentation'
+            f"{deviation:.2g} degrees. Use affine cameras for this table "
+            '(camera="affine"), or fit a table in which the objects turn further, and '
+            'transform this one with that model. See "How reliable is the depth?" in '
+            "the documentation"
         )
 
 

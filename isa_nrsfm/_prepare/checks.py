@@ -145,12 +145,15 @@ def check_size(
             )
         if largest > 0 and camera == "affine":
             most = largest_n_components(n_points, "weak_perspective")
-            possible += f" with affine cameras and {most} with calibrated cameras"
+            possible += (
+                f" with affine cameras, and {most} with calibrated ones "
+                '(camera="weak_perspective")'
+            )
         of_affine = camera in (None, "affine")
         needed = 3 * n_components + 4 if of_affine else (n_components + 8) // 2
         raise ValueError(
-            f"n_components={n_components} needs at least {needed} points, X has "
-            f"{n_points}; {possible}"
+            f"n_components={n_components} needs at least {needed} points, the table "
+            f"has {n_points}; {possible}"
         )
     smallest = smallest_n_frames(n_components, n_points)
     if n_frames < smallest:
@@ -159,7 +162,7 @@ def check_size(
             possible = f"; the largest possible n_components is {most}"
         raise ValueError(
             f"n_components={n_components} needs at least {smallest} frames (rows), "
-            f"X has n_samples={n_frames}{possible}"
+            f"the table has n_samples={n_frames}{possible}"
         )
 
 
