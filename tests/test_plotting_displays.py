@@ -212,6 +212,21 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert widths[0] == widths[1] == widths[2] < widths[3] / 2
 
 
+def test_notes_of_narrow_side_views_end_within_the_figure():
+    rng = np.random.default_rng(0)
+    narrow = np.array([0.2, 1.0, 0.2])
+    display = BasisShapeDisplay(
+        mean_shape=narrow * rng.normal(size=(20, 3)),
+        basis=0.1 * narrow * rng.normal(size=(12, 20, 3)),
+        depth_note="depth not determined",
+    ).plot()
+    display.figure_.canvas.draw()
+    for side in display.axes_[:, 1]:
+        assert side.get_xlabel() == "depth not determined"
+        note = side.xaxis.label.get_window_extent()
+        assert note.x1 <= display.figure_.bbox.x1
+
+
 def test_dense_shapes_are_clouds():
     display = random_shapes(n_points=401).plot()
     assert display.arrows_ == []

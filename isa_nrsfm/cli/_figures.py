@@ -177,7 +177,7 @@ def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:
         for axis, (x, y) in zip(pair, VIEWS, strict=True):
             axis.set(xlim=limits[x], ylim=limits[y])
             axis.yaxis.set_inverted(whole.origin == "upper")
-        pair[1].set_xlabel(whole.depth_note, fontsize="x-small")
+        pair[1].set_xlabel(whole.depth_note, loc="right", fontsize="x-small")
         title = wrap_title(f"{name} ({count} frames)", pair)
         pair[0].set_title(title, loc="left", fontsize="small", parse_math=False)
     line = import_optional("matplotlib.lines", extra="plot").Line2D

@@ -351,7 +351,7 @@ class BasisShapeDisplay:
                 show_view(axis, view, limits[block], self.origin)
             title = wrap_title(self._title(block, amplitudes, reduction[block]), pair)
             pair[0].set_title(title, loc="left", fontsize="small")
-            pair[1].set_xlabel(self.depth_note, fontsize="x-small")
+            pair[1].set_xlabel(self.depth_note, loc="right", fontsize="x-small")
         if ax is None:
             self._add_legend()
         return self
