@@ -10,7 +10,9 @@ import pytest
 from fit_runs import MODEL
 from layers import slow_after
 
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.io import read_landmarks
 
 N_FRAMES = 40
 LOST, EMPTY = 3, 7
@@ -96,8 +98,8 @@ def test_files_are_fitted_and_transformed(write, run, tmp_path):
         (write_openface, "--image-size 640x480", "--image-size needs --format mediapi"),
         (
             write_openface,
-            "--min-confidence 1 --format table",
-            "has format table, which has no confidences",
+            "--min-confidence 1 --columns x_#,y_#",
+            "has no confidences of all points. Their columns need the names of the x",
         ),
         (write_pts, "--min-confidence 1", "is given, but these landmarks (pts)"),
     ],
@@ -130,6 +132,80 @@ def test_a_model_of_other_points_is_refused(run, tmp_path):
     code, out, _ = run("transform", folder / MODEL, openface, *output)
     assert code == 0
     assert "1  without coefficients: tracking failed" in out
+
+
+def with_confidences(folder, axes):
+    """Return a table of points, confidences for it, and where to write it."""
+    points = tracks(20)
+    names = [axes.format(axis, j) for j in range(20) for axis in "xy"]
+    table = pd.DataFrame(points.reshape(N_FRAMES, -1), columns=names)
+    confidence = np.random.default_rng(0).uniform(0.2, 1.0, (N_FRAMES, 20))
+    table.insert(0, "id", [f"i{i}" for i in range(N_FRAMES)])
+    return table, confidence, folder / "table.csv"
+
+
+@pytest.mark.parametrize(
+    ("axes", "word"),
+    [
+        ("p{1}_{0}", "conf"),
+        ("joint {1}.{0}", "likelihood"),
+        ("{0}{1}", "c"),
+        ("{0}_{1}", "score"),
+    ],
+)
+def test_confidences_of_a_plain_table(run, tmp_path, axes, word):
+    table, confidence, path = with_confidences(tmp_path, axes)
+    points = table.columns[1:]
+    for j in range(20):
+        table[axes.format(word, j)] = confidence[:, j]
+    table.to_csv(path, index=False)
+    folder, blanked = tmp_path / "results", tmp_path / "blanked"
+    unsure = ["--min-confidence", "0.4"]
+    assert run("fit", path, "-o", folder, *QUICK, *unsure)[0] == 0
+    alpha = pd.read_csv(folder / "alpha.csv")
+    assert list(alpha) == ["row", "id", "alpha_1"]
+    without = table[["id", *points]].copy()
+    without[points] = without[points].mask(np.repeat(confidence < 0.4, 2, axis=1))
+    without.to_csv(tmp_path / "without.csv", index=False)
+    assert run("fit", tmp_path / "without.csv", "-o", blanked, *QUICK)[0] == 0
+    pd.testing.assert_frame_equal(alpha, pd.read_csv(blanked / "alpha.csv"))
+    output = tmp_path / "again.csv"
+    assert run("transform", folder / MODEL, path, "-o", output, *unsure)[0] == 0
+    np.testing.assert_allclose(
+        pd.read_csv(output)["alpha_1"], alpha["alpha_1"], atol=1e-3
+    )
+
+    found = read_landmarks(path, "table", min_confidence=0.4)
+    np.testing.assert_array_equal(found.confidence, confidence)
+    np.testing.assert_array_equal(found.points, without[points])
+    assert list(found.frames) == ["id"]
+    # Unused, they are counted, and not copied.
+    code, out, _ = run("fit", path, "-o", folder, *QUICK)
+    assert code == 0
+    assert f"not used: {axes.format(word, 0)}, ... (confidences) (20)" in out
+    assert list(pd.read_csv(folder / "alpha.csv")) == ["row", "id", "alpha_1"]
+
+
+def test_confidences_of_a_plain_table_are_weights(run, tmp_path):
+    table, confidence, path = with_confidences(tmp_path, "p{1}_{0}")
+    confidence[3, 5] = 0.0
+    points = table.columns[1:]
+    for j in range(20):
+        table[f"p{j}_conf"] = confidence[:, j]
+    table.to_csv(path, index=False)
+    options = ["--weights", "confidence", "-k", "1", "--no-figures"]
+    some = ["--points", "without:2,7"]
+    assert run("fit", path, "-o", tmp_path / "fit", *options, *some)[0] == 0
+    left = np.delete(np.arange(20), [2, 7])
+    X = table[points].to_numpy().reshape(N_FRAMES, 20, 2)[:, left]
+    model = AffineNRSfM(1, random_state=0)
+    model.fit(X.reshape(N_FRAMES, -1), point_weight=confidence[:, left])
+    alpha = pd.read_csv(tmp_path / "fit/alpha.csv")["alpha_1"]
+    np.testing.assert_allclose(alpha, model.alpha_[:, 0], atol=1e-6)
+    table["p3_conf"] = "good"
+    table.to_csv(path, index=False)
+    _, _, err = run("fit", path, "-o", tmp_path / "fit", *options)
+    assert "column 'p3_conf' should hold numbers, but in row 0" in err
 
 
 SHARES = "like shares of the width and height of an image"

@@ -176,9 +176,9 @@ def test_numbers_of_all_kinds_become_floats(frame):
         (["1,5", "2", "3", "4", "5"], "in row 0 .* has '1,5'"),
         ([1, 2, 3, 4, np.inf], "'x2' is infinite in row 4"),
         (["1", "inf", "3", "4", "5"], "'x2' is infinite in row 1"),
-        ([True, False, True, True, True], "'x2' should hold coordinates; got bool"),
-        ([1j] * 5, "'x2' should hold coordinates; got complex128"),
-        (pd.date_range("2000", periods=5), "'x2' should hold coordinates, .* in row 0"),
+        ([True, False, True, True, True], "'x2' should hold numbers; got bool"),
+        ([1j] * 5, "'x2' should hold numbers; got complex128"),
+        (pd.date_range("2000", periods=5), "'x2' should hold numbers, .* in row 0"),
     ],
 )
 def test_cells_that_are_no_coordinates_are_named(frame, cells, message):

@@ -458,4 +458,4 @@ class TestCommandLine:
         pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
         code, _, err = run("fit", table, *options, "-k", "2")
         assert code != 0
-        assert "has format table, which has no confidences" in err
+        assert "has no confidences of all points. Their columns need" in err

@@ -26,12 +26,14 @@ from isa_nrsfm.cli._times import image_numbers
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
+    CONFIDENCES,
     LandmarkColumns,
+    confidence_columns,
     find_landmark_columns,
     landmark_sets,
 )
 from isa_nrsfm.io._landmarks import Landmarks
-from isa_nrsfm.io._tables import tracks_in
+from isa_nrsfm.io._tables import confidences_in, tracks_in
 from isa_nrsfm.skeletons import (
     SKELETONS,
     Skeleton,
@@ -97,6 +99,7 @@ def read_frames(
     The format in the options becomes the one found.
     """
     chosen = failed = layout = confidence = None
+    not_used: dict[str, int] = {}
     args.format = _format(args) if table is None else TABLE
     if args.format != TABLE:
         pd = import_optional("pandas", extra="io")
@@ -115,24 +118,28 @@ def read_frames(
             chosen = find_landmark_columns(table.columns, args.columns)
     if estimator is not None:
         columns = _columns_of_model(estimator, table, chosen)
+    else:
+        columns = chosen or find_landmark_columns(table.columns)
+    if args.format == TABLE:
+        table, confidence, not_used = _with_confidences(args, table, columns)
+    if estimator is not None:
         if chosen is not None:
             kept = [chosen.x.index(name) for name in columns.x]
             layout = _part_of_layout(layout, kept)
-        return _frames(args, table, columns, failed, layout, confidence)
-    columns = chosen or find_landmark_columns(table.columns)
-    if args.points is None:
-        return _frames(args, table, columns, failed, layout, confidence)
-    layout = _layout(args, table, columns, layout)
-    left = _kept_points(args.points, columns.points, layout)
-    names, x, y = (
-        tuple(each[j] for j in left) for each in (columns.points, columns.x, columns.y)
-    )
-    dropped = [name for name in columns.interleaved if name not in {*x, *y}]
-    columns = columns._replace(points=names, x=x, y=y)
-    layout = _part_of_layout(layout, left)
-    table = table.drop(columns=dropped)
+    elif args.points is not None:
+        layout = _layout(args, table, columns, layout)
+        left = _kept_points(args.points, columns.points, layout)
+        names, x, y = (
+            tuple(each[j] for j in left)
+            for each in (columns.points, columns.x, columns.y)
+        )
+        dropped = [name for name in columns.interleaved if name not in {*x, *y}]
+        columns = columns._replace(points=names, x=x, y=y)
+        layout = _part_of_layout(layout, left)
+        table = table.drop(columns=dropped)
+        not_used[f"--points {args.points}"] = len(dropped) // 2
     frames = _frames(args, table, columns, failed, layout, confidence)
-    frames.not_used[f"--points {args.points}"] = len(dropped) // 2
+    frames.not_used.update(not_used)
     return frames
 
 
@@ -181,21 +188,41 @@ def _format(args: Namespace) -> str:
         raise ValueError(
             f"--image-size needs --format mediapipe; {args.table} has format {found}"
         )
-    if args.min_confidence is not None and found == TABLE:
-        raise ValueError(
-            f"--min-confidence: {args.table} has format table, which has no confidences"
-        )
-    if _weights_asked(args) and found == TABLE:
-        raise ValueError(
-            f"--weights: {args.table} has format table, which has no confidences. "
-            "Read a file of a tracker, or leave out --weights"
-        )
     return found
 
 
 def _weights_asked(args: Namespace) -> bool:
     """Return whether confidences are weights; some commands have no such option."""
     return getattr(args, "weights", None) is not None
+
+
+def _with_confidences(
+    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns
+) -> tuple["pd.DataFrame", "pd.DataFrame | None", dict[str, int]]:
+    """Take the confidences out of a plain table, and apply them if asked to.
+
+    Returns the table, the confidences as weights, and those that are not used.
+    """
+    names = confidence_columns(table.columns, columns.x, columns.y)
+    rest = table.drop(columns=names)
+    if args.min_confidence is None and not _weights_asked(args):
+        unused = {f"{names[0].strip()}, ... (confidences)": len(names)} if names else {}
+        return rest, None, unused
+    confidence = confidences_in(table, columns.x, columns.y)
+    if confidence is None:
+        option = "--weights" if args.min_confidence is None else "--min-confidence"
+        raise ValueError(
+            f"{option}: {args.table} has no confidences of all points. Their columns "
+            "need the names of the x columns, with one of the words "
+            f"{', '.join(CONFIDENCES)} for x, such as nose_conf beside nose_x"
+        )
+    points = table[columns.interleaved]
+    failed = np.zeros(len(table), dtype=bool)
+    found = Landmarks(points, rest, confidence, failed, TABLE, columns.points)
+    if args.min_confidence is not None:
+        found = found.without_unsure_points(args.min_confidence)
+        rest[columns.interleaved] = found.points
+    return rest, _confidence(args, found), {}
 
 
 def _confidence(args: Namespace, found: Landmarks) -> "pd.DataFrame | None":

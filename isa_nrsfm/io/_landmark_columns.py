@@ -6,11 +6,13 @@ In patterns ``#`` is a number and ``*`` is any text.
 import re
 from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 
+# What stands for the axis letter in the names of confidences: nose_conf, conf_0.
+CONFIDENCES = ("confidence", "conf", "likelihood", "score", "visibility", "c")
 # One basis shape needs 3 K + 3 = 6 dimensions, and J centred points have J - 1.
 MIN_POINTS = 7
 
@@ -120,6 +122,30 @@ def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:
             for other, other_size in sizes.items()
         )
     }
+
+
+def confidence_columns(
+    names: Iterable[Hashable], x: Iterable[str], y: Iterable[str]
+) -> list[Any]:
+    """Return the columns with the confidences of points of x and y columns, if any.
+
+    They are named alike with one of the words `CONFIDENCES` for the axis letter.
+
+    >>> from isa_nrsfm.io._landmark_columns import confidence_columns
+    >>> confidence_columns(["nose_x", "nose_y", "nose_conf"], ["nose_x"], ["nose_y"])
+    ['nose_conf']
+    """
+    by_name = {str(name).strip(): name for name in names}
+    parts = []
+    for pair in zip(map(str.strip, x), map(str.strip, y), strict=True):
+        same = [a == b for a, b in zip(*pair, strict=False)]
+        place = [*same, False].index(False)  # of the axis letter
+        parts.append((pair[0][:place], pair[0][place + 1 :]))
+    for word in CONFIDENCES:
+        found = [f"{before}{word}{after}" for before, after in parts]
+        if by_name.keys() >= {*found}:
+            return [by_name[name] for name in found]
+    return []
 
 
 def _select(names: Sequence[Hashable], patterns: Sequence[str]) -> LandmarkColumns:

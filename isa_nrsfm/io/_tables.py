@@ -1,6 +1,6 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -11,7 +11,7 @@ from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.column_names import parse_coordinate, point_names
-from isa_nrsfm.io._landmark_columns import find_landmark_columns
+from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.io._separated_values import SEPARATORS, checked_rows, read_parquet
 
@@ -230,13 +230,26 @@ def read_named_columns(
 ) -> Landmarks:
     """Read a table whose landmark columns are recognised by their names."""
     points, other = landmark_table(parse_table(path), columns=columns, missing=missing)
+    confidence = confidences_in(other, points.columns[::2], points.columns[1::2])
+    if confidence is not None:
+        other = other.drop(columns=confidence.columns)
     return assemble(
         points.to_numpy().reshape(len(points), -1, 2),
         point_names(points.columns[::2]),
         other,
         format="table",
         columns=list(points.columns),
+        confidence=None if confidence is None else confidence.to_numpy(),
     )
+
+
+def confidences_in(
+    frame: "pd.DataFrame", x: Iterable[str], y: Iterable[str]
+) -> "pd.DataFrame | None":
+    """Return the confidences (n_frames, n_points) of points of x and y columns."""
+    pd = import_optional("pandas", extra="io")
+    found = {name: _as_numbers(frame[name]) for name in confidence_columns(frame, x, y)}
+    return pd.DataFrame(found, index=frame.index) if found else None
 
 
 def table_suffix(path: "str | os.PathLike[str]") -> str:
@@ -307,7 +320,7 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     types = pd.api.types
     if types.is_bool_dtype(column) or types.is_complex_dtype(column):
         raise ValueError(
-            f"column {column.name!r} should hold coordinates; got {column.dtype}"
+            f"column {column.name!r} should hold numbers; got {column.dtype}"
         )
     if types.is_numeric_dtype(column):
         values = column.to_numpy(dtype=np.float64, na_value=np.nan)
@@ -317,7 +330,7 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
         if found is None:
             bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
             raise ValueError(
-                f"column {column.name!r} should hold coordinates, but in row "
+                f"column {column.name!r} should hold numbers, but in row "
                 f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}"
                 + "; decimals are written with a point"
                 * ("," in text.iloc[bad])
