@@ -321,10 +321,7 @@ def camera_advice(camera: str, ratio: float, determined: bool) -> str:
     if np.isnan(ratio):
         return ""
     if camera != "affine" and not determined:
-        return (
-            "next: affine cameras for this table, or the model of a table in which the "
-            "objects turn further, which can transform this one"
-        )
+        return "next: affine cameras for this table"
     if ratio >= OTHER_CAMERAS:
         return "keep these cameras" if camera == "affine" else "next: affine cameras"
     if ratio >= SAME_NOISE:

@@ -256,6 +256,14 @@ def test_unestimated_certainty_withholds_nothing():
     assert DepthCertainty(turning=0.5, turns=0.01 * np.eye(3)).determined
 
 
+@pytest.mark.parametrize("turning", [0.1, 1.0, 1.6])
+def test_advice_to_turn_further_is_not_given_after_all_sides(turning):
+    certainty = DepthCertainty(turning=turning, turns=turning**2 * np.eye(3))
+    assert not certainty.determined
+    assert ("turn further" in certainty.advice) == (turning < 1.5)
+    assert ("x and y have the same unit" in certainty.advice) == (turning > 1.5)
+
+
 def test_outliers_are_left_out_with_a_robust_loss():
     rng = np.random.default_rng(0)
     shapes = rng.normal(size=(2, 3, 20)) * [[[1.0]], [[0.1]]]

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 # errors above this share are warned of as well: they are at most 0.47 where rotations
 # are determined (mean of ten tables, ``python -m benchmarks.depth``).
 LARGEST_SHARE = 0.55
+# RMS turning out of the image plane, if all sides of a half sphere are seen as often.
+HALF_SPHERE = np.sqrt(np.pi - 2)
 
 
 class DepthCertainty(NamedTuple):
@@ -63,14 +65,22 @@ class DepthCertainty(NamedTuple):
     def advice(self) -> str:
         """Reason and remedy for depths that are not determined."""
         turning, deviation = np.degrees([self.turning, self.turning_deviation])
+        other = (
+            "fit a table in which the objects turn further, and transform this one "
+            "with that model"
+        )
+        if self.turning > HALF_SPHERE:
+            other = (
+                "make sure that x and y have the same unit, unlike shares of the width "
+                "and height of an image"
+            )
         return (
             "the depth of the shapes is not determined: apart from their deformation "
             f"the objects turn by {turning:.2g} degrees (root mean square) out of the "
             "image plane, and these rotations have a standard deviation of "
             f"{deviation:.2g} degrees. Use affine cameras for this table "
-            '(camera="affine"), or fit a table in which the objects turn further, and '
-            'transform this one with that model. See "How reliable is the depth?" in '
-            "the documentation"
+            f'(camera="affine"), or {other}. See "How reliable is the depth?" in the '
+            "documentation"
         )
 
 
