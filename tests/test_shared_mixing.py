@@ -201,14 +201,14 @@ class TestOptimality:
             return F + 3 * np.linalg.slogdet(W)[1]
 
         slopes = _shared_mixing._slopes(np.sum(Y**2, axis=2), tail, 3)
-        gradient, hessian = _shared_mixing._relative_derivatives(Y, *slopes)
+        gradient, blocks = _shared_mixing._relative_derivatives(Y, *slopes)
         h = 1e-4
         for _ in range(5):
             E = rng.normal(size=(3, 3))
             up, here, down = (likelihood(s * h * E) for s in (1, 0, -1))
             first, second = (up - down) / (2 * h), (up - 2 * here + down) / h**2
             assert_allclose(np.sum(gradient * E), first, rtol=1e-6, atol=1e-6)
-            curvature = np.einsum("ka,kalb,lb->", E, hessian, E)
+            curvature = np.einsum("ka,kab,kb->", E, blocks, E) - 3 * np.sum(E * E.T)
             assert_allclose(curvature, second, rtol=1e-4)
 
     def test_more_starts_find_likelier_signals(self):
@@ -310,12 +310,24 @@ class TestSteps:
 
     def test_ascent_maximises_the_quadratic_model_or_there_is_none(self):
         rng = np.random.default_rng(0)
-        root, gradient = rng.normal(size=(4, 4)), rng.normal(size=(2, 2))
-        H = -(root @ root.T)
-        E = _shared_mixing._ascent(gradient, H.reshape((2,) * 4), 0.5)
-        model = H - 0.5 * np.eye(4)
-        assert_allclose(gradient.ravel() + model @ E.ravel(), 0, atol=1e-10)
-        assert _shared_mixing._ascent(gradient, -H.reshape((2,) * 4), 0.0) is None
+        n, size, shift = 5, 3, 0.5
+        root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))
+        blocks = -(root @ root.transpose(0, 2, 1)) - 4.0 * np.eye(n)
+        E = _shared_mixing._ascent(gradient, blocks, shift, size)
+        slope = np.einsum("kab,kb->ka", blocks, E) - size * E.T - shift * E
+        assert_allclose(gradient + slope, 0, atol=1e-4 * np.linalg.norm(gradient))
+        # Weaker blocks than the coupling, and blocks without a maximum at all
+        for factor in (0.25, -1.0):
+            weak = -factor * 4.0 * np.tile(np.eye(n), (n, 1, 1))
+            assert _shared_mixing._ascent(gradient, weak, shift, size) is None
+        # A direction that the diagonals of the blocks do not show
+        one = np.ones((n, n))
+        assert (
+            _shared_mixing._ascent(
+                one, 10.0 * one - 16.0 * np.eye(n) + 0 * blocks, 0.0, size
+            )
+            is None
+        )
 
 
 class TestDegenerate:
