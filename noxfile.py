@@ -41,9 +41,10 @@ def quick(session: nox.Session) -> None:
 
 @nox.session
 def full(session: nox.Session) -> None:
-    """Run all tests."""
+    """Run all tests, with more examples of properties."""
     session.install("-e", ".[test]")
-    session.run("pytest", "-n", "2", "-m", "", *session.posargs, env=THREADS)
+    env = {**THREADS, "HYPOTHESIS_PROFILE": "ci"}
+    session.run("pytest", "-n", "2", "-m", "", *session.posargs, env=env)
 
 
 @nox.session(venv_backend="uv")

@@ -115,6 +115,7 @@ def test_fits_in_four_threads_leave_the_process_as_it_was(error):
     assert state() == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_threads")
 def test_results_are_the_same_to_the_bit():
     X = make_nonrigid_tracks(300, 120, 3, noise=0.02, random_state=0).data

@@ -59,6 +59,7 @@ class TestThreads:
         model = AffineNRSfM(K, random_state=0).fit(chunked(X, columns=16))
         assert_same_model(model, AffineNRSfM(K, random_state=0).fit(X))
 
+    @pytest.mark.slow
     def test_robust_fit_is_that_in_memory(self):
         X = table(0.1)
         wrong = np.random.default_rng(1).random(X.shape) < 0.03

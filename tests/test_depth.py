@@ -417,6 +417,7 @@ def swinging_body(seed, n_frames=150, turn=90):
     return tracks.reshape(n_frames, -1), shapes
 
 
+@pytest.mark.slow
 def test_weak_perspective_finds_what_orthographic_cameras_find():
     # Without starts of one scale its error is 1.8 times that of orthographic cameras.
     X, shapes = swinging_body(4)

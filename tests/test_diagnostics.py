@@ -240,7 +240,8 @@ class TestPoseShare:
         assert -0.1 < share[0] <= 0
         assert np.isnan(share[1])
 
-    @pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "affine"]))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
     def test_a_contour_that_slides_is_named(self, camera):
         faces = make_face_tracks(
             300, n_components=2, camera="weak_perspective", noise=0.01, random_state=0

@@ -99,6 +99,7 @@ class TestSmoother:
 
 
 class TestEstimation:
+    @pytest.mark.slow
     def test_finds_the_autoregression(self):
         rng, true = np.random.default_rng(0), random_dynamics()
         data = [

@@ -1086,7 +1086,8 @@ def test_shapes_of_fitted_frames(camera):
             model.reconstruct(frames, return_std=True)
 
 
-@pytest.mark.parametrize("camera", slow_after(1, [*CALIBRATED, "affine"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [*CALIBRATED, "affine"])
 def test_the_number_of_components_is_found(camera):
     truth = make_nonrigid_tracks(150, 40, 2, camera=camera, noise=0.02, random_state=1)
     model = AffineNRSfM("auto", camera=camera, random_state=0).fit(truth.data)

@@ -241,7 +241,8 @@ def test_default_strategies_are_invariant(load_data, name, n_components, refinem
     assert_shapes_agree(all_shapes(other), all_shapes(first)[:, points])
 
 
-@pytest.mark.parametrize("loss", slow_after(1, ["cauchy", "huber"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["cauchy", "huber"])
 def test_robust_fits_are_invariant(loss):
     # The weights stop changing at some distance from their limit.
     original = make_nonrigid_tracks(

@@ -422,9 +422,10 @@ def with_outliers(made, seed, share=0.05, size=1.0):
     return tracks.reshape(len(tracks), -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "size"),
-    slow_after(1, [(0, 5.0), (0, 1.0), (1, 1.0)], together=True),
+    [(0, 5.0), (0, 1.0), (1, 1.0)],
 )
 @pytest.mark.parametrize("loss", LOSSES[1:])
 def test_robust_losses_withstand_outliers(loss, seed, size):

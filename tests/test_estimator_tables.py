@@ -428,11 +428,10 @@ def of_unit(unit, refinement):
     return fit(unit * FACES, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("loss", "scale_frames"),
-    slow_after(
-        1, [("linear", False), ("huber", True), ("cauchy", False)], together=True
-    ),
+    [("linear", False), ("huber", True), ("cauchy", False)],
 )
 def test_joint_refinement_of_frames_that_are_lines_or_tiny(loss, scale_frames):
     tracks = lines_and_tiny_frames()
@@ -499,6 +498,7 @@ def test_one_basis_shape_needs_no_independence(load_data, name):
     assert_allclose(values, values[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation(tmp_path):
     # 17 points allow 4 basis shapes with affine cameras. Bodies have many more.
     bodies = make_body_tracks(200, camera="orthographic", random_state=0)

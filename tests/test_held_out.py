@@ -154,9 +154,8 @@ def test_score_leaves_frames_without_camera_out():
     assert np.isnan(model.score(X))
 
 
-@pytest.mark.parametrize(
-    ("n_components", "seed"), slow_after(1, [(1, 0), (3, 2), (5, 4)], together=True)
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("n_components", "seed"), [(1, 0), (3, 2), (5, 4)])
 def test_score_of_new_frames_is_best_at_the_true_number(n_components, seed):
     X = table(n_components, seed)
     # The nearest numbers, two of either side: fits far below the true one take long.

@@ -182,6 +182,7 @@ class TestCameras:
         assert model.inverse_snr_ < EXACT**2
         assert error_of(model, faces.tracks, faces.shapes) < 5e-4
 
+    @pytest.mark.slow
     @CALIBRATED
     @pytest.mark.parametrize(("deviation", "largest"), [(0.0, EXACT), (0.01, 0.01)])
     def test_calibrated_cameras_show_true_shapes(self, camera, deviation, largest):
@@ -218,7 +219,8 @@ class TestCameras:
 
 
 class TestNumberOfComponents:
-    @pytest.mark.parametrize("n_components", slow_after(1, [0, 2]))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("n_components", [0, 2])
     def test_of_many_points(self, n_components):
         tracks, _ = random_table(
             deviation=0.02, n_frames=80, n_points=300, n_components=n_components

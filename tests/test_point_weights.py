@@ -113,6 +113,7 @@ class TestMeaning:
         with pytest.warns(UserWarning, match="only one of"):
             assert_array_equal(fitted().transform(X, point_weight=weights), expected)
 
+    @pytest.mark.slow
     @CAMERAS
     def test_weights_of_two_are_two_columns_of_each_point(self, camera):
         X = make_nonrigid_tracks(
@@ -308,6 +309,7 @@ class TestRouting:
         again = pipeline.transform(X, point_weight=weights)
         assert_allclose(again, found, atol=1e-9)
 
+    @pytest.mark.slow
     def test_grid_search(self):
         X, weights, _ = noisy()
         model = estimator().set_fit_request(point_weight=True)

@@ -50,6 +50,7 @@ def test_the_number_that_made_the_table_is_found(fitted):
     assert fitted.refit_time_ > 0
 
 
+@pytest.mark.slow
 def test_results_are_those_of_a_plain_search(fitted):
     grid = {"n_components": [1, 2, 3]}
     plain = GridSearchCV(inner(), grid, cv=3, refit=False).fit(X)

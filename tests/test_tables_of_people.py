@@ -382,6 +382,7 @@ def test_codes_are_finite_numbers(number, capsys):
     assert "--missing-value: expected a number, such as -1" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
     path, folder = tmp_path / "table.csv", tmp_path / "out"
     write_landmarks(path)
