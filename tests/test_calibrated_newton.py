@@ -13,7 +13,7 @@ from scenes import with_gaps
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
+from isa_nrsfm._frames.calibrated_newton import CalibratedSearch, calibrated_starts
 from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpacked
@@ -325,3 +325,25 @@ class TestReversal:
                 np.zeros(n),
             )
             assert value(scene, i, fits.motion[i], noise) <= end.fun + 1e-6
+
+
+def test_completed_starts_are_scaled_rotations_with_the_first_two_columns():
+    """Also of equal singular values, of one, of none, and of axes in the columns."""
+    rng = np.random.default_rng(0)
+    M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
+    M[:, :2, :4] = 0.0
+    M[:, :2, 0] = np.eye(2)
+    M[0, 0, 1] = M[1, 1, 2] = M[0, 1, 3] = 2.0
+    M[:, :2, 4] = 0.0
+    affine = M.copy()
+    completed = calibrated_starts(CAMERAS["weak_perspective"], M)[1]
+    assert_array_equal(M, affine)
+    size = np.linalg.norm(M[:, :2], axis=(0, 1), ord=2)
+    size[4] = 1.0
+    products = (
+        np.einsum("rci,sci->irs", completed, completed) / size[:, None, None] ** 2
+    )
+    assert_allclose(products, np.broadcast_to(np.eye(2), products.shape), atol=1e-12)
+    some = np.arange(40) != 4
+    assert_allclose(completed[:, :2, some] / size[some], M[:, :2, some] / size[some])
+    assert (np.einsum("ri,ri->i", completed[:, 2], M[:, 2]) >= 0).all()

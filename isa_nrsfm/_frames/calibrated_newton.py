@@ -191,30 +191,32 @@ class CalibratedSearch(FrameSearch):
 
 def calibrated_starts(model: CameraModel, M: NDArray) -> list[NDArray]:
     """Return the nearest cameras and those of `_completed`, of affine M (2, 3, n)."""
-    starts = []
-    for rows, scales in nearest_calibrated(frames_first(M)), _completed(M):
-        scales = scales if model.scaled else np.ones_like(scales)
-        starts.append(frames_last(scales[:, None, None] * rows))
-    return starts
+    rows, scales = nearest_calibrated(frames_first(M))
+    starts = (frames_last(rows), scales), _completed(M)
+    return [scale * rows if model.scaled else rows for rows, scale in starts]
 
 
 def _completed(M: NDArray) -> tuple[NDArray, NDArray]:
     """Return orthonormal rows and scales from the first two columns of affine cameras.
 
     The third column of cameras (2, 3, n) belongs to the thinnest axis. For thin objects
-    it is not determined. The first two are ``U diag(s_1, s_2) V^T``. In a scaled
-    rotation the third is ``+- sqrt(s_1^2 - s_2^2) u_2``, with the sign of the affine
-    camera.
+    it is not determined. The first two, N, have singular values s_1 and s_2. In a
+    scaled rotation of scale s_1 the third, z, has ``z z^T = s_1^2 I - N N^T``, and
+    here the sign of the affine camera.
     """
-    affine = frames_first(M)
-    U, values, Vt = np.linalg.svd(affine[:, :, :2])
-    scale = np.where(values[:, 0] > 0, values[:, 0], 1.0)
-    cosine = values[:, 1] / scale
-    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-    depth = sine[:, None] * U[:, :, 1]
-    sign = np.where(np.einsum("ir,ir->i", depth, affine[:, :, 2]) < 0, -1.0, 1.0)
-    block = (U * np.stack([np.ones_like(cosine), cosine], axis=1)[:, None]) @ Vt
-    return np.concatenate([block, (sign[:, None] * depth)[..., None]], axis=2), scale
+    N, third = M[:, :2], M[:, 2]
+    (p, r), q = (N**2).sum(axis=1), (N[0] * N[1]).sum(axis=0)
+    half = 0.5 * (p - r)
+    height = np.hypot(half, q)
+    scale = np.sqrt(0.5 * (p + r) + height)
+    scale = np.where(scale > 0, scale, 1.0)
+    # The larger entry of z, and the other one from their product -q, without cancelling
+    large = np.sqrt(height + np.abs(half))
+    small = np.divide(-q, large, where=large > 0, out=np.zeros_like(q))
+    z = np.where(half > 0, (small, large), (large, small)) / scale
+    z = np.where((z * third).sum(axis=0) < 0, -z, z)
+    N = np.where(p + r > 0, N / scale, np.eye(2)[..., None])
+    return np.concatenate([N, z[:, None]], axis=1), scale
 
 
 def _value(problem: FrameProblem, posterior: CoefficientPosterior) -> NDArray:
