@@ -5,7 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._joint.common_depths import _principal, common_coordinates
+from isa_nrsfm._joint.common_depths import (
+    _principal,
+    _rotations,
+    _turned,
+    common_coordinates,
+)
 
 FLOOR = 1e-5
 
@@ -118,3 +123,25 @@ def test_expectation_is_that_of_probabilistic_components(s2):
     assert_allclose(found, expected, atol=1e-12)
     off = (shapes - mean).reshape(500, -1)
     assert_allclose(fit, mean + (off @ expected).reshape(shapes.shape), atol=1e-12)
+
+
+def test_steps_of_rotations_reach_those_of_procrustes():
+    rng = np.random.default_rng(0)
+    fit = rng.standard_normal((50, 3, 12))
+    own = Rotation.from_rotvec(rng.standard_normal((50, 3))).as_matrix() @ fit
+    own += 0.1 * rng.standard_normal(own.shape)
+    best = _rotations(own, fit)
+    assert_allclose(np.linalg.det(best), 1.0)
+    R = best @ Rotation.from_rotvec(0.3 * rng.standard_normal((50, 3))).as_matrix()
+    errors = [np.linalg.norm(own - R @ fit)]
+    for _ in range(15):
+        R = _turned(R, R.transpose(0, 2, 1) @ own, fit)
+        errors.append(np.linalg.norm(own - R @ fit))
+    assert np.all(np.diff(errors) < 1e-12)
+    assert_allclose(R, best, atol=1e-12)
+
+
+def test_steps_of_rotations_leave_points_on_a_line_in_place():
+    line = np.linspace(-1, 1, 5) * np.array([[0.0], [0.0], [1.0]])
+    R = _turned(np.eye(3)[None], line[None], line[None])
+    assert_allclose(R, np.eye(3)[None], atol=1e-12)
