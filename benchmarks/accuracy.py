@@ -37,6 +37,7 @@ from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint import fit as joint_fit
 from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 from isa_nrsfm._tables.tracks import centred_tracks, weighting_sizes
@@ -558,8 +559,7 @@ SPOILS = {
 
 def common_rotation(truth, rotations):
     """Return C for which the products R C of true rotations are nearest to others."""
-    U, _, Vt = np.linalg.svd(np.einsum("iba,ibc->ac", truth, rotations))
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return procrustes(np.einsum("iba,ibc->ac", truth, rotations))
 
 
 def turn_errors(truth, rotations):

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks._data import ICT, load_arrays
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.export import frame_poses
 
@@ -54,8 +55,7 @@ def rotation_ratio(model, X, rotations):
     found = []
     for mirror in (np.eye(3), np.diag([1.0, 1.0, -1.0])):
         turned = mirror @ model.rotations_ @ mirror
-        U, _, Vt = np.linalg.svd(np.einsum("iab,iac->bc", rotations, turned))
-        common = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        common = procrustes(np.einsum("iab,iac->bc", rotations, turned))
         off = (rotations @ common).transpose(0, 2, 1) @ turned
         off = Rotation.from_matrix(off).as_rotvec() @ mirror
         ratio = np.sqrt(np.einsum("ia,iab,ib->i", off, precision, off).mean() / 3)

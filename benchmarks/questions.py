@@ -22,6 +22,7 @@ from benchmarks._data import (
 )
 from benchmarks.accuracy import common_rotation, hidden_at_random, with_noise
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 from isa_nrsfm._tables.tracks import centred_tracks
 from isa_nrsfm.analysis import (
@@ -110,9 +111,8 @@ def turned_error(shapes, truth):
     S, T = (each - each.mean(axis=1, keepdims=True) for each in (shapes, truth))
     errors = []
     for mirror in (1.0, -1.0):
-        U, _, Vt = np.linalg.svd((S * [1.0, 1.0, mirror]).transpose(0, 2, 1) @ T)
-        U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-        off = S * [1.0, 1.0, mirror] @ (U @ Vt) - T
+        own = S * [1.0, 1.0, mirror]
+        off = own @ procrustes(own.transpose(0, 2, 1) @ T) - T
         size = np.linalg.norm(T, axis=(1, 2))
         errors.append(np.mean(np.linalg.norm(off, axis=(1, 2)) / size))
     return min(errors)

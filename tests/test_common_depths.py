@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._joint.common_depths import (
     _principal,
-    _rotations,
     _turned,
     common_coordinates,
 )
+from isa_nrsfm._linalg.small_matrices import procrustes
 
 FLOOR = 1e-5
 
@@ -130,7 +130,7 @@ def test_steps_of_rotations_reach_those_of_procrustes():
     fit = rng.standard_normal((50, 3, 12))
     own = Rotation.from_rotvec(rng.standard_normal((50, 3))).as_matrix() @ fit
     own += 0.1 * rng.standard_normal(own.shape)
-    best = _rotations(own, fit)
+    best = procrustes(own @ fit.transpose(0, 2, 1))
     assert_allclose(np.linalg.det(best), 1.0)
     R = best @ Rotation.from_rotvec(0.3 * rng.standard_normal((50, 3))).as_matrix()
     errors = [np.linalg.norm(own - R @ fit)]

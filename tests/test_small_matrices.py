@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
@@ -16,6 +17,7 @@ from isa_nrsfm._linalg.small_matrices import (
     of_frames,
     packed_products,
     pair_indices,
+    procrustes,
     solve_positive,
     sweep,
     unpack3,
@@ -222,3 +224,16 @@ def test_nothing_to_solve(k, n):
 def test_packing_of_3x3_matrices():
     entries = np.random.default_rng(0).normal(size=(4, 6, 5))
     assert_array_equal(unpack3(entries)[:, ROWS, COLUMNS], entries)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_procrustes_rotations_are_those_of_scipy(mirrored):
+    rng = np.random.default_rng(0)
+    shapes = rng.standard_normal((20, 7, 3))
+    target = shapes * [1.0, 1.0, -1.0] if mirrored else shapes[::-1]
+    found = procrustes(target.transpose(0, 2, 1) @ shapes)
+    pairs = zip(target, shapes, strict=True)
+    expected = [Rotation.align_vectors(*pair)[0].as_matrix() for pair in pairs]
+    assert_allclose(found, expected, atol=1e-10)
+    assert_allclose(np.linalg.det(found), 1.0)
+    assert_allclose(procrustes(target[0].T @ shapes[0]), found[0], atol=1e-12)

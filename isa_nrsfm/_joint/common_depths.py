@@ -23,6 +23,7 @@ from isa_nrsfm._linalg.small_matrices import (
     frames_first,
     frames_last,
     inverse3,
+    procrustes,
 )
 
 # Steps, and the share of the noise floor in the last one. With 60, 100, 150, 300 and
@@ -119,16 +120,9 @@ def _aligning(own: NDArray) -> NDArray:
     """Return rotations (n_frames, 3, 3) that align shapes with their mean."""
     mean = own[0]
     for _ in range(5):
-        R = _rotations(own, mean)
+        R = procrustes(own @ mean.T)
         mean = (R.transpose(0, 2, 1) @ own).mean(axis=0)
     return R
-
-
-def _rotations(own: NDArray, shapes: NDArray) -> NDArray:
-    """Return rotations R (n_frames, 3, 3) that minimise ``||own - R shapes||``."""
-    U, _, Vt = np.linalg.svd(own @ np.swapaxes(shapes, -1, -2))
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return np.asarray(U @ Vt)
 
 
 def _turned(R: NDArray, shapes: NDArray, fit: NDArray) -> NDArray:

@@ -233,3 +233,10 @@ def polar(matrices: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """
     U, values, Vt = np.linalg.svd(matrices, full_matrices=False)
     return U @ Vt, values, U
+
+
+def procrustes(matrices: NDArray) -> NDArray:
+    """Return the rotations R that maximise ``tr(R^T A)`` for matrices A (..., 3, 3)."""
+    U, _, Vt = np.linalg.svd(matrices)
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from isa_nrsfm._linalg.rounding import OF_DIFFERENCES
+from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera, strain_basis
 from isa_nrsfm._metric_upgrade.refinement import (
     MetricFit,
@@ -236,7 +237,8 @@ def euclidean_frames(
     seen[:, :, :2] = seen[:, :, :2] @ (stretches / scales[:, None, None])
     shapes = seen @ rotations
     # The rotation nearest to the mean shape.
-    turns = _rotations_to_mean(shapes, mean @ np.linalg.inv(metric.Q).T)
+    mean = (mean - mean.mean(axis=0)) @ np.linalg.inv(metric.Q).T
+    turns = procrustes(shapes.transpose(0, 2, 1) @ mean)
     found = shapes @ turns, rotations @ turns, scales
     return EuclideanFrames(*(of_all_rows(values, usable) for values in found))
 
@@ -273,11 +275,3 @@ def fit_strain(cameras: NDArray, alpha: NDArray, rigid: MetricFit) -> MetricFit:
         if np.abs(np.log([noise, variance]) - np.log(previous)).max() < 0.05:
             break
     return refine_metric(cameras, alpha, fit, camera, ridge)
-
-
-def _rotations_to_mean(shapes: NDArray, mean_shape: NDArray) -> NDArray:
-    """Return rotations O (I, 3, 3), ``shape @ O`` nearest to the mean shape (J, 3)."""
-    centred = mean_shape - mean_shape.mean(axis=0)
-    left, _, right = np.linalg.svd(shapes.transpose(0, 2, 1) @ centred)
-    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    return left @ right
