@@ -580,7 +580,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             )
         if calibrated and self.camera_ == "affine":
             raise ValueError(
-                f"{name} needs a model with calibrated cameras; got camera='affine'"
+                f"{name} needs a model with calibrated cameras; got camera='affine'. "
+                "Fit with camera='weak_perspective' or camera='orthographic'"
             )
         return frames
 

@@ -117,11 +117,15 @@ class TestPointDistances:
         again = point_distances(model, [MOUTH], truth.data)
         assert_allclose(again, eyes, atol=2e-3)
 
+    def test_a_pair_alone_is_no_list_of_pairs(self, fitted):
+        with pytest.raises(ValueError, match=r"\[\(62, 66\)\].* got 48 instead"):
+            point_distances(fitted[1], MOUTH)
+
 
 def test_uncertainty_needs_calibrated_cameras(fitted):
     truth, model = fitted
     if model.camera == "affine":
-        with pytest.raises(ValueError, match="needs a model with calibrated cameras"):
+        with pytest.raises(ValueError, match="Fit with camera='weak_perspective'"):
             model.rotation_covariance(truth.data)
     else:
         covariance = model.rotation_covariance(truth.data)

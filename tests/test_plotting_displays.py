@@ -475,14 +475,24 @@ def test_random_frames(faces, estimator):
     counts = np.zeros(5)
     rng = np.random.RandomState(0)
     for _ in range(300):
-        counts[choose_frames(5, 2, None, rng)] += 1
+        counts[choose_frames(np.zeros((5, 8)), 2, None, rng)] += 1
     assert_allclose(counts, 120, atol=40)
-    assert_array_equal(choose_frames(4, None, None, rng), range(4))
-    with pytest.raises(ValueError, match="between 1 and the 4 rows of X; got 6"):
+    assert_array_equal(choose_frames(np.zeros((4, 8)), None, None, rng), range(4))
+    with pytest.raises(ValueError, match=r"the 4 rows of X with .* got 6"):
         ReprojectionDisplay.from_estimator(estimator, faces.data[:4], n_frames=6)
     for frames in ([80], [-1], 3, [], [0.5]):
         with pytest.raises(ValueError, match="frames must be"):
             ReprojectionDisplay.from_estimator(estimator, faces.data, frames=frames)
+
+
+def test_random_rows_can_be_fitted(estimator, faces):
+    X = faces.data[:6].copy()
+    X[1] = np.nan
+    X[4, 2:] = np.nan
+    display = ReprojectionDisplay.from_estimator(estimator, X)
+    assert_array_equal(display.frames, [0, 2, 3, 5])
+    with pytest.raises(ValueError, match="the 4 rows of X with at least 4 points"):
+        ReprojectionDisplay.from_estimator(estimator, X, n_frames=5)
 
 
 def test_rows_of_dataframes_may_have_names(faces):

@@ -233,9 +233,9 @@ def point_distances(
     Raises
     ------
     ValueError
-        If there is no such point, if `length` is not positive, if `unit` is not given
-        and the points are not those of a face, or for the reasons given in
-        `frame_poses`.
+        If `pairs` is a single pair, if there is no such point, if `length` is not
+        positive, if `unit` is not given and the points are not those of a face, or for
+        the reasons given in `frame_poses`.
 
     Examples
     --------
@@ -273,6 +273,11 @@ def point_distances(
 def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
     """Return the numbers of two different points, given by number or name."""
     found = []
+    if np.ndim(pair) == 0:
+        raise ValueError(
+            "expected pairs of points, such as [(62, 66)] for the distance of points "
+            f"62 and 66; got {pair!r} instead of a pair"
+        )
     for each in pair:
         if str(each) in names:
             found.append(list(names).index(str(each)))

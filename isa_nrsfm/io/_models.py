@@ -95,7 +95,9 @@ def save_model(estimator: AffineNRSfM, path: str | os.PathLike[str]) -> None:
     """
     if type(estimator) is not AffineNRSfM:
         raise ValueError(
-            f"only an AffineNRSfM can be saved; got {full_name(type(estimator))}"
+            f"only an AffineNRSfM can be saved; got {full_name(type(estimator))}. Save "
+            "the AffineNRSfM in it, such as pipeline[0] or search.best_estimator_, or "
+            "all of it with joblib.dump"
         )
     check_is_fitted(estimator)
     arrays: Arrays = {}

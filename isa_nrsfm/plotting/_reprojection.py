@@ -13,7 +13,7 @@ from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.scikit_learn import taken_rows
 from isa_nrsfm._tables.column_names import checked_names
 from isa_nrsfm._tables.sources import unmasked
-from isa_nrsfm._tables.tracks import table_to_tracks, tracks_to_table
+from isa_nrsfm._tables.tracks import FEWEST_POINTS, table_to_tracks, tracks_to_table
 from isa_nrsfm.metrics import inverse_snr
 from isa_nrsfm.plotting._axes import (
     OBSERVED_COLOUR,
@@ -32,19 +32,25 @@ from isa_nrsfm.plotting._views import view_and_layout
 
 
 def choose_frames(
-    n_rows: int, n_frames: int | None, frames: ArrayLike | None, random_state: Any
+    X: Any, n_frames: int | None, frames: ArrayLike | None, random_state: Any
 ) -> NDArray[np.intp]:
-    """Return the rows to draw: the given ones, or random ones in ascending order."""
+    """Return the rows to draw: the given ones, or random ones in ascending order.
+
+    Random rows have enough points for a fit.
+    """
     if frames is not None:
-        return chosen_numbers(frames, "frames", n_rows, "row numbers of X")
+        return chosen_numbers(frames, "frames", len(X), "row numbers of X")
+    n_coordinates = np.isfinite(np.asarray(unmasked(X), dtype=float)).sum(axis=1)
+    rows = np.flatnonzero(n_coordinates >= 2 * FEWEST_POINTS)
     if n_frames is None:
-        n_frames = min(6, n_rows)
-    if not 1 <= n_frames <= n_rows:
+        n_frames = min(6, len(rows))
+    if not 1 <= n_frames <= len(rows):
         raise ValueError(
-            f"n_frames must be between 1 and the {n_rows} rows of X; got {n_frames}"
+            f"n_frames must be between 1 and the {len(rows)} rows of X with at least "
+            f"{FEWEST_POINTS} points; got {n_frames}"
         )
     rng = check_random_state(random_state)
-    return np.sort(rng.choice(n_rows, size=n_frames, replace=False))
+    return np.sort(rng.choice(rows, size=n_frames, replace=False))
 
 
 PANEL_WIDTH = 2.3  # inches
@@ -191,8 +197,8 @@ class ReprojectionDisplay:
             A table of landmarks in the estimator's layout. The titles name the rows
             of a pandas DataFrame by its index.
         n_frames : int, default=None
-            How many rows to draw at random, without repetition. By default 6, or all
-            rows of a shorter table.
+            How many rows to draw at random, without repetition, of the rows with at
+            least four points. By default 6, or all of fewer rows.
         frames : array-like of int, default=None
             The rows to draw, in place of random ones.
         random_state : int, RandomState instance or None, default=None
@@ -226,7 +232,7 @@ class ReprojectionDisplay:
             `origin` is not of the kind given above.
         """
         check_is_fitted(estimator, "mean_shape_")
-        rows = choose_frames(len(X), n_frames, frames, random_state)
+        rows = choose_frames(X, n_frames, frames, random_state)
         table = taken_rows(X, rows)
         _, _, skeleton, origin = view_and_layout(estimator, edges, origin)
         observed, reprojected = (
