@@ -202,10 +202,12 @@ def fitted_groups(
         for task in neighbourhoods(distances, size)
     ]
     quiet = settings._replace(on_step=None)
+    # In the order of memory that pickled arrays have, else rounding errors differ.
     fits = Parallel(n_jobs=n_jobs, return_as="generator")(
         delayed(group_fit)(
             scene._replace(
-                rows=scene.rows[:, :, points], first=scene.first[:, :, points]
+                rows=np.take(scene.rows, points, axis=2),
+                first=np.take(scene.first, points, axis=2),
             ),
             n_components,
             quiet,
