@@ -261,7 +261,8 @@ def test_only_fitted_models_are_saved(model, path):
 
     for other in (PCA().fit(TABLE), Stranger()):
         name = type(other).__name__
-        with pytest.raises(ValueError, match=rf"only an .*\b{name}.* joblib"):
+        message = rf"only an AffineNRSfM .*\b{name}\b.* joblib"
+        with pytest.raises(ValueError, match=message):
             save_model(other, path)
     with pytest.raises(NotFittedError):
         save_model(AffineNRSfM(), path)

@@ -478,7 +478,8 @@ def test_random_frames(faces, estimator):
         counts[choose_frames(np.zeros((5, 8)), 2, None, rng)] += 1
     assert_allclose(counts, 120, atol=40)
     assert_array_equal(choose_frames(np.zeros((4, 8)), None, None, rng), range(4))
-    with pytest.raises(ValueError, match=r"the 4 rows of X with .* got 6"):
+    message = "between 1 and the 4 rows of X with at least 4 points; got 6"
+    with pytest.raises(ValueError, match=message):
         ReprojectionDisplay.from_estimator(estimator, faces.data[:4], n_frames=6)
     for frames in ([80], [-1], 3, [], [0.5]):
         with pytest.raises(ValueError, match="frames must be"):

@@ -322,12 +322,8 @@ class TestSteps:
             assert _shared_mixing._ascent(gradient, weak, shift, size) is None
         # A direction that the diagonals of the blocks do not show
         one = np.ones((n, n))
-        assert (
-            _shared_mixing._ascent(
-                one, 10.0 * one - 16.0 * np.eye(n) + 0 * blocks, 0.0, size
-            )
-            is None
-        )
+        blocks = np.tile(10.0 * one - 16.0 * np.eye(n), (n, 1, 1))
+        assert _shared_mixing._ascent(one, blocks, 0.0, size) is None
 
 
 class TestDegenerate:

@@ -272,12 +272,12 @@ def point_distances(
 
 def point_numbers(pair: Sequence[Any], names: Sequence[str]) -> tuple[int, int]:
     """Return the numbers of two different points, given by number or name."""
-    found = []
     if np.ndim(pair) == 0:
         raise ValueError(
             "expected pairs of points, such as [(62, 66)] for the distance of points "
             f"62 and 66; got {pair!r} instead of a pair"
         )
+    found = []
     for each in pair:
         if str(each) in names:
             found.append(list(names).index(str(each)))
