@@ -182,7 +182,7 @@ class TableModel(NamedTuple):
     def _tracks(self, rows: NDArray) -> NDArray:
         """Return the tracks (n, n_points, 2) of some rows."""
         tracks, n_half, _ = without_half_points(table_to_tracks(rows, self.layout))
-        if n_half.any():  # row numbers within a block would be misleading
+        if n_half.any():  # of a table read later: row numbers would be of the block
             warn_caller(
                 "some points have only one of their two coordinates. They count as "
                 "missing"

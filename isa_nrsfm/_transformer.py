@@ -32,7 +32,12 @@ from isa_nrsfm._tables.sources import (
     open_table,
     unmasked,
 )
-from isa_nrsfm._tables.tracks import Layout, tracks_to_table
+from isa_nrsfm._tables.tracks import (
+    Layout,
+    clean_tracks,
+    table_to_tracks,
+    tracks_to_table,
+)
 
 
 class SmoothedCoefficients(NamedTuple):
@@ -635,6 +640,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             least = {"ensure_min_samples": 2, "ensure_min_features": 2} if reset else {}
             X = validated_table(self, X, layout, reset=reset, **CHECKS, **least)
             checked_range(X)
+            if not reset:  # a fit warns of half points itself
+                names = getattr(self, "feature_names_in_", None)
+                tracks = clean_tracks(table_to_tracks(X, layout), layout, names)
+                X = tracks_to_table(tracks, layout)
         return open_table(X, self.n_jobs, self.working_memory)
 
 

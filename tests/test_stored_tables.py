@@ -287,8 +287,10 @@ class TestErrors:
         X = table()
         X[[40, 120], 3] = np.nan
         with pytest.warns(UserWarning, match="in 2 of 150 rows .*row 40") as w:
-            estimator(working_memory=0.05).fit(memmap(X, tmp_path))
+            model = estimator(working_memory=0.05).fit(memmap(X, tmp_path))
         assert len(w) == 1
+        with pytest.warns(UserWarning, match="some points have only one of their two"):
+            model.transform(memmap(X, tmp_path))
 
     def test_number_of_columns(self, tmp_path):
         X = table()
