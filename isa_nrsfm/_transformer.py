@@ -3,7 +3,7 @@
 import copy
 from functools import partial
 from numbers import Integral, Real
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,11 @@ from isa_nrsfm._tables.tracks import (
     clean_tracks,
     table_to_tracks,
     tracks_to_table,
+)
+
+_NEEDS_CALIBRATED = (
+    "needs a model with calibrated cameras; got camera='affine'. Fit with "
+    "camera='weak_perspective' or camera='orthographic'"
 )
 
 
@@ -149,6 +154,15 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
     def __sklearn_is_fitted__(self) -> bool:
         """Return whether a fit has ended."""
         return hasattr(self, "_model")
+
+    if not TYPE_CHECKING:  # mypy would accept any name
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise an error; it states why affine fits lack an attribute."""
+            affine = vars(self).get("camera_") == "affine"
+            if affine and name in ("rotations_", "scales_", "depth_uncertainty_"):
+                raise AttributeError(f"{name} {_NEEDS_CALIBRATED}", name=name, obj=self)
+            return super().__getattribute__(name)
 
     def _html_repr(self) -> str:
         """Return scikit-learn's diagram for notebooks, and a summary."""
@@ -584,10 +598,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
                 f"variance; got refinement={self.refinement!r}"
             )
         if calibrated and self.camera_ == "affine":
-            raise ValueError(
-                f"{name} needs a model with calibrated cameras; got camera='affine'. "
-                "Fit with camera='weak_perspective' or camera='orthographic'"
-            )
+            raise ValueError(f"{name} {_NEEDS_CALIBRATED}")
         return frames
 
     def _weighted(

@@ -234,7 +234,12 @@ class TestTurnedFaces:
 def test_affine_models_have_no_deviations_of_depths():
     X, *_ = faces_turned_by(20, n_frames=60)
     model = fitted(X, 1, camera="affine")
-    assert not hasattr(model, "depth_uncertainty_")
+    for name in ("depth_uncertainty_", "rotations_", "scales_"):
+        assert not hasattr(model, name)
+        with pytest.raises(AttributeError, match=f"{name} needs .* Fit with camera="):
+            getattr(model, name)
+    with pytest.raises(AttributeError, match="no attribute 'depth_error_'"):
+        _ = model.depth_error_
     with pytest.raises(ValueError, match="return_std needs a model with calibrated"):
         model.reconstruct(X, return_std=True)
 
