@@ -205,7 +205,7 @@ def test_options_reach_the_estimator(run, table, tmp_path, options, expected):
     assert type(found["isa"]).__name__ == "FastISA"
     isa = {name: found[name] for name in found if name.startswith("isa")}
     assert found == default | isa | expected
-    assert (" (outliers count fully)\n" in out) == ("huber" in options)
+    assert (" % (outliers count fully): energy " in out) == ("huber" in options)
 
 
 @pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))

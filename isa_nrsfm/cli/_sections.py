@@ -123,7 +123,8 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
 def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
     """Return the quality of a fit, with a remark on its inverse SNR."""
     return [
-        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}",
+        f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
+        "squares) of the residuals, relative to that of the centred points.",
         f"held-out error {_percent(quality['held_out_error'])}: the same for points "
         "predicted from the other points of their frame. If it is much larger, look "
         "first for wrong points (outliers, or missing points with coordinates such as "
@@ -307,10 +308,13 @@ def _alpha(coefficients: list[dict[str, Any]]) -> Section:
                 f"{100 * max(share, 0):.0f} %" if known else "",
             ]
         )
-    cells = Cells(["", "energy", "mean", "std", "min", "max", "pose"], rows)
-    if not any(row[-1] for row in rows):
-        return [cells]
-    return [cells, "pose: variance that yaw, pitch and roll predict, cross-validated"]
+    parts: list[str | Cells] = [
+        Cells(["", "energy", "mean", "std", "min", "max", "pose"], rows),
+        "energy: share of the deformation in the images (sum of squares)",
+    ]
+    if any(row[-1] for row in rows):
+        parts.append("pose: variance that yaw, pitch and roll predict, cross-validated")
+    return parts
 
 
 def _choice(choice: dict[str, Any]) -> Section:
@@ -347,7 +351,9 @@ def _label(label: dict[str, Any]) -> Section:
     if label["n_without_label"]:
         title += f"; {label['n_without_label']} without a label left out"
     names = names_of_components(None, len(label["values"]))
-    statistic = "eta squared" if label["statistic"] == "eta_squared" else "Spearman"
+    statistic, meaning = "Spearman", "rank correlation, from -1 to 1"
+    if label["statistic"] == "eta_squared":
+        statistic, meaning = "eta squared", "share of the variance between classes"
     tests = [*zip(names, label["values"], label["p_values"], strict=True)]
     rows = [[name, f"{value:z.2f}", f"{p:.3f}"] for name, value, p in tests]
     means = _class_means(label, names)
@@ -368,7 +374,7 @@ def _label(label: dict[str, Any]) -> Section:
         )
     return [
         Cells(["", statistic, "p"], rows, title),
-        f"p-values: permutations of {label['permuted']}",
+        f"{statistic}: {meaning}; p-values: permutations of {label['permuted']}",
         *means,
         score,
     ]
