@@ -376,6 +376,7 @@ def test_the_choice_in_words(run, errors, chosen, expected):
     text = text_of("", {"Choice": section})
     assert expected in text
     assert ("K = 3-5 would take about 10 s more" in text) == (min(errors) < 1)
+    assert ("errors in frames held out of the fit" in text) == (min(errors) < 1)
     assert "%" in text
     assert ". %" not in text
 

@@ -333,7 +333,7 @@ def _choice(choice: dict[str, Any]) -> Section:
     cells = Cells(["K", "held-out error", "standard error", ""], rows)
     if min(errors) >= 1:
         return [cells, NO_SHAPE]
-    parts: list[str | Cells] = [cells]
+    parts: list[str | Cells] = [cells, "errors in frames held out of the fit"]
     if choice["chosen"] == tried[-1]:
         parts.append("larger K may be better: this is the largest that was tried")
     if "next" in choice:
