@@ -188,6 +188,10 @@ def test_the_page_of_questions_runs():
     np.testing.assert_allclose(
         names["mouth_mm"][:, 0], 90 * names["mouth"][:, 0], rtol=1e-10
     )
+    lips = names["shapes_mm"][:, 62] - names["shapes_mm"][:, 66]
+    np.testing.assert_allclose(
+        names["mouth_mm"][:, 0], np.linalg.norm(lips, axis=1), rtol=1e-10
+    )
     assert Path("time.png").stat().st_size
     assert Path("gestures.png").stat().st_size
 
