@@ -146,7 +146,8 @@ axis.legend()
 # --------------
 #
 # `write_viewer` writes a page of the shapes. With ``depth_std`` uncertain points have
-# long bars. Drag to turn the body, and select or play frames.
+# long bars. Drag to turn the body, and select or play frames. If your table has y
+# pointing up, as most motion capture, add ``origin="lower"``.
 
 edges = [(6 * i + a, 6 * i + b) for i in range(n_limbs) for a, b in sides]
 with TemporaryDirectory() as folder:

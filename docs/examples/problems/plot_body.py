@@ -73,6 +73,8 @@ axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
 
 # %%
 # The basis shapes, from the front and from the side. ``write_viewer(model, "body.html",
-# edges="h36m-17", labels=bodies.labels)`` writes an interactive page.
+# edges="h36m-17", labels=bodies.labels)`` writes an interactive page. The layout tells
+# which way is up. For other points, such as markers of motion capture, set
+# ``origin="lower"`` if figures are upside down.
 
 BasisShapeDisplay.from_estimator(model, n_columns=3)
