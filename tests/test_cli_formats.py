@@ -224,11 +224,13 @@ def write_shares(folder, change=lambda shares: shares):
     ("change", "is_named"),
     [
         (lambda shares: shares, True),
+        (lambda shares: shares - np.quantile(shares, 0.04), True),
+        (lambda shares: shares - np.quantile(shares, 0.06), False),
         (lambda shares: shares - shares.mean(axis=1, keepdims=True), False),
         (lambda shares: (shares - shares.min()) / np.ptp(shares), False),
         (lambda shares: shares * [1920, 1080], False),
     ],
-    ids=["shares", "centred", "scaled", "pixels"],
+    ids=["shares", "4 % outside", "6 % outside", "centred", "scaled", "pixels"],
 )
 def test_shares_of_an_image_in_a_plain_table_are_named(run, tmp_path, change, is_named):
     path = write_shares(tmp_path, change)
