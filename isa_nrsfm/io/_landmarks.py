@@ -55,6 +55,11 @@ class Landmarks:
     point_names: tuple[str, ...]
     skeleton: Skeleton | None = None
 
+    def __repr__(self) -> str:
+        """Return the numbers of frames and points instead of the tables."""
+        size = f"{len(self.points)} frames of {len(self.point_names)} points"
+        return f"Landmarks({size}, format={self.format!r})"
+
     def without_unsure_points(self, min_confidence: float) -> "Landmarks":
         """
         Return the landmarks with points of low confidence as NaN.
