@@ -42,9 +42,14 @@ def fitted(X, refinement, n_components, camera, n_jobs=None, seed=0):
 def in_camera(model, X):
     """Return shapes of frames, and deviations of depths, in the axes of cameras."""
     shapes, deviations = model.reconstruct(X, return_std=True)
-    rotations, scales = full_rotations(model.decompose(X).motion)
-    shapes = scales[:, None, None] * shapes @ rotations.transpose(0, 2, 1)
-    return shapes, scales[:, None] * deviations
+    fit = model.decompose(X)
+    return turned(shapes, fit), full_rotations(fit.motion)[1][:, None] * deviations
+
+
+def turned(shapes, fit):
+    """Return shapes of frames in the axes of the cameras of a fit."""
+    rotations, scales = full_rotations(fit.motion)
+    return scales[:, None, None] * shapes @ rotations.transpose(0, 2, 1)
 
 
 def standardised(shapes, deviations, truth, scale=False):
@@ -62,6 +67,15 @@ def standardised(shapes, deviations, truth, scale=False):
     return np.sqrt(np.mean((off / std) ** 2)), *ranks
 
 
+def errors_3d(truth, shapes, scale=False):
+    """Return the errors of shapes in each convention."""
+    return [
+        mean_shape_error_3d(truth, shapes, convention=convention, **scaled)
+        for convention in CONVENTIONS
+        for scaled in [{"scale": scale} if convention == "sequence" else {}]
+    ]
+
+
 def report(title, X, truth, cases, scale=False, n_jobs=None):
     """Print a row for each case (refinement, K, camera) of a table of known shapes."""
     _, unit = fitted(X, "joint", min(12, X.shape[1] // 2 - 4), cases[0][2])
@@ -69,13 +83,7 @@ def report(title, X, truth, cases, scale=False, n_jobs=None):
         model, seconds = fitted(X, refinement, n_components, camera, n_jobs)
         shapes, deviations = in_camera(model, X)
         known = np.isfinite(shapes).all(axis=(1, 2))
-        errors = [
-            mean_shape_error_3d(
-                truth[known], shapes[known], convention=convention, **scaled
-            )
-            for convention in CONVENTIONS
-            for scaled in [{"scale": scale} if convention == "sequence" else {}]
-        ]
+        errors = errors_3d(truth[known], shapes[known], scale)
         ratio, rank, _ = standardised(
             shapes[known], deviations[known], truth[known], scale
         )
@@ -124,24 +132,56 @@ def complete(options):
             report(name, X, truth, cases, scale, options.jobs)
 
 
+def poor_tables(X, seed):
+    """Return a table with 40 % of the points missing, and with noise of 2 %."""
+    tracks, rng = X.reshape(len(X), -1, 2), np.random.default_rng(seed)
+    size = np.sqrt(np.mean((tracks - tracks.mean(axis=1, keepdims=True)) ** 2))
+    noise = 0.02 * size * rng.standard_normal(tracks.shape)
+    hidden = rng.random(tracks.shape[:2])[:, :, None] < 0.4
+    holes = np.where(hidden, np.nan, tracks)
+    return {
+        "40 % missing": holes.reshape(X.shape),
+        "2 % noise": (tracks + noise).reshape(X.shape),
+    }
+
+
 def spoiled(options):
     """Missing points (40 %), noise (2 % of the size), and 15 points of a body."""
     heading()
     for name in filter(is_present, CAPTURED[:2]):
         X, truth = load(name).X, shapes_in_camera(name)
-        tracks = X.reshape(len(X), -1, 2)
-        size = np.sqrt(np.mean((tracks - tracks.mean(axis=1, keepdims=True)) ** 2))
         for seed in range(options.seeds):
-            rng = np.random.default_rng(seed)
-            noise = 0.02 * size * rng.standard_normal(tracks.shape)
-            hidden = rng.random(tracks.shape[:2])[:, :, None] < 0.4
-            holes = np.where(hidden, np.nan, tracks).reshape(X.shape)
-            report(f"{name} 40 % missing", holes, truth, both(12), n_jobs=options.jobs)
-            noisy = (tracks + noise).reshape(X.shape)
-            report(f"{name} 2 % noise", noisy, truth, both(12), n_jobs=options.jobs)
-        few = tracks[:, JOINTS].reshape(len(X), -1)
+            for title, table in poor_tables(X, seed).items():
+                report(f"{name} {title}", table, truth, both(12), n_jobs=options.jobs)
+        few = X.reshape(len(X), -1, 2)[:, JOINTS].reshape(len(X), -1)
         cases = [("joint", 3, "orthographic"), *both("auto")]
         report(f"{name} 15 joints", few, truth[:, JOINTS], cases, n_jobs=options.jobs)
+
+
+def smoothed(options):
+    """Errors of frames by themselves, and of frames smoothed in time."""
+    columns = "".join(f"{name:>18}" for name in CONVENTIONS)
+    print(f"{'table':22}{columns}")
+    for name in filter(is_present, CAPTURED):
+        X, truth = load(name).X, shapes_in_camera(name)
+        for seed in range(options.seeds):
+            for title, table in {"": X, **poor_tables(X, seed)}.items():
+                arguments = "consensus", "auto", "orthographic", options.jobs
+                model, _ = fitted(table, *arguments)
+                alone, smooth = (
+                    errors_3d(truth, turned(model.reconstruct(fit), fit))
+                    for fit in (
+                        model.decompose(table),
+                        model.smooth(table).decomposition,
+                    )
+                )
+                print(
+                    f"{f'{name} {title}':22}"
+                    + "".join(
+                        f"{a:9.4f}{b:9.4f}" for a, b in zip(alone, smooth, strict=True)
+                    ),
+                    flush=True,
+                )
 
 
 def new_frames(options):
@@ -182,6 +222,7 @@ def synthetic(options):
 SECTIONS = {
     "complete": complete,
     "spoiled": spoiled,
+    "smoothed": smoothed,
     "new": new_frames,
     "synthetic": synthetic,
 }

@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._frames.models import Decomposition, PosteriorFrames, RigidFrames
+from isa_nrsfm._frames.models import (
+    Decomposition,
+    LinearisedFrames,
+    PosteriorFrames,
+    RigidFrames,
+)
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._metric_upgrade.deforming import DeformationMetric, euclidean_frames
@@ -62,6 +67,14 @@ class TableModel(NamedTuple):
         whole = FramePosterior.unknown(len(rows), len(self.basis))
         whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
         return whole
+
+    def linearised(self, rows: NDArray) -> LinearisedFrames:
+        """Return each fit and the likelihood near it, before the gauge."""
+        assert isinstance(self.frames, PosteriorFrames)
+        usable, centred, translation, sizes = self._ready(self._tracks(rows))
+        fit = self.frames.linearised(centred, sizes)
+        fit = fit._replace(translation=fit.translation + translation)
+        return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
 
     def reconstruct(
         self,

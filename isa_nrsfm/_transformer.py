@@ -14,7 +14,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from isa_nrsfm._compat.scikit_learn import ShownEstimator
 from isa_nrsfm._diagnostics import Diagnostics, diagnose
 from isa_nrsfm._fitted_model import TableModel
-from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
+from isa_nrsfm._frames.dynamics import smoothed_frames
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
@@ -47,7 +48,7 @@ _NEEDS_CALIBRATED = (
 
 class SmoothedCoefficients(NamedTuple):
     """
-    Coefficients of frames, given all frames of their sequence.
+    Coefficients and cameras of frames, given all frames of their sequence.
 
     Attributes
     ----------
@@ -57,14 +58,18 @@ class SmoothedCoefficients(NamedTuple):
     alpha_std : ndarray of shape (n_frames, n_components)
         Posterior standard deviations.
     time_scales : ndarray of shape (n_components,) or (0,)
-        Decay times of the coefficients, the longest first, in the units of `time`: ``-1
-        / log |l|`` with the eigenvalues l of the transition. Infinite where ``|l|`` is
-        one or more. Empty if the frames show no dynamics.
+        Time scales T of the coefficients, the longest first, in the units of `time`:
+        the correlation after a time t is ``(1 + t / T) exp(-t / T)``. Infinite for 1000
+        frames or more. Empty if the frames show no dynamics.
+    decomposition : Decomposition
+        Smoothed cameras, positions and coefficients, for `AffineNRSfM.reconstruct` and
+        exports. Cameras are filled in, positions are NaN if too few points are visible.
     """
 
     alpha: NDArray
     alpha_std: NDArray
     time_scales: NDArray
+    decomposition: Decomposition
 
 
 class CoefficientNamesMixin(ClassNamePrefixFeaturesOutMixin):
@@ -220,15 +225,15 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         groups: Any = None,
         max_gap: int = 30,
         max_iter: int = 100,
-        tol: float = 1e-3,
+        tol: float = 1.0,
     ) -> SmoothedCoefficients:
         """
-        Return coefficients of the frames of a video, smoothed in time.
+        Return coefficients and cameras of the frames of a video, smoothed in time.
 
-        The coefficients follow a first-order autoregression that is estimated from the
-        table. Each frame is weighted by the posterior covariance of its coefficients:
-        frames with few visible points have little weight. The fit of the shapes does
-        not depend on the order of the frames: smoothing is a step after it.
+        Coefficients are Gaussian processes in time, cameras are integrated random
+        walks, both estimated from the table. Each frame has the weight of its
+        likelihood: frames with few visible points have little weight. The fit of the
+        shapes does not depend on the order of the frames: smoothing is a step after it.
 
         Parameters
         ----------
@@ -237,8 +242,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             temporal order.
         time : array-like of shape (n_frames,), default=None
             Times of the frames, numbers or dates (in seconds from the first). Their
-            median difference is one step of the autoregression. Other differences are
-            rounded to whole steps. If None, consecutive frames are one step apart.
+            median difference is one step. Other differences are rounded to whole steps.
+            If None, consecutive frames are one step apart.
         groups : array-like of shape (n_frames,), default=None
             Person, video or scene of each frame. Smoothing does not cross groups.
             Each has its own intercept, so that differences between people are not taken
@@ -246,15 +251,16 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         max_gap : int, default=30
             Largest gap, in steps, across which coefficients are smoothed.
         max_iter : int, default=100
-            Largest number of iterations of expectation maximisation.
-        tol : float, default=1e-3
-            The iteration ends when no coefficient changes by more than this share of
-            its prior standard deviation.
+            Largest number of iterations of the search for time scales.
+        tol : float, default=1.0
+            The search ends when no derivative of the log-likelihood, by the logarithm
+            of a time scale or variance, is larger.
 
         Returns
         -------
         SmoothedCoefficients
-            Named tuple of alpha, alpha_std (n_frames, n_components) and time_scales.
+            Named tuple of alpha, alpha_std (n_frames, n_components), time_scales and
+            decomposition.
 
         Raises
         ------
@@ -264,35 +270,35 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
 
         Notes
         -----
-        The model is a linear dynamic system (Rauch, Tung, Striebel, 1965; Shumway,
-        Stoffer, 1982), observed through the likelihood of each frame. The transition
-        has a ridge of greatest evidence. If the evidence for dynamics is weak, as for
-        photos in any order, the coefficients are those of `transform`. With groups, the
+        The processes have the Matern covariance of order 3/2 (Hartikainen, Sarkka,
+        2010). Coefficients and camera of a frame are observed through its likelihood,
+        linearised at the fit of `transform` (Rauch, Tung, Striebel, 1965). Time scales
+        and variances maximise the likelihood. If the evidence for dynamics is weak, as
+        for photos in any order, the result is that of `transform`. With groups, the
         likelihood is compared with that of groups with intercepts alone.
         """
-        # Imported here: it imports linear models, which `transform` does not need.
-        from isa_nrsfm.analysis._dynamics import smoothed_posterior
-
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
         check_scalar(tol, "tol", Real, min_val=0.0)
         table = self._opened(X)
         frames = self._jointly_fitted("smooth")
-        alone = table.joined(self._model.posterior)
-        mean, covariance, time_scales = smoothed_posterior(
-            alone.alpha,
-            alone.covariance,
+        alone = table.joined(self._model.linearised)
+        found = smoothed_frames(
+            alone,
+            CAMERAS[self.camera_],
             time,
             groups,
             max_gap=max_gap,
             max_iter=max_iter,
             tol=tol,
         )
-        alpha, deviation, _ = frames.gauge.coefficients(mean, covariance)
-        dtype = table.empty.dtype
-        return SmoothedCoefficients(
-            alpha.astype(dtype), deviation.astype(dtype), time_scales
+        given, scales = (alone, np.empty(0)) if found is None else (found, found[-1])
+        motion, alpha, deviation = frames.gauge.apply(
+            given.motion, given.alpha, given.covariance
         )
+        fit = Decomposition(motion, given.translation, alpha, deviation)
+        fit = Decomposition(*(each.astype(table.empty.dtype) for each in fit))
+        return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
 
     def rotation_covariance(self, X: Any) -> NDArray:
         """

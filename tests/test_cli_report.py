@@ -237,7 +237,6 @@ def test_a_later_run_removes_figures_of_labels(tmp_path, capsys):
             "within 8.24 s; changes last in 2 of 3 directions",
         ),
         ([8.24, 3.0], "fade within 8.24, 3 s"),
-        ([15.4, 15.4, 3.0], "fade within 15.4, 3 s"),
         ([np.inf], "t: changes last in 1 of 1 directions"),
         ([], "no dynamics found"),
     ],

@@ -18,11 +18,13 @@ index of all arrays here: M and G are (2, 3, n_frames), steps (n_parameters, n_f
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.small_matrices import (
     COLUMNS,
     DIAGONAL,
     ROWS,
+    frames_first,
     inverse3,
     packed_products,
     polar,
@@ -54,6 +56,10 @@ class AffineCameras:
     def moved(self, M: NDArray, step: NDArray) -> NDArray:
         """Return cameras (2, 3, n) after steps (p, n)."""
         return M + step.reshape(M.shape) if self.n_parameters else M
+
+    def steps_between(self, M: NDArray, N: NDArray) -> NDArray:
+        """Return the steps (p, n) that move cameras M to N (2, 3, n)."""
+        return (N - M).reshape(6, -1)[: self.n_parameters]
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return the derivatives (p, 2, 3, n) of cameras."""
@@ -100,6 +106,15 @@ class CalibratedCameras:
         """Return cameras (2, 3, n) after steps w (3, n), or w and l (4, n)."""
         turned = rotated(M, step[:3])
         return np.exp(step[3]) * turned if self.scaled else turned
+
+    def steps_between(self, M: NDArray, N: NDArray) -> NDArray:
+        """Return the steps (p, n) that move cameras M to N (2, 3, n)."""
+        R, scales = full_rotations(frames_first(M))
+        turned, others = full_rotations(frames_first(N))
+        turns = Rotation.from_matrix(R.transpose(0, 2, 1) @ turned).as_rotvec().T
+        if not self.scaled:
+            return turns
+        return np.concatenate([turns, np.log(others / scales)[None]])
 
     def tangents(self, M: NDArray) -> NDArray:
         """Return ``M hat(e_c)``, and M itself where there are scales."""

@@ -25,7 +25,7 @@ from isa_nrsfm._frames.search import (
     largest_objective,
 )
 from isa_nrsfm._frames.single_frame import SingleSearch
-from isa_nrsfm._linalg.small_matrices import in_lanes
+from isa_nrsfm._linalg.small_matrices import frames_last, in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
 from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
 
@@ -97,6 +97,24 @@ class FrameMap(NamedTuple):
         slope = self.mixing[1:, 1:] - new[:, :, None] * self.mixing[0, 1:]
         variance = np.vecdot(slope @ covariance, slope)
         return new, np.sqrt(variance) / np.abs(scale)[:, None], scale
+
+
+class LinearisedFrames(NamedTuple):
+    """Fits of frames, and the likelihood near them, before the gauge.
+
+    motion (n, 2, 3), translation (n, 2), in the units of the table. alpha (n, K) and
+    its posterior covariance (n, K, K). precision (n, K + p, K + p): curvature of minus
+    the log-likelihood by coefficients and the p parameters of the camera, the position
+    eliminated. slope (n, K + p, 2): derivatives of the mean of the image of the visible
+    points by them.
+    """
+
+    motion: NDArray
+    translation: NDArray
+    alpha: NDArray
+    covariance: NDArray
+    precision: NDArray
+    slope: NDArray
 
 
 class RigidFrames(NamedTuple):
@@ -266,6 +284,35 @@ class PosteriorFrames:
     def prepared_posterior(self, block: FrameTracks) -> FramePosterior:
         """Return the fit of prepared frames of size one, before the gauge."""
         return self._search.fit(block, self.noise_variance, starts=self.starts)
+
+    def linearised(self, tracks: NDArray, sizes: NDArray) -> LinearisedFrames:
+        """Return fits of tracks (n, J, 2), NaN where missing, of sizes (n,)."""
+        unit = tracks / sizes[:, None, None]
+        found = self.posterior(unit)
+        weights = seen_points(tracks).astype(float)
+        if self.loss != "linear":
+            distance = distances(unit, self.shapes, *found[:3])
+            deviation = np.sqrt(self.noise_variance)
+            weights = frame_weights(self.loss, distance, deviation, robust_sizes(unit))
+        motion = found.motion * sizes[:, None, None]
+        shapes = self.shapes[0] + np.tensordot(found.alpha, self.shapes[1:], 1)
+        tangents = CAMERAS[self.camera].tangents(frames_last(motion))
+        bent = np.einsum("ira,kaj->ikrj", motion, self.shapes[1:])
+        turned = np.einsum("prai,iaj->iprj", tangents, shapes)
+        T = np.concatenate([bent, turned], axis=1)
+        share = weights / np.maximum(weights.sum(axis=1), 1e-300)[:, None]
+        slope = np.einsum("iprj,ij->ipr", T, share)
+        T -= slope[..., None]
+        T *= np.sqrt(weights / self.noise_variance)[:, None, None]
+        T = T.reshape(*T.shape[:2], 2 * tracks.shape[1]) / sizes[:, None, None]
+        return LinearisedFrames(
+            motion,
+            found.translation * sizes[:, None],
+            found.alpha,
+            found.covariance,
+            T @ T.transpose(0, 2, 1),
+            slope,
+        )
 
     def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
         """Compute the standard deviations (n, J) of depths with calibrated cameras.

@@ -52,3 +52,37 @@ def checked_times(time: Any, n_rows: int) -> NDArray:
     if time.dtype.kind in "mM":
         return np.asarray((time - time.min()) / np.timedelta64(1, "s"))
     return check_array(time, dtype=np.float64, ensure_2d=False, input_name="time")
+
+
+def sequences_of(
+    time: NDArray, groups: NDArray | None, max_gap: int
+) -> tuple[list[tuple[NDArray, NDArray]], float]:
+    """Return the rows and steps of each sequence, and the time of a step (the median).
+
+    A gap of more than max_gap steps begins a new sequence. Refuses times that do not
+    rise within groups, and groups that have only one row each.
+    """
+    if groups is None:
+        groups = np.zeros(len(time), dtype=int)
+    rows_of = [np.flatnonzero(groups == group) for group in range(groups.max() + 1)]
+    for rows in rows_of:
+        falling = np.flatnonzero(np.diff(time[rows]) <= 0)
+        if len(falling):
+            first, second = rows[falling[0]], rows[falling[0] + 1]
+            raise ValueError(
+                f"times must increase within a group; row {second} has "
+                f"{time[second]:g} after {time[first]:g} of row {first}"
+            )
+    differences = np.concatenate([np.diff(time[rows]) for rows in rows_of])
+    if not len(differences):
+        raise ValueError("no group has two rows, so that there is no sequence")
+    unit = float(np.median(differences))
+    found = []
+    for rows in rows_of:
+        lengths = np.maximum(np.rint(np.diff(time[rows]) / unit), 1).astype(int)
+        for part in np.split(
+            np.arange(len(rows)), np.flatnonzero(lengths > max_gap) + 1
+        ):
+            steps = np.cumsum(np.append(0, lengths[part[:-1]]))
+            found.append((rows[part], steps))
+    return found, unit

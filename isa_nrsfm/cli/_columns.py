@@ -12,7 +12,11 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
-from isa_nrsfm._tables.frame_columns import checked_times, group_numbers
+from isa_nrsfm._tables.frame_columns import (
+    checked_times,
+    group_numbers,
+    sequences_of,
+)
 from isa_nrsfm.analysis import (
     AlignedFrames,
     WithinGroups,
@@ -20,7 +24,6 @@ from isa_nrsfm.analysis import (
     between_share,
     predictability,
 )
-from isa_nrsfm.analysis._dynamics import sequences_of
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.cli._progress import show_stage
 from isa_nrsfm.cli._reading import Frames, cells_of, column_named

@@ -146,7 +146,7 @@ def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
     alpha = fit.estimator.alpha_
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
-        alpha, deviation, _ = fit.smooth
+        alpha, deviation = fit.smooth[:2]
     return CoefficientsDisplay(
         alpha=alpha,
         alpha_std=deviation,

@@ -414,8 +414,7 @@ def _time(time: dict[str, Any]) -> Section:
     fading = scales[np.isfinite(scales)]
     found = []
     if len(fading):
-        # Both times of an oscillation are the same.
-        listed = _listed([*dict.fromkeys(f"{each:.3g}" for each in fading)])
+        listed = _listed([f"{each:.3g}" for each in fading])
         found.append(f"changes of the shape fade within {listed} {time['unit']}")
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")

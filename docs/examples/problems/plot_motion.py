@@ -40,10 +40,10 @@ for left, right in axes:
     right.set_ylim(left.get_ylim())
 
 # %%
-# Bands are one standard deviation. They widen where no points are visible. The decay
-# times of the motion are estimated from the table.
+# Bands are one standard deviation. They widen where no points are visible. The time
+# scales of the motion are estimated from the table.
 
-print("decay times, seconds:", smooth.time_scales.round(1))
+print("time scales, seconds:", smooth.time_scales.round(2))
 
 # %%
 # The output lists the 3D errors of the visible frames, after the best rotation and
@@ -70,5 +70,6 @@ print("shuffled: time scales", shuffled.time_scales, end=", ")
 print(f"changed by {np.abs(shuffled.alpha - alone.alpha[order]).max():.1g}")
 
 # %%
-# Cameras are not smoothed. On the command line, ``--time COLUMN`` or ``--fps 25`` does
-# the same, with the figure ``time.png``.
+# ``smooth.decomposition`` contains smoothed cameras, for `AffineNRSfM.reconstruct`. On
+# the command line, ``--time COLUMN`` or ``--fps 25`` smooths coefficients, with the
+# figure ``time.png``.

@@ -1,0 +1,374 @@
+"""Coefficients and cameras in time: Kalman filter, smoother, maximum likelihood.
+
+Each coefficient of a sequence is a Gaussian process of variance one in time, with the
+Matern covariance of order 3/2 and a rate l per step of its own ::
+
+    E x_s x_t = (1 + l |s - t|) exp(-l |s - t|).
+
+It is the first entry of the state ``(x, y)``, y the scaled derivative of x, with ::
+
+    (x, y)_t+1 = F (x, y)_t + w_t,  F = exp(-l) [[1 + l, l], [-l, 1 - l]],
+    w_t ~ N(0, I - F F^T),  (x, y)_1 ~ N(0, I).
+
+So frames by themselves have the prior N(0, I) of the fit. With sequences of several
+people a coefficient is ``x_t + u``. The variance of the process is 1 - b then, and the
+intercept u of a sequence is drawn from N(0, b): differences between people are not
+taken for dynamics.
+
+Parameters of cameras are integrated random walks, ``(w, v)_t+1 = (w + v, v)_t`` plus
+noise of the covariance ``q [[1/3, 1/2], [1/2, 1]]``. They are relative to the camera of
+each frame by itself.
+
+A frame is observed through its likelihood as a function of its coefficients and camera,
+a normal density with the precision L_t and the information vector h_t. All rates, b and
+q maximise the likelihood of the sequences. Its gradient is the expected gradient of the
+joint density of states and frames (Fisher's identity).
+
+References: Hartikainen, Sarkka, "Kalman filtering and smoothing solutions to temporal
+Gaussian process regression models", 2010; Rauch, Tung, Striebel, "Maximum likelihood
+estimates of linear dynamic systems", 1965.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from isa_nrsfm._compat.blas_threads import one_blas_thread
+from isa_nrsfm._frames.camera_models import CameraModel
+from isa_nrsfm._frames.models import LinearisedFrames
+from isa_nrsfm._linalg.small_matrices import frames_first, frames_last
+from isa_nrsfm._tables.frame_columns import (
+    checked_times,
+    group_numbers,
+    sequences_of,
+)
+
+# Least logarithm of the evidence for dynamics over that for none: a Bayes factor of 20,
+# "strong" (Kass, Raftery, "Bayes factors", 1995). Motion capture has hundreds, the same
+# frames shuffled less than one.
+STRONG_EVIDENCE = 3.0
+# Least and largest rates per step. At the largest one, the correlation of neighbouring
+# frames is below 0.001. At the least one, the variance of w_t is above rounding errors.
+LEAST_RATE, LARGEST_RATE = 1e-3, 10.0
+# Prior variance of the camera of the first frame, in units of the posterior variance of
+# the camera of a frame by itself: not informative, and above rounding errors.
+UNKNOWN = 1e6
+# Logarithm of the rate from which the search starts.
+FIRST_RATE = np.log(0.3)
+# Covariance of an integrated random walk after one step
+WALK = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+
+
+class Observations(NamedTuple):
+    """Likelihoods of the frames of a sequence, coefficients first, then cameras.
+
+    L_t (n_steps, p, p), h_t (n_steps, p), and the changes (n_steps, p) of the origin of
+    the parameters from the frame before.
+    """
+
+    precision: NDArray
+    information: NDArray
+    change: NDArray
+
+
+class Dynamics(NamedTuple):
+    """Logarithms of rates (K,) and of q (p - K,), log odds of b (K,) or (0,)."""
+
+    rates: NDArray
+    walks: NDArray
+    shares: NDArray
+
+    @property
+    def between(self) -> NDArray:
+        """Variances b (K,) of the intercepts, or (0,)."""
+        return expit(self.shares)
+
+    def blocks(self) -> NDArray:
+        """Return F and the covariances of noise and first states (3, 2, 2, p)."""
+        rate, one = np.exp(self.rates), np.eye(2)[:, :, None]
+        F = np.array([[1 + rate, rate], [-rate, 1 - rate]]) * np.exp(-rate)
+        Q = one - np.einsum("abk,cbk->ack", F, F)
+        within = 1.0 - self.between if len(self.shares) else 1.0
+        processes = np.stack([F, within * Q, within * one * np.ones_like(rate)])
+        parts = np.array([[[1.0, 1.0], [0.0, 1.0]], WALK, UNKNOWN * np.eye(2)])
+        walks = np.repeat(parts[..., None], len(self.walks), axis=3)
+        walks[1] *= np.exp(self.walks)
+        return np.concatenate([processes, walks], axis=3)
+
+    def matrices(self) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+        """Return F, covariances of noise and first states, and the map to parameters.
+
+        States (D,) are x and w (p,), y and v (p,), u (K,) or (0,). The map is (p, D).
+        """
+        n, n_intercepts = len(self.rates) + len(self.walks), len(self.shares)
+        rest = np.ones(n_intercepts), np.zeros(n_intercepts), self.between
+        F, Q, first = (
+            block_diag(
+                np.block([[np.diag(b) for b in row] for row in each]), np.diag(r)
+            )
+            for each, r in zip(self.blocks(), rest, strict=True)
+        )
+        shown = np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, n_intercepts)])
+        return F, Q, first, shown
+
+
+class Smoothed(NamedTuple):
+    """Posterior of the parameters of a sequence, given all of its frames.
+
+    Means (n_steps, p), covariances (n_steps, p, p), the log-likelihood of the frames,
+    up to a constant of each frame, and moments (4, D, D) of the states z: sums over t
+    of ``E z_t+1 z_t+1^T``, ``E z_t+1 z_t^T``, ``E z_t z_t^T``, and ``E z_1 z_1^T``.
+    """
+
+    mean: NDArray
+    covariance: NDArray
+    log_likelihood: float
+    moments: NDArray
+
+
+class SmoothedFrames(NamedTuple):
+    """Frames, given all frames of their sequences, before the gauge.
+
+    alpha (I, K) and its covariance (I, K, K), cameras (I, 2, 3) and positions (I, 2) in
+    the units of the table, NaN where no frame of a sequence has one, and time scales
+    (K,), the longest first.
+    """
+
+    alpha: NDArray
+    covariance: NDArray
+    motion: NDArray
+    translation: NDArray
+    time_scales: NDArray
+
+
+@one_blas_thread
+def smoothed_frames(
+    alone: LinearisedFrames,
+    camera: CameraModel,
+    time: Any,
+    groups: Any,
+    *,
+    max_gap: int,
+    max_iter: int,
+    tol: float,
+) -> SmoothedFrames | None:
+    """Return frames given all frames of their sequences; None without dynamics.
+
+    Time scales are ``1 / l``, infinite for the least rates.
+    """
+    n_frames, K = alone.alpha.shape
+    times, numbers = checked_times(time, n_frames), group_numbers(groups, n_frames)
+    sequences, unit = sequences_of(times, numbers, max_gap)
+    known = np.isfinite(alone.alpha).all(axis=1)
+    if not known.any():
+        return None
+    # Parameters of cameras in units of their conditional standard deviations
+    precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
+    precision[:K] = 1.0
+    scale = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
+    origins, observed = zip(
+        *(_observations(alone, camera, scale, known, *each) for each in sequences),
+        strict=True,
+    )
+    # Differences between groups are not taken for dynamics.
+    intercepts = numbers is not None and bool(numbers.any())
+    dynamics = estimated_dynamics(observed, K, intercepts, max_iter, tol)
+    if dynamics is None:
+        return None
+    alpha, covariance = np.empty((n_frames, K)), np.empty((n_frames, K, K))
+    motion, translation = alone.motion.copy(), alone.translation.copy()
+    for (rows, steps), origin, each in zip(sequences, origins, observed, strict=True):
+        found = smoothed(each, dynamics)
+        mean = scale * found.mean[steps]
+        alpha[rows], covariance[rows] = mean[:, :K], found.covariance[steps, :K, :K]
+        moved = camera.moved(frames_last(alone.motion[origin]), mean[:, K:].T)
+        motion[rows] = frames_first(moved)
+        mean[:, :K] -= alone.alpha[rows]
+        translation[rows] -= np.einsum("ip,ipr->ir", mean, alone.slope[rows])
+    rates = np.exp(np.sort(dynamics.rates))
+    scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
+    return SmoothedFrames(alpha, covariance, motion, translation, scales)
+
+
+def _observations(
+    alone: LinearisedFrames,
+    camera: CameraModel,
+    scale: NDArray,
+    known: NDArray,
+    rows: NDArray,
+    steps: NDArray,
+) -> tuple[NDArray, Observations]:
+    """Return the origin of each row of a sequence, and the likelihoods of its steps.
+
+    The origin is the last known row, before the first one the first one.
+    """
+    n_steps, n, K = steps[-1] + 1, len(scale), alone.alpha.shape[1]
+    data = Observations(
+        np.zeros((n_steps, n, n)), np.zeros((n_steps, n)), np.zeros((n_steps, n))
+    )
+    seen = known[rows]
+    chosen, at = rows[seen], steps[seen]
+    if not len(chosen):
+        return rows, data
+    precision, alpha = alone.precision[chosen], alone.alpha[chosen]
+    # At the posterior mode the likelihood has the gradient alpha.
+    information = np.einsum("ipk,ik->ip", precision[:, :, :K], alpha)
+    information[:, :K] += alpha
+    data.precision[at] = scale[:, None] * precision * scale
+    data.information[at] = scale * information
+    if len(chosen) > 1:
+        motion = frames_last(alone.motion[chosen])
+        between = camera.steps_between(motion[..., :-1], motion[..., 1:])
+        data.change[at[1:], K:] = between.T / scale[K:]
+    return chosen[np.maximum(np.cumsum(seen) - 1, 0)], data
+
+
+def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
+    """Return the posterior of a sequence: Kalman filter and smoother."""
+    F, Q, first, shown = dynamics.matrices()
+    n_steps, n = observed.information.shape
+    mean, covariance = np.empty((n_steps, len(F))), np.empty((n_steps, *F.shape))
+    change = observed.change @ np.eye(n, len(F))
+    m, P, log_likelihood = np.zeros(len(F)), first, 0.0
+    # Filter: prediction, then update by ``P - P H^T (I + L S)^-1 L H P``, S = H P H^T
+    for t, (L, h, _) in enumerate(zip(*observed, strict=True)):
+        if t:
+            m, P = F @ m - change[t], F @ P @ F.T + Q
+        across, seen = shown @ P, shown @ m
+        growth, off = np.eye(n) + L @ across @ shown.T, h - L @ seen
+        solved = np.linalg.solve(growth, np.column_stack([L @ across, off]))
+        step = across.T @ solved[:, -1]
+        # Integral of exp(h^T x - x^T L x / 2) over the predicted density
+        square = seen @ (h + off) + off @ shown @ step
+        log_likelihood += 0.5 * float(square - np.linalg.slogdet(growth)[1])
+        m, P = m + step, _symmetric(P - across.T @ solved[:, :-1])
+        mean[t], covariance[t] = m, P
+    # Smoother, from the last frame to the first: gain J = P F^T P_predicted^-1
+    late, lagged, early = np.zeros((3, *F.shape))
+    for t in range(n_steps - 2, -1, -1):
+        across = F @ covariance[t]
+        predicted = across @ F.T + Q
+        J = np.linalg.solve(predicted, across).T
+        following = mean[t + 1] + change[t + 1]
+        late += covariance[t + 1] + np.outer(following, following)
+        lagged += covariance[t + 1] @ J.T
+        mean[t] += J @ (following - F @ mean[t])
+        covariance[t] += _symmetric(J @ (covariance[t + 1] - predicted) @ J.T)
+        lagged += np.outer(following, mean[t])
+        early += covariance[t] + np.outer(mean[t], mean[t])
+    moments = [late, lagged, early, covariance[0] + np.outer(mean[0], mean[0])]
+    return Smoothed(
+        mean @ shown.T,
+        shown @ covariance @ shown.T,
+        log_likelihood,
+        np.stack(moments),
+    )
+
+
+def estimated_dynamics(
+    sequences: Sequence[Observations],
+    n_components: int,
+    intercepts: bool,
+    max_iter: int,
+    tol: float,
+) -> Dynamics | None:
+    """Return the most likely dynamics of sequences; None without strong evidence."""
+    n_walks = sequences[0].information.shape[1] - n_components
+    lengths = n_components, n_walks, n_components * intercepts
+    splits = np.cumsum(lengths)[:-1]
+
+    def minus_log_likelihood(parameters: NDArray) -> tuple[float, NDArray]:
+        dynamics = Dynamics(*np.split(parameters, splits))
+        ends = [smoothed(each, dynamics) for each in sequences]
+        moments = np.sum([each.moments for each in ends], axis=0)
+        n_pairs = sum(len(each.mean) - 1 for each in ends)
+        slope = expected_gradient(dynamics, moments, n_pairs, len(ends))
+        return -sum(each.log_likelihood for each in ends), -slope
+
+    found = []
+    for least in np.log([LEAST_RATE, LARGEST_RATE]):
+        start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
+        limits = [(least, np.log(LARGEST_RATE)), (-14.0, 14.0), (-7.0, 7.0)]
+        bounds = [limits[i] for i in np.repeat([0, 1, 2], lengths)]
+        options = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
+        found.append(
+            minimize(
+                minus_log_likelihood,
+                start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=bounds,
+                options=options,
+            )
+        )
+    # Akaike's criterion: one rate for each coefficient
+    if found[1].fun - found[0].fun <= n_components + STRONG_EVIDENCE:
+        return None
+    return Dynamics(*np.split(found[0].x, splits))
+
+
+def expected_gradient(
+    dynamics: Dynamics, moments: NDArray, n_pairs: int, n_sequences: int
+) -> NDArray:
+    """Return the gradient of the expected log density of states and frames.
+
+    It is the gradient of the log-likelihood (Fisher's identity). The density is a sum
+    over coefficients and cameras: central differences of all at once.
+    """
+
+    def difference(name: str) -> NDArray:
+        ends = [
+            expected_log_density(
+                dynamics._replace(**{name: getattr(dynamics, name) + change}),
+                moments,
+                n_pairs,
+                n_sequences,
+            )
+            for change in (1e-4, -1e-4)
+        ]
+        return (ends[0] - ends[1]) / 2e-4
+
+    K = len(dynamics.rates)
+    shares = difference("shares")[:K] if len(dynamics.shares) else np.empty(0)
+    return np.concatenate([difference("rates")[:K], difference("walks")[K:], shares])
+
+
+def expected_log_density(
+    dynamics: Dynamics, moments: NDArray, n_pairs: int, n_sequences: int
+) -> NDArray:
+    """Return the expected log density (p,) by coefficient and camera parameter."""
+    F, Q, first = dynamics.blocks()
+    n = F.shape[2]
+    states = moments[:, : 2 * n, : 2 * n].reshape(4, 2, n, 2, n)
+    late, lagged, early, start = np.einsum("makbk->mabk", states)
+    across = np.einsum("abk,cbk->ack", F, lagged)
+    noise = late - across - across.swapaxes(0, 1)
+    noise += np.einsum("abk,bck,dck->adk", F, early, F)
+    density = _log_density(noise, Q, n_pairs) + _log_density(start, first, n_sequences)
+    if len(dynamics.shares):
+        K, b = len(dynamics.shares), dynamics.between
+        square = np.diagonal(moments[3])[2 * n :]
+        density[:K] -= 0.5 * (n_sequences * np.log(b) + square / b)
+    return density
+
+
+def _log_density(moments: NDArray, covariance: NDArray, number: int) -> NDArray:
+    """Return expected normal log densities (k,), up to constants.
+
+    For the summed second moments (2, 2, k) of a number of samples, and covariances.
+    """
+    (a, b), (c, d) = covariance
+    determinant = a * d - b * c
+    square = d * moments[0, 0] - b * moments[0, 1] - c * moments[1, 0]
+    square += a * moments[1, 1]
+    return np.asarray(-0.5 * (number * np.log(determinant) + square / determinant))
+
+
+def _symmetric(matrix: NDArray) -> NDArray:
+    """Return the symmetric part of a matrix."""
+    return 0.5 * (matrix + matrix.T)
