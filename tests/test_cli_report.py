@@ -27,6 +27,7 @@ from isa_nrsfm.cli._fit import (  # noqa: E402
 from isa_nrsfm.cli._sections import fit_sections, fit_text, text_of  # noqa: E402
 from isa_nrsfm.cli._times import read_times, time_unit  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
+from isa_nrsfm.export import frame_poses  # noqa: E402
 from isa_nrsfm.io import load_model  # noqa: E402
 from isa_nrsfm.plotting import ComponentChoiceDisplay  # noqa: E402
 
@@ -159,6 +160,9 @@ def test_labels_groups_and_times_are_those_of_python(run):
     for suffix, values in (("within", within), ("smooth", smooth.alpha)):
         columns = [f"alpha_1_{suffix}", f"alpha_2_{suffix}"]
         np.testing.assert_allclose(alpha[columns], values, atol=1e-9)
+    cameras = pd.read_csv(folder / "cameras.csv")
+    poses = frame_poses(model, smooth.decomposition)
+    np.testing.assert_allclose(cameras["yaw_smooth"], poses.yaw, atol=1e-6)
     between = between_share(model.alpha_, person).between
     np.testing.assert_allclose(report["groups"]["between"], between)
     assert len(report["time"]["time_scales"]) == 2

@@ -110,7 +110,7 @@ def fit_table(
             shown = {"labels": _first_classes(asked, X), "times": asked.times}
             if args.std and estimator.camera_ != "affine":
                 shown["depth_std"] = estimator.reconstruct(X, return_std=True)[1]
-            write_results(new, estimator, frames, drawn, **shown)
+            write_results(new, estimator, frames, smooth, drawn, **shown)
             report = {
                 "command": "fit",
                 "arguments": args.arguments,

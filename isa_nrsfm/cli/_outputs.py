@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm import AffineNRSfM, export
+from isa_nrsfm import AffineNRSfM, SmoothedCoefficients, export
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.column_names import names_of_points
@@ -41,7 +41,8 @@ RESULTS = {
     "calibrated cameras a scale times two rows of a rotation; inverse_snr is the "
     "energy of the reprojection error relative to that of the frame; yaw, pitch and "
     "roll in degrees, if the cameras determine them: zero for a frontal, upright "
-    "object of a known layout, and for the mean camera of other objects",
+    "object of a known layout, and for the mean camera of other objects; yaw_smooth, "
+    "pitch_smooth, roll_smooth (--time, --fps): smoothed",
     "shapes.csv": "mean shape and basis shapes, a row for each point; the shape of a "
     "frame is mean + sum_k alpha_k basis_k, in the axes X, Y, Z of cameras.csv",
     "shapes.npz": "mean_shape, basis, alpha, cameras and names as arrays; the shape of "
@@ -115,6 +116,7 @@ def write_results(
     folder: Path,
     estimator: AffineNRSfM,
     frames: Frames,
+    smooth: SmoothedCoefficients | None,
     drawn: dict[str, Any],
     **shown: Any,
 ) -> None:
@@ -141,6 +143,10 @@ def write_results(
             columns = columns.dropna(axis="columns", how="all")
             cameras = cameras.join(columns)
             shown["camera"] = "weak_perspective" if len(columns.columns) else None
+            if smooth is not None and shown["camera"]:
+                poses = export.frame_poses(estimator, smooth.decomposition, **drawn)
+                for name in ("yaw", "pitch", "roll"):
+                    cameras[f"{name}_smooth"] = getattr(poses, name)
         except (ValueError, UserWarning) as error:
             warn_caller(
                 f"viewer.html has affine shapes, and cameras.csv has no angles: {error}"

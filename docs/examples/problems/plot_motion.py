@@ -71,5 +71,5 @@ print(f"changed by {np.abs(shuffled.alpha - alone.alpha[order]).max():.1g}")
 
 # %%
 # ``smooth.decomposition`` contains smoothed cameras, for `AffineNRSfM.reconstruct`. On
-# the command line, ``--time COLUMN`` or ``--fps 25`` smooths coefficients, with the
-# figure ``time.png``.
+# the command line, ``--time COLUMN`` or ``--fps 25`` smooths coefficients and angles,
+# with the figure ``time.png``.
