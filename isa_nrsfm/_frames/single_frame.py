@@ -78,8 +78,8 @@ class SingleSearch:
         for n_steps in range(MAX_STEPS):
             c = np.append(1.0, alpha)
             T = (self.sums @ c).reshape(-1, 3, 3)
-            inverse = np.linalg.inv(0.5 * np.tensordot(c, T, 1))
-            Y = np.tensordot(c, P, 1)
+            inverse = np.linalg.inv(0.5 * _sum(c, T))
+            Y = _sum(c, P)
             M = Y @ inverse
             Q = (M.T @ M).ravel()
             held = (self.pairs @ Q).reshape(K + 1, K + 1)[1:, 1:].copy()
@@ -144,7 +144,7 @@ class SingleSearch:
         E = np.outer(c, c)
         E[1:, 1:] += noise * camera.Q
         A = (E.ravel() @ self.pairs).reshape(3, 3)
-        G = M @ A - np.tensordot(c, P, 1)
+        G = M @ A - _sum(c, P)
         D = self.model.tangents(M)
         flat = D.reshape(n, 6)
         gradient, definite = flat @ G.ravel(), (D @ A).reshape(n, 6) @ flat.T
@@ -191,3 +191,9 @@ class SingleSearch:
             else:
                 damping = max(8.0 * damping, 0.1)
         return None
+
+
+def _sum(c: NDArray, matrices: NDArray) -> NDArray:
+    """Return ``sum_k c_k A_k`` of few matrices (k, m, n), faster than `np.tensordot`."""
+    rows = matrices.reshape(len(c), -1)
+    return np.asarray(c @ rows).reshape(matrices.shape[1:])
