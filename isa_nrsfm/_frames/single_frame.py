@@ -194,6 +194,6 @@ class SingleSearch:
 
 
 def _sum(c: NDArray, matrices: NDArray) -> NDArray:
-    """Return ``sum_k c_k A_k`` of few matrices (k, m, n), faster than `np.tensordot`."""
+    """Return ``sum_k c_k A_k`` of matrices (k, m, n), faster than `np.tensordot`."""
     rows = matrices.reshape(len(c), -1)
     return np.asarray(c @ rows).reshape(matrices.shape[1:])
