@@ -101,10 +101,7 @@ class Browser:
     def run(self, code):
         """Return the value of an expression, once it is known."""
         answer = self.call(
-            "Runtime.evaluate",
-            expression=code,
-            returnByValue=True,
-            awaitPromise=True,
+            "Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True
         )
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{code}: {answer['exceptionDetails']}")

@@ -51,6 +51,12 @@ def pytest_terminal_summary(terminalreporter):
         terminalreporter.write_line(f"{number} skipped: {reason}")
 
 
+@pytest.fixture
+def rng():
+    """Return a new generator of random numbers, the same for each test."""
+    return np.random.default_rng(0)
+
+
 @pytest.fixture(scope="session")
 def data_path():
     """Return a function from a file name to its path; skip where it is absent."""

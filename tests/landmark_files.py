@@ -305,13 +305,7 @@ WRITERS = {
 }
 # The points that are not `TRACKS`.
 EXPECTED = dict.fromkeys(
-    [
-        "pyfeat-mp",
-        "pyfeat-parquet",
-        "mediapipe-pixels",
-        "mediapipe-sizes",
-        "mediapipe-tsv",
-    ],
-    MESH,
+    [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")], MESH
 )
-EXPECTED |= {"pts-file": TRACKS[:1], "wflw": WFLW, "wflw-test": WFLW}
+EXPECTED |= {"pyfeat-parquet": MESH, "pts-file": TRACKS[:1]}
+EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

@@ -85,6 +85,12 @@ def with_gaps(tracks, share=0.3, seed=0):
     return pairs.reshape(tracks.shape)
 
 
+def with_missing(tracks, missing, seed=0):
+    """Return tracks with points missing at random, and the mask of those seen."""
+    seen = np.random.default_rng(seed).random(tracks.shape[:2]) >= missing
+    return np.where(seen[..., None], tracks, tracks.dtype.type(np.nan)), seen
+
+
 def random_cameras(rng, n_frames):
     """Return cameras with orthonormal rows, (I, 2, 3), in all orientations."""
     return Rotation.random(n_frames, rng).as_matrix()[:, :2]

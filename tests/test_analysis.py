@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import sklearn
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -71,10 +72,9 @@ class TestAssociation:
         assert found.p_value[0] == 0.01
         assert found.p_value[1:].min() > 0.05
 
-    def test_labels_of_people_are_permuted_among_people(self):
+    def test_labels_of_people_are_permuted_among_people(self, rng):
         # Four people, two of each sex: of the six ways to deal the labels out two are
         # as extreme. Frame by frame it would look certain.
-        rng = rng_of(0)
         person = np.repeat(np.arange(4), 30)
         alpha = np.array([0.0, 0.1, 5.0, 5.1])[person] + 0.01 * rng.normal(size=120)
         sex = np.array(["m", "m", "f", "f"])[person]
@@ -203,8 +203,7 @@ class TestAssociation:
         ],
     )
     def test_refusals(self, y, options, message):
-        with pytest.raises(ValueError, match=message):
-            association(related()[0], y, **options)
+        refused(message, association, related()[0], y, **options)
 
     def test_refuses_a_table_without_coefficients(self):
         with pytest.raises(ValueError, match="no frame has coefficients"):
@@ -224,9 +223,8 @@ class TestPredictability:
         y = alpha @ [1.0, 2.0, 3.0]
         assert predictability(alpha, y, random_state=0).min() > 0.99
 
-    def test_groups_stay_together(self):
+    def test_groups_stay_together(self, rng):
         # Each person has coefficients of one's own that tell the label, and no other's.
-        rng = rng_of(0)
         person = np.repeat(np.arange(12), 10)
         y = (np.arange(12) % 2)[person]
         alpha = 10.0 * rng.normal(size=(12, 8))[person] + rng.normal(size=(120, 8))
@@ -255,8 +253,7 @@ class TestPredictability:
         [(np.r_[2, np.arange(119) % 2], None), (np.arange(120) % 2, np.zeros(120))],
     )
     def test_refuses_what_has_no_two_folds(self, y, groups):
-        with pytest.raises(ValueError, match="two folds need"):
-            predictability(related()[0], y, groups)
+        refused("two folds need", predictability, related()[0], y, groups)
 
 
 class TestWithinGroups:
@@ -321,8 +318,7 @@ class TestWithinGroups:
 
 
 class TestBetweenShare:
-    def test_of_a_random_effects_model(self):
-        rng = rng_of(0)
+    def test_of_a_random_effects_model(self, rng):
         sizes = rng.integers(2, 12, 400)
         person = np.repeat(np.arange(400), sizes)
         share = np.array([0.0, 0.3, 0.9, 1.0])
@@ -342,8 +338,7 @@ class TestBetweenShare:
 
 class TestAlignedFrames:
     @pytest.mark.parametrize("turn", [True, False])
-    def test_position_size_and_turn_are_taken_away(self, turn):
-        rng = rng_of(0)
+    def test_position_size_and_turn_are_taken_away(self, turn, rng):
         shape = rng.normal(size=20) + 1j * rng.normal(size=20)
         angles = 1j * (rng.normal(size=(9, 1)) if turn else np.zeros((9, 1)))
         frames = np.exp(angles) * rng.uniform(1, 5, (9, 1)) * shape
@@ -355,5 +350,4 @@ class TestAlignedFrames:
         assert_allclose(np.mean(np.abs(points) ** 2, axis=1), 1)
 
     def test_refuses_half_a_point(self):
-        with pytest.raises(ValueError, match="two columns per point; got 3"):
-            AlignedFrames().fit(np.ones((4, 3)))
+        refused("two columns per point; got 3", AlignedFrames().fit, np.ones((4, 3)))

@@ -28,10 +28,7 @@ from isa_nrsfm.baselines._pseudo_inverse import (
     orthographic_cameras,
     truncate_rank,
 )
-from isa_nrsfm.baselines._shape_sequence import (
-    camera_signs,
-    shape_signs,
-)
+from isa_nrsfm.baselines._shape_sequence import camera_signs, shape_signs
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
 rng_of = np.random.default_rng
@@ -41,8 +38,7 @@ tall_and_wide = pytest.mark.parametrize("n_frames", [50, 10])
 
 class TestShapeSequences:
     @tall_and_wide
-    def test_signs_make_shapes_similar(self, n_frames):
-        rng = rng_of(0)
+    def test_signs_make_shapes_similar(self, n_frames, rng):
         shapes = rng.normal(size=(8, 3)) + 0.5 * rng.normal(size=(n_frames, 8, 3))
         signs, order = rng.choice([-1.0, 1.0], n_frames), rng.permutation(n_frames)
         found = shape_signs(signs[:, None, None] * shapes)
@@ -245,9 +241,8 @@ class TestBlockDictionary:
             assert_array_equal(active, blocks.any(axis=(2, 3)))
 
     @pytest.mark.parametrize("ridge", [0.001, 0.01])
-    def test_share_of_a_block_that_is_left(self, ridge):
+    def test_share_of_a_block_that_is_left(self, ridge, rng):
         # Two atoms without overlap, of which the second explains the share x.
-        rng = rng_of(0)
         atoms = np.linalg.qr(rng.normal(size=(20, 6)))[0].T.reshape(2, 3, 20)
         cameras = random_cameras(rng, 40) / np.sqrt(2)
         x = np.linspace(0, 0.2, 40)
@@ -382,8 +377,7 @@ class TestAlignment:
         # Minus the truth is the same with all coefficients of the other sign.
         assert_allclose(found * np.sign(np.sum(found * truth)), truth, atol=1e-7)
 
-    def test_least_distance(self):
-        rng = rng_of(0)
+    def test_least_distance(self, rng):
         cameras = random_cameras(rng, 40)
         blocks = rng.normal(size=(40, 1, 1)) * cameras @ random_rotation(0).T
         blocks += 0.3 * rng.normal(size=blocks.shape)
@@ -429,9 +423,8 @@ class TestAlignment:
         assert not padded[1][:, 0].any()
         assert not padded[2][0].any()
 
-    def test_atoms_without_shared_frames_are_aligned_by_their_shapes(self):
+    def test_atoms_without_shared_frames_are_aligned_by_their_shapes(self, rng):
         # One shape, nearly, learnt as three atoms of 20 frames each.
-        rng = rng_of(0)
         true = rng.normal(size=(3, 30)) + 0.01 * rng.normal(size=(3, 3, 30))
         coefficients = np.kron(np.eye(3), np.ones((20, 1)))
         cameras = random_cameras(rng, 60)

@@ -11,12 +11,7 @@ from layers import slow_after
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
-from benchmarks import (
-    _fits,
-    _paper,
-    questions,
-    sensitivity,
-)
+from benchmarks import _fits, _paper, questions, sensitivity
 from benchmarks._markdown import cell, value
 from benchmarks._methods import METHODS, Found
 from benchmarks._results import Record, Results, rounded
@@ -131,8 +126,7 @@ def test_what_methods_find_explains_the_table(tracks, method):
     np.testing.assert_allclose(eye, np.broadcast_to(np.eye(3), eye.shape), atol=1e-8)
 
 
-def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image():
-    rng = np.random.default_rng(0)
+def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image(rng):
     truth = rng.normal(size=(5, 20, 3))
     turned = np.stack([S @ random_rotation(i, 3) for i, S in enumerate(truth)])
     mirrored = turned * [1.0, 1.0, -1.0] + 3.0

@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import (
-    measurements,
-    random_rotation,
-    structured_motion,
-)
+from scenes import measurements, random_rotation, structured_motion
 
 from isa_nrsfm._paper.block_structure import (
     leading_blocks,

@@ -327,9 +327,8 @@ class TestReversal:
             assert value(scene, i, fits.motion[i], noise) <= end.fun + 1e-6
 
 
-def test_completed_starts_are_scaled_rotations_with_the_first_two_columns():
+def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):
     """Also of equal singular values, of one, of none, and of axes in the columns."""
-    rng = np.random.default_rng(0)
     M = rng.standard_normal((2, 3, 40)) * 10.0 ** rng.uniform(-3, 3, 40)
     M[:, :2, :4] = 0.0
     M[:, :2, 0] = np.eye(2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from cameras import lorentz_cameras
 from numpy.testing import assert_allclose
+from refusals import refused
 from scenes import face_model, faces
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -174,14 +175,12 @@ class TestDegenerateCameras:
         ],
     )
     def test_refuses(self, motion, camera, message):
-        with pytest.raises(ValueError, match=message):
-            metric_upgrade(motion, camera)
+        refused(message, metric_upgrade, motion, camera)
 
 
 class TestEuclideanShapes:
-    def test_images_stay_what_they_are(self):
+    def test_images_stay_what_they_are(self, rng):
         motion, *_ = scene(0, "weak_perspective")
-        rng = np.random.default_rng(0)
         mean, basis = rng.standard_normal((9, 3)), rng.standard_normal((2, 9, 3))
         Q = metric_upgrade(motion).Q
         for shapes in (mean, basis):
@@ -200,8 +199,7 @@ class TestEuclideanShapes:
         ],
     )
     def test_refuses(self, shapes, Q, message):
-        with pytest.raises(ValueError, match=message):
-            euclidean_shapes(shapes, Q)
+        refused(message, euclidean_shapes, shapes, Q)
 
 
 def strained_scene(seed, n_frames=40, n_components=2, size=0.2, noise=0.0):
@@ -348,8 +346,7 @@ class TestEuclideanFrames:
     def test_refuses(self, fitted, index, value, message):
         arguments = list(fitted)
         arguments[index] = value
-        with pytest.raises(ValueError, match=message):
-            euclidean_frames(*arguments)
+        refused(message, euclidean_frames, *arguments)
 
 
 @both_cameras

@@ -8,11 +8,6 @@ from scenes import permute_frames, random_rotation, rotate_frames
 from isa_nrsfm._frames.camera_models import mean_view, reference_camera, rigid_cameras
 
 
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
-
-
 def centred_shape(rng, n_points=15, flat=0):
     shape = rng.normal(size=(n_points, 3))
     shape[:, 3 - flat :] = 0

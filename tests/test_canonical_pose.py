@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.calibration import canonical_pose
@@ -172,16 +173,13 @@ class TestPrincipalAxes:
     ],
 )
 def test_refuses(face, arguments, message):
-    with pytest.raises(ValueError, match=message):
-        canonical_pose(face, **arguments)
+    refused(message, canonical_pose, face, **arguments)
 
 
 def test_refuses_shapes(face):
     with pytest.raises(ValueError, match="'ibug-68' has 68 points, the shape 60"):
         canonical_pose(face[:60], scheme="ibug-68")
-    with pytest.raises(ValueError, match=r"\(n_points, 3\).*got the shape \(68, 2\)"):
-        canonical_pose(face[:, :2])
+    refused(r"\(n_points, 3\).*got the shape \(68, 2\)", canonical_pose, face[:, :2])
     holes = face.copy()
     holes[3] = np.nan
-    with pytest.raises(ValueError, match="with 3 entries that are not"):
-        canonical_pose(holes)
+    refused("with 3 entries that are not", canonical_pose, holes)

@@ -555,10 +555,7 @@ def test_columns_choose_among_several_sets(run, fails, faces, tmp_path):
 
 
 def test_named_index_of_a_parquet_file_is_a_column(run, faces, tmp_path):
-    path, options = (
-        tmp_path / "faces.parquet",
-        ["-o", tmp_path, *UNREFINED],
-    )
+    path, options = (tmp_path / "faces.parquet", ["-o", tmp_path, *UNREFINED])
     # An index without a name, such as the numbers of chosen rows, is none.
     for table in (faces.set_index("name"), faces[5:]):
         table.to_parquet(path)

@@ -19,11 +19,7 @@ from isa_nrsfm.analysis import WithinGroups, association, between_share  # noqa:
 from isa_nrsfm.cli import main  # noqa: E402
 from isa_nrsfm.cli._columns import Columns, Label  # noqa: E402
 from isa_nrsfm.cli._figures import Fit, figures_of  # noqa: E402
-from isa_nrsfm.cli._fit import (  # noqa: E402
-    choice_report,
-    choose_n_components,
-    extrapolated,
-)
+from isa_nrsfm.cli._fit import choice_report, choose_n_components, extrapolated  # noqa: E402
 from isa_nrsfm.cli._sections import fit_sections, fit_text, text_of  # noqa: E402
 from isa_nrsfm.cli._times import read_times, time_unit  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
@@ -236,10 +232,7 @@ def test_a_later_run_removes_figures_of_labels(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("scales", "expected"),
     [
-        (
-            [np.inf, np.inf, 8.24],
-            "within 8.24 s; changes last in 2 of 3 directions",
-        ),
+        ([np.inf, np.inf, 8.24], "within 8.24 s; changes last in 2 of 3 directions"),
         ([8.24, 3.0], "fade within 8.24, 3 s"),
         ([np.inf], "t: changes last in 1 of 1 directions"),
         ([], "no dynamics found"),

@@ -5,11 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._joint.common_depths import (
-    _principal,
-    _turned,
-    common_coordinates,
-)
+from isa_nrsfm._joint.common_depths import _principal, _turned, common_coordinates
 from isa_nrsfm._linalg.small_matrices import procrustes
 
 FLOOR = 1e-5
@@ -107,9 +103,8 @@ def test_mean_depths_of_frames_stay():
 
 
 @pytest.mark.parametrize("s2", [1e-3, 0.05])
-def test_expectation_is_that_of_probabilistic_components(s2):
+def test_expectation_is_that_of_probabilistic_components(s2, rng):
     """It is ``B (B^T B + s2 I)^-1 B^T`` for ``B = U (v - s2)^.5``."""
-    rng = np.random.default_rng(0)
     B = rng.standard_normal((12, 2))
     shapes = (rng.standard_normal((500, 2)) @ B.T).reshape(500, 3, 4)
     shapes += 0.1 * rng.standard_normal(shapes.shape)
@@ -125,8 +120,7 @@ def test_expectation_is_that_of_probabilistic_components(s2):
     assert_allclose(fit, mean + (off @ expected).reshape(shapes.shape), atol=1e-12)
 
 
-def test_steps_of_rotations_reach_those_of_procrustes():
-    rng = np.random.default_rng(0)
+def test_steps_of_rotations_reach_those_of_procrustes(rng):
     fit = rng.standard_normal((50, 3, 12))
     own = Rotation.from_rotvec(rng.standard_normal((50, 3))).as_matrix() @ fit
     own += 0.1 * rng.standard_normal(own.shape)

@@ -113,12 +113,11 @@ def test_missing_points_are_conditional_expectations(small):
         assert_allclose(result[~mask], gain @ frame[mask], atol=1e-5)
 
 
-def test_the_fit_is_a_stationary_point_of_the_likelihood(small):
+def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
     centred, _, sizes = small
     rows = unit_rows(centred, sizes)
     model = completion_model(rows, 3, tol=-1.0, max_iter=2000)  # never ends before
     best = log_likelihood(*model, *small)
-    rng = np.random.default_rng(0)
     for _ in range(10):
         step = 1e-4 * rng.normal(size=model.B.shape) * np.std(model.B)
         up, down = (
@@ -269,8 +268,7 @@ def test_rigid_objects_and_more_basis_shapes(dtype):
     assert assert_completes(tracks, seen, 5) < 3e-4
 
 
-def test_flat_objects():
-    rng = np.random.default_rng(0)
+def test_flat_objects(rng):
     tracks = rng.normal(size=(40, 2)) @ rng.normal(size=(200, 2, 2)) + 5
     assert assert_completes(tracks, random_mask((200, 40), 0.3, 0), 1) < 1e-5
 

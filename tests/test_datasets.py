@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 
 from isa_nrsfm._tables.column_names import names_layout
 from isa_nrsfm._tables.tracks import table_to_tracks
@@ -151,8 +152,7 @@ class TestEveryMaker:
     ],
 )
 def test_parameters_of_one_maker(make, parameter, value):
-    with pytest.raises(ValueError, match=f"The '{parameter}' parameter"):
-        make(**{parameter: value})
+    refused(f"The '{parameter}' parameter", make, **{parameter: value})
 
 
 @linear
@@ -342,8 +342,7 @@ class TestPeople:
             assert_allclose(found, found[:1].repeat(len(found), axis=0), rtol=1e-6)
         firsts = [found[0] for found in of_people]
         assert np.ptp(firsts, axis=0).min() > 1e-3 * np.mean(firsts)
-        with pytest.raises(ValueError, match="at least 2 frames for each of 5 people"):
-            MAKERS[kind](9, n_people=5)
+        refused("at least 2 frames for each of 5 people", MAKERS[kind], 9, n_people=5)
 
     def test_poses_are_what_they_are_called(self):
         hands = make_hand_tracks(400, random_state=0)

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import refused
 from scipy.io import savemat
 
 from isa_nrsfm._tables.column_names import names_layout
@@ -223,10 +224,8 @@ def test_addresses_name_one_version_of_one_file(remote):
 @pytest.mark.parametrize("fetch", [fetch_shark, fetch_muct])
 class TestEveryFetcher:
     def test_refuses_parameters_of_another_kind(self, fetch):
-        with pytest.raises(ValueError, match="'data_home' parameter of fetch_"):
-            fetch(data_home=3)
-        with pytest.raises(ValueError, match="'download_if_missing' parameter"):
-            fetch(download_if_missing="no")
+        refused("'data_home' parameter of fetch_", fetch, data_home=3)
+        refused("'download_if_missing' parameter", fetch, download_if_missing="no")
 
     def test_describes_the_data(self, fetch, tmp_path, shark_file, muct_file):
         for file in (shark_file, muct_file):

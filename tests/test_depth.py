@@ -82,8 +82,7 @@ def turned():
 
 
 class TestExtents:
-    def test_gradient_by_differences(self):
-        rng = np.random.default_rng(0)
+    def test_gradient_by_differences(self, rng):
         shapes = rng.normal(size=(3, 3, 20)) * np.array([3.0, 1.0, 0.2])[:, None]
         step = 1e-6 * rng.normal(size=shapes.shape)
         for centred in (True, False):
@@ -269,8 +268,7 @@ def test_advice_to_turn_further_is_not_given_after_all_sides(turning):
     assert ("x and y have the same unit" in certainty.advice) == (turning > 1.5)
 
 
-def test_outliers_are_left_out_with_a_robust_loss():
-    rng = np.random.default_rng(0)
+def test_outliers_are_left_out_with_a_robust_loss(rng):
     shapes = rng.normal(size=(2, 3, 20)) * [[[1.0]], [[0.1]]]
     shapes -= shapes.mean(axis=2, keepdims=True)
     rotations = Rotation.from_rotvec(0.4 * rng.normal(size=(12, 3))).as_matrix()
@@ -296,8 +294,7 @@ def test_outliers_are_left_out_with_a_robust_loss():
 
 
 class TestJackknife:
-    def test_by_its_definition(self, monkeypatch):
-        rng = np.random.default_rng(0)
+    def test_by_its_definition(self, monkeypatch, rng):
         shapes = rng.normal(size=(3, 3, 20)) * [[[1.0]], [[0.1]], [[0.1]]]
         shapes -= shapes.mean(axis=2, keepdims=True)
         rotations = Rotation.from_rotvec(0.4 * rng.normal(size=(30, 3)))
@@ -333,8 +330,7 @@ class TestJackknife:
         assert found.turning == pytest.approx(np.sqrt(square))
 
     @pytest.mark.parametrize("mirrored", [False, True])
-    def test_differences_of_two_fits(self, mirrored):
-        rng = np.random.default_rng(0)
+    def test_differences_of_two_fits(self, mirrored, rng):
         kept = np.arange(7) != 3
         z, off = rng.normal(size=(200, 7)), 0.1 * rng.normal(size=(200, 6))
         off -= off.mean(axis=1, keepdims=True)
@@ -362,8 +358,7 @@ class TestJackknife:
         assert_allclose(turns, expected, atol=1e-4 * expected.max())
 
 
-def test_neighbours_are_groups_of_equal_size():
-    rng = np.random.default_rng(0)
+def test_neighbours_are_groups_of_equal_size(rng):
     centres = 10 * rng.normal(size=(3, N_GROUPS))
     points = np.repeat(centres, 4, axis=1) + rng.normal(size=(3, 4 * N_GROUPS))
     groups = neighbours(points)

@@ -56,9 +56,8 @@ class TestReliabilities:
         assert_allclose(found[:2], expected, rtol=1e-9)
 
     @pytest.mark.parametrize("gamma", [0.2, 2.0, 20.0])
-    def test_are_correlations_with_the_truth(self, gamma):
+    def test_are_correlations_with_the_truth(self, gamma, rng):
         # A random matrix of rank one and noise: its left singular vector.
-        rng = np.random.default_rng(0)
         n_frames, signal = 300, 10 * np.sqrt(gamma)
         true = rng.normal(size=n_frames)
         noise = rng.normal(size=(n_frames, int(gamma * n_frames)))
@@ -117,9 +116,8 @@ class TestReliabilities:
 
 
 class TestWeakInformation:
-    def test_is_what_cameras_and_coefficients_do_not_explain(self):
+    def test_is_what_cameras_and_coefficients_do_not_explain(self, rng):
         # By differences: images are linear in each of the unknowns.
-        rng = np.random.default_rng(0)
         n_frames, n_points, n_components = 5, 9, 2
         shapes = rng.normal(size=(n_components + 1, n_points, 3))
         shapes -= shapes.mean(axis=1, keepdims=True)
@@ -145,8 +143,7 @@ class TestWeakInformation:
                         8,
                     ),
                     changes(
-                        lambda x, M=M, a=a: images(M, 0.0, a + x, still),
-                        n_components,
+                        lambda x, M=M, a=a: images(M, 0.0, a + x, still), n_components
                     ),
                 ]
             )
@@ -159,8 +156,7 @@ class TestWeakInformation:
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
         assert_allclose(found, expected, atol=1e-10 * np.abs(expected).max())
 
-    def test_some_of_many_frames_stand_for_all(self):
-        rng = np.random.default_rng(0)
+    def test_some_of_many_frames_stand_for_all(self, rng):
         mean_shape, basis = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
         motion, alpha = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
         one = weak_information(mean_shape, basis, motion, alpha)
@@ -207,8 +203,7 @@ def with_outliers(faces, share, seed=0):
 
 
 class TestPoseShare:
-    def test_is_that_of_frames_left_out(self):
-        rng = np.random.default_rng(0)
+    def test_is_that_of_frames_left_out(self, rng):
         R = Rotation.from_rotvec(0.4 * rng.normal(size=(40, 3))).as_matrix()
         scales = rng.uniform(0.5, 2.0, size=(40, 1, 1))
         alpha = rng.normal(size=(40, 2))
@@ -228,8 +223,7 @@ class TestPoseShare:
         assert_allclose(pose_share(turned, alpha), expected, rtol=1e-9)
 
     @pytest.mark.parametrize("n_frames", [2, 19])
-    def test_of_few_frames_is_not_known(self, n_frames):
-        rng = np.random.default_rng(0)
+    def test_of_few_frames_is_not_known(self, n_frames, rng):
         motion = rng.normal(size=(n_frames, 2, 3))
         assert np.isnan(pose_share(motion, rng.normal(size=(n_frames, 2)))).all()
 
@@ -265,8 +259,7 @@ class TestPoseShare:
 
 
 class TestOutliers:
-    def test_are_found_beside_badly_explained_points_and_frames(self):
-        rng = np.random.default_rng(0)
+    def test_are_found_beside_badly_explained_points_and_frames(self, rng):
         lengths = np.linalg.norm(rng.normal(size=(50, 20, 2)), axis=2)
         lengths[7] *= 10
         lengths[:, 3] *= 10

@@ -12,6 +12,7 @@ from export_models import face_model
 from fit_runs import FIGURES, FILES, fit, whole_run, write_landmarks
 from layers import slow_after
 from numpy.testing import assert_array_equal
+from refusals import refused
 from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -200,8 +201,7 @@ class TestKeepFrames:
             raise AssertionError("the fit has begun")
 
         monkeypatch.setattr(AffineNRSfM, "_checked", never)
-        with pytest.raises(ValueError, match=r"frames_folder should be .* got ''"):
-            self.estimator("").fit(table)
+        refused(r"frames_folder should be .* got ''", self.estimator("").fit, table)
         (tmp_path / "file").write_bytes(OLD)
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
             with pytest.raises(OSError) as error:  # noqa: PT011
@@ -216,8 +216,7 @@ class TestKeepFrames:
         assert not (tmp_path / "no").exists(), faults.operations
 
     def test_folders_of_a_fit_that_fails_are_removed(self, tmp_path, table):
-        with pytest.raises(ValueError, match="points"):
-            self.estimator(tmp_path / "new" / "kept").fit(table[:, :6])
+        refused("points", self.estimator(tmp_path / "new" / "kept").fit, table[:, :6])
         assert list(tmp_path.iterdir()) == []
 
 

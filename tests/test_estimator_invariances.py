@@ -299,9 +299,8 @@ def test_x_and_y_are_the_axes_of_the_mean_camera(tracks, model, unscaled, scale_
         assert np.corrcoef(image[:, axis], fitted.mean_shape_[:, axis])[0, 1] > 0.95
 
 
-def test_axes_are_principal_axes_where_cameras_have_no_common_view():
+def test_axes_are_principal_axes_where_cameras_have_no_common_view(rng):
     # Cameras that look from everywhere, frames at any angle: their mean is nothing.
-    rng = np.random.default_rng(0)
     made = make_nonrigid_tracks(400, 30, n_components=2, noise=0.01, random_state=0)
     turned = made.tracks @ rotations(angles(made.tracks, rng))
     for scale_frames in (True, False):

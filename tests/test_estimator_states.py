@@ -338,10 +338,7 @@ def test_frames_that_are_equal_support_one_basis_shape():
 @pytest.mark.parametrize(
     ("seed", "parameters"),
     [
-        (
-            1123,
-            {"n_components": 1, "camera": "weak_perspective", "loss": "huber"},
-        ),
+        (1123, {"n_components": 1, "camera": "weak_perspective", "loss": "huber"}),
         (
             50025,
             {

@@ -234,8 +234,7 @@ def test_flat_objects_that_deform_in_their_plane(dtype):
 
 @pytest.mark.parametrize("n_components", [1, 2, 5])
 @pytest.mark.parametrize("n_different", [1, 2, 3])
-def test_repeated_frames(n_different, n_components):
-    rng = np.random.default_rng(0)
+def test_repeated_frames(n_different, n_components, rng):
     tracks = rng.normal(size=(n_different, 20, 2))
     model = fitted(np.repeat(tracks, 15, axis=0), n_components)
     assert model.rank_floor_ < 1e-25
@@ -315,8 +314,7 @@ def test_frames_that_are_lines_or_tiny():
         fitted(tracks, 2, scale_frames=scale_frames)
 
 
-def test_two_places_only():
-    rng = np.random.default_rng(0)
+def test_two_places_only(rng):
     tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
     model = fitted(tracks, 1)
     assert model.inverse_snr_ < 1e-25
@@ -430,8 +428,7 @@ def of_unit(unit, refinement):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("loss", "scale_frames"),
-    [("linear", False), ("huber", True), ("cauchy", False)],
+    ("loss", "scale_frames"), [("linear", False), ("huber", True), ("cauchy", False)]
 )
 def test_joint_refinement_of_frames_that_are_lines_or_tiny(loss, scale_frames):
     tracks = lines_and_tiny_frames()
@@ -452,8 +449,7 @@ def test_any_unit_is_fitted(scale, refinement):
     assert_allclose(scaled.inverse_snr_, once.inverse_snr_, rtol=1e-6)
 
 
-def test_joint_refinement_of_points_in_two_places():
-    rng = np.random.default_rng(0)
+def test_joint_refinement_of_points_in_two_places(rng):
     tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
     assert jointly(tracks, 1).inverse_snr_ < 1e-20
 

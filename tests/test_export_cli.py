@@ -155,11 +155,7 @@ def test_the_viewer_shows_a_table_with_its_labels(export):
         ("a.txt", ["--edges", "none"], "--edges is an option of viewer and glb; "),
         ("a.html", ["--label", "mood"], "--label needs a TABLE"),
         ("a.glb", ["--zeros-missing"], "--zeros-missing needs a TABLE"),
-        (
-            "a.html",
-            ["table.csv", "--label", "age"],
-            "has no column 'age'; its",
-        ),
+        ("a.html", ["table.csv", "--label", "age"], "has no column 'age'; its"),
         ("a.glb", ["--names", "jaw"], "names must hold 2 names"),
         ("a.txt", ["--n-modes", "999"], "n_modes must be at most"),
     ],
@@ -184,9 +180,8 @@ def test_inputs_are_not_overwritten(folder, capsys):
     assert "would be overwritten by the results" in capsys.readouterr().err
 
 
-def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys):
+def test_the_viewer_of_a_flat_object_has_affine_shapes(tmp_path, capsys, rng):
     # Cameras that turn about the viewing direction see two directions of space.
-    rng = np.random.default_rng(0)
     angle = rng.uniform(0, 2 * np.pi, 40)
     turns = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     tracks = rng.standard_normal((20, 2)) @ turns.transpose(2, 1, 0)

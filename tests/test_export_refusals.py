@@ -4,13 +4,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from export_models import (
-    N_FRAMES,
-    blob_model,
-    calibrated_model,
-    face_model,
-    faces,
-)
+from export_models import N_FRAMES, blob_model, calibrated_model, face_model, faces
+from refusals import refused
 from sklearn.decomposition import PCA
 from sklearn.exceptions import NotFittedError
 
@@ -62,8 +57,7 @@ CASES = [
 def test_bad_options(tmp_path, function, options, message):
     suffix = {write_glb: ".glb", write_viewer: ".html"}.get(function)
     path = [] if suffix is None else [tmp_path / f"model{suffix}"]
-    with pytest.raises(ValueError, match=message):
-        function(face_model(), *path, **options)
+    refused(message, function, face_model(), *path, **options)
     assert not any(tmp_path.iterdir())
 
 
@@ -101,13 +95,11 @@ def test_other_suffixes(tmp_path, write, suffixes):
 
 
 def test_models_that_have_no_frames_of_their_own():
-    with pytest.raises(ValueError, match="model should be an AffineNRSfM; got PCA"):
-        frame_poses(PCA())
+    refused("model should be an AffineNRSfM; got PCA", frame_poses, PCA())
     with pytest.raises(NotFittedError):
         frame_poses(AffineNRSfM())
     with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
         frame_poses(blob_model(), camera="orthographic")
     table = faces().data[:40]
     without = AffineNRSfM(1, refinement=None, random_state=0, keep_frames=False)
-    with pytest.raises(ValueError, match="exporting shapes needs the cameras"):
-        frame_poses(without.fit(table))
+    refused("exporting shapes needs the cameras", frame_poses, without.fit(table))

@@ -55,12 +55,7 @@ class Scene(NamedTuple):
 
 def random_scene(camera="orthographic", seed=0, n_frames=60, n_components=2, **options):
     truth = make_nonrigid_tracks(
-        n_frames,
-        N_POINTS,
-        n_components,
-        camera=camera,
-        random_state=seed,
-        **options,
+        n_frames, N_POINTS, n_components, camera=camera, random_state=seed, **options
     )
     tracks = truth.tracks - truth.tracks.mean(axis=1, keepdims=True)
     shapes = np.concatenate([truth.mean_shape[None], truth.basis])

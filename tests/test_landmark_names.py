@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from landmark_files import openface_names
+from refusals import refused
 
 from isa_nrsfm._tables.column_names import names_layout, parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import (
@@ -98,8 +99,7 @@ def test_several_sets_are_refused_with_the_ways_to_choose():
 
 def test_a_numbered_set_with_another_point_of_that_form_is_ambiguous():
     names = [*named("lm_{p}_{a}"), "box_x", "box_y"]
-    with pytest.raises(ValueError, match=r"'lm_#_x,lm_#_y' \(9 .*'\*_x,\*_y' \(10 "):
-        find_landmark_columns(names)
+    refused(r"'lm_#_x,lm_#_y' \(9 .*'\*_x,\*_y' \(10 ", find_landmark_columns, names)
     assert len(find_landmark_columns(names, columns="lm_#_x,lm_#_y").x) == N_POINTS
     assert len(find_landmark_columns(names, columns="*_x,*_y").x) == N_POINTS + 1
 
@@ -128,8 +128,7 @@ def test_small_sets_do_not_compete_and_do_not_suffice():
     assert len(small) == 2 * (MIN_POINTS - 1)
     found = find_landmark_columns(small + named("{a}{p}"))
     assert found.pattern == "x#,y#"
-    with pytest.raises(ValueError, match=r"fewer than 7 points: '\*_x,\*_y' \(6\)"):
-        find_landmark_columns(small)
+    refused(r"fewer than 7 points: '\*_x,\*_y' \(6\)", find_landmark_columns, small)
     assert len(find_landmark_columns(small, columns="*_x,*_y").x) == MIN_POINTS - 1
 
 
@@ -153,8 +152,7 @@ def test_small_sets_do_not_compete_and_do_not_suffice():
     ],
 )
 def test_errors_name_what_is_wrong(names, columns, message):
-    with pytest.raises(ValueError, match=message):
-        find_landmark_columns(names, columns)
+    refused(message, find_landmark_columns, names, columns)
 
 
 OTHER_NAMES = "AU01_r pose_Tx p_rx FaceRectX x _x max0 frame index1 a,b_x x_ p_scale"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from refusals import refused
 
 import isa_nrsfm
 from isa_nrsfm import AffineNRSfM
@@ -88,8 +89,7 @@ def test_a_name_that_is_misspelt_is_an_error_at_once(name):
     with pytest.raises(AttributeError, match=rf"{name}.*'AffineNRSFM'") as error:
         package.AffineNRSFM  # noqa: B018
     assert error.value.name == "AffineNRSFM"
-    with pytest.raises(ImportError, match="AffineNRSFM"):
-        exec(f"from {name} import AffineNRSFM")
+    refused("AffineNRSFM", exec, f"from {name} import AffineNRSFM", error=ImportError)
 
 
 def test_a_name_is_asked_for_once(monkeypatch):
@@ -101,8 +101,7 @@ def test_a_name_is_asked_for_once(monkeypatch):
 def test_the_error_of_an_import_comes_through(monkeypatch):
     monkeypatch.delenv("EAGER_IMPORT", raising=False)
     find, _, _ = lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})
-    with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
-        find("Absent")
+    refused(r"isa_nrsfm\.isa\._absent", find, "Absent", error=ModuleNotFoundError)
     monkeypatch.setenv("EAGER_IMPORT", "1")
     with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
         lazy_names("isa_nrsfm.isa", {"isa_nrsfm.isa._absent": ["Absent"]})

@@ -5,12 +5,7 @@ import pytest
 
 pytest.importorskip("distributed", reason="needs the extra dask")
 
-from benchmarks.load import (
-    BACKENDS,
-    Load,
-    described,
-    under_load,
-)
+from benchmarks.load import BACKENDS, Load, described, under_load
 
 MEMORY = [90.0, 100.0, *[130.0] * 16, 103.0, 104.0]
 FINE = Load(190.0, 3, 1, [0.0, 1e-12], MEMORY, (8, 8), (5, 4))

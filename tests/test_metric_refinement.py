@@ -89,8 +89,7 @@ class TestParts:
         assert_allclose(ortho, np.linalg.norm(gram - np.eye(2), axis=(1, 2)))
 
     @both_cameras
-    def test_derivatives_by_central_differences(self, camera):
-        rng = np.random.default_rng(0)
+    def test_derivatives_by_central_differences(self, camera, rng):
         motion, alpha = rng.standard_normal((4, 2, 3)), rng.standard_normal((2, 4))
         basis = strain_basis(camera)
         numbers = 0.3 * rng.standard_normal((2, len(basis)))
@@ -128,8 +127,7 @@ class TestParts:
         assert_allclose(slopes, own_slopes)
 
     @both_cameras
-    def test_blocks_of_frames_add_up(self, camera):
-        rng = np.random.default_rng(0)
+    def test_blocks_of_frames_add_up(self, camera, rng):
         n = BLOCK_FRAMES + 10
         motion, alpha = rng.standard_normal((n, 2, 3)), rng.standard_normal((n, 2))
         strain = 0.1 * strain_basis(camera)[:2]

@@ -5,6 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from scipy.optimize import minimize
 from scipy.stats import ortho_group
 
@@ -112,8 +113,7 @@ class TestInverseSNR:
         ],
     )
     def test_refusals(self, X, X_hat, options, message):
-        with pytest.raises(ValueError, match=message):
-            inverse_snr(X, X_hat, **options)
+        refused(message, inverse_snr, X, X_hat, **options)
 
 
 class TestAffineShapeError:
@@ -300,8 +300,7 @@ class TestBasisSimilarity:
     )
     def test_errors(self, scene, arguments, message):
         basis = arguments.pop("basis", scene.basis)
-        with pytest.raises(ValueError, match=message):
-            basis_similarity(scene.basis, basis, **arguments)
+        refused(message, basis_similarity, scene.basis, basis, **arguments)
 
 
 class TestSubspaceDistance:
@@ -364,5 +363,4 @@ class TestSubspaceDistance:
         ],
     )
     def test_refusals(self, a, b, size, message):
-        with pytest.raises(ValueError, match=message):
-            subspace_distance(a, b, size)
+        refused(message, subspace_distance, a, b, size)

@@ -49,10 +49,7 @@ CHANGES = {
         lambda S, X: (S, SIGNS * X),
         {"affine", "frame", "frame, no scale"},
     ),
-    "rotations of frames": (
-        lambda S, X: (S, X @ TURNS),
-        {"frame", "frame, no scale"},
-    ),
+    "rotations of frames": (lambda S, X: (S, X @ TURNS), {"frame", "frame, no scale"}),
     "affinity": (lambda S, X: (S, X @ AFFINITY), {"affine"}),
     "singular affinity": (lambda S, X: (S, X @ np.diag([1, 1e3, 1e-3])), {"affine"}),
 }

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from scenes import random_rotation
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
@@ -74,7 +75,7 @@ class TestResult:
         assert found.cost == pytest.approx(cost_of(found.cameras))
 
     @pytest.mark.parametrize("noise_variance", [0.0, 1e-2])
-    def test_is_a_minimum(self, noise_variance):
+    def test_is_a_minimum(self, noise_variance, rng):
         P, _ = scene(0, noise=0.02)
         found = orthonormal_cameras(P, noise_variance)
 
@@ -86,7 +87,6 @@ class TestResult:
         Q = found.mixing.ravel()
         least = cost(Q)
         assert np.abs(approx_fprime(Q, cost, 1e-7)).max() < 1e-5 * np.abs(P).max()
-        rng = np.random.default_rng(0)
         assert all(
             cost(Q + size * np.abs(Q).max() * rng.normal(size=Q.shape)) > least
             for size in (1e-3, 1e-2, 1e-1)
@@ -99,10 +99,9 @@ class TestResult:
         assert (np.diff(costs) <= 1e-12).all()
         assert costs[-1] < 0.1 * costs[0]
 
-    def test_scales_and_triangular_mixtures_of_columns_do_not_matter(self):
+    def test_scales_and_triangular_mixtures_of_columns_do_not_matter(self, rng):
         P, _ = scene(1, noise=0.01)
         expected = orthonormal_cameras(P)
-        rng = np.random.default_rng(0)
         upper = np.triu(rng.normal(size=(P.shape[1],) * 2), 1) + np.eye(P.shape[1])
         for mixing in (upper, np.diag(10.0 ** rng.integers(-9, 9, P.shape[1]))):
             found = orthonormal_cameras(P @ mixing)
@@ -118,8 +117,7 @@ class TestResult:
 
 
 class TestNoise:
-    def test_price_is_what_noise_costs(self):
-        rng = np.random.default_rng(0)
+    def test_price_is_what_noise_costs(self, rng):
         cameras = Rotation.random(3000, np.random.default_rng(0)).as_matrix()[:, :2]
         Q = rng.normal(size=(5, 3))
         P = cameras.reshape(-1, 3) @ np.linalg.pinv(Q)
@@ -141,8 +139,7 @@ class TestNoise:
 
 
 @pytest.mark.parametrize("price", [0.0, 0.3])
-def test_derivatives(price):
-    rng = np.random.default_rng(0)
+def test_derivatives(price, rng):
     P, Q = rng.normal(size=(14, 5)), rng.normal(size=(5, 3))
     L = np.sqrt(price) * np.triu(rng.normal(size=(5, 5)))
     numerical = approx_fprime(
@@ -166,7 +163,7 @@ class TestMixture:
         ]
 
     @pytest.mark.parametrize("price", [0.0, 0.1])
-    def test_cost_by_its_definition_is_a_minimum(self, price):
+    def test_cost_by_its_definition_is_a_minimum(self, price, rng):
         P = self.columns(9)
         L = np.sqrt(price) * np.eye(9)
         Q, cost = orthonormal_mixture(P, np.eye(3), L)
@@ -177,7 +174,6 @@ class TestMixture:
         assert cost == pytest.approx(value(Q))
         gradient = approx_fprime(Q.ravel(), lambda q: value(q.reshape(9, 3)), 1e-7)
         assert np.abs(gradient).max() < 1e-4
-        rng = np.random.default_rng(0)
         assert all(
             value(Q + size * rng.normal(size=Q.shape)) > cost
             for size in (1e-2, 1e-1)
@@ -197,14 +193,12 @@ class TestPrincipalColumns:
         assert_allclose(np.abs(cosines), np.eye(rank), atol=1e-8)
 
     @pytest.mark.parametrize("rank", [1, 3, 9])
-    def test_of_exact_tables_are_as_many_as_their_rank(self, rank):
-        rng = np.random.default_rng(0)
+    def test_of_exact_tables_are_as_many_as_their_rank(self, rank, rng):
         W = rng.normal(size=(120, rank)) @ rng.normal(size=(rank, 40))
         assert principal_columns(W).shape == (120, rank)
 
 
-def test_polar_factors():
-    rng = np.random.default_rng(0)
+def test_polar_factors(rng):
     cameras = rng.normal(size=(6, 2, 3))
     nearest = polar(cameras)[0]
     assert_allclose(orthonormality_residuals(nearest), np.zeros((3, 6)), atol=1e-14)
@@ -238,9 +232,7 @@ class TestColumns:
         ],
     )
     def test_are_refused(self, columns, message):
-        with pytest.raises(ValueError, match=message):
-            orthonormal_cameras(columns)
+        refused(message, orthonormal_cameras, columns)
 
     def test_variance_is_not_negative(self):
-        with pytest.raises(ValueError, match="must not be negative; got -1"):
-            orthonormal_cameras(scene(0)[0], -1.0)
+        refused("must not be negative; got -1", orthonormal_cameras, scene(0)[0], -1.0)

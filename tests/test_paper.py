@@ -5,10 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import (
-    random_rotation,
-    spherical_sources,
-)
+from scenes import random_rotation, spherical_sources
 from sklearn.base import BaseEstimator
 
 from isa_nrsfm import FastISA, PooledFastICA
@@ -18,11 +15,7 @@ from isa_nrsfm._paper.pipeline import run_paper_pipeline
 from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
 
-OPTIONS = {
-    "block_recovery": "generalized_eigen",
-    "max_iter": 500,
-    "tol": 1e-12,
-}
+OPTIONS = {"block_recovery": "generalized_eigen", "max_iter": 500, "tol": 1e-12}
 
 
 class Found(NamedTuple):
@@ -130,10 +123,7 @@ class TestIdealData:
 
     @pytest.mark.parametrize(
         "isa",
-        [
-            FastISA(n_init=3, random_state=0),
-            PooledFastICA(n_init=3, random_state=0),
-        ],
+        [FastISA(n_init=3, random_state=0), PooledFastICA(n_init=3, random_state=0)],
     )
     def test_three_basis_shapes_are_found_up_to_sampling(self, isa):
         W, shapes = ideal_matrix(0, 3, n_points=2000)
@@ -181,10 +171,7 @@ class TestIdentities:
     def test_stages_are_reported_in_order(self, faces):
         stages = []
         run(faces, 2, report=stages.append)
-        assert stages == [
-            "independent subspaces",
-            "block structure and refinement",
-        ]
+        assert stages == ["independent subspaces", "block structure and refinement"]
 
 
 class Recorder(BaseEstimator):

@@ -212,8 +212,7 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert widths[0] == widths[1] == widths[2] < widths[3] / 2
 
 
-def test_notes_of_narrow_side_views_end_within_the_figure():
-    rng = np.random.default_rng(0)
+def test_notes_of_narrow_side_views_end_within_the_figure(rng):
     narrow = np.array([0.2, 1.0, 0.2])
     display = BasisShapeDisplay(
         mean_shape=narrow * rng.normal(size=(20, 3)),

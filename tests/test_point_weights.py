@@ -10,6 +10,7 @@ import pytest
 import sklearn
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from refusals import refused
 from scenes import random_scene
 from sklearn.base import clone
 from sklearn.exceptions import UnsetMetadataPassedError
@@ -169,9 +170,8 @@ class TestAccuracy:
         assert (model.alpha_std_ > 1.2 * fitted().alpha_std_).all()
         assert (model.alpha_std_ < 1.8 * fitted().alpha_std_).all()
 
-    def test_many_points_are_refined_with_weights(self):
+    def test_many_points_are_refined_with_weights(self, rng):
         scene = make_nonrigid_tracks(N_FRAMES, 320, K, random_state=0)
-        rng = np.random.default_rng(0)
         deviation = np.where(rng.random((N_FRAMES, 320)) < 0.4, 0.3, 0.01)
         noise = deviation[..., None] * rng.normal(size=scene.tracks.shape)
         X = (scene.tracks + noise).reshape(N_FRAMES, -1)
@@ -209,12 +209,11 @@ class TestMethods:
         unkept = clone(model).set_params(keep_frames=False)
         assert_array_equal(unkept.fit_transform(X, point_weight=weights), alpha)
 
-    def test_score_counts_points_by_weight(self):
+    def test_score_counts_points_by_weight(self, rng):
         model, (X, weights, _) = fitted(), noisy()
         # 1e-4 of the noise plus that of the predictions; 0.04 without weights
         assert -1e-3 < model.score(X, point_weight=weights) < -1e-4
         assert model.score(X) < -0.01
-        rng = np.random.default_rng(0)
         assert model.score(X, point_weight=rng.permuted(weights, axis=1)) < -0.01
 
     def test_orthographic_cameras_have_one_weighted_size(self):
@@ -232,14 +231,13 @@ class TestMethods:
 class TestFrames:
     """Frames with numbers of observations, in the likelihood."""
 
-    def test_gradient(self):
+    def test_gradient(self, rng):
         scene = random_scene(noise=0.05, kind="missing")
         rows = FrameBlocks.of_array(scene.centred.transpose(0, 2, 1), 7)
         weights = 3.0 * scene.weights
         likelihood = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
         assert likelihood.n_seen == pytest.approx(2 * weights.sum())
         at = likelihood(scene.shapes, scene.motion, 0.01)
-        rng = np.random.default_rng(0)
         turn, step = rng.normal(size=scene.shapes.shape), 1e-6
         values = [
             likelihood(scene.shapes + s * turn, scene.motion, 0.01).value
@@ -277,8 +275,7 @@ class TestFrames:
         part = JointFrames.from_repeated(rows, scene.weights).take(np.arange(5))
         assert part.totals[0] == pytest.approx(2 * scene.weights[:5].sum())
 
-    def test_sizes(self):
-        rng = np.random.default_rng(0)
+    def test_sizes(self, rng):
         tracks, weights = rng.normal(size=(3, 6, 2)), rng.integers(0, 4, (3, 6))
         expected = []
         for points, w in zip(tracks, weights, strict=True):
@@ -345,16 +342,13 @@ class TestRefusals:
         weights = noisy().weights.copy()
         weights[2, 3] = value
         model = estimator() if method == "fit" else fitted()
-        with pytest.raises(ValueError, match=message):
-            getattr(model, method)(noisy().X, point_weight=weights)
+        refused(message, getattr(model, method), noisy().X, point_weight=weights)
 
     @pytest.mark.parametrize("shape", [(60, 40), (59, 20), (1, 20)])
     def test_shape(self, shape):
         message = r"a column for each point, the shape \(60, 20\); got "
-        with pytest.raises(ValueError, match=message):
-            estimator().fit(noisy().X, point_weight=np.ones(shape))
-        with pytest.raises(ValueError, match=message):
-            fitted().transform(noisy().X, point_weight=np.ones(shape))
+        refused(message, estimator().fit, noisy().X, point_weight=np.ones(shape))
+        refused(message, fitted().transform, noisy().X, point_weight=np.ones(shape))
 
     @pytest.mark.parametrize(
         ("params", "message"),
@@ -388,8 +382,7 @@ class TestRefusals:
     def test_fewer_observations_than_unknowns(self, camera, least):
         weights = noisy().weights * (0.99 * least * N_FRAMES / noisy().weights.sum())
         message = f"fewer than the {least} that .* Multiply point_weight by a number"
-        with pytest.raises(ValueError, match=message):
-            estimator(camera=camera).fit(noisy().X, point_weight=weights)
+        refused(message, estimator(camera=camera).fit, noisy().X, point_weight=weights)
 
     def test_models_without_a_fit(self):
         with pytest.raises(ValueError, match="not fitted"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from groupings import GROUPINGS, energy_inside
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from scenes import random_rotation, spherical_sources
 from sklearn.exceptions import ConvergenceWarning
 
@@ -87,8 +88,7 @@ class TestCovariance:
         ],
     )
     def test_bad_covariances_are_refused(self, planted, covariance, message):
-        with pytest.raises(ValueError, match=message):
-            PooledFastICA().fit(planted[0], covariance=covariance)
+        refused(message, PooledFastICA().fit, planted[0], covariance=covariance)
 
 
 class TestLikelihood:

@@ -3,9 +3,9 @@
 import warnings
 
 import numpy as np
-import pytest
 from hypothesis import assume, given, strategies as st
 from numpy.testing import assert_allclose
+from refusals import refused
 from sklearn.base import BaseEstimator
 from sklearn.exceptions import ConvergenceWarning
 
@@ -114,11 +114,9 @@ def test_tables_are_refused_if_and_only_if_they_are_too_small(
             if largest > 0
             else "at least 7 points are needed for n_components=1$"
         )
-        with pytest.raises(ValueError, match=message):
-            fit(tracks, n_components)
+        refused(message, fit, tracks, n_components)
     elif n_frames < smallest:
-        with pytest.raises(ValueError, match=f"at least {smallest} frames"):
-            fit(tracks, n_components)
+        refused(f"at least {smallest} frames", fit, tracks, n_components)
     else:
         assert fit(tracks, n_components).basis_.shape == (n_components, n_points, 3)
 
@@ -135,8 +133,7 @@ def test_frames_of_equal_points_are_refused(table, rows, value, dtype):
     broken = tracks.astype(dtype)
     broken[sorted(rows)] = np.array([value, -3.0 * value], dtype)
     message = rf"equal in {len(rows)} of \d+ frames \(first: row {min(rows)}\)"
-    with pytest.raises(ValueError, match=message):
-        fit(broken, n_components)
+    refused(message, fit, broken, n_components)
     # New frames of this kind have no camera.
     frames = fit(tracks, n_components).decompose(broken.reshape(len(broken), -1))
     unknown = np.isin(np.arange(len(broken)), list(rows))

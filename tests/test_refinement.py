@@ -5,16 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import (
-    measurements,
-    structured_motion,
-)
+from scenes import measurements, structured_motion
 
 from isa_nrsfm._paper.alternating import _step, refine_alternating
-from isa_nrsfm._paper.block_structure import (
-    motion_products,
-    recover_blocks,
-)
+from isa_nrsfm._paper.block_structure import motion_products, recover_blocks
 from isa_nrsfm._paper.factors import factorise
 
 
@@ -185,9 +179,7 @@ class TestInvariances:
     def test_units(self, scene, result, unit):
         for of_rigid, of_motion in ((unit, unit), (1.0, unit), (unit, 1.0)):
             other = refine(
-                of_rigid * scene.rigid,
-                of_motion * scene.motion,
-                random_starts(0, 3, 4),
+                of_rigid * scene.rigid, of_motion * scene.motion, random_starts(0, 3, 4)
             )
             same_up_to_sign(other.E, result.E, atol=1e-6)
             assert_allclose(other.energy / of_motion**2, result.energy)

@@ -200,8 +200,7 @@ class TestSizes:
 
 
 class TestDistantPoints:
-    def test_by_definition(self):
-        rng = np.random.default_rng(0)
+    def test_by_definition(self, rng):
         tracks = rng.normal(size=(10, 15, 2))
         tracks[3, :4] = np.nan
         tracks[5, 2] += 8 * DISTANT

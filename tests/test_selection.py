@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import sklearn
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import refused
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.model_selection import (
     GridSearchCV,
@@ -266,22 +267,19 @@ def test_fewest_basis_shapes_are_fitted():
     ],
 )
 def test_what_cannot_be_tried_is_refused(parameters, message):
-    with pytest.raises(ValueError, match=message):
-        AffineNRSfMCV(**parameters).fit(X)
+    refused(message, AffineNRSfMCV(**parameters).fit, X)
 
 
 def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
     monkeypatch.delattr("isa_nrsfm._selection.estimator.walk")
-    with pytest.raises(ValueError, match="n_components=500"):
-        AffineNRSfMCV((1, 500)).fit(X)
+    refused("n_components=500", AffineNRSfMCV((1, 500)).fit, X)
 
 
 def test_the_limit_of_the_parts_is_named():
     few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
-    with pytest.raises(
-        ValueError, match=r"9 frames, enough for n_components=3 at most"
-    ):
-        AffineNRSfMCV((3, 5)).fit(few)
+    refused(
+        r"9 frames, enough for n_components=3 at most", AffineNRSfMCV((3, 5)).fit, few
+    )
     hidden = X.copy()
     hidden[6:, :2] = np.nan  # five of the six rows that show it are held out
     with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):

@@ -149,11 +149,7 @@ class TestReturned:
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     "kinds",
-    [
-        ["product"] * 4,
-        ["student", "product", "gaussian", "uniform"],
-        ["gaussian"] * 4,
-    ],
+    [["product"] * 4, ["student", "product", "gaussian", "uniform"], ["gaussian"] * 4],
     ids=["heavy", "mixed", "gaussian"],
 )
 class TestInvariance:
@@ -181,17 +177,15 @@ class TestInvariance:
 
 class TestOptimality:
     @pytest.mark.parametrize("size", [1, 3])
-    def test_no_mixing_near_by_is_likelier(self, size):
+    def test_no_mixing_near_by_is_likelier(self, size, rng):
         Z = white(sources(["product", "uniform", "student", "laplace"], 0, 200, size))
         W = shared_mixing(Z)
         most = _shared_mixing._fit_densities(W, Z)[0]
-        rng = np.random.default_rng(0)
         for _ in range(50):
             E = 1e-3 * rng.normal(size=W.shape)
             assert _shared_mixing._fit_densities(W + E @ W, Z)[0] < most
 
-    def test_derivatives_by_differences(self):
-        rng = np.random.default_rng(0)
+    def test_derivatives_by_differences(self, rng):
         Y, tail = rng.normal(size=(3, 40, 3)), np.array([[2.0], [LIGHT], [8.0]])
 
         def likelihood(E):
@@ -250,8 +244,7 @@ class TestDensities:
 
     @pytest.mark.parametrize("size", [1, 3])
     @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
-    def test_tail_and_scale_are_found(self, size, scale):
-        rng = np.random.default_rng(0)
+    def test_tail_and_scale_are_found(self, size, scale, rng):
         shape = (1, 20_000, size)
         student = rng.normal(size=shape) / np.sqrt(
             rng.chisquare(8, size=(1, 20_000, 1)) / 8
@@ -281,8 +274,7 @@ class TestDensities:
 
 
 class TestSteps:
-    def test_few_samples_are_spread_from_the_smallest_to_the_largest(self):
-        rng = np.random.default_rng(0)
+    def test_few_samples_are_spread_from_the_smallest_to_the_largest(self, rng):
         few = rng.normal(size=(2, 3000, 3))
         assert _shared_mixing._few_samples(few) is few
         many = rng.normal(size=(2, 6000, 3))
@@ -308,8 +300,7 @@ class TestSteps:
             U, _, Vt = np.linalg.svd(start)
             assert_allclose(end, U @ Vt, atol=1e-10)
 
-    def test_ascent_maximises_the_quadratic_model_or_there_is_none(self):
-        rng = np.random.default_rng(0)
+    def test_ascent_maximises_the_quadratic_model_or_there_is_none(self, rng):
         n, size, shift = 5, 3, 0.5
         root, gradient = rng.normal(size=(n, n, n)), rng.normal(size=(n, n))
         blocks = -(root @ root.transpose(0, 2, 1)) - 4.0 * np.eye(n)
@@ -369,9 +360,8 @@ class TestDegenerate:
 
     @pytest.mark.parametrize("n_moving", [1, 8, 20])
     @pytest.mark.parametrize("shift", [0.0, 1.0])
-    def test_most_points_rest(self, n_moving, shift):
+    def test_most_points_rest(self, n_moving, shift, rng):
         # Signals that vanish at most samples: the likelihood must have a bound.
-        rng = np.random.default_rng(0)
         signals = np.zeros((5, 68, 3)) + shift * rng.normal(size=(5, 1, 3))
         signals[:, :n_moving] += sources(["product"] * 5, 0, 68, 3)[:, :n_moving]
         signals -= signals.mean(axis=1, keepdims=True)

@@ -227,8 +227,7 @@ def test_packing_of_3x3_matrices():
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_procrustes_rotations_are_those_of_scipy(mirrored):
-    rng = np.random.default_rng(0)
+def test_procrustes_rotations_are_those_of_scipy(mirrored, rng):
     shapes = rng.standard_normal((20, 7, 3))
     target = shapes * [1.0, 1.0, -1.0] if mirrored else shapes[::-1]
     found = procrustes(target.transpose(0, 2, 1) @ shapes)

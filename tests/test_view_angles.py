@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm.calibration import view_angles
@@ -17,8 +18,7 @@ def rotation(yaw, pitch, roll):
     return R
 
 
-def test_angles_of_their_definition():
-    rng = np.random.default_rng(0)
+def test_angles_of_their_definition(rng):
     wanted = rng.uniform([-180, -90, -180], [180, 90, 180], (50, 3))
     found = view_angles([rotation(*each) for each in wanted])
     assert_allclose(np.transpose(found), wanted, atol=1e-9)
@@ -48,5 +48,4 @@ def test_frames_without_a_rotation_have_no_angles():
     ],
 )
 def test_refusals(rotations, message):
-    with pytest.raises(ValueError, match=message):
-        view_angles(rotations)
+    refused(message, view_angles, rotations)
