@@ -112,6 +112,33 @@ def run(capsys):
 
 
 @pytest.fixture
+def succeeds(run):
+    """Return a function that runs a command that succeeds: its output and errors."""
+
+    def outputs(*argv):
+        code, out, err = run(*argv)
+        assert code == 0, err
+        return out, err
+
+    return outputs
+
+
+@pytest.fixture
+def fails(run):
+    """Return a function that runs a command that fails and returns its message."""
+
+    def message(*argv):
+        code, out, err = run(*argv)
+        assert (code, out) == (1, "")
+        last = err.splitlines()[-1]
+        assert last.startswith("isa-nrsfm: error: ")
+        assert "Traceback" not in err
+        return last
+
+    return message
+
+
+@pytest.fixture
 def landmark_tables(monkeypatch):
     """Widen the tables of scikit-learn's checks to tables of landmarks."""
     # They hand their tables to no function of ours on the way.

@@ -64,21 +64,6 @@ def fitted(table, tmp_path_factory):
 
 
 @pytest.fixture
-def fails(run):
-    """Return a function that runs a command that fails and returns its message."""
-
-    def message(*argv):
-        code, out, err = run(*argv)
-        assert (code, out) == (1, "")
-        last = err.splitlines()[-1]
-        assert last.startswith("isa-nrsfm: error: ")
-        assert "Traceback" not in err
-        return last
-
-    return message
-
-
-@pytest.fixture
 def changed(faces, tmp_path):
     """Return a function that writes a changed copy of the table."""
 
@@ -197,9 +182,8 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
         ),
     ],
 )
-def test_options_reach_the_estimator(run, table, tmp_path, options, expected):
-    code, out, _ = run("fit", table, "-o", tmp_path, "--no-figures", *options.split())
-    assert code == 0
+def test_options_reach_the_estimator(succeeds, table, tmp_path, options, expected):
+    out, _ = succeeds("fit", table, "-o", tmp_path, "--no-figures", *options.split())
     found = load_model(tmp_path / MODEL).get_params()
     default = AffineNRSfM(random_state=0).get_params()
     assert type(found["isa"]).__name__ == "FastISA"
@@ -248,7 +232,7 @@ def test_calibrated_cameras(run, tmp_path, camera):
     assert f"{camera.replace('_', '-')} cameras" in page
 
 
-def test_outliers_are_reported(run, tmp_path):
+def test_outliers_are_reported(succeeds, tmp_path):
     scene = make_nonrigid_tracks(60, 20, 1, noise=0.01, random_state=0)
     table = pd.DataFrame(scene.data, columns=scene.feature_names)
     for row in range(8, 16):
@@ -256,8 +240,7 @@ def test_outliers_are_reported(run, tmp_path):
     table["name"] = np.where(np.arange(60) < 5, "skip", "keep")
     table.to_csv(tmp_path / "faces.csv", index=False)
     fit = ["fit", tmp_path / "faces.csv", "-o", tmp_path, "--no-figures", "-k", 1]
-    code, out, err = run(*fit, "--skip-rows", "name=skip")
-    assert code == 0
+    out, err = succeeds(*fit, "--skip-rows", "name=skip")
     assert "warning: the table has outliers: " in err
     assert "Use --loss cauchy, or correct them" in err
     model = report_of(tmp_path)["model"]
@@ -269,20 +252,18 @@ def test_outliers_are_reported(run, tmp_path):
     assert 4 <= len(largest) == model["outliers"]["n_points"]
     assert {row for row, _ in largest} < {*range(8, 16)}
     assert all(point == row for row, point in largest[:4])
-    code, _, err = run(*fit, "--loss", "cauchy")
-    assert code == 0
+    _, err = succeeds(*fit, "--loss", "cauchy")
     assert "outliers" not in err
 
 
-def test_rows_with_missing_points_are_fitted(run, changed, faces, tmp_path):
+def test_rows_with_missing_points_are_fitted(succeeds, changed, faces, tmp_path):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0  # 9 is an ir row
         faces.loc[[4, 11], ["x_7", "y_7"]] = np.nan
         faces.loc[12, "y_8"] = np.nan
 
     options = ["--skip-rows", "name=^ir", "--zeros-missing", *UNREFINED]
-    code, out, err = run("fit", changed(change), "-o", tmp_path, *options)
-    assert code == 0
+    out, err = succeeds("fit", changed(change), "-o", tmp_path, *options)
     # The row is that of the table, however many are skipped before.
     assert len(err.splitlines()) == 1
     assert "point 8 (x_8, y_8) in row 12" in err
@@ -307,7 +288,7 @@ def test_rows_with_missing_points_are_fitted(run, changed, faces, tmp_path):
 
 
 def test_rows_that_cannot_be_fitted_are_counted_and_empty(
-    run, changed, faces, tmp_path
+    succeeds, changed, faces, tmp_path
 ):
     def change(faces):
         faces.loc[[4, 9], LANDMARKS] = np.nan  # 9 is an ir row
@@ -318,8 +299,8 @@ def test_rows_that_cannot_be_fitted_are_counted_and_empty(
 
     path, skipped = changed(change), ["--skip-rows", "name=^ir"]
     options = [*skipped, "--skip-rows", "code = 1$|^nothing", "--std", *NO_FIGURES]
-    code, out, err = run("fit", path, "-o", tmp_path, *options)
-    assert (code, err) == (0, "")
+    out, err = succeeds("fit", path, "-o", tmp_path, *options)
+    assert err == ""
     left_out = report_of(tmp_path)["table"]["rows_left_out"]
     assert {each["reason"]: each["first_rows"] for each in left_out} == {
         "name matches '^ir'": [9, 19, 29, 39, 49, 59],
@@ -342,9 +323,8 @@ def test_rows_that_cannot_be_fitted_are_counted_and_empty(
     assert list(alpha["name"]) == list(faces["name"][kept])
     # transform leaves out the same rows, and gives the same numbers.
     again = tmp_path / "again.csv"
-    code, out, _ = run("transform", tmp_path / MODEL, path, "-o", again, "--std",
+    out, _ = succeeds("transform", tmp_path / MODEL, path, "-o", again, "--std",
                        *skipped)  # fmt: skip
-    assert code == 0
     assert " 1  without coefficients: points on one line, others missing\n" in out
     again = pd.read_csv(again)
     assert list(again) == list(alpha)
@@ -374,12 +354,11 @@ def test_standard_deviations_are_written_where_they_are_known(
     assert "was fitted with refinement=None" in message
 
 
-def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
+def test_points_at_zero_cause_a_warning(succeeds, changed, tmp_path):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = 0.0
 
-    code, _, err = run("fit", changed(change), "-o", tmp_path, *NO_FIGURES, "-k", 1)
-    assert code == 0
+    _, err = succeeds("fit", changed(change), "-o", tmp_path, *NO_FIGURES, "-k", 1)
     zeros, few = report_of(tmp_path)["warnings"]
     assert "".join(f"isa-nrsfm: warning: {text}\n" for text in (zeros, few)) == err
     assert zeros.startswith("in 2 of 60 rows points are at exactly (0, 0) (2 in all).")
@@ -388,7 +367,7 @@ def test_points_at_zero_cause_a_warning(run, changed, tmp_path):
 
 
 def test_origin_of_the_coordinates_is_not_a_missing_point(
-    run, fails, changed, tmp_path
+    succeeds, fails, changed, tmp_path
 ):
     def change(faces):
         nose = faces[["x_30", "y_30"]].to_numpy()
@@ -396,8 +375,7 @@ def test_origin_of_the_coordinates_is_not_a_missing_point(
         faces.loc[1, LANDMARKS] *= -1  # the origin is (-0, -0)
 
     path, folder = changed(change), tmp_path / "results"
-    code, _, err = run("fit", path, "-o", folder, *UNREFINED)
-    assert code == 0
+    _, err = succeeds("fit", path, "-o", folder, *UNREFINED)
     assert "(0, 0)" not in err
     assert "(-0" not in err
     message = fails("fit", path, "-o", folder, *UNREFINED, "--zeros-missing")
@@ -407,7 +385,7 @@ def test_origin_of_the_coordinates_is_not_a_missing_point(
     assert "leave out --zeros-missing" in message
     left = message.partition("--points ")[2]
     options = ["--zeros-missing", "--points", left]
-    assert run("fit", path, "-o", folder, *UNREFINED, *options)[0] == 0
+    succeeds("fit", path, "-o", folder, *UNREFINED, *options)
 
 
 def test_zeros_of_a_point_that_no_row_shows_cause_a_warning(run, changed, tmp_path):
@@ -419,7 +397,7 @@ def test_zeros_of_a_point_that_no_row_shows_cause_a_warning(run, changed, tmp_pa
     assert "in 60 of 60 rows points are at exactly (0, 0) (60 in all)" in err
 
 
-def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path):
+def test_transform_gives_each_row_its_coefficients(succeeds, fitted, faces, tmp_path):
     model = load_model(fitted / MODEL)
     new = faces.iloc[::-1].reset_index(drop=True)
     new.loc[2, ["x_3", "y_3"]] = np.nan
@@ -427,10 +405,9 @@ def test_transform_gives_each_row_its_coefficients(run, fitted, faces, tmp_path)
     shuffled = new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]]
     path, output = tmp_path / "new.parquet", tmp_path / "new-alpha.csv"
     shuffled.to_parquet(path)
-    code, out, err = run(
+    out, err = succeeds(
         "transform", fitted / MODEL, path, "-o", output, "--skip-rows", "name=^ir"
     )
-    assert code == 0
     assert "renamed to alpha_1_ (not alpha_1)\n" in err
     assert out.startswith("2 coefficients of 54 frames\n")
     assert " 1 points (0.0272 %) are missing in 1 of these rows\n" in out
@@ -478,17 +455,15 @@ def test_transform_knows_the_missing_points_of_the_fit(
     pd.testing.assert_frame_equal(alpha, expected)
 
 
-def test_transform_of_no_usable_row_is_empty(run, fitted, faces, tmp_path):
+def test_transform_of_no_usable_row_is_empty(succeeds, fitted, faces, tmp_path):
     path, output = tmp_path / "new.csv", tmp_path / "alpha.tsv"
     faces.assign(**dict.fromkeys(LANDMARKS, "")).to_csv(path, index=False)
     transform = ["transform", fitted / MODEL, path, "-o", output]
-    code, out, _ = run(*transform)
-    assert code == 0
+    out, _ = succeeds(*transform)
     assert "60  without coefficients: all points missing" in out
     assert "no frame was fitted" in out
     assert pd.read_csv(output, sep="\t")["alpha_2"].isna().all()
-    code, out, _ = run(*transform, "--skip-rows", "name=i")
-    assert code == 0
+    out, _ = succeeds(*transform, "--skip-rows", "name=i")
     assert out.endswith(" 0 rows\n")
 
 
@@ -531,7 +506,7 @@ def test_transform_names_the_difference_between_points(fails, fitted, faces, tmp
     assert "the model has 20 points, the table has 68 (x_#,y_#)" in message
 
 
-def test_columns_choose_among_several_sets(run, fails, faces, tmp_path):
+def test_columns_choose_among_several_sets(succeeds, fails, faces, tmp_path):
     path = tmp_path / "faces.csv"
     eyes = faces[LANDMARKS].add_prefix("eye_")
     pd.concat([faces, eyes], axis=1).to_csv(path, index=False)
@@ -548,8 +523,7 @@ def test_columns_choose_among_several_sets(run, fails, faces, tmp_path):
         *UNREFINED,
         "--no-figures",
     ]
-    code, out, _ = run(*fit)
-    assert code == 0
+    out, _ = succeeds(*fit)
     assert "eye_x_0, eye_y_0, eye_x_1, eye_y_1, ..., eye_x_67, eye_y_67" in out
     assert "coordinates not used: x_#,y_# (68)" in out
 
@@ -781,13 +755,12 @@ def test_demo_writes_a_table_and_finds_its_faces(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_table_as_it_is_distributed(run, data_path, tmp_path):
+def test_table_as_it_is_distributed(succeeds, data_path, tmp_path):
     table = data_path("raw/muct76-opencv.csv")
-    code, out, err = run(
+    out, err = succeeds(
         "fit", table, "--skip-rows", "name=^ir", "--zeros-missing", "-k", "2",
         "--n-init", "1", "--no-figures", "-o", tmp_path,
     )  # fmt: skip
-    assert code == 0
     # Faces of this table are turned, and their jaw is the visible outline.
     (warned,) = err.splitlines()
     assert "15 points of xm2vts-68 follow the visible outline" in warned

@@ -50,7 +50,7 @@ def test_paths_that_are_not_utf8(run, faces, tmp_path):
     assert page.stat().st_size > 0
 
 
-def test_files_of_points_whose_names_are_not_utf8(run, faces, tmp_path):
+def test_files_of_points_whose_names_are_not_utf8(succeeds, faces, tmp_path):
     folder = tmp_path / os.fsdecode(b"pts \xfe")
     folder.mkdir()
     points = faces.iloc[:, 1:].to_numpy().reshape(40, -1, 2)
@@ -60,8 +60,7 @@ def test_files_of_points_whose_names_are_not_utf8(run, faces, tmp_path):
         (folder / f"{i:02d} {NOT_UTF8}.pts").write_text(text)
     found = read_landmarks(folder)
     assert found.frames["file"][3] == "03 caf\\udce9 \\udcff.pts"
-    code, _, errors = run("fit", folder, "-o", tmp_path / "results", *QUICK)
-    assert code == 0, errors
+    succeeds("fit", folder, "-o", tmp_path / "results", *QUICK)
     alpha = pd.read_csv(tmp_path / "results" / "alpha.csv")
     assert list(alpha["file"]) == list(found.frames["file"])
 

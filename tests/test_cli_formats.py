@@ -104,33 +104,29 @@ def test_files_are_fitted_and_transformed(write, run, tmp_path):
         (write_pts, "--min-confidence 1", "is given, but these landmarks (pts)"),
     ],
 )
-def test_options_without_effect_are_refused(run, tmp_path, write, options, message):
+def test_options_without_effect_are_refused(fails, tmp_path, write, options, message):
     path, *_ = write(tmp_path)
     folder = ["-o", tmp_path / "results", *QUICK]
-    code, _, err = run("fit", path, *options.split(), *folder)
-    assert code == 1
-    assert message in err
+    assert message in fails("fit", path, *options.split(), *folder)
 
 
-def test_columns_make_any_file_a_table(run, tmp_path):
+def test_columns_make_any_file_a_table(succeeds, tmp_path):
     path, *_ = write_openface(tmp_path)
-    code, out, _ = run("fit", path, "--columns", "x_#,y_#", "-o", tmp_path, *QUICK)
-    assert code == 0
+    out, _ = succeeds("fit", path, "--columns", "x_#,y_#", "-o", tmp_path, *QUICK)
     assert "fitted to 40 frames" in out
 
 
-def test_a_model_of_other_points_is_refused(run, tmp_path):
+def test_a_model_of_other_points_is_refused(fails, succeeds, tmp_path):
     # All name their points x_0, y_0, ..., and are not the same points.
     path, *_ = write_pts(tmp_path)
     folder, output = tmp_path / "results", ["-o", tmp_path / "a.csv"]
-    assert run("fit", path, "-o", folder, *QUICK)[0] == 0
+    succeeds("fit", path, "-o", folder, *QUICK)
     mesh, options, *_ = write_mediapipe(tmp_path)
-    code, _, err = run("transform", folder / MODEL, mesh, *output, *options)
-    assert code == 1
-    assert "820 columns are only in the table (x_68, y_68," in err
+    assert "820 columns are only in the table (x_68, y_68," in fails(
+        "transform", folder / MODEL, mesh, *output, *options
+    )
     openface, *_ = write_openface(tmp_path)
-    code, out, _ = run("transform", folder / MODEL, openface, *output)
-    assert code == 0
+    out, _ = succeeds("transform", folder / MODEL, openface, *output)
     assert "1  without coefficients: tracking failed" in out
 
 
@@ -153,7 +149,7 @@ def with_confidences(folder, axes):
         ("{0}_{1}", "score"),
     ],
 )
-def test_confidences_of_a_plain_table(run, tmp_path, axes, word):
+def test_confidences_of_a_plain_table(succeeds, tmp_path, axes, word):
     table, confidence, path = with_confidences(tmp_path, axes)
     points = table.columns[1:]
     for j in range(20):
@@ -161,16 +157,16 @@ def test_confidences_of_a_plain_table(run, tmp_path, axes, word):
     table.to_csv(path, index=False)
     folder, blanked = tmp_path / "results", tmp_path / "blanked"
     unsure = ["--min-confidence", "0.4"]
-    assert run("fit", path, "-o", folder, *QUICK, *unsure)[0] == 0
+    succeeds("fit", path, "-o", folder, *QUICK, *unsure)
     alpha = pd.read_csv(folder / "alpha.csv")
     assert list(alpha) == ["row", "id", "alpha_1"]
     without = table[["id", *points]].copy()
     without[points] = without[points].mask(np.repeat(confidence < 0.4, 2, axis=1))
     without.to_csv(tmp_path / "without.csv", index=False)
-    assert run("fit", tmp_path / "without.csv", "-o", blanked, *QUICK)[0] == 0
+    succeeds("fit", tmp_path / "without.csv", "-o", blanked, *QUICK)
     pd.testing.assert_frame_equal(alpha, pd.read_csv(blanked / "alpha.csv"))
     output = tmp_path / "again.csv"
-    assert run("transform", folder / MODEL, path, "-o", output, *unsure)[0] == 0
+    succeeds("transform", folder / MODEL, path, "-o", output, *unsure)
     np.testing.assert_allclose(
         pd.read_csv(output)["alpha_1"], alpha["alpha_1"], atol=1e-3
     )
@@ -180,8 +176,7 @@ def test_confidences_of_a_plain_table(run, tmp_path, axes, word):
     np.testing.assert_array_equal(found.points, without[points])
     assert list(found.frames) == ["id"]
     # Unused, they are counted, and not copied.
-    code, out, _ = run("fit", path, "-o", folder, *QUICK)
-    assert code == 0
+    out, _ = succeeds("fit", path, "-o", folder, *QUICK)
     assert f"not used: {axes.format(word, 0)}, ... (confidences) (20)" in out
     assert list(pd.read_csv(folder / "alpha.csv")) == ["row", "id", "alpha_1"]
 
@@ -232,10 +227,11 @@ def write_shares(folder, change=lambda shares: shares):
     ],
     ids=["shares", "4 % outside", "6 % outside", "centred", "scaled", "pixels"],
 )
-def test_shares_of_an_image_in_a_plain_table_are_named(run, tmp_path, change, is_named):
+def test_shares_of_an_image_in_a_plain_table_are_named(
+    succeeds, tmp_path, change, is_named
+):
     path = write_shares(tmp_path, change)
-    code, _, err = run("fit", path, "-o", tmp_path / "results", *QUICK)
-    assert code == 0
+    _, err = succeeds("fit", path, "-o", tmp_path / "results", *QUICK)
     assert (SHARES in err) == is_named
     assert ("--format mediapipe --image-size" in err) == is_named
 
@@ -243,15 +239,14 @@ def test_shares_of_an_image_in_a_plain_table_are_named(run, tmp_path, change, is
 MEDIAPIPE = ["--format", "mediapipe", "--image-size", "1920x1080"]
 
 
-def test_points_outside_of_the_image_are_counted(run, tmp_path):
+def test_points_outside_of_the_image_are_counted(succeeds, tmp_path):
     def change(shares):
         shares[3, 5] = [0.5, 1.25]
         shares[4, 6] = [-0.125, 0.5]
         return shares
 
     path = write_shares(tmp_path, change)
-    code, _, err = run("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
-    assert code == 0
+    _, err = succeeds("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
     expected = (
         "warning: 2 of 840 points are outside the image, by at most 0.25 of its width "
         "or height (point 5 in row 3)\n"
@@ -260,8 +255,8 @@ def test_points_outside_of_the_image_are_counted(run, tmp_path):
     assert SHARES not in err
 
 
-def test_coordinates_that_are_no_shares_are_refused(run, tmp_path):
+def test_coordinates_that_are_no_shares_are_refused(fails, tmp_path):
     path = write_shares(tmp_path, lambda shares: shares - shares[:, :1])
-    code, _, err = run("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
-    assert code == 1
-    assert "the coordinates are no shares of the width and height of an image" in err
+    assert "the coordinates are no shares of the width and height of an image" in fails(
+        "fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK
+    )

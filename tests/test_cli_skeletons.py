@@ -59,10 +59,9 @@ def folder(table, tmp_path_factory):
     return folder
 
 
-def test_layouts_are_recognised_by_order_or_names(run, bodies, folder, tmp_path):
+def test_layouts_are_recognised_by_order_or_names(succeeds, bodies, folder, tmp_path):
     path = write(make_hand_tracks(120, random_state=0), tmp_path / "hands.csv")
-    code, report, _ = run("fit", path, "-o", tmp_path, *QUICK)
-    assert code == 0
+    report, _ = succeeds("fit", path, "-o", tmp_path, *QUICK)
     assert "points recognised as hand-21" in report
     stored = json.loads((tmp_path / "report.json").read_text())["model"]["skeleton"]
     assert stored == "hand-21"
@@ -72,7 +71,7 @@ def test_layouts_are_recognised_by_order_or_names(run, bodies, folder, tmp_path)
     assert json.loads((folder / "report.json").read_text())["model"]["skeleton"] is None
     names = [f"{name}_{axis}" for name in bodies.point_names for axis in "xy"]
     path = write(bodies, tmp_path / "bodies.csv", names)
-    assert run("fit", path, "-o", tmp_path, "--no-figures", *QUICK)[0] == 0
+    succeeds("fit", path, "-o", tmp_path, "--no-figures", *QUICK)
     sides = get_skeleton("coco-17").sides.tolist()
     assert edges_of(tmp_path / "viewer.html") == (pairs_of("coco-17"), sides)
 
@@ -95,7 +94,7 @@ def test_fit_takes_a_skeleton_for_all_that_it_draws(run, table, tmp_path, monkey
     assert edges_of(tmp_path / "viewer.html")[0] == pairs_of("coco-17")
 
 
-def test_edges_of_a_file(run, table, folder, tmp_path):
+def test_edges_of_a_file(succeeds, table, folder, tmp_path):
     own = tmp_path / "edges.csv"
     own.write_text("5,7\n7,9\n")
     fit = ["fit", table, "-o", tmp_path / "out", "--no-figures", *QUICK]
@@ -105,38 +104,36 @@ def test_edges_of_a_file(run, table, folder, tmp_path):
         (["--edges", "none"], False),
         (["--edges", own], False),
     ):
-        code, report, _ = run(*fit, *options)
-        assert code == 0
+        report, _ = succeeds(*fit, *options)
         assert ("--edges FILE or --skeleton LAYOUT" in report) == is_noted
     assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (7, 9)}
     # Of triangles the sides are drawn, each once.
     own.write_text("0,1,2\n2,1,3\n")
-    assert run(*fit, "--edges", own)[0] == 0
+    succeeds(*fit, "--edges", own)
     sides = {(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)}
     assert edges_of(tmp_path / "out/viewer.html")[0] == sides
     config = tmp_path / "config.yaml"
     config.write_text("skeleton:\n- ['5', '7']\n- ['6', '8']\n")
-    assert run(*fit, "--skeleton", config)[0] == 0
+    succeeds(*fit, "--skeleton", config)
     assert edges_of(tmp_path / "out/viewer.html")[0] == {(5, 7), (6, 8)}
     skeleton = ["--skeleton", "coco-17"]
     export = ["export", folder / MODEL, "-o", tmp_path / "a.glb"]
-    assert run(*export, *skeleton)[0] == 0
+    succeeds(*export, *skeleton)
     materials = Read(tmp_path / "a.glb").document["materials"]
     assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
 
 
-def test_transform_writes_a_page_of_the_new_frames(run, table, folder, tmp_path):
+def test_transform_writes_a_page_of_the_new_frames(
+    fails, succeeds, table, folder, tmp_path
+):
     page = tmp_path / "new.html"
     transform = ["transform", folder / MODEL, table]
     transform += ["-o", tmp_path / "alpha.csv", "--skeleton", "coco-17"]
-    code, report, _ = run(*transform, "--viewer", page)
-    assert code == 0
+    report, _ = succeeds(*transform, "--viewer", page)
     assert str(page) in report
     assert edges_of(page)[0] == pairs_of("coco-17")
     assert len(content_of(page)["rows"]) == 120
-    code, _, error = run(*transform)
-    assert code == 1
-    assert "--edges, --skeleton and --origin need --viewer" in error
+    assert "--edges, --skeleton and --origin need --viewer" in fails(*transform)
 
 
 def test_where_y_is_zero_is_said(run, tmp_path):
@@ -178,15 +175,13 @@ def test_where_y_is_zero_is_said(run, tmp_path):
     ],
 )
 def test_what_does_not_fit_is_refused_before_the_fit(
-    run, table, tmp_path, options, message
+    fails, table, tmp_path, options, message
 ):
-    code, _, error = run("fit", table, "-o", tmp_path / "out", *options)
-    assert code == 1
-    assert message in error
+    assert message in fails("fit", table, "-o", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
 
 
-def test_edges_are_numbers_of_named_points(run, bodies, tmp_path):
+def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
     names = [f"j{j:02d}.{axis}" for j in range(17) for axis in "xy"]
     table = write(bodies, tmp_path / "named.csv", names)
     edges, out = tmp_path / "edges.csv", tmp_path / "out"
@@ -195,9 +190,9 @@ def test_edges_are_numbers_of_named_points(run, bodies, tmp_path):
     assert "line 2: expected the names of two or three points" in run(*fit)[2]
     edges.write_text("5,7\n7,j09\n")
     # Of some of the points, numbers could be those of the table or of these points.
-    code, _, error = run(*fit, "--points", "without:0-4")
-    assert code == 1
-    assert "such as j05, j06 (without --points also their numbers from zero)" in error
+    assert "such as j05, j06 (without --points also their numbers from zero)" in fails(
+        *fit, "--points", "without:0-4"
+    )
     assert not out.exists()
     assert run(*fit)[0] == 0
     assert edges_of(out / "viewer.html")[0] == {(5, 7), (7, 9)}
@@ -210,10 +205,11 @@ def faces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("options", [[], ["--skeleton", "ibug-68"]])
-def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, options):
+def test_inner_points_are_fitted_drawn_and_transformed(
+    succeeds, faces, tmp_path, options
+):
     inner = ["--points", "inner", *options, "--no-figures"]
-    code, report, _ = run("fit", faces, "-o", tmp_path, *inner, *QUICK)
-    assert code == 0
+    report, _ = succeeds("fit", faces, "-o", tmp_path, *inner, *QUICK)
     assert "60 frames of 51 points" in report
     assert "coordinates not used: --points inner (17)" in report
     assert "points recognised as ibug-51" in report
@@ -225,11 +221,10 @@ def test_inner_points_are_fitted_drawn_and_transformed(run, faces, tmp_path, opt
     # The table with all points has these points.
     for columns in ([], ["--columns", "x_#,y_#"]):
         page = ["--viewer", tmp_path / "v.html"]
-        code, report, _ = run(
+        report, _ = succeeds(
             "transform", tmp_path / MODEL, faces, "-o", tmp_path / "a.csv",
             *columns, *page,
         )  # fmt: skip
-        assert code == 0
         found = pd.read_csv(tmp_path / "a.csv")["alpha_1"]
         np.testing.assert_allclose(found, alpha["alpha_1"], atol=1e-9)
         assert edges_of(tmp_path / "v.html")[0] == pairs_of("ibug-51")
@@ -259,8 +254,6 @@ def test_points_are_named(run, faces, tmp_path, points, kept):
         ("faces", "0-3", "needs at least 7 points, the table has 4"),
     ],
 )
-def test_points_that_are_none(run, request, given, tmp_path, points, message):
+def test_points_that_are_none(fails, request, given, tmp_path, points, message):
     options = ["-o", tmp_path / "o", "--points", points, *QUICK]
-    code, _, error = run("fit", request.getfixturevalue(given), *options)
-    assert code == 1
-    assert message in error
+    assert message in fails("fit", request.getfixturevalue(given), *options)

@@ -305,18 +305,17 @@ class TestFit:
         assert (folder / "mine.txt").read_bytes() == OLD
         assert os.readlink(folder / "link") == "mine.txt"
 
-    def test_what_is_no_plain_file_is_not_replaced(self, run, landmarks, tmp_path):
+    def test_what_is_no_plain_file_is_not_replaced(self, fails, landmarks, tmp_path):
         folder = tmp_path / "out"
         folder.mkdir()
         (folder / "alpha.csv").symlink_to(landmarks)
-        code, _, err = run("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert code == 1
+        err = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
         assert "alpha.csv would be overwritten" in err or "overwritten by" in err
         (folder / "alpha.csv").unlink()
         (folder / "alpha.csv").mkdir()
-        code, _, err = run("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
-        assert code == 1
-        assert f"{folder / 'alpha.csv'}: is no plain file" in err
+        assert f"{folder / 'alpha.csv'}: is no plain file" in fails(
+            "fit", landmarks, "-o", folder, "-k", 1, "--no-figures"
+        )
         assert os.listdir(folder) == ["alpha.csv"]
 
 
@@ -328,36 +327,35 @@ class TestRunsThatAreMixed:
         copied(old_run, folder)
         return folder
 
-    def warned(self, run, folder, landmarks, model="model.npz"):
+    def warned(self, succeeds, folder, landmarks, model="model.npz"):
         errors = []
         for argv in (
             ("transform", folder / model, landmarks, "-o", folder / "new.csv"),
             ("export", folder / model, "-o", folder / "new.npz"),
         ):
-            code, _, err = run(*argv)
-            assert code == 0
+            _, err = succeeds(*argv)
             errors.append(err)
         assert errors[0] == errors[1]
         return errors[0]
 
-    def test_files_of_one_run(self, run, folder, landmarks):
-        assert self.warned(run, folder, landmarks) == ""
+    def test_files_of_one_run(self, succeeds, folder, landmarks):
+        assert self.warned(succeeds, folder, landmarks) == ""
         for absent in ("alpha.csv", "report.json"):
             (folder / absent).unlink()
-            assert self.warned(run, folder, landmarks) == ""
+            assert self.warned(succeeds, folder, landmarks) == ""
         # Reports of something else
         for text in ("", "[]", '{"sha256": 3}', '{"sha256": {"../a": "b"}}'):
             (folder / "report.json").write_text(text)
-            assert self.warned(run, folder, landmarks) == ""
+            assert self.warned(succeeds, folder, landmarks) == ""
 
-    def test_files_of_two_runs(self, run, folder, landmarks, tmp_path):
+    def test_files_of_two_runs(self, succeeds, folder, landmarks, tmp_path):
         assert fit(landmarks, tmp_path / "other", 2, "--no-figures") == 0
         for name in ("alpha.csv", "model.npz"):
             shutil.copy(tmp_path / "other" / name, folder)
-        said = self.warned(run, folder, landmarks)
+        said = self.warned(succeeds, folder, landmarks)
         assert f"{folder / 'report.json'} is of another run than model.npz" in said
 
-    def test_a_model_elsewhere(self, run, folder, landmarks):
+    def test_a_model_elsewhere(self, succeeds, folder, landmarks):
         shutil.copy(folder / "model.npz", folder / "copy.npz")
         (folder / "model.npz").write_bytes(OLD)
-        assert self.warned(run, folder, landmarks, "copy.npz") == ""
+        assert self.warned(succeeds, folder, landmarks, "copy.npz") == ""

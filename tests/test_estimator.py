@@ -101,15 +101,11 @@ def scales_frames(model):
 def size_weights(model, table):
     """Return one over the square of the sizes of frames, those of the loss."""
     tracks = tracks_of(table, model.layout)
-    if model.loss == "linear":
-        weights = frame_weights(tracks, True)
-    else:
-        weights = robust_sizes(tracks) ** -2
-    return (
-        weights
-        if scales_frames(model)
-        else np.full_like(weights, 1 / np.mean(1 / weights))
-    )
+    linear = model.loss == "linear"
+    weights = frame_weights(tracks, True) if linear else robust_sizes(tracks) ** -2
+    if scales_frames(model):
+        return weights
+    return np.full_like(weights, 1 / np.mean(1 / weights))
 
 
 @pytest.fixture(scope="module")
@@ -740,22 +736,18 @@ def test_too_few_basis_shapes_are_better_than_none(n_components):
     ids=str,
 )
 @pytest.mark.parametrize("refinement", ["joint", "alternating", None])
+@may_not_converge
 def test_all_combinations_of_methods_explain_more_than_a_rigid_shape(
     block_recovery, refinement, isa
 ):
     model = estimator(block_recovery=block_recovery, refinement=refinement, isa=isa)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model.fit(TABLE)
+    model.fit(TABLE)
     S = model.singular_values_
     rigid = 1 - np.sum(S[:3] ** 2) / np.sum(S**2) * (1 - model.rank_floor_)
     assert model.rank_floor_ < model.inverse_snr_ < rigid
     if refinement is None:
         assert model.n_iter_ == 1
-        refined = clone(model).set_params(refinement="alternating")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
-            refined.fit(TABLE)
+        refined = clone(model).set_params(refinement="alternating").fit(TABLE)
         assert refined.inverse_snr_ <= model.inverse_snr_ * (1 + 1e-9)
     else:
         assert model.inverse_snr_ < 0.5 * rigid
@@ -914,15 +906,16 @@ def test_strategies_of_others_can_be_used():
     assert model.inverse_snr_ < 0.01
 
 
-@pytest.mark.parametrize("subspace_size", [1, 2, 6])
-@pytest.mark.parametrize("strategy", [FastISA, PooledFastICA])
-def test_strategies_with_other_subspaces_are_refused(strategy, subspace_size):
-    isa = strategy(subspace_size, n_init=2)
-    refused("subspace_size", estimator(2, isa=isa).fit, TABLE)
-
-
-def test_strategies_with_too_few_components_are_refused():
-    refused("components_", estimator(2, isa=Given(rows=5)).fit, TABLE)
+@pytest.mark.parametrize(
+    ("isa", "message"),
+    [
+        *((FastISA(size, n_init=2), "subspace_size") for size in (1, 2, 6)),
+        *((PooledFastICA(size, n_init=2), "subspace_size") for size in (1, 2, 6)),
+        (Given(rows=5), "components_"),
+    ],
+)
+def test_strategies_with_other_subspaces_or_too_few_are_refused(isa, message):
+    refused(message, estimator(2, isa=isa).fit, TABLE)
 
 
 def test_verbose_prints_a_line_for_each_stage(capsys):
@@ -1008,15 +1001,9 @@ def test_images_are_those_of_scaled_rotations(camera, refinement):
 @pytest.mark.parametrize("camera", CALIBRATED)
 def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
     model, truth = calibrated(camera)
-    S = model.reconstruct(truth.data)
-    errors = []
-    for fitted in (model, model.mirrored()):
-        convention = "sequence" if camera == "orthographic" else "frame"
-        errors.append(
-            mean_shape_error_3d(
-                truth.shapes, fitted.reconstruct(truth.data), convention=convention
-            )
-        )
+    convention = "sequence" if camera == "orthographic" else "frame"
+    both = (each.reconstruct(truth.data) for each in (model, model.mirrored()))
+    errors = [mean_shape_error_3d(truth.shapes, S, convention=convention) for S in both]
     # Both mirror images are as good, for an alignment that may reflect.
     assert errors[0] < 0.01
     assert errors[1] == pytest.approx(errors[0], rel=1e-6)
@@ -1025,7 +1012,6 @@ def test_calibrated_shapes_and_rotations_are_the_true_ones(camera):
     U, _, Vt = np.linalg.svd(np.einsum("irc,ird->cd", rows, true_rows))
     angle = np.abs(rows @ (U @ Vt) - true_rows).max()
     assert np.degrees(angle) < 2
-    assert S.shape == truth.shapes.shape
 
 
 @pytest.mark.parametrize("camera", ["affine", *CALIBRATED])
@@ -1125,20 +1111,16 @@ def test_intervals_of_coefficients_hold(loss, camera, rng):
 
 
 @pytest.mark.parametrize(
-    ("truth", "n_components", "least", "most", "meaning"),
+    ("truth", "least", "most", "meaning"),
     [
-        ("weak_perspective", 2, 1.0, 1.1, "as well as affine ones"),
-        ("affine", 2, 10.0, np.inf, "probably not calibrated"),
+        ("weak_perspective", 1.0, 1.1, "as well as affine ones"),
+        ("affine", 10.0, np.inf, "probably not calibrated"),
     ],
 )
 @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
-def test_diagnostics_say_what_the_cameras_are(
-    camera, truth, n_components, least, most, meaning
-):
-    table = make_nonrigid_tracks(
-        150, 40, 2, camera=truth, noise=0.02, random_state=0
-    ).data
-    model = AffineNRSfM(n_components, camera=camera, random_state=0).fit(table)
+def test_diagnostics_say_what_the_cameras_are(camera, truth, least, most, meaning):
+    made = make_nonrigid_tracks(150, 40, 2, camera=truth, noise=0.02, random_state=0)
+    model = AffineNRSfM(2, camera=camera, random_state=0).fit(made.data)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         found = model.diagnostics()

@@ -316,8 +316,8 @@ def test_frames_that_are_lines_or_tiny():
 
 def test_two_places_only(rng):
     tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
-    model = fitted(tracks, 1)
-    assert model.inverse_snr_ < 1e-25
+    assert fitted(tracks, 1).inverse_snr_ < 1e-25
+    assert jointly(tracks, 1).inverse_snr_ < 1e-20
     # ... on the diagonal of the image: in the other layout all points are equal.
     diagonal = np.repeat(rng.normal(size=(40, 2, 1)), 10, axis=1) * [1, 1]
     assert fitted(diagonal, 1).inverse_snr_ < 1e-25
@@ -447,11 +447,6 @@ def test_any_unit_is_fitted(scale, refinement):
     once, scaled = (of_unit(unit, refinement) for unit in (1.0, scale))
     assert_allclose(scaled.alpha_, once.alpha_, atol=1e-6)
     assert_allclose(scaled.inverse_snr_, once.inverse_snr_, rtol=1e-6)
-
-
-def test_joint_refinement_of_points_in_two_places(rng):
-    tracks = np.repeat(rng.normal(size=(40, 2, 2)), 10, axis=1)
-    assert jointly(tracks, 1).inverse_snr_ < 1e-20
 
 
 # --- accuracy -----------------------------------------------------------------------

@@ -76,9 +76,9 @@ def regauged(fit, seed=1, shift=0.05):
     )
 
 
-def canonical(fit, independence="shapes"):
+def canonical(fit, *options):
     """Return the canonical fit, and the standard deviations for unit covariances."""
-    gauge, frames = independent_gauge(*fit, independence)
+    gauge, frames = independent_gauge(*fit, *(options or ["shapes"]))
     n_frames, n_components = fit.alpha.shape
     covariance = np.broadcast_to(
         np.eye(n_components), (n_frames,) + 2 * (n_components,)
@@ -212,19 +212,14 @@ BOTH = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 class TestCalibratedCameras:
     """Space may only be turned, and orthographic cameras absorb no scales."""
 
-    def canonical(self, fit, independence, camera, unit=None):
-        gauge, frames = independent_gauge(*fit, independence, camera, unit)
-        covariance = np.broadcast_to(np.eye(3), (60, 3, 3))
-        motion, alpha, _ = frames.apply(fit.motion, fit.alpha, covariance)
-        shapes = np.concatenate([gauge.mean_shape[None], gauge.basis])
-        return Fit(shapes.transpose(0, 2, 1), motion, alpha), frames.space
-
     @BOTH
     @EACH
     @pytest.mark.parametrize("unit", [None, 3.0])
     def test_images_stay_and_cameras_stay_calibrated(self, camera, independence, unit):
         fit = calibrated(random_fit(), camera)
-        result, space = self.canonical(fit, independence, camera, unit)
+        options = independence, camera, unit
+        result, _ = canonical(fit, *options)
+        space = independent_gauge(*fit, *options)[1].space
         assert_allclose(result.images(), fit.images(), atol=1e-10)
         size = np.linalg.norm(space, axis=0)
         assert_allclose(space @ space.T, size[0] ** 2 * np.eye(3), atol=1e-10)
@@ -243,7 +238,7 @@ class TestCalibratedCameras:
     @EACH
     def test_conditions(self, camera, independence):
         fit = calibrated(random_fit(), camera)
-        result, _ = self.canonical(fit, independence, camera)
+        result, _ = canonical(fit, independence, camera)
         assert_allclose(result.alpha.mean(axis=0), 0, atol=1e-12)
         assert_allclose(result.alpha.std(axis=0), 1, rtol=1e-12)
         if camera == "weak_perspective":
@@ -266,8 +261,8 @@ class TestCalibratedCameras:
             alpha,
         )
         assert_allclose(other.images(), fit.images(), atol=1e-10)
-        expected, _ = self.canonical(fit, independence, camera)
-        assert_same(self.canonical(other, independence, camera)[0], expected)
+        expected, _ = canonical(fit, independence, camera)
+        assert_same(canonical(other, independence, camera)[0], expected)
 
 
 class TestStandardDeviations:

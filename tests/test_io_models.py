@@ -19,7 +19,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refused
 from sklearn.base import clone
 from sklearn.decomposition import PCA
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.exceptions import NotFittedError
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm.datasets import make_face_tracks
@@ -110,11 +110,7 @@ def fitted(tmp_path_factory):
             folder = tmp_path_factory.mktemp("frames")
             parameters["frames_folder"] = folder if kind is not str else str(folder)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)
             warnings.filterwarnings("ignore", "no point is visible in 1 of 20")
-            warnings.filterwarnings(
-                "ignore", "the depth of the shapes is not determined"
-            )
             model = AffineNRSfM(**parameters).fit(table)
         return (model.mirrored() if mirror else model), table
 
@@ -210,7 +206,6 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
         assert sorted(["header", *header["arrays"]]) == sorted(file)
 
 
-@pytest.mark.filterwarnings("ignore:the depth of the shapes is not determined")
 @pytest.mark.parametrize("case", ["names", "alternating", "not refined"])
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)

@@ -52,6 +52,12 @@ def disturbed(state, seed=1, size=0.1):
     return JointState(shapes, motion, 5 * state.noise)
 
 
+def scene_and_start(**options):
+    """Return a table and a state that is some way off."""
+    scene = random_scene(**options)
+    return scene, disturbed(scene.truth)
+
+
 def refined(scene, start=None, *, penalty=0.0, max_iter=1000, tol=1e-3):
     start = disturbed(scene.truth) if start is None else start
     likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
@@ -99,8 +105,7 @@ class TestHistory:
     def test_falls_from_the_objective_at_the_start_to_that_at_the_end(
         self, kind, penalty
     ):
-        scene = random_scene(kind=kind)
-        start = disturbed(scene.truth)
+        scene, start = scene_and_start(kind=kind)
         result = refined(scene, start, penalty=penalty)
         likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
         assert result.converged
@@ -216,12 +221,17 @@ def disturbed_by(cameras, state, seed=1, size=0.1):
 
 @cache
 def optimum_of(camera, kind="complete"):
-    """Return a minimum of the objective with cameras of a model, and its table."""
-    scene, cameras = random_scene(kind=kind, camera=camera), CAMERAS[camera]
-    likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
-    start = disturbed_by(cameras, scene.truth)
-    result = refine_joint(likelihood, start, cameras, max_iter=5000, tol=1e-10)
-    return scene, likelihood, start, result
+    """Return a minimum of the objective with cameras of a model."""
+    _, likelihood, start = problem_of(camera, 1.0, kind=kind)
+    result = refine_joint(likelihood, start, CAMERAS[camera], max_iter=5000, tol=1e-10)
+    return likelihood, start, result
+
+
+def problem_of(camera, penalty=0.0, **options):
+    """Return a table of cameras of a model, its objective and a state to start from."""
+    scene = random_scene(camera=camera, **options)
+    likelihood = likelihood_of(scene.tracks, scene.weights, penalty)
+    return scene, likelihood, disturbed_by(CAMERAS[camera], scene.truth)
 
 
 EACH = pytest.mark.parametrize("camera", CAMERAS)
@@ -231,7 +241,7 @@ class TestCameras:
     @EACH
     @KINDS
     def test_history_falls_and_cameras_stay_of_their_model(self, camera, kind):
-        _, likelihood, start, result = optimum_of(camera, kind)
+        likelihood, start, result = optimum_of(camera, kind)
         assert result.converged
         assert (np.diff(result.history) < 0).all()
         assert result.history[0] == likelihood(*start).value
@@ -242,7 +252,7 @@ class TestCameras:
     @EACH
     @KINDS
     def test_objective_rises_in_every_direction(self, camera, kind):
-        _, likelihood, _, result = optimum_of(camera, kind)
+        likelihood, _, result = optimum_of(camera, kind)
         cameras = CAMERAS[camera]
         assert result.gradient_norm < 5e-6
         rng = np.random.default_rng(2)
@@ -265,9 +275,7 @@ class TestCameras:
     @KINDS
     def test_gradient_norm_by_its_definition(self, camera, kind):
         # The gradient in the metric of the curvature, in units of the coordinates.
-        scene, cameras = random_scene(kind=kind, camera=camera), CAMERAS[camera]
-        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
-        start = disturbed_by(cameras, scene.truth)
+        cameras, (_, likelihood, start) = CAMERAS[camera], problem_of(camera, kind=kind)
         result = refine_joint(likelihood, start, cameras, max_iter=3, tol=1e-3)
         passed = likelihood(*result.state)
         noise, motion = result.state.noise, result.state.motion
@@ -288,10 +296,8 @@ class TestCameras:
     @EACH
     @KINDS
     def test_tables_without_noise_are_fitted_to_the_floor(self, camera, kind):
-        scene = random_scene(noise=0.0, kind=kind, camera=camera)
         cameras = CAMERAS[camera]
-        likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
-        start = disturbed_by(cameras, scene.truth)
+        _, likelihood, start = problem_of(camera, noise=0.0, kind=kind)
         result = refine_joint(likelihood, start, cameras, max_iter=1000, tol=1e-3)
         assert result.converged
         assert (np.diff(result.history) <= 0).all()
@@ -324,11 +330,9 @@ class TestHeldCameras:
 class TestLeastNoise:
     @pytest.mark.parametrize("camera", CAMERAS)
     def test_noise_stays_above(self, camera):
-        scene, cameras = random_scene(camera=camera), CAMERAS[camera]
-        likelihood = likelihood_of(scene.tracks, None, 0.0)
+        cameras, (_, likelihood, start) = CAMERAS[camera], problem_of(camera)
         mean_square = likelihood.square / likelihood.n_seen
         least = 10 * DEVIATION**2 / mean_square
-        start = disturbed_by(cameras, scene.truth)
         result = refine_joint(
             likelihood, start, cameras, least_noise=least, max_iter=1000, tol=1e-6
         )
@@ -351,8 +355,8 @@ class TestLeastNoise:
 
 class TestWithoutNoise:
     def test_starts_at_the_floor_where_the_start_has_no_noise(self):
-        scene = random_scene()
-        start = disturbed(scene.truth)._replace(noise=0.0)
+        scene, start = scene_and_start()
+        start = start._replace(noise=0.0)
         state = refined(scene, start, max_iter=0).state
         mean_square = np.mean(scene.tracks**2)
         assert state.noise == pytest.approx(NOISE_FLOOR * mean_square)
@@ -398,9 +402,8 @@ class TestLineSearch:
 
     @pytest.mark.parametrize(("noise", "most"), [(0.0, 2.5), (DEVIATION, 1.5)])
     def test_mostly_takes_the_first_step(self, noise, most):
-        scene = random_scene(noise=noise)
+        scene, start = scene_and_start(noise=noise)
         likelihood = counted(scene)
-        start = disturbed(scene.truth)
         result = refine_joint(likelihood, start, AFFINE, max_iter=1000, tol=1e-6)
         assert likelihood.n_calls < most * len(result.history)
 
@@ -408,8 +411,7 @@ class TestLineSearch:
 class TestDegenerate:
     def test_basis_shapes_of_zero_stay_zero(self):
         # A saddle point of the objective: the search does not leave it by itself.
-        scene = random_scene()
-        start = disturbed(scene.truth)
+        scene, start = scene_and_start()
         start.shapes[1:] = 0.0
         result = refined(scene, start)
         assert result.converged
@@ -419,8 +421,7 @@ class TestDegenerate:
     @pytest.mark.parametrize("value", [np.nan, np.inf])
     @pytest.mark.filterwarnings("ignore::RuntimeWarning")
     def test_ends_where_the_start_is_not_finite(self, part, value):
-        scene = random_scene()
-        start = disturbed(scene.truth)
+        scene, start = scene_and_start()
         if part == "noise":
             start = start._replace(noise=value)
         else:
@@ -430,22 +431,19 @@ class TestDegenerate:
         assert likelihood.n_calls < 100
 
     def test_has_not_converged_where_the_objective_is_not_finite(self):
-        scene = random_scene()
-        start = disturbed(scene.truth)
+        scene, start = scene_and_start()
         start.motion[3] = np.nan
         assert not refined(scene, start).converged
 
     def test_point_that_no_frame_shows_stays_where_it_is(self):
-        scene = random_scene(kind="weighted")
+        scene, start = scene_and_start(kind="weighted")
         scene.weights[:, 3] = 0.0
-        start = disturbed(scene.truth)
         result = refined(scene, start)
         assert result.converged
         assert_array_equal(result.state.shapes[..., 3], start.shapes[..., 3])
 
     def test_cameras_of_zero(self):
-        scene = random_scene()
-        start = disturbed(scene.truth)
+        scene, start = scene_and_start()
         start.motion[:] = 0.0
         result = refined(scene, start)
         assert all(np.isfinite(each).all() for each in result.state)

@@ -27,11 +27,6 @@ AFFINITIES = [
 FLAT = np.array([[0.0, 0.0, 2.0, 0.0], [1.0, 1.0, 1.0, 1.0]])
 
 
-@pytest.fixture
-def rng():
-    return np.random.RandomState(0)
-
-
 @pytest.fixture(scope="module")
 def scene():
     return make_nonrigid_tracks(60, 30, 3, amplitude=0.3, random_state=0)

@@ -411,12 +411,9 @@ class TestCommandLine:
         table = pd.read_csv(path)
         return table.filter(like="alpha_").to_numpy()
 
-    def test_fit_and_transform(self, results, tmp_path, run):
+    def test_fit_and_transform(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence"]
-        code, _, err = run(
-            "fit", results, *options, "-o", tmp_path / "out", *self.QUICK
-        )
-        assert code == 0, err
+        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
         found = read_landmarks(results)
         model = estimator().fit(found.points, point_weight=found.confidence)
         alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
@@ -424,16 +421,12 @@ class TestCommandLine:
         assert np.abs(alpha - estimator().fit(found.points).alpha_).max() > 0.1
         new = tmp_path / "new.csv"
         saved = tmp_path / "out" / "model.npz"
-        code, _, err = run("transform", saved, results, *options, "-o", new)
-        assert code == 0, err
+        succeeds("transform", saved, results, *options, "-o", new)
         assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
 
-    def test_some_points(self, results, tmp_path, run):
+    def test_some_points(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence", "--points", "without:3,7"]
-        code, _, err = run(
-            "fit", results, *options, "-o", tmp_path / "out", *self.QUICK
-        )
-        assert code == 0, err
+        succeeds("fit", results, *options, "-o", tmp_path / "out", *self.QUICK)
         left = np.delete(np.arange(N_POINTS), [3, 7])
         found = read_landmarks(results)
         X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
@@ -443,14 +436,14 @@ class TestCommandLine:
         alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
         assert_allclose(alpha, model.alpha_, atol=1e-6)
 
-    def test_refusals(self, results, tmp_path, run):
+    def test_refusals(self, results, tmp_path, fails):
         options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]
-        code, _, err = run("fit", results, *options, "-k", "1-2")
-        assert code != 0
-        assert "--weights needs one number of basis shapes" in err
+        assert "--weights needs one number of basis shapes" in fails(
+            "fit", results, *options, "-k", "1-2"
+        )
         table = tmp_path / "table.csv"
         names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
         pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
-        code, _, err = run("fit", table, *options, "-k", "2")
-        assert code != 0
-        assert "has no confidences of all points. Their columns need" in err
+        assert "has no confidences of all points. Their columns need" in fails(
+            "fit", table, *options, "-k", "2"
+        )

@@ -153,26 +153,18 @@ class TestReturned:
     ids=["heavy", "mixed", "gaussian"],
 )
 class TestInvariance:
-    def signals(self, kinds, size, seed):
-        return sources(kinds, seed, 200 if size == 1 else 68, size)
-
-    def test_to_the_basis(self, kinds, size, seed):
-        signals = self.signals(kinds, size, seed)
-        mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
+    def test_to_basis_order_of_samples_and_common_rotations(self, kinds, size, seed):
+        signals = sources(kinds, seed, 200 if size == 1 else 68, size)
         found = unmix(signals)
-        assert_allclose(matched(found, unmix(1e-6 * mixed)), found, atol=1e-7)
-
-    def test_to_the_order_of_samples(self, kinds, size, seed):
-        signals = self.signals(kinds, size, seed)
+        mixed = np.tensordot(random_mixing(seed + 7, len(kinds)), signals, 1)
         order = np.random.default_rng(seed).permutation(signals.shape[1])
-        found = unmix(signals)[:, order]
-        assert_allclose(matched(found, unmix(signals[:, order])), found, atol=1e-7)
-
-    def test_to_a_common_rotation_or_reflection(self, kinds, size, seed):
-        signals = self.signals(kinds, size, seed)
-        R = -random_rotation(seed, size)
-        found = unmix(signals) @ R
-        assert_allclose(matched(found, unmix(signals @ R)), found, atol=1e-7)
+        R = -random_rotation(seed, size)  # or reflections
+        for changed, expected in (
+            (1e-6 * mixed, found),
+            (signals[:, order], found[:, order]),
+            (signals @ R, found @ R),
+        ):
+            assert_allclose(matched(expected, unmix(changed)), expected, atol=1e-7)
 
 
 class TestOptimality:
