@@ -1,4 +1,4 @@
-"""Calls that are refused."""
+"""Calls that are refused, or that warn."""
 
 import pytest
 
@@ -8,3 +8,9 @@ def refused(message, call, /, *args, error=ValueError, **kwargs):
     with pytest.raises(error, match=message) as caught:
         call(*args, **kwargs)
     return caught.value
+
+
+def warned(message, call, /, *args, category=UserWarning, **kwargs):
+    """Check that a call warns with a message that matches, and return its result."""
+    with pytest.warns(category, match=message):
+        return call(*args, **kwargs)

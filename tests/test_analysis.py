@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import sklearn
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 from scipy.stats import spearmanr
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -313,8 +313,7 @@ class TestWithinGroups:
         with pytest.warns(UserWarning, match="a single frame: 1 of"):
             WithinGroups().fit_transform(self.alpha[:3], groups=["a", "a", "b"])
         step = WithinGroups().fit(self.alpha, groups=self.people)
-        with pytest.warns(UserWarning, match="a single frame: 1 of"):
-            step.transform(self.alpha[:1], groups=["new"])
+        warned("a single frame: 1 of", step.transform, self.alpha[:1], groups=["new"])
 
 
 class TestBetweenShare:

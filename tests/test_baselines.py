@@ -13,7 +13,7 @@ from estimator_contract import (
 )
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 from scenes import random_cameras, with_gaps
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
@@ -168,8 +168,7 @@ class TestContract:
         ):
             refused(message, make(K).fit, wrong)
         planar = tracks_to_table(table_to_tracks(X), "planar")
-        with pytest.warns(UserWarning, match="layout='planar' explains the table"):
-            make(2).fit(planar)
+        warned("layout='planar' explains the table", make(2).fit, planar)
 
 
 class TestFitted:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from numpy.typing import NDArray
 from scenes import measurements, random_cameras, random_rotation
 from scipy.spatial.transform import Rotation
@@ -282,8 +282,7 @@ class TestBlockDictionary:
         given = self.disturbed(seed)
         frames, atoms, blocks, active = (part.copy() for part in given)
         new, coded, used, residuals = update_atoms(*given)
-        for part, copy in zip(given, (frames, atoms, blocks, active), strict=True):
-            assert_array_equal(part, copy)
+        assert_equal(given, (frames, atoms, blocks, active))
         assert_allclose(residuals, frames - images(coded, new), atol=1e-12)
         before = np.sum((frames - images(blocks, atoms)) ** 2)
         assert np.sum(residuals**2) < 0.5 * before

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from layers import slow_after
+from refusals import refused
 from scenes import random_rotation
 
 import benchmarks.__main__ as command
@@ -257,6 +258,5 @@ def test_absent_sets_are_skipped_by_name(tmp_path, monkeypatch, capsys):
     ],
 )
 def test_command_refuses_what_it_does_not_know(arguments, message, capsys):
-    with pytest.raises(SystemExit):
-        command.main(arguments)
+    refused(None, command.main, arguments, error=SystemExit)
     assert message in capsys.readouterr().err

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from cameras import lorentz_cameras
 from numpy.testing import assert_allclose
-from refusals import refused
+from refusals import refused, warned
 from scenes import face_model, faces
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
@@ -152,8 +152,7 @@ class TestDegenerateCameras:
     @both_cameras
     def test_two_cameras_are_not_enough(self, camera):
         motion, *_ = scene(1, camera, n_frames=2)
-        with pytest.warns(UserWarning, match="hardly determine"):
-            upgrade = metric_upgrade(motion, camera)
+        upgrade = warned("hardly determine", metric_upgrade, motion, camera)
         assert upgrade.condition_number > 1e6
         assert np.isfinite(upgrade.Q).all()
 

@@ -7,6 +7,7 @@ import sys
 import joblib
 import pytest
 from numpy.testing import assert_array_equal
+from refusals import warned
 from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.model_selection import GridSearchCV
@@ -132,8 +133,7 @@ class TestAlone:
 class TestInside:
     def test_a_pipeline(self):
         pipeline = make_pipeline(estimator(refinement=None), PCA(1))
-        with pytest.warns(UserWarning, match="PCA does not support callbacks"):
-            _, recorder = recorded(pipeline)
+        _, recorder = warned("PCA does not support callbacks", recorded, pipeline)
         assert recorder.tasks().count("table") == 1
         assert recorder.told[0] == ("setup", "Pipeline", "")
 

@@ -133,8 +133,7 @@ class TestScheme:
 class TestPrincipalAxes:
     @pytest.fixture
     def points(self):
-        rng = np.random.default_rng(0)
-        return rng.standard_normal((200, 3)) * [1.0, 3.0, 2.0]
+        return np.random.default_rng(0).standard_normal((200, 3)) * [1.0, 3.0, 2.0]
 
     @pytest.mark.parametrize("seed", range(5))
     def test_nearest_axes(self, points, seed):

@@ -287,9 +287,7 @@ def test_rows_with_missing_points_are_fitted(succeeds, changed, faces, tmp_path)
     )
 
 
-def test_rows_that_cannot_be_fitted_are_counted_and_empty(
-    succeeds, changed, faces, tmp_path
-):
+def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path):
     def change(faces):
         faces.loc[[4, 9], LANDMARKS] = np.nan  # 9 is an ir row
         faces.loc[5, LANDMARKS[6:]] = np.nan
@@ -333,9 +331,7 @@ def test_rows_that_cannot_be_fitted_are_counted_and_empty(
     )
 
 
-def test_standard_deviations_are_written_where_they_are_known(
-    run, fails, table, fitted, tmp_path
-):
+def test_standard_deviations_are_written(run, fails, table, fitted, tmp_path):
     output = tmp_path / "alpha.csv"
     assert run("transform", fitted / MODEL, table, "-o", output, "--std")[0] == 0
     written = pd.read_csv(output)
@@ -366,9 +362,7 @@ def test_points_at_zero_cause_a_warning(succeeds, changed, tmp_path):
     assert re.search(r"alpha_1 \(.* row [39]\)", few)
 
 
-def test_origin_of_the_coordinates_is_not_a_missing_point(
-    succeeds, fails, changed, tmp_path
-):
+def test_origin_is_not_a_missing_point(succeeds, fails, changed, tmp_path):
     def change(faces):
         nose = faces[["x_30", "y_30"]].to_numpy()
         faces[LANDMARKS] -= np.tile(nose, 68)
@@ -431,9 +425,7 @@ def test_transform_gives_each_row_its_coefficients(succeeds, fitted, faces, tmp_
 @pytest.mark.parametrize(
     ("number", "option"), [(0, ["--zeros-missing"]), (-1, ["--missing-value", "-1"])]
 )
-def test_transform_knows_the_missing_points_of_the_fit(
-    run, changed, tmp_path, number, option
-):
+def test_transform_knows_missing_points(run, changed, tmp_path, number, option):
     def change(faces):
         faces.loc[[3, 9], ["x_5", "y_5"]] = float(number)
 
@@ -470,7 +462,7 @@ def test_transform_of_no_usable_row_is_empty(succeeds, fitted, faces, tmp_path):
 @pytest.mark.parametrize(
     ("layout", "named"), [("interleaved", True), ("planar", True), ("planar", False)]
 )
-def test_transform_follows_the_layout_of_the_model(
+def test_transform_has_the_layout_of_the_model(
     run, faces, table, tmp_path, layout, named
 ):
     planar = layout == "planar"
@@ -575,9 +567,7 @@ def test_bad_inputs_are_refused_in_one_line(fails, table, fitted, faces, tmp_pat
     assert "a.txt: a table is a .csv, .tsv or .parquet file" in message
 
 
-def test_outputs_that_cannot_be_written_are_refused(
-    fails, table, fitted, faces, tmp_path
-):
+def test_bad_outputs_are_refused(fails, table, fitted, faces, tmp_path):
     for name in (table, tmp_path / "alpha.csv", tmp_path / "model.NPZ"):
         message = fails("fit", table, "-o", name, *QUICK)
         assert f"--output {name}: expected a folder" in message
@@ -642,9 +632,7 @@ def test_figures_are_not_written_to_another_run(fails, fitted, table, tmp_path):
         assert (tmp_path / name).read_bytes() == (fitted / name).read_bytes()
 
 
-def test_missing_libraries_are_named_before_the_fit(
-    fails, table, tmp_path, monkeypatch
-):
+def test_missing_libraries_are_named_at_once(fails, table, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     message = fails("fit", table, "-o", tmp_path / "results", *QUICK)
     assert 'pip install "isa-nrsfm[plot]"' in message
@@ -709,9 +697,7 @@ def test_interruption_ends_with_code_130(run, table, tmp_path, monkeypatch):
     assert (code, out, err) == (130, "", "isa-nrsfm: interrupted\n")
 
 
-def test_warnings_are_shown_once_in_one_line_with_options(
-    run, table, tmp_path, monkeypatch
-):
+def test_warnings_are_shown_once_with_options(run, table, tmp_path, monkeypatch):
     fit = AffineNRSfM.fit
 
     def warn_and_fit(self, X, y=None):

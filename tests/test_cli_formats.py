@@ -227,9 +227,7 @@ def write_shares(folder, change=lambda shares: shares):
     ],
     ids=["shares", "4 % outside", "6 % outside", "centred", "scaled", "pixels"],
 )
-def test_shares_of_an_image_in_a_plain_table_are_named(
-    succeeds, tmp_path, change, is_named
-):
+def test_shares_of_an_image_are_named(succeeds, tmp_path, change, is_named):
     path = write_shares(tmp_path, change)
     _, err = succeeds("fit", path, "-o", tmp_path / "results", *QUICK)
     assert (SHARES in err) == is_named

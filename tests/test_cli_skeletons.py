@@ -123,9 +123,7 @@ def test_edges_of_a_file(succeeds, table, folder, tmp_path):
     assert [m["name"] for m in materials] == ["points and edges", "left", "right"]
 
 
-def test_transform_writes_a_page_of_the_new_frames(
-    fails, succeeds, table, folder, tmp_path
-):
+def test_transform_writes_a_page(fails, succeeds, table, folder, tmp_path):
     page = tmp_path / "new.html"
     transform = ["transform", folder / MODEL, table]
     transform += ["-o", tmp_path / "alpha.csv", "--skeleton", "coco-17"]
@@ -174,9 +172,7 @@ def test_where_y_is_zero_is_said(run, tmp_path):
         (["--skeleton", "absent.yaml"], "absent.yaml: No such file"),
     ],
 )
-def test_what_does_not_fit_is_refused_before_the_fit(
-    fails, table, tmp_path, options, message
-):
+def test_what_does_not_fit_is_refused_at_once(fails, table, tmp_path, options, message):
     assert message in fails("fit", table, "-o", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
 
@@ -205,9 +201,7 @@ def faces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("options", [[], ["--skeleton", "ibug-68"]])
-def test_inner_points_are_fitted_drawn_and_transformed(
-    succeeds, faces, tmp_path, options
-):
+def test_inner_points_are_fitted_and_drawn(succeeds, faces, tmp_path, options):
     inner = ["--points", "inner", *options, "--no-figures"]
     report, _ = succeeds("fit", faces, "-o", tmp_path, *inner, *QUICK)
     assert "60 frames of 51 points" in report

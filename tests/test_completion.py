@@ -153,9 +153,7 @@ def test_the_mean_square_of_a_step_is_that_of_least_squares_with_a_ridge(small):
     ("n_frames", "n_points", "n_components", "missing"),
     [(60, 30, 2, 0.2), (60, 30, 3, 0.3), (300, 68, 5, 0.3), (300, 68, 9, 0.2)],
 )
-def test_tables_of_the_rank_without_noise(
-    n_frames, n_points, n_components, missing, seed
-):
+def test_tables_without_noise(n_frames, n_points, n_components, missing, seed):
     scene = make_nonrigid_tracks(n_frames, n_points, n_components, random_state=seed)
     seen = random_mask((n_frames, n_points), missing, seed)
     determined = seen.sum(axis=1) >= 3 * n_components + 4

@@ -130,9 +130,7 @@ class TestCluster:
         model = SampledNRSfM(K, random_state=0).fit(chunked(X))
         assert_same_model(model, SampledNRSfM(K, random_state=0).fit(X))
 
-    def test_a_worker_that_is_killed_does_not_change_the_result(
-        self, cluster, monkeypatch
-    ):
+    def test_a_killed_worker_does_not_change_the_result(self, cluster, monkeypatch):
         X = table()
         compute, maps = DaskBlocks.map, []
 

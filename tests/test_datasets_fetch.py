@@ -129,9 +129,7 @@ class TestFilesThatAreThere:
         assert fetch_file(remote, str(tmp_path)) == path
         assert fetch_file(remote, tmp_path, download_if_missing=False) == path
 
-    def test_may_be_in_the_home_of_scikit_learn(
-        self, tmp_path, without_pooch, monkeypatch
-    ):
+    def test_may_be_in_the_home_of_sklearn(self, tmp_path, without_pooch, monkeypatch):
         monkeypatch.setenv("SCIKIT_LEARN_DATA", str(tmp_path))
         remote = described(CONTENT, "http://256.0.0.0/thing.bin")
         (tmp_path / "isa_nrsfm").mkdir()

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from refusals import warned
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm import AffineNRSfM
@@ -128,8 +129,7 @@ class TestFrontalFaces:
 
     def test_angles_are_withheld(self, frontal):
         X, model = frontal
-        with pytest.warns(UserWarning, match="is not determined"):
-            poses = frame_poses(model, X)
+        poses = warned("is not determined", frame_poses, model, X)
         assert np.isnan(poses[:3]).all()
         assert np.isnan(poses[4:]).all()
         assert np.isfinite(poses.scale).all()
@@ -147,8 +147,7 @@ class TestFrontalFaces:
     def test_affine_angles_are_withheld_likewise(self):
         X, *_ = faces_turned_by(2)
         model = fitted(X, camera="affine")
-        with pytest.warns(UserWarning, match="hardly determine the metric"):
-            poses = frame_poses(model, X)
+        poses = warned("hardly determine the metric", frame_poses, model, X)
         assert np.isnan(poses[:3]).all()
 
     def test_a_model_of_turned_faces_determines_them(self, turned):

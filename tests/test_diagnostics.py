@@ -87,9 +87,7 @@ class TestReliabilities:
         slow_after(1, [(100, 68, 4), (300, 68, 1), (60, 478, 2)], together=True),
     )
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
-    def test_noise_of_rigid_objects_has_none(
-        self, n_frames, n_points, n_components, loss
-    ):
+    def test_noise_of_rigid_objects(self, n_frames, n_points, n_components, loss):
         rigid = make_nonrigid_tracks(
             n_frames, n_points, 0, noise=0.01, random_state=n_frames
         )

@@ -165,9 +165,7 @@ def with_changes(tracks, *names):
     ),
     ids=", ".join,
 )
-def test_coefficients_do_not_depend_on_the_images_placement(
-    tracks, model, variant, changes
-):
+def test_coefficients_do_not_depend_on_placement(tracks, model, variant, changes):
     changed = with_changes(tracks, *changes)
     assert_models_agree(estimator(variant).fit(table_of(changed)), model)
     # The model of the first table gives the coefficients of the second one.

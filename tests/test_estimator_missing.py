@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from frame_parts import ATTRIBUTES_OF_FRAMES
 from layers import slow_after
-from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from refusals import refused, warned
 from sklearn.base import clone
 from sklearn.model_selection import GridSearchCV
 
@@ -195,8 +195,7 @@ def test_methods_make_nothing_of_rows_that_show_nothing():
     expected = fitted_without_empty_rows(refinement="joint")
     table = with_empty_rows(HOLED.data)
     assert fitted.score(table) == expected.score(HOLED.data[~EMPTY])
-    for found, wanted in zip(fitted.diagnostics(), expected.diagnostics(), strict=True):
-        assert_array_equal(found, wanted)
+    assert_equal(fitted.diagnostics(), expected.diagnostics())
     shapes = fitted.reconstruct(table, camera="weak_perspective")
     wanted = expected.reconstruct(HOLED.data[~EMPTY], camera="weak_perspective")
     assert_array_equal(shapes[~EMPTY], wanted)
@@ -207,11 +206,9 @@ def test_methods_make_nothing_of_rows_that_show_nothing():
 def test_rows_that_show_nothing_in_a_search():
     table = with_empty_rows(COMPLETE.data)
     search = GridSearchCV(estimator(refinement=None), {"n_components": [1, K]}, cv=2)
-    with pytest.warns(UserWarning, match="no point is visible"):
-        search.fit(table)
+    warned("no point is visible", search.fit, table)
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
-    with pytest.warns(UserWarning, match="no point is visible"):
-        found = search.best_estimator_.fit_transform(table)
+    found = warned("no point is visible", search.best_estimator_.fit_transform, table)
     assert_array_equal(found, search.best_estimator_.alpha_)
 
 

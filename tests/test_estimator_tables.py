@@ -127,9 +127,7 @@ def assert_zero_from(model, first):
 @pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
 @pytest.mark.parametrize("refinement", ["alternating", None])
 @pytest.mark.parametrize("n_components", range(1, 7))
-def test_shark_has_one_basis_shape_of_rank_two(
-    load_data, n_components, refinement, isa
-):
+def test_shark_has_one_shape_of_rank_two(load_data, n_components, refinement, isa):
     tracks = real_tracks(load_data, "shark_torresani")
     model = fitted(tracks, n_components, isa=isa, refinement=refinement)
     assert model.rank_floor_ < 1e-25
@@ -360,8 +358,7 @@ def test_joint_refinement_of_flat_objects(n_components, noise):
     ),
 )
 def test_joint_refinement_of_repeated_frames(n_different, n_components, seed):
-    rng = np.random.default_rng(seed)
-    tracks = rng.normal(size=(n_different, 20, 2))
+    tracks = np.random.default_rng(seed).normal(size=(n_different, 20, 2))
     model = jointly(np.repeat(tracks, 12, axis=0), n_components)
     assert model.inverse_snr_ < 1e-9
     assert ((model.reliability_ >= 0) & (model.reliability_ < 1 + 1e-12)).all()
@@ -465,9 +462,7 @@ def test_any_unit_is_fitted(scale, refinement):
     ],
     ids=lambda value: str(value),
 )
-def test_inverse_snr_of_known_tables(
-    load_data, name, n_components, params, percent, seed
-):
+def test_inverse_snr_of_tables(load_data, name, n_components, params, percent, seed):
     table = table_of(real_tracks(load_data, name))
     params = {"refinement": "alternating"} | params
     model = AffineNRSfM(n_components, random_state=seed, **params).fit(table)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 from export_models import N_COMPONENTS, aligned, calibrated_model, face_model, faces
-from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from refusals import refused, warned
 from scipy.io import loadmat, savemat
 
 from isa_nrsfm import AffineNRSfM, FastISA
@@ -77,8 +77,7 @@ def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
     truth, model = faces(camera=camera), calibrated_model(camera)
     pdm = point_distribution_model(model)
     again = point_distribution_model(model, camera=None)
-    for one, other in zip(pdm, again, strict=True):
-        assert_array_equal(one, other)
+    assert_equal(pdm, again)
     error = aligned(pdm.mean, truth.mean_shape) - truth.mean_shape
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(truth.mean_shape)
     shapes = on_tangent_space(model.reconstruct(truth.data), pdm.mean)
@@ -106,8 +105,7 @@ def test_rows_without_points_are_left_out():
     options = {"isa": FastISA(n_init=1), "refinement": None, "random_state": 0}
     model = AffineNRSfM(1, **options).fit(table[:40])
     table[40:] = np.nan
-    with pytest.warns(UserWarning, match="no point is visible"):
-        with_empty = AffineNRSfM(1, **options).fit(table)
+    with_empty = warned("no point is visible", AffineNRSfM(1, **options).fit, table)
     found, expected = map(point_distribution_model, (with_empty, model))
     for one, other in zip(found, expected, strict=True):
         assert_allclose(one, other, rtol=1e-9, atol=1e-9)
@@ -122,8 +120,7 @@ def test_a_share_of_the_variance_takes_as_few_modes_as_have_it(pdm):
         found = point_distribution_model(model, n_modes=float(between))
         assert len(found.modes) == n_modes
         exact = point_distribution_model(model, n_modes=n_modes)
-        for one, other in zip(found, exact, strict=True):
-            assert_array_equal(one, other)
+        assert_equal(found, exact)
 
 
 @pytest.mark.parametrize("shape", [(30, 12), (12, 30)])
@@ -150,8 +147,7 @@ def test_another_unit_of_length(pdm):
 def test_files_give_the_same_numbers_again(pdm, tmp_path, suffix):
     path = tmp_path / f"pdm{suffix}"
     write_pdm(pdm, path)
-    for written, read in zip(pdm, read_pdm(str(path)), strict=True):
-        assert_array_equal(read, written)
+    assert_equal(read_pdm(str(path)), pdm)
     if suffix == ".mat":  # as MATLAB code of OpenFace has them
         shapes = {name: loadmat(path)[name].shape for name in "MVE"}
         m = N_COMPONENTS

@@ -96,8 +96,7 @@ def test_other_suffixes(tmp_path, write, suffixes):
 
 def test_models_that_have_no_frames_of_their_own():
     refused("model should be an AffineNRSfM; got PCA", frame_poses, PCA())
-    with pytest.raises(NotFittedError):
-        frame_poses(AffineNRSfM())
+    refused(None, frame_poses, AffineNRSfM(), error=NotFittedError)
     with pytest.raises(ValueError, match='camera must be "weak_perspective" or None'):
         frame_poses(blob_model(), camera="orthographic")
     table = faces().data[:40]

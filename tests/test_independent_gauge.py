@@ -287,8 +287,7 @@ class TestStandardDeviations:
         # The covariance of the coefficients of a fit that is as good, to first order.
         fit = random_fit()
         mixing = random_mixing(1, 4)
-        rng = np.random.default_rng(3)
-        root = rng.normal(size=(60, 3, 3))
+        root = np.random.default_rng(3).normal(size=(60, 3, 3))
         step = 1e-6
         slopes = [
             remixed(fit.alpha + step * e, mixing)[0]

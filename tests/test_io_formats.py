@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 
 from isa_nrsfm.io import (
     FORMATS,
@@ -285,8 +285,7 @@ def test_deeplabcut_unique_points_are_left_out_with_a_warning(tmp_path):
         axis=1,
     )
     path = files.write_deeplabcut(tmp_path / "a.csv", both)
-    with pytest.warns(UserWarning, match="points corner belong to no animal"):
-        landmarks = read_landmarks(path)
+    landmarks = warned("points corner belong to no animal", read_landmarks, path)
     assert_allclose(tracks_of(landmarks), TRACKS)
     files.write_deeplabcut(path, both.rename(columns={"single": "mouse 2"}))
     refused("'mouse' and 'mouse 2' have different", read_landmarks, path)
@@ -489,8 +488,7 @@ def test_only_one_matching_format_is_picked(tmp_path):
 
 def test_unknown_files_are_told_what_was_expected(tmp_path):
     path = tmp_path / "a.slp"
-    with pytest.raises(FileNotFoundError):
-        read_landmarks(path)
+    refused(None, read_landmarks, path, error=FileNotFoundError)
     path.write_bytes(b"x")
     refused(r"a\.slp is of no known format.*sleap: the", read_landmarks, path)
     refused(r"expected the datasets", read_landmarks, path, "sleap")

@@ -197,9 +197,7 @@ class TestCameras:
     @EACH
     @GAPS
     @pytest.mark.parametrize("seed", slow_after(1, range(2)))
-    def test_noise_is_the_true_one_within_the_error_of_sampling(
-        self, camera, gaps, seed
-    ):
+    def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps, seed):
         tracks, _, model = fit_of(camera, seed, gaps)
         freedom = np.isfinite(tracks).sum() - 3 * 3 * 39
         freedom -= (2 + CAMERAS[camera].n_parameters) * 60

@@ -102,9 +102,7 @@ KINDS = pytest.mark.parametrize("kind", ["complete", "weighted"])
 class TestHistory:
     @KINDS
     @pytest.mark.parametrize("penalty", slow_after(1, [10.0, 0.0]))
-    def test_falls_from_the_objective_at_the_start_to_that_at_the_end(
-        self, kind, penalty
-    ):
+    def test_falls_from_the_start_to_the_end(self, kind, penalty):
         scene, start = scene_and_start(kind=kind)
         result = refined(scene, start, penalty=penalty)
         likelihood = likelihood_of(scene.tracks, scene.weights, penalty)

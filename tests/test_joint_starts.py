@@ -154,9 +154,7 @@ class TestLiftedShapes:
 
     @BOTH
     @pytest.mark.parametrize("n_frames", [60, 200])
-    def test_basis_shapes_are_principal_directions_of_what_is_left(
-        self, camera, n_frames
-    ):
+    def test_basis_shapes_are_principal_directions(self, camera, n_frames):
         # With more frames than coordinates, and with fewer.
         scene = random_scene(camera, n_frames=n_frames)
         shapes = lifted_shapes(scene.rows, scene.motion, 3)

@@ -174,8 +174,7 @@ def test_transform_loads_no_more_than_it_uses(tmp_path):
 
 
 def test_the_help_has_the_formats_and_defaults_that_there_are(capsys):
-    with pytest.raises(SystemExit):
-        build_parser().parse_args(["fit", "--help"])
+    refused(None, build_parser().parse_args, ["fit", "--help"], error=SystemExit)
     text = " ".join(capsys.readouterr().out.split())
     assert f"{', '.join(FORMATS).removesuffix(', table')}, or table" in text
     pooled, fast = PooledFastICA().n_init, FastISA().n_init

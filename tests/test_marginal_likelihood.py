@@ -84,9 +84,7 @@ class TestValue:
 
     @KINDS
     @PENALTIES
-    def test_penalty_adds_the_energies_of_the_images_of_the_basis_shapes(
-        self, kind, penalty
-    ):
+    def test_penalty_adds_the_energies_of_the_basis_shapes(self, kind, penalty):
         scene = random_scene(kind)
         energies = sum(
             np.sum((root * (M @ shapes[1:])) ** 2, axis=(1, 2))
@@ -221,9 +219,7 @@ class TestCurvature:
             assert_allclose(got[:, i], packed, rtol=1e-10, atol=1e-12)
 
     @PENALTIES
-    def test_newton_steps_with_them_are_those_of_expectation_maximisation(
-        self, penalty
-    ):
+    def test_newton_steps_are_those_of_expectation_maximisation(self, penalty):
         # M_i = (sum_k c_ik W_i B_k^T) A_i^-1 for the shapes held, and
         # B = N^-1 sum_i (c_i (x) M_i^T) W_i for the cameras held.
         scene = random_scene("complete")

@@ -94,8 +94,7 @@ class TestMetricQuadric:
             assert (Q is not None) == found
 
     def test_leaves_out_frames_without_camera(self):
-        rng = np.random.default_rng(9)
-        motion = noisy_cameras(rng)
+        motion = noisy_cameras(np.random.default_rng(9))
         nothing = [np.full((1, 2, 3), value) for value in (np.nan, 0.0)]
         assert_allclose(
             metric_quadric(np.concatenate([motion, *nothing])), metric_quadric(motion)

@@ -50,9 +50,8 @@ def exact_cameras(seed, camera, n_frames=20, spread=None):
 
 
 def noisy_cameras(seed, camera, n_frames=30):
-    rng = np.random.default_rng(seed)
     motion, _ = exact_cameras(seed, camera, n_frames, spread=0.7)
-    return motion + 0.3 * rng.standard_normal(motion.shape)
+    return motion + 0.3 * np.random.default_rng(seed).standard_normal(motion.shape)
 
 
 def bad_start(seed):

@@ -36,16 +36,14 @@ def test_the_front_view_is_the_reference_camera():
 
 
 def test_the_scale_is_that_of_the_median_camera():
-    rng = np.random.default_rng(2)
     scales = [1.0, 2.0, 3.0, 100.0, 3.0]
-    motion = weak_perspective(rng, 5, scales)
+    motion = weak_perspective(np.random.default_rng(2), 5, scales)
     T = viewing_transform(motion, motion.mean(axis=0))
     assert_allclose(T @ T.T, 9 * np.eye(3), atol=1e-7)
 
 
 def test_cameras_that_say_nothing_about_depth():
-    rng = np.random.default_rng(6)
-    same = np.repeat(rng.standard_normal((1, 2, 3)), 10, axis=0)
+    same = np.repeat(np.random.default_rng(6).standard_normal((1, 2, 3)), 10, axis=0)
     assert np.isfinite(viewing_transform(same, same[0])).all()
 
 

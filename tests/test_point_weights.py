@@ -10,7 +10,7 @@ import pytest
 import sklearn
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
-from refusals import refused
+from refusals import refused, warned
 from scenes import random_scene
 from sklearn.base import clone
 from sklearn.exceptions import UnsetMetadataPassedError
@@ -108,8 +108,7 @@ class TestMeaning:
         X[3, 8], X[5, 10:12] = np.nan, np.nan  # a half point, a missing one
         weights = table.weights.copy()
         weights[3, 4], weights[5, 5] = 1.0, 1.0
-        with pytest.warns(UserWarning, match="only one of"):
-            expected = fitted().transform(X, point_weight=weights)
+        expected = warned("only one of", fitted().transform, X, point_weight=weights)
         weights[3, 4], weights[5, 5] = 9.0, 1e50
         with pytest.warns(UserWarning, match="only one of"):
             assert_array_equal(fitted().transform(X, point_weight=weights), expected)

@@ -102,9 +102,7 @@ def test_tables_of_low_rank_give_finite_numbers(seed, rank, n_components):
 
 
 @given(st.integers(2, 30), st.integers(1, 20), st.integers(1, 6), seeds)
-def test_tables_are_refused_if_and_only_if_they_are_too_small(
-    n_frames, n_points, n_components, seed
-):
+def test_tables_that_are_too_small_are_refused(n_frames, n_points, n_components, seed):
     tracks = np.random.default_rng(seed).normal(size=(n_frames, n_points, 2))
     largest = (n_points - 4) // 3
     smallest = int(np.ceil(8 * (n_components + 2) / 5))

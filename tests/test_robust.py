@@ -270,8 +270,7 @@ class TestGrossOutliers:
 
     def test_missing_points_are_not_among_them(self):
         tracks, where = spoilt(rigid_tracks(), 2.0)
-        rng = np.random.default_rng(2)
-        hidden = rng.random(where.shape) < 0.1
+        hidden = np.random.default_rng(2).random(where.shape) < 0.1
         tracks[hidden] = np.nan
         found = gross_outliers(tracks)
         assert not found[hidden].any()
@@ -280,8 +279,7 @@ class TestGrossOutliers:
 
     def test_frames_with_many_of_them_keep_all_points(self):
         tracks = rigid_tracks()
-        rng = np.random.default_rng(1)
-        tracks[4] = rng.normal(size=tracks.shape[1:])
+        tracks[4] = np.random.default_rng(1).normal(size=tracks.shape[1:])
         assert not gross_outliers(tracks)[4].any()
 
     def test_frames_with_not_so_many_do_not(self):

@@ -119,8 +119,7 @@ def test_methods_are_those_of_the_best_estimator(fitted):
 def test_nothing_is_there_before_the_fit():
     search = AffineNRSfMCV()
     assert not hasattr(search, "n_features_in_")
-    with pytest.raises(NotFittedError):
-        search.transform(X)
+    refused(None, search.transform, X, error=NotFittedError)
 
 
 @pytest.mark.slow

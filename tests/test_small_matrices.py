@@ -62,8 +62,7 @@ class TestThreeByThree:
     @pytest.mark.parametrize("rank", [0, 1, 2])
     @pytest.mark.parametrize("unit", [1e-100, 1.0, 1e100])
     def test_singular_matrices_have_a_generalised_inverse(self, rank, unit):
-        rng = np.random.default_rng(rank)
-        X = rng.normal(size=(40, 3, rank))
+        X = np.random.default_rng(rank).normal(size=(40, 3, rank))
         X[:10, 0] = 0  # flat along an axis
         A = unit * last_to_first((X @ X.swapaxes(1, 2)).T)
         inverse = last_to_first(inverse3(np.moveaxis(A, 0, -1)[ROWS, COLUMNS]))

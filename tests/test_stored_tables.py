@@ -8,7 +8,7 @@ import pytest
 from frame_parts import ATTRIBUTES_OF_FRAMES
 from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
@@ -88,8 +88,7 @@ class TestFit:
         expected.fit(memmap(X[~empty], tmp_path))
         X[empty] = np.nan
         model = estimator(**params, frames_folder=tmp_path / "found")
-        with pytest.warns(UserWarning, match=f"{empty.sum()} of 150 rows"):
-            model.fit(memmap(X, tmp_path))
+        warned(f"{empty.sum()} of 150 rows", model.fit, memmap(X, tmp_path))
         for name in OF_SHAPES:
             assert_array_equal(getattr(model, name), getattr(expected, name))
         for name in ATTRIBUTES_OF_FRAMES:

@@ -5,6 +5,7 @@ from copy import copy
 
 import numpy as np
 import pytest
+from refusals import warned
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
@@ -66,8 +67,7 @@ def test_summary_of_calibrated_cameras(camera):
 def test_rows_without_points_are_told():
     table = TABLE.copy()
     table[[3, 8]] = np.nan
-    with pytest.warns(UserWarning, match="2 of 60"):
-        shown = summary(estimator(scale_frames=False).fit(table))
+    shown = warned("2 of 60", summary, estimator(scale_frames=False).fit(table))
     assert shown["Frames"] == "58, 2 rows without points"
     assert shown["Noise"].endswith("in the units of the table")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 from scenes import with_missing
 
 from isa_nrsfm._prepare import checks
@@ -251,8 +251,7 @@ class TestOtherLayout:
         else:
             X = make_face_tracks(60, missing=0.3, random_state=kind).data
         warn_if_other_layout(X, "interleaved", True)
-        with pytest.warns(UserWarning, match="layout='interleaved' explains"):
-            warn_if_other_layout(X, "planar", True)
+        warned("layout='interleaved' explains", warn_if_other_layout, X, "planar", True)
 
     def test_a_rigid_object_seen_in_the_right_layout(self, rng):
         tracks = rng.normal(size=(12, 3)) @ rng.normal(size=(20, 3, 2))

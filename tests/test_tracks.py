@@ -88,9 +88,7 @@ class TestMissingPoints:
     @pytest.mark.parametrize("order", ["C", "F"])
     @pytest.mark.parametrize("layout", LAYOUTS)
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-    def test_complete_tables_have_the_plain_values_to_the_last_bit(
-        self, rng, dtype, layout, order
-    ):
+    def test_complete_tables_have_the_plain_values(self, rng, dtype, layout, order):
         X = np.asarray(7 + rng.normal(size=(50, 40)), dtype=dtype, order=order)
         tracks = table_to_tracks(X, layout)
         assert clean_tracks(tracks) is tracks

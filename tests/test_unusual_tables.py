@@ -97,9 +97,7 @@ def test_sizes_within_the_range_change_no_coefficient(params, size):
 
 
 @pytest.mark.parametrize("size", [1e160, 1e300, 1e-160, 1e-300])
-def test_coordinates_outside_the_range_are_refused_with_the_range(
-    model, size, tmp_path
-):
+def test_coordinates_outside_the_range_are_refused(model, size, tmp_path):
     match = "between 1e-150 and 2e\\+153 .* another unit"
     refused(match, estimator().fit, size * X)
     refused(match, PseudoInverseNRSfM(1).fit, size * X)
