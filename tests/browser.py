@@ -12,16 +12,10 @@ import numpy as np
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--remote-debugging-pipe",
-)
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync "
+    "--remote-debugging-pipe"
+).split()
 PATIENCE = 30.0
 
 
@@ -88,13 +82,8 @@ class Browser:
     def open(self, url, width=1200, height=800, mobile=False):
         """Show a page in a window of a size, with no events before it."""
         self.events.clear()
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=mobile,
-        )
+        size = {"width": width, "height": height, "mobile": mobile}
+        self.call("Emulation.setDeviceMetricsOverride", deviceScaleFactor=1, **size)
         self.call("Page.navigate", url=url)
         self.wait("document.readyState === 'complete'")
 
@@ -125,31 +114,16 @@ class Browser:
 
     def drag(self, start, end):
         """Drag with the mouse."""
-        for kind, (x, y) in (
-            ("mousePressed", start),
-            ("mouseMoved", end),
-            ("mouseReleased", end),
-        ):
-            self.call(
-                "Input.dispatchMouseEvent",
-                type=kind,
-                x=x,
-                y=y,
-                button="left",
-                buttons=1,
-                clickCount=1,
-            )
+        button = {"button": "left", "buttons": 1, "clickCount": 1}
+        kinds = "mousePressed", "mouseMoved", "mouseReleased"
+        for kind, (x, y) in zip(kinds, (start, end, end), strict=True):
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
 
     def press(self, key, code=0):
         """Press a key."""
+        keys = {"key": key, "code": key, "windowsVirtualKeyCode": code}
         for kind in ("keyDown", "keyUp"):
-            self.call(
-                "Input.dispatchKeyEvent",
-                type=kind,
-                key=key,
-                code=key,
-                windowsVirtualKeyCode=code,
-            )
+            self.call("Input.dispatchKeyEvent", type=kind, **keys)
 
     def complaints(self):
         """Return what errors and warnings came up since the page was opened."""

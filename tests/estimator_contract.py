@@ -37,18 +37,13 @@ NARROW_TABLE_CHECKS = {
 
 # Checks that scikit-learn runs on its own estimators but `check_estimator` does not.
 EXTRA_CHECKS = (
-    "check_dataframe_column_names_consistency",
-    "check_get_feature_names_out_error",
-    "check_global_output_transform_pandas",
-    "check_global_set_output_transform_polars",
-    "check_inplace_ensure_writeable",
-    "check_param_validation",
-    "check_set_output_transform",
-    "check_set_output_transform_pandas",
-    "check_set_output_transform_polars",
-    "check_transformer_get_feature_names_out",
-    "check_transformer_get_feature_names_out_pandas",
-)
+    "check_dataframe_column_names_consistency check_get_feature_names_out_error "
+    "check_global_output_transform_pandas check_global_set_output_transform_polars "
+    "check_inplace_ensure_writeable check_param_validation check_set_output_transform "
+    "check_set_output_transform_pandas check_set_output_transform_polars "
+    "check_transformer_get_feature_names_out "
+    "check_transformer_get_feature_names_out_pandas"
+).split()
 
 
 def widen(estimator, X, X_test=None, kernel=None):

@@ -43,15 +43,9 @@ deterministic = pytest.mark.parametrize("method", list(METHODS)[:2])
 @cache
 def table(seed=0, noise=0.01, n_frames=60, n_points=30, n_components=2, **parameters):
     """Return a table of orthographic cameras with its truth, to be left as it is."""
-    return make_nonrigid_tracks(
-        n_frames,
-        n_points,
-        n_components,
-        noise=noise,
-        camera="orthographic",
-        random_state=seed,
-        **parameters,
-    )
+    sizes = n_frames, n_points, n_components
+    parameters |= {"camera": "orthographic", "noise": noise, "random_state": seed}
+    return make_nonrigid_tracks(*sizes, **parameters)
 
 
 @cache

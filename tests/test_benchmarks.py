@@ -35,18 +35,8 @@ COMMANDS = [
 
 def record(**changes):
     """Return a record of a run that took two seconds."""
-    plain = Record(
-        section="truth",
-        set="drink",
-        method="joint",
-        seed=0,
-        status="ok",
-        values={"inverse_snr": 0.01},
-        parameters={},
-        seconds=2.0,
-        memory=10.0,
-        environment="now",
-    )
+    run = "truth", "drink", "joint", 0, "ok", {"inverse_snr": 0.01}, {}, 2.0, 10.0
+    plain = Record(*run, environment="now")
     return plain._replace(**changes)
 
 

@@ -115,13 +115,10 @@ class TestAlone:
         clone(estimator(refinement=None).set_callbacks(recorder)).fit(TABLE)
         assert "table" in recorder.tasks()
 
-    def test_fitted_models_with_callbacks_can_be_pickled(self):
-        model, _ = recorded(estimator(refinement=None))
+    def test_files_hold_no_callbacks(self, tmp_path):
+        model, recorder = recorded(estimator(refinement=None))
         loaded = pickle.loads(pickle.dumps(model))
         assert_array_equal(loaded.transform(TABLE), model.alpha_)
-
-    def test_model_files_hold_no_callbacks(self, tmp_path):
-        model, recorder = recorded(estimator(refinement=None))
         save_model(model, tmp_path / "model.npz")
         loaded = load_model(tmp_path / "model.npz")
         assert_array_equal(loaded.transform(TABLE), model.alpha_)

@@ -29,24 +29,14 @@ def angle_between(one, two):
 
 class TestByPoints:
     @pytest.mark.parametrize("turn", ROTATIONS)
-    def test_pose_does_not_depend_on_how_the_shape_is_turned(self, face, turn):
-        upright = canonical_pose(face, **POINTS)
-        pose = canonical_pose(face @ turn.T, **POINTS)
-        assert_allclose(pose.shape, upright.shape, atol=1e-10)
-        assert_allclose(pose.shape, face @ turn.T @ pose.rotation.T, atol=1e-10)
-        assert np.linalg.det(pose.rotation) == pytest.approx(1)
-        assert not pose.mirrored
-
-    @pytest.mark.parametrize("turn", ROTATIONS)
-    def test_mirror_images(self, face, turn):
-        upright = canonical_pose(face, **POINTS)
-        pose = canonical_pose(face @ MIRROR @ turn.T, **POINTS)
-        assert pose.mirrored
-        assert np.linalg.det(pose.rotation) == pytest.approx(-1)
-        assert_allclose(pose.shape, upright.shape, atol=1e-10)
-        assert_allclose(
-            pose.shape, face @ MIRROR @ turn.T @ pose.rotation.T, atol=1e-10
-        )
+    @pytest.mark.parametrize("mirror", [np.eye(3), MIRROR], ids=["same", "mirrored"])
+    def test_turned_shapes_and_mirror_images_have_one_pose(self, face, turn, mirror):
+        given = face @ mirror @ turn.T
+        pose = canonical_pose(given, **POINTS)
+        assert_allclose(pose.shape, canonical_pose(face, **POINTS).shape, atol=1e-10)
+        assert_allclose(pose.shape, given @ pose.rotation.T, atol=1e-10)
+        assert np.linalg.det(pose.rotation) == pytest.approx(np.linalg.det(mirror))
+        assert pose.mirrored == (mirror is MIRROR)
 
     def test_mirror_images_stay_what_they_are_without_front(self, face):
         pose = canonical_pose(face @ MIRROR, left_right=LEFT_RIGHT, up=UP)

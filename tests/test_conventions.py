@@ -19,29 +19,12 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "isa_nrsfm"
 TESTS = ROOT / "tests"
 FOLDERS = ["isa_nrsfm", "tests", "benchmarks", "docs"]
-OPTIONAL = [
-    "h5py",
-    "matplotlib",
-    "pandas",
-    "polars",
-    "pooch",
-    "pyarrow",
-    "yaml",
-]
+OPTIONAL = "h5py matplotlib pandas polars pooch pyarrow yaml".split()
 # Where everybody finds names; each has __all__.
+PUBLIC = "analysis baselines calibration cli datasets export io isa metrics plotting"
 PUBLIC_MODULES = [
     "isa_nrsfm",
-    "isa_nrsfm.analysis",
-    "isa_nrsfm.baselines",
-    "isa_nrsfm.calibration",
-    "isa_nrsfm.cli",
-    "isa_nrsfm.datasets",
-    "isa_nrsfm.export",
-    "isa_nrsfm.io",
-    "isa_nrsfm.isa",
-    "isa_nrsfm.metrics",
-    "isa_nrsfm.plotting",
-    "isa_nrsfm.skeletons",
+    *(f"isa_nrsfm.{name}" for name in [*PUBLIC.split(), "skeletons"]),
 ]
 # Not every docstring needs an extended summary, a See Also section or an example.
 NOT_NEEDED = {"ES01", "SA01", "EX01"}

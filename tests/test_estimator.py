@@ -32,13 +32,9 @@ N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
 ONLY_JOINT = (
-    "alpha_std_",
-    "noise_variance_",
-    "camera_noise_ratio_",
-    "reliability_",
-    "objective_history_",
-    "gradient_norm_",
-)
+    "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_ objective_history_ "
+    "gradient_norm_"
+).split()
 
 
 # What noise is left in the table at the true number of basis shapes.

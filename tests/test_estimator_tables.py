@@ -16,18 +16,10 @@ from isa_nrsfm.datasets import make_body_tracks, make_face_tracks
 from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.metrics import mean_shape_error_3d
 
-REAL_TABLES = [
-    "akhter_drink",
-    "akhter_pickup",
-    "akhter_yoga",
-    "expressions_dlib_68",
-    "faces_wild_68_combined",
-    "flag_mocap_30x250",
-    "hands_kazuhito_21",
-    "ict_bu3dfe_like_68",
-    "muct_68",
-    "shark_torresani",
-]
+REAL_TABLES = (
+    "akhter_drink akhter_pickup akhter_yoga expressions_dlib_68 faces_wild_68_combined "
+    "flag_mocap_30x250 hands_kazuhito_21 ict_bu3dfe_like_68 muct_68 shark_torresani"
+).split()
 FAST = FastISA(n_init=2)
 FACES = make_face_tracks(60, n_components=2, random_state=0).tracks
 

@@ -162,12 +162,8 @@ def test_transform_loads_no_more_than_it_uses(tmp_path):
     assert (tmp_path / "alpha.csv").exists()
     assert "isa_nrsfm._estimator" in loaded
     not_used = {
-        "matplotlib",
-        "scipy.io",
-        "sklearn.decomposition",
-        "sklearn.model_selection",
-        "isa_nrsfm.cli._fit",
-        "isa_nrsfm.export._viewer",
+        *"matplotlib scipy.io sklearn.decomposition sklearn.model_selection".split(),
+        *(f"isa_nrsfm.{name}" for name in ("cli._fit", "export._viewer")),
         "isa_nrsfm.plotting._views",
     }
     assert not loaded & not_used

@@ -25,14 +25,8 @@ N_COMPONENTS = 2
 
 def scene(seed, noise=0.0, n_frames=60):
     """Return the left singular vectors times singular values, and true cameras."""
-    truth = make_nonrigid_tracks(
-        n_frames,
-        40,
-        N_COMPONENTS,
-        camera="orthographic",
-        noise=noise,
-        random_state=seed,
-    )
+    options = {"camera": "orthographic", "noise": noise, "random_state": seed}
+    truth = make_nonrigid_tracks(n_frames, 40, N_COMPONENTS, **options)
     W = measurement_matrix(centred_tracks(truth.tracks)[0])
     U, S, _ = np.linalg.svd(W, full_matrices=False)
     n = 3 * N_COMPONENTS + 3

@@ -73,17 +73,13 @@ class TestThreeByThree:
 @pytest.mark.parametrize("n", NUMBERS)
 class TestPositiveDefinite:
     @pytest.mark.parametrize("k", range(1, 16))
-    def test_solution(self, k, n):
+    def test_solution_and_inverse(self, k, n):
         A = positive_matrices(k, k, n)
         b = np.random.default_rng(0).normal(size=(k, n))
         x, positive = solve_positive(packed(A), b)
         expected = np.linalg.solve(last_to_first(A), b.T[..., None])[..., 0].T
         assert_allclose(x, expected, rtol=1e-10, atol=1e-11 * np.abs(x).max())
         assert positive.all()
-
-    @pytest.mark.parametrize("k", range(1, 16))
-    def test_inverse(self, k, n):
-        A = positive_matrices(k, k, n)
         inverse, positive = invert_positive(packed(A))
         expected = np.linalg.inv(last_to_first(A))
         assert_allclose(last_to_first(unpacked(inverse)), expected, atol=1e-9)
@@ -130,13 +126,10 @@ class TestPositiveDefinite:
 
 
 class TestPacking:
-    def test_unpacked_is_the_matrix(self):
-        A = positive_matrices(0, 5, 3)
-        assert_array_equal(unpacked(packed(A)), A)
-
-    def test_diagonal(self):
+    def test_unpacked_is_the_matrix_and_has_its_diagonal(self):
         A = positive_matrices(0, 5, 3)
         matrices = packed(A)
+        assert_array_equal(unpacked(matrices), A)
         assert_array_equal(matrices[diagonal_of(matrices)], np.diagonal(A).T)
 
     @pytest.mark.parametrize("n", NUMBERS)

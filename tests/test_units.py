@@ -26,13 +26,8 @@ COLUMNS = [
     {"camera": "orthographic"},
 ]
 OF_JOINT_FIT = {
-    "alpha_std_",
-    "noise_variance_",
-    "camera_noise_ratio_",
-    "depth_uncertainty_",
-    "reliability_",
-    "objective_history_",
-    "gradient_norm_",
+    *("alpha_std_", "noise_variance_", "camera_noise_ratio_", "depth_uncertainty_"),
+    *("reliability_", "objective_history_", "gradient_norm_"),
 }
 # What is different with orthographic cameras where there is no joint refinement: it is
 # the covariance of what multiplies white signals, not shapes in the units of the table.
@@ -53,14 +48,8 @@ def units():
 
 def table(camera):
     """Return a table that such cameras see, away from the origin."""
-    scene = make_nonrigid_tracks(
-        60,
-        30,
-        2,
-        noise=0.01,
-        camera="orthographic" if camera == "orthographic" else "weak_perspective",
-        random_state=0,
-    )
+    camera = camera if camera == "orthographic" else "weak_perspective"
+    scene = make_nonrigid_tracks(60, 30, 2, noise=0.01, camera=camera, random_state=0)
     return scene.data + 5.0
 
 

@@ -23,6 +23,14 @@ DRAWN = (
 )
 
 
+def show(browser, frame):
+    """Move the slider of frames."""
+    browser.run(
+        "(() => { const slider = document.getElementById('frame'); slider.value ="
+        f" {frame}; slider.dispatchEvent(new Event('input')); }})()"
+    )
+
+
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
     """Return a browser, or skip."""
@@ -160,10 +168,7 @@ def test_frames_play_and_stop(browser, page):
 
 def test_a_frame_is_seen_as_by_its_camera(browser, page):
     browser.open(page)
-    browser.run(
-        "(() => { const slider = document.getElementById('frame'); slider.value = 7;"
-        " slider.dispatchEvent(new Event('input')); })()"
-    )
+    show(browser, 7)
     before = browser.array("viewer.projected()")[:, :2]
     browser.click("pose")
     seen = browser.array("viewer.projected()")[:, :2]
@@ -182,9 +187,8 @@ def test_a_frame_is_seen_as_by_its_camera(browser, page):
 def test_a_click_in_the_plane_of_coefficients_shows_the_nearest_frame(browser, page):
     browser.open(page)
     browser.run("document.getElementById('plane').scrollIntoView()")
-    box = browser.run(
-        "document.getElementById('plane').getBoundingClientRect().toJSON()"
-    )
+    where = "document.getElementById('plane').getBoundingClientRect().toJSON()"
+    box = browser.run(where)
     # The frame with the largest first coefficient is farthest to the right.
     alpha = face_model().alpha_[np.linspace(0, N_FRAMES - 1, 60).astype(int)]
     right = int(np.argmax(alpha[:, 0]))
@@ -241,10 +245,7 @@ def test_error_bars_are_along_the_viewing_direction(browser, tmp_path):
     assert browser.run("viewer.state().frame") == 0
     assert not browser.run("document.getElementById('barred').hidden")
     for frame in (0, 7):
-        browser.run(
-            f"(() => {{ const slider = document.getElementById('frame'); slider.value ="
-            f" {frame}; slider.dispatchEvent(new Event('input')); }})()"
-        )
+        show(browser, frame)
         browser.run("document.getElementById('pose').checked = true")
         browser.run("document.getElementById('front').click()")
         # In the view of its camera a bar is a point, but for the perspective.
