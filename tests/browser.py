@@ -31,9 +31,8 @@ class Browser:
         # The browser reads from its file 3 and writes to its file 4.
         theirs_in, self._to = os.pipe()
         self._from, theirs_out = os.pipe()
-        high = [
-            fcntl.fcntl(file, fcntl.F_DUPFD, 20) for file in (theirs_in, theirs_out)
-        ]
+        files = theirs_in, theirs_out
+        high = [fcntl.fcntl(file, fcntl.F_DUPFD, 20) for file in files]
         quiet = os.open(os.devnull, os.O_RDWR)
         places = zip([quiet, quiet, *high], [1, 2, 3, 4], strict=True)
         command = [program, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
@@ -89,9 +88,8 @@ class Browser:
 
     def run(self, code):
         """Return the value of an expression, once it is known."""
-        answer = self.call(
-            "Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True
-        )
+        options = {"returnByValue": True, "awaitPromise": True}
+        answer = self.call("Runtime.evaluate", expression=code, **options)
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{code}: {answer['exceptionDetails']}")
         return answer["result"].get("value")

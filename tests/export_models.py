@@ -15,9 +15,8 @@ LABELS = [["neutral", HOSTILE, "smile"][i % 3] for i in range(N_FRAMES)]
 @cache
 def faces(noise=0.005, camera="weak_perspective"):
     """Return artificial faces seen by calibrated cameras."""
-    return make_face_tracks(
-        N_FRAMES, n_components=N_COMPONENTS, camera=camera, noise=noise, random_state=0
-    )
+    options = {"camera": camera, "noise": noise, "random_state": 0}
+    return make_face_tracks(N_FRAMES, n_components=N_COMPONENTS, **options)
 
 
 @cache

@@ -304,8 +304,7 @@ WRITERS = {
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
-EXPECTED = dict.fromkeys(
-    [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")], MESH
-)
+IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
+EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
 EXPECTED |= {"pyfeat-parquet": MESH, "pts-file": TRACKS[:1]}
 EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

@@ -99,9 +99,8 @@ def random_cameras(rng, n_frames):
 @cache
 def faces(n_frames=60, n_components=2, **options):
     """Return generated faces, to be left as they are."""
-    return make_face_tracks(
-        n_frames, n_components=n_components, random_state=0, **options
-    )
+    options = {"n_components": n_components, "random_state": 0} | options
+    return make_face_tracks(n_frames, **options)
 
 
 @cache

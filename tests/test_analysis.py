@@ -43,9 +43,8 @@ def least_p(trial, n_trials=60, **options):
     """Return the least p-value of each random trial (alpha, y, groups)."""
     least = []
     for seed in range(n_trials):
-        found = association(
-            *trial(seed), n_permutations=99, random_state=seed, **options
-        )
+        options = {"n_permutations": 99, "random_state": seed} | options
+        found = association(*trial(seed), **options)
         least.append(found.p_value.min())
     return np.array(least)
 
@@ -99,9 +98,8 @@ class TestAssociation:
     def test_labels_in_blocks_of_a_video_go_with_nothing_by_chance(self):
         # Nine in ten are significant if single frames are permuted.
         assert np.mean(least_p(video) <= 0.05) < 0.15
-        alone = least_p(
-            lambda seed: [a[rng_of(0).permutation(200)] for a in video(seed)]
-        )
+        order = rng_of(0).permutation(200)
+        alone = least_p(lambda seed: [a[order] for a in video(seed)])
         assert np.mean(alone <= 0.05) > 0.5
 
     def test_a_real_effect_in_a_video_is_found(self):
@@ -262,13 +260,11 @@ class TestWithinGroups:
 
     def test_neutral_frames(self):
         neutral = np.arange(30) % 10 < 2
-        got = WithinGroups().fit_transform(
-            self.alpha, groups=self.people, neutral=neutral
-        )
+        given = {"groups": self.people, "neutral": neutral}
+        got = WithinGroups().fit_transform(self.alpha, **given)
         for person in "abc":
-            assert_allclose(
-                got[(self.people == person) & neutral].mean(axis=0), 0, atol=1e-15
-            )
+            means = got[(self.people == person) & neutral].mean(axis=0)
+            assert_allclose(means, 0, atol=1e-15)
 
     def test_groups_of_the_fit_keep_their_means(self):
         step = WithinGroups().fit(self.alpha, groups=self.people)
@@ -277,9 +273,8 @@ class TestWithinGroups:
 
     def test_new_groups_have_their_own(self):
         step = WithinGroups().fit(self.alpha, groups=self.people)
-        got = step.transform(
-            [[1.0, 2.0], [3.0, 2.0], [0.0, 0.0]], groups=["x", "x", "a"]
-        )
+        rows = [[1.0, 2.0], [3.0, 2.0], [0.0, 0.0]]
+        got = step.transform(rows, groups=["x", "x", "a"])
         assert_allclose(got[:2], [[-1, 0], [1, 0]])
         assert_allclose(got[2], -self.alpha[:10].mean(axis=0))
 
@@ -297,9 +292,8 @@ class TestWithinGroups:
             step.set_transform_request(groups=True, neutral=False)
             pipeline = make_pipeline(step)
             got = pipeline.fit_transform(self.alpha, groups=self.people)
-        assert_allclose(
-            got, WithinGroups().fit_transform(self.alpha, groups=self.people)
-        )
+        expected = WithinGroups().fit_transform(self.alpha, groups=self.people)
+        assert_allclose(got, expected)
 
     def test_groups_without_neutral_frames_are_refused(self):
         with pytest.raises(

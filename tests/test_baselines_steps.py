@@ -110,9 +110,8 @@ class TestNuclearNorm:
     def solve(self, W, price=0.5, max_iter=20_000, tol=1e-11, cameras=None, **options):
         cameras = self.cameras if cameras is None else cameras
         start = least_norm_shapes(W, cameras)
-        return nuclear_norm_shapes(
-            W, cameras, price, start, max_iter=max_iter, tol=tol, **options
-        )
+        options |= {"max_iter": max_iter, "tol": tol}
+        return nuclear_norm_shapes(W, cameras, price, start, **options)
 
     def errors(self, W, shapes):
         return W.reshape(20, 2, -1) - self.cameras @ shapes.swapaxes(1, 2)

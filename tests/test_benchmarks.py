@@ -231,9 +231,8 @@ def test_absent_sets_are_skipped_by_name(tmp_path, monkeypatch, capsys):
         ("faces_wild", "faces_wild_68_combined"),
         ("ict_dense", "ict_bu3dfe_like_basis"),
     ):
-        line = (
-            f"reprojection {name}: skipped, no {file}.npz in the folder ISA_NRSFM_DATA"
-        )
+        line = f"reprojection {name}: skipped, no {file}.npz in the folder "
+        line += "ISA_NRSFM_DATA"
         assert line in printed
     assert not list(tmp_path.glob("*.md"))
 

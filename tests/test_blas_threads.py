@@ -123,9 +123,8 @@ def test_results_are_the_same_to_the_bit():
     for number in (1, 2):
         with threadpool_limits(number, user_api="blas"):
             model = AffineNRSfM(3, random_state=0).fit(X)
-            fits.append(
-                (model.basis_, model.alpha_, model.transform(X), model.score(X))
-            )
+            of_table = model.transform(X), model.score(X)
+            fits.append((model.basis_, model.alpha_, *of_table))
     for one, two in zip(*fits, strict=True):
         assert_array_equal(one, two)
 

@@ -76,9 +76,8 @@ class TestProducts:
         M_0 = scene.rigid.reshape(-1, 2, 3)
         for i, M_i in enumerate(scene.motion.reshape(len(M_0), 2, -1)):
             assert_allclose(products.cross[i], M_0[i].T @ M_i, atol=1e-13)
-            assert_allclose(
-                products.rigid[i].reshape(3, 3), M_0[i].T @ M_0[i], atol=1e-13
-            )
+            rigid = products.rigid[i].reshape(3, 3)
+            assert_allclose(rigid, M_0[i].T @ M_0[i], atol=1e-13)
         assert_allclose(products.gram, scene.motion.T @ scene.motion, atol=1e-12)
 
     def test_rotated_products_are_those_of_the_rotated_motion(self):
@@ -114,9 +113,8 @@ class TestAllMethods:
         scene = structured_motion(0, noise=0.3)
         D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
         for factors in ((unit, unit), (1.0, unit), (unit, 1.0)):
-            products = motion_products(
-                factors[0] * scene.rigid, factors[1] * scene.motion
-            )
+            rigid, motion = factors[0] * scene.rigid, factors[1] * scene.motion
+            products = motion_products(rigid, motion)
             other = recover_blocks(products, method)
             assert_allclose(direction(other), direction(D), atol=1e-7)
 

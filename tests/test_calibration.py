@@ -278,9 +278,8 @@ class TestEuclideanFrames:
         _, motion, alpha, mean, basis = fitted
         frames = euclidean_frames(*fitted)
         affine = mean + np.tensordot(alpha, basis, 1)
-        images = frames.scales[:, None, None] * (
-            frames.shapes @ frames.rotations[:, :2].transpose(0, 2, 1)
-        )
+        rows = frames.rotations[:, :2].transpose(0, 2, 1)
+        images = frames.scales[:, None, None] * (frames.shapes @ rows)
         assert_allclose(images, affine @ motion.transpose(0, 2, 1), atol=1e-12)
         R = frames.rotations
         assert_allclose(R @ R.transpose(0, 2, 1) - np.eye(3), 0, atol=1e-12)
@@ -357,8 +356,7 @@ def test_models_with_calibrated_cameras_have_a_metric(camera, recwarn):
     assert_allclose(metric.strain, 0.0, atol=1e-6)
     assert metric.residual < 1e-10
     assert len(recwarn) == 0
-    frames = euclidean_frames(
-        metric, model.motion_, model.alpha_, model.mean_shape_, model.basis_
-    )
+    fit = model.motion_, model.alpha_, model.mean_shape_, model.basis_
+    frames = euclidean_frames(metric, *fit)
     shapes = model.reconstruct(faces().data)
     assert mean_shape_error_3d(shapes, frames.shapes, convention="frame") < 1e-6

@@ -40,9 +40,8 @@ def faces():
     """Return a table of faces with a name for each row."""
     bunch = make_face_tracks(N_FRAMES, n_components=N_COMPONENTS, random_state=0)
     frame = pd.DataFrame(bunch.data, columns=LANDMARKS)
-    frame.insert(
-        0, "name", [f"{'ir' if i % 10 == 9 else 'i'}{i:03d}" for i in range(60)]
-    )
+    names = [f"{'ir' if i % 10 == 9 else 'i'}{i:03d}" for i in range(60)]
+    frame.insert(0, "name", names)
     frame["code"] = [f"{i:04d}" for i in range(N_FRAMES)]
     return frame
 
@@ -103,9 +102,8 @@ def test_fit_writes_all_that_its_report_lists(run, table, tmp_path):
     assert set(report["seconds"]) == {"read", "fit", "write", "figures"}
     seconds = sum(report["seconds"].values())
     assert seconds == pytest.approx(time.perf_counter() - since, abs=0.5)
-    assert sum(row["energy_share"] for row in report["model"]["alpha"]) == (
-        pytest.approx(1)
-    )
+    shares = [row["energy_share"] for row in report["model"]["alpha"]]
+    assert sum(shares) == pytest.approx(1)
 
 
 def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
@@ -127,9 +125,8 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     arrays = np.load(fitted / "shapes.npz", allow_pickle=False)
     assert list(arrays["component_names"]) == ["alpha_1", "alpha_2"]
     assert list(arrays["point_names"]) == [str(j) for j in range(68)]
-    shapes = arrays["mean_shape"] + np.tensordot(
-        alpha[["alpha_1", "alpha_2"]].to_numpy(), arrays["basis"], 1
-    )
+    weights = alpha[["alpha_1", "alpha_2"]].to_numpy()
+    shapes = arrays["mean_shape"] + np.tensordot(weights, arrays["basis"], 1)
     points = pd.read_csv(fitted / "shapes.csv", dtype={"point": str})
     assert list(points["point"]) == list(arrays["point_names"])
     assert " ".join(points)[:46] == "point mean_X mean_Y mean_Z basis_1_X basis_1_Y"
@@ -139,9 +136,8 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
         np.testing.assert_allclose(written, expected, rtol=1e-12)
     motion = cameras.iloc[:, 1:7].to_numpy().reshape(-1, 2, 3)
     images = shapes @ motion.swapaxes(1, 2) + cameras[["tx", "ty"]].to_numpy()[:, None]
-    np.testing.assert_allclose(
-        images.reshape(len(X), -1), model.reproject(X), rtol=1e-9
-    )
+    images_of_table = images.reshape(len(X), -1)
+    np.testing.assert_allclose(images_of_table, model.reproject(X), rtol=1e-9)
 
     report = report_of(fitted)["model"]
     assert report["inverse_snr"] == pytest.approx(model.inverse_snr_)
@@ -194,9 +190,8 @@ def test_options_reach_the_estimator(succeeds, table, tmp_path, options, expecte
 
 @pytest.mark.parametrize("camera", slow_after(1, ["orthographic", "weak_perspective"]))
 def test_calibrated_cameras(run, tmp_path, camera):
-    faces = make_face_tracks(
-        40, n_components=1, camera=camera, noise=0.01, random_state=0
-    )
+    options = {"camera": camera, "noise": 0.01, "random_state": 0}
+    faces = make_face_tracks(40, n_components=1, **options)
     X = pd.DataFrame(faces.data, columns=faces.feature_names)
     path, folder = tmp_path / "faces.csv", tmp_path / "results"
     X.to_csv(path, index=False)
@@ -246,9 +241,8 @@ def test_outliers_are_reported(succeeds, tmp_path):
     model = report_of(tmp_path)["model"]
     assert model["outliers"]["message"][1:] in " ".join(out.split())
     # The basis shape bends to some of the eight. Rows are those of the table.
-    largest = [
-        (each["row"], int(each["point"])) for each in model["outliers"]["largest"]
-    ]
+    largest = model["outliers"]["largest"]
+    largest = [(each["row"], int(each["point"])) for each in largest]
     assert 4 <= len(largest) == model["outliers"]["n_points"]
     assert {row for row, _ in largest} < {*range(8, 16)}
     assert all(point == row for row, point in largest[:4])
@@ -282,9 +276,8 @@ def test_rows_with_missing_points_are_fitted(succeeds, changed, faces, tmp_path)
     assert list(alpha["row"]) == list(X.index)
     np.testing.assert_allclose(alpha[["alpha_1", "alpha_2"]], again.alpha_, atol=1e-9)
     off = (again.reproject(X) - X).to_numpy()
-    assert report["model"]["rms_point_error"] == pytest.approx(
-        np.sqrt(2 * np.nanmean(off**2))
-    )
+    error = np.sqrt(2 * np.nanmean(off**2))
+    assert report["model"]["rms_point_error"] == pytest.approx(error)
 
 
 def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path):
@@ -326,9 +319,8 @@ def test_rows_that_cannot_be_fitted_are_empty(succeeds, changed, faces, tmp_path
     assert " 1  without coefficients: points on one line, others missing\n" in out
     again = pd.read_csv(again)
     assert list(again) == list(alpha)
-    np.testing.assert_allclose(
-        again.filter(like="alpha"), alpha.filter(like="alpha"), atol=1e-7
-    )
+    found, expected = again.filter(like="alpha"), alpha.filter(like="alpha")
+    np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
 def test_standard_deviations_are_written(run, fails, table, fitted, tmp_path):
@@ -373,9 +365,8 @@ def test_origin_is_not_a_missing_point(succeeds, fails, changed, tmp_path):
     assert "(0, 0)" not in err
     assert "(-0" not in err
     message = fails("fit", path, "-o", folder, *UNREFINED, "--zeros-missing")
-    assert (
-        "--zeros-missing: 1 of 68 points are missing in all rows (first: 30)" in message
-    )
+    expected = "--zeros-missing: 1 of 68 points are missing in all rows (first: 30)"
+    assert expected in message
     assert "leave out --zeros-missing" in message
     left = message.partition("--points ")[2]
     options = ["--zeros-missing", "--points", left]
@@ -399,9 +390,8 @@ def test_transform_gives_each_row_its_coefficients(succeeds, fitted, faces, tmp_
     shuffled = new[[*LANDMARKS[1::2], "alpha_1", "name", *LANDMARKS[0::2]]]
     path, output = tmp_path / "new.parquet", tmp_path / "new-alpha.csv"
     shuffled.to_parquet(path)
-    out, err = succeeds(
-        "transform", fitted / MODEL, path, "-o", output, "--skip-rows", "name=^ir"
-    )
+    transform = ["transform", fitted / MODEL, path, "-o", output]
+    out, err = succeeds(*transform, "--skip-rows", "name=^ir")
     assert "renamed to alpha_1_ (not alpha_1)\n" in err
     assert out.startswith("2 coefficients of 54 frames\n")
     assert " 1 points (0.0272 %) are missing in 1 of these rows\n" in out

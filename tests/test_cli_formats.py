@@ -122,9 +122,8 @@ def test_a_model_of_other_points_is_refused(fails, succeeds, tmp_path):
     folder, output = tmp_path / "results", ["-o", tmp_path / "a.csv"]
     succeeds("fit", path, "-o", folder, *QUICK)
     mesh, options, *_ = write_mediapipe(tmp_path)
-    assert "820 columns are only in the table (x_68, y_68," in fails(
-        "transform", folder / MODEL, mesh, *output, *options
-    )
+    message = fails("transform", folder / MODEL, mesh, *output, *options)
+    assert "820 columns are only in the table (x_68, y_68," in message
     openface, *_ = write_openface(tmp_path)
     out, _ = succeeds("transform", folder / MODEL, openface, *output)
     assert "1  without coefficients: tracking failed" in out
@@ -167,9 +166,8 @@ def test_confidences_of_a_plain_table(succeeds, tmp_path, axes, word):
     pd.testing.assert_frame_equal(alpha, pd.read_csv(blanked / "alpha.csv"))
     output = tmp_path / "again.csv"
     succeeds("transform", folder / MODEL, path, "-o", output, *unsure)
-    np.testing.assert_allclose(
-        pd.read_csv(output)["alpha_1"], alpha["alpha_1"], atol=1e-3
-    )
+    found = pd.read_csv(output)["alpha_1"]
+    np.testing.assert_allclose(found, alpha["alpha_1"], atol=1e-3)
 
     found = read_landmarks(path, "table", min_confidence=0.4)
     np.testing.assert_array_equal(found.confidence, confidence)

@@ -36,9 +36,8 @@ def table_of(seed=0):
     """Return a table of a thing that waves, with other columns."""
     phase = 0.12 * np.arange(N)
     alpha = np.stack([np.sin(phase), np.cos(0.6 * phase)], axis=1)
-    scene = make_nonrigid_tracks(
-        n_frames=N, n_points=14, n_components=2, noise=0.0, random_state=seed
-    )
+    made = {"n_frames": N, "n_points": 14, "n_components": 2}
+    scene = make_nonrigid_tracks(**made, noise=0.0, random_state=seed)
     shapes = scene.mean_shape + np.einsum("ik,kjc->ijc", alpha, scene.basis)
     tracks = shapes @ scene.motion.swapaxes(1, 2)
     rng = np.random.default_rng(seed)

@@ -186,9 +186,8 @@ def test_edges_are_numbers_of_named_points(run, fails, bodies, tmp_path):
     assert "line 2: expected the names of two or three points" in run(*fit)[2]
     edges.write_text("5,7\n7,j09\n")
     # Of some of the points, numbers could be those of the table or of these points.
-    assert "such as j05, j06 (without --points also their numbers from zero)" in fails(
-        *fit, "--points", "without:0-4"
-    )
+    message = "such as j05, j06 (without --points also their numbers from zero)"
+    assert message in fails(*fit, "--points", "without:0-4")
     assert not out.exists()
     assert run(*fit)[0] == 0
     assert edges_of(out / "viewer.html")[0] == {(5, 7), (7, 9)}

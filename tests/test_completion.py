@@ -25,9 +25,8 @@ def hide(tracks, seen):
 def random_mask(shape, missing, seed, least=4):
     """Return a mask of seen points, at least some in every frame."""
     order = np.random.default_rng(seed).random(shape)
-    return (order >= missing) | (
-        order.argsort(axis=1).argsort(axis=1) >= shape[1] - least
-    )
+    rank = order.argsort(axis=1).argsort(axis=1)
+    return (order >= missing) | (rank >= shape[1] - least)
 
 
 def unit_rows(centred, sizes):
@@ -105,9 +104,8 @@ def test_missing_points_are_conditional_expectations(small):
     far = 1e7  # variance of the translation, which may be anything
     covariance = model.B.T @ model.B + model.noise * np.eye(9) + far
     for frame, mask, result in zip(centred, seen, filled, strict=True):
-        gain = covariance[np.ix_(~mask, mask)] @ np.linalg.inv(
-            covariance[np.ix_(mask, mask)]
-        )
+        inverse = np.linalg.inv(covariance[np.ix_(mask, mask)])
+        gain = covariance[np.ix_(~mask, mask)] @ inverse
         assert_allclose(result[~mask], gain @ frame[mask], atol=1e-5)
 
 
@@ -118,14 +116,12 @@ def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
     best = log_likelihood(*model, *small)
     for _ in range(10):
         step = 1e-4 * rng.normal(size=model.B.shape) * np.std(model.B)
-        up, down = (
-            log_likelihood(model.B + s * step, model.noise, *small) for s in (1, -1)
-        )
+        near = model.B + step, model.B - step
+        up, down = (log_likelihood(B, model.noise, *small) for B in near)
         assert abs(up - down) < 1e-6
         assert max(up, down) < best
-    up, down = (
-        log_likelihood(model.B, model.noise * f, *small) for f in (1.001, 1 / 1.001)
-    )
+    near = 1.001 * model.noise, model.noise / 1.001
+    up, down = (log_likelihood(model.B, noise, *small) for noise in near)
     assert abs(up - down) < 1e-6
     assert max(up, down) < best
 

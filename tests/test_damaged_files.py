@@ -46,9 +46,8 @@ REFUSALS = (ValueError, TypeError, OSError, NotFittedError)
 SECONDS, MEMORY = 60, 2**31
 
 FACES = make_face_tracks(20, n_components=1, random_state=0).data[:, :28]
-PDM = PointDistributionModel(
-    files.scene(7, 3)[..., 0][:, :3].copy(), np.ones((2, 7, 3)), np.array([2.0, 1.0])
-)
+MEAN = files.scene(7, 3)[..., 0][:, :3].copy()
+PDM = PointDistributionModel(MEAN, np.ones((2, 7, 3)), np.array([2.0, 1.0]))
 
 
 # --- damages ------------------------------------------------------------------------

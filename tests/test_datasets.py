@@ -177,9 +177,8 @@ class TestRandomTables:
     @pytest.mark.parametrize("shapes", ["heavy_tailed", "gaussian"])
     @pytest.mark.parametrize("amplitude", [0.0, 0.3])
     def test_amplitude_is_the_relative_size_of_the_deformation(self, shapes, amplitude):
-        scene = make_nonrigid_tracks(
-            25, 12, amplitude=amplitude, shapes=shapes, random_state=0
-        )
+        options = {"amplitude": amplitude, "shapes": shapes}
+        scene = make_nonrigid_tracks(25, 12, **options, random_state=0)
         # Root mean squares of coordinates and of lengths have the same ratio.
         deformation = root_mean_square(scene.shapes - scene.mean_shape)
         ratio = deformation / root_mean_square(scene.mean_shape)
@@ -205,16 +204,14 @@ class TestRandomTables:
         ("coefficients", "expected"), [("gaussian", 3.0), ("heavy_tailed", 6.0)]
     )
     def test_tails_of_the_coefficients(self, coefficients, expected):
-        alpha = make_nonrigid_tracks(
-            50_000, 4, 2, coefficients=coefficients, random_state=0
-        ).alpha
+        options = {"coefficients": coefficients, "random_state": 0}
+        alpha = make_nonrigid_tracks(50_000, 4, 2, **options).alpha
         assert_allclose(np.mean(alpha**4, axis=0), expected, rtol=0.1)
         assert_allclose(np.mean(alpha[:, 0] * alpha[:, 1]), 0, atol=0.02)
 
     def test_orientations_are_uniform(self):
-        scene = make_nonrigid_tracks(
-            20_000, 4, 0, camera="orthographic", random_state=0
-        )
+        options = {"camera": "orthographic", "random_state": 0}
+        scene = make_nonrigid_tracks(20_000, 4, 0, **options)
         assert_allclose(scene.motion.mean(axis=0), 0, atol=0.02)
         axes = scene.motion[:, 0]
         assert_allclose(axes.T @ axes / len(axes), np.eye(3) / 3, atol=0.01)

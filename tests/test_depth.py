@@ -89,9 +89,8 @@ class TestExtents:
         for centred in (True, False):
             _, gradient = extent_penalty(shapes, centred)
             change = [extent_penalty(shapes + s * step, centred)[0] for s in (1, -1)]
-            assert_allclose(
-                np.sum(gradient * step), np.subtract(*change) / 2, rtol=1e-5
-            )
+            slope = np.subtract(*change) / 2
+            assert_allclose(np.sum(gradient * step), slope, rtol=1e-5)
 
     def test_by_definition_and_in_all_units(self):
         shapes = np.zeros((1, 3, 6))
@@ -99,9 +98,8 @@ class TestExtents:
         squares = np.array([128.0, 2.0, 2.0])
         ratio = squares.mean() / np.prod(squares) ** (1 / 3)
         assert_allclose(extent_penalty(shapes)[0], ratio - 1, rtol=0.05)
-        assert_allclose(
-            extent_penalty(7 * shapes)[0], extent_penalty(shapes)[0], rtol=1e-12
-        )
+        value = extent_penalty(shapes)[0]
+        assert_allclose(extent_penalty(7 * shapes)[0], value, rtol=1e-12)
 
     def test_is_zero_for_equal_extents_and_finite_for_flat_and_empty_shapes(self):
         cube = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(1, 3, 8)
@@ -310,13 +308,11 @@ class TestJackknife:
                 return n, n * np.eye(3), n * self.kept
 
         monkeypatch.setattr(jackknife, "_Refit", Refit)
-        frames = PosteriorFrames(
-            shapes, 1e-4, np.zeros((0, 2)), "linear", FrameMap.identity(2)
-        )
+        still = np.zeros((0, 2)), "linear", FrameMap.identity(2)
+        frames = PosteriorFrames(shapes, 1e-4, *still)
         frames = replace(frames, camera="orthographic")
-        rows = rotations.as_matrix()[:, :2] @ (
-            shapes[0] + np.tensordot(alpha, shapes[1:], 1)
-        )
+        deformed = shapes[0] + np.tensordot(alpha, shapes[1:], 1)
+        rows = rotations.as_matrix()[:, :2] @ deformed
         found = depth_certainty(frames, FrameBlocks.of_array(rows, 8))
         assert found.total == pytest.approx(np.sqrt(4 / 5 * 15))
         assert_allclose(found.turns, 4 / 5 * 15 * np.eye(3))

@@ -88,9 +88,8 @@ class TestReliabilities:
     )
     @pytest.mark.parametrize("loss", ["linear", "cauchy"])
     def test_noise_of_rigid_objects(self, n_frames, n_points, n_components, loss):
-        rigid = make_nonrigid_tracks(
-            n_frames, n_points, 0, noise=0.01, random_state=n_frames
-        )
+        options = {"noise": 0.01, "random_state": n_frames}
+        rigid = make_nonrigid_tracks(n_frames, n_points, 0, **options)
         model = AffineNRSfM(n_components, loss=loss, random_state=0).fit(rigid.data)
         # With 60 frames the robust weights of one seed of four leave a share of 0.2.
         few = n_frames == 60 and loss == "cauchy"
@@ -103,9 +102,8 @@ class TestReliabilities:
 
     @pytest.mark.parametrize("n_points", [68, 400])
     def test_true_shapes_keep_theirs(self, n_points):
-        truth = make_nonrigid_tracks(
-            100, n_points, 2, noise=0.02, amplitude=0.1, random_state=0
-        )
+        options = {"noise": 0.02, "amplitude": 0.1, "random_state": 0}
+        truth = make_nonrigid_tracks(100, n_points, 2, **options)
         model = AffineNRSfM(4, random_state=0).fit(truth.data)
         assert (model.reliability_[:2] > 0.98).all()
         assert (model.reliability_[2:] == 0).all()
@@ -235,9 +233,8 @@ class TestPoseShare:
     @pytest.mark.slow
     @pytest.mark.parametrize("camera", ["weak_perspective", "affine"])
     def test_a_contour_that_slides_is_named(self, camera):
-        faces = make_face_tracks(
-            300, n_components=2, camera="weak_perspective", noise=0.01, random_state=0
-        )
+        options = {"camera": "weak_perspective", "noise": 0.01, "random_state": 0}
+        faces = make_face_tracks(300, n_components=2, **options)
         model = AffineNRSfM(2, camera=camera, random_state=0).fit(faces.data)
         assert np.abs(model.diagnostics().pose_share).max() < 0.1
         assert model.diagnostics().messages == ()
@@ -308,9 +305,8 @@ class TestOutliers:
 
 @pytest.mark.parametrize("share", [5e-4, 6e-4])
 def test_outliers_are_named_by_rows_and_most_frequent_points(share):
-    found = SimpleNamespace(
-        outlier_share=share, outliers=np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
-    )
+    points = np.array([[3, 1], [0, 2], [3, 2], [7, 0]])
+    found = SimpleNamespace(outlier_share=share, outliers=points)
     advice = outlier_advice(found, np.arange(10, 20), ["a", "b", "c"])
     if share == 5e-4:
         assert advice == ""
@@ -351,10 +347,7 @@ def test_messages_on_the_basis_come_first():
 
 @pytest.mark.parametrize("ratio", [1.0, 1.5, 100.0])
 def test_advice_on_cameras_does_not_lead_back(ratio):
-    assert camera_advice("weak_perspective", ratio, determined=False).startswith(
-        "next: affine cameras for this table"
-    )
+    found = camera_advice("weak_perspective", ratio, determined=False)
+    assert found.startswith("next: affine cameras for this table")
     found = camera_advice("affine", ratio, determined=True)
-    assert found.startswith("keep these cameras") or found.endswith(
-        "with these cameras"
-    )
+    assert re.search("^keep these cameras|with these cameras$", found)

@@ -29,9 +29,8 @@ from isa_nrsfm.io import read_table, save_model, write_table
 OLD = b"what was there before"
 TABLE = pd.DataFrame({"x0": np.linspace(0, 1, 9) / 3, "y0": np.arange(9.0)})
 # More than what a file buffers.
-LONG_TABLE = pd.DataFrame(
-    np.random.default_rng(0).normal(size=(2000, 2)), columns=["x0", "y0"]
-)
+NUMBERS = np.random.default_rng(0).normal(size=(2000, 2))
+LONG_TABLE = pd.DataFrame(NUMBERS, columns=["x0", "y0"])
 
 
 def pdm():
@@ -100,9 +99,8 @@ def test_a_file_is_written_whole_or_stays(tmp_path, name, strike, exists):
     path = tmp_path / "folder" / name
     prepare = (lambda: path.write_bytes(OLD)) if exists else (lambda: None)
     n_failed = 0
-    for raised, before, operations in every_fault(
-        path.parent, strike, prepare, lambda: write(path)
-    ):
+    faults = every_fault(path.parent, strike, prepare, lambda: write(path))
+    for raised, before, operations in faults:
         assert strike == "killed" or leftovers(path.parent) == [], operations
         if isinstance(raised, OSError):
             assert raised.filename == str(path)
@@ -310,9 +308,8 @@ class TestFit:
         assert "alpha.csv would be overwritten" in err or "overwritten by" in err
         (folder / "alpha.csv").unlink()
         (folder / "alpha.csv").mkdir()
-        assert f"{folder / 'alpha.csv'}: is no plain file" in fails(
-            "fit", landmarks, "-o", folder, "-k", 1, "--no-figures"
-        )
+        message = fails("fit", landmarks, "-o", folder, "-k", 1, "--no-figures")
+        assert f"{folder / 'alpha.csv'}: is no plain file" in message
         assert os.listdir(folder) == ["alpha.csv"]
 
 

@@ -62,9 +62,8 @@ def video(tmp_path, monkeypatch):
 @pytest.fixture
 def sequence(tables):
     """Write the tracks of one camera in the orders of MATLAB code; return them."""
-    scene = make_nonrigid_tracks(
-        60, 20, 2, camera="orthographic", noise=0.001, missing=0.0, random_state=0
-    )
+    options = {"camera": "orthographic", "noise": 0.001, "missing": 0.0}
+    scene = make_nonrigid_tracks(60, 20, 2, **options, random_state=0)
     W = scene.tracks.transpose(0, 2, 1).reshape(120, 20)
     savemat(
         "tracks.mat",
@@ -112,9 +111,8 @@ def test_figures_of_the_readme_are_those_of_the_benchmarks():
     methods = ["rigid mean shape", "BMM", "Kong-Lucey"]
     methods += ["ISA2, paper's refinement", "ISA, weak perspective"]
     lines = text("README.md").partition("## How accurate")[2].partition("\n## ")[0]
-    table = [
-        re.split(r" \| ", x.strip("| ")) for x in lines.splitlines() if x[:1] == "|"
-    ]
+    rows = [line.strip("| ") for line in lines.splitlines() if line[:1] == "|"]
+    table = [re.split(r" \| ", row) for row in rows]
     assert table[0][1:] == list(order)
     for method, row in zip(methods, table[2:], strict=True):
         cells = next(line for line in printed if line[0] == f"| {method}")
@@ -186,13 +184,9 @@ def test_the_page_of_questions_runs():
     expected = names["model"].transform(names["X"][names["order"]])
     np.testing.assert_allclose(names["shuffled"].alpha, expected, atol=1e-10)
     assert np.median(names["poses"].yaw_std) < 1
-    np.testing.assert_allclose(
-        names["mouth_mm"][:, 0], 90 * names["mouth"][:, 0], rtol=1e-10
-    )
     lips = names["shapes_mm"][:, 62] - names["shapes_mm"][:, 66]
-    np.testing.assert_allclose(
-        names["mouth_mm"][:, 0], np.linalg.norm(lips, axis=1), rtol=1e-10
-    )
+    for mouth in (90 * names["mouth"][:, 0], np.linalg.norm(lips, axis=1)):
+        np.testing.assert_allclose(names["mouth_mm"][:, 0], mouth, rtol=1e-10)
     assert Path("time.png").stat().st_size
     assert Path("gestures.png").stat().st_size
 
@@ -268,7 +262,6 @@ def test_the_order_of_the_gallery_is_complete():
 
 
 def test_all_layouts_are_listed():
-    listed = re.findall(
-        r"^\| `([a-z0-9-]+)` \|", text("docs/skeletons.md"), re.MULTILINE
-    )
+    page = text("docs/skeletons.md")
+    listed = re.findall(r"^\| `([a-z0-9-]+)` \|", page, re.MULTILINE)
     assert listed == list(SKELETONS)

@@ -84,9 +84,8 @@ def model_tracks(model, motion, translation, alpha):
 def frame_weights(tracks, scale_frames):
     """Return the documented weight of each frame in the inverse SNR."""
     centred = tracks - tracks.mean(axis=1, keepdims=True)
-    return (
-        1 / np.mean(centred**2, axis=(1, 2)) if scale_frames else np.ones(len(tracks))
-    )
+    sizes = np.mean(centred**2, axis=(1, 2))
+    return 1 / sizes if scale_frames else np.ones(len(tracks))
 
 
 def scales_frames(model):
@@ -235,9 +234,8 @@ def scaled_matrix(model, table):
     tracks = tracks_of(table, model.layout)
     centred = tracks - tracks.mean(axis=1, keepdims=True)
     weights = frame_weights(tracks, scales_frames(model))
-    return np.vstack(
-        list((centred * np.sqrt(weights)[:, None, None]).transpose(0, 2, 1))
-    )
+    scaled = centred * np.sqrt(weights)[:, None, None]
+    return np.vstack(list(scaled.transpose(0, 2, 1)))
 
 
 def is_joint(model):
@@ -366,9 +364,8 @@ def test_methods_follow_the_formula(variant, which):
 
     shapes = model.reconstruct(table)
     assert shapes.shape == (len(table), N_POINTS, 3)
-    assert_allclose(
-        shapes, model.mean_shape_ + np.einsum("ik,kjc->ijc", alpha, model.basis_)
-    )
+    expected = model.mean_shape_ + np.einsum("ik,kjc->ijc", alpha, model.basis_)
+    assert_allclose(shapes, expected)
     expected = model_tracks(model, motion, translation, alpha)
     scale = np.abs(table).max()
     for result in (
@@ -376,9 +373,8 @@ def test_methods_follow_the_formula(variant, which):
         model.inverse_transform(alpha, motion, translation),
     ):
         assert result.shape == table.shape
-        assert_allclose(
-            tracks_of(result, model.layout), expected, atol=1e-12 * scale, rtol=0
-        )
+        found = tracks_of(result, model.layout)
+        assert_allclose(found, expected, atol=1e-12 * scale, rtol=0)
 
     if which == "fitted":
         tracks = tracks_of(table, model.layout)
@@ -435,9 +431,8 @@ def test_table_that_the_model_has_made_is_taken_apart_again(model):
 def test_inverse_transform_takes_the_mean_view_by_default(model):
     sizes = 1 / np.sqrt(frame_weights(tracks_of(TABLE), True))
     mean_view = np.mean(model.motion_ / sizes[:, None, None], axis=0)
-    assert_allclose(
-        model.reference_motion_, mean_view * np.sqrt(np.mean(sizes**2)), atol=1e-10
-    )
+    expected = mean_view * np.sqrt(np.mean(sizes**2))
+    assert_allclose(model.reference_motion_, expected, atol=1e-10)
     assert_allclose(model.reference_translation_, model.translation_.mean(axis=0))
 
     alpha = model.alpha_[:4]
@@ -452,9 +447,8 @@ def test_inverse_transform_takes_the_mean_view_by_default(model):
         (camera, model.reference_translation_),
         (model.reference_motion_, position),
     ]:
-        assert_allclose(
-            model.inverse_transform(alpha, motion, translation), table, rtol=1e-12
-        )
+        found = model.inverse_transform(alpha, motion, translation)
+        assert_allclose(found, table, rtol=1e-12)
     # The same coefficients come out again: the table is made by the model.
     # The prior draws them a little to zero.
     assert_allclose(model.transform(table), alpha, atol=model.alpha_std_.max())
@@ -551,9 +545,8 @@ def test_planar_tables_equal_interleaved_ones():
     model = clone(reference).set_params(layout="planar").fit(planar(TABLE))
     assert_allclose(model.alpha_, reference.alpha_, atol=1e-9)
     assert_allclose(model.basis_, reference.basis_, atol=1e-10)
-    assert_allclose(
-        model.reproject(planar(TABLE)), planar(reference.reproject(TABLE)), rtol=1e-9
-    )
+    expected = planar(reference.reproject(TABLE))
+    assert_allclose(model.reproject(planar(TABLE)), expected, rtol=1e-9)
 
 
 # --- errors -------------------------------------------------------------------------
@@ -928,9 +921,8 @@ def test_pipeline_ends_in_a_classifier():
     pipeline = make_pipeline(model, LogisticRegression())
     pipeline.fit(TABLE, labels)
     assert pipeline.score(TABLE, labels) > 0.8
-    assert pipeline[:-1].get_feature_names_out().tolist() == [
-        f"alpha_{k}" for k in range(1, 5)
-    ]
+    names = pipeline[:-1].get_feature_names_out().tolist()
+    assert names == [f"alpha_{k}" for k in range(1, 5)]
 
 
 def test_grid_search_over_own_and_nested_parameters():
@@ -962,9 +954,8 @@ CALIBRATED = ("weak_perspective", "orthographic")
 @cache
 def calibrated(camera, refinement="joint"):
     """Return a model with calibrated cameras, to be left as it is, and its table."""
-    truth = make_nonrigid_tracks(
-        80, 40, 2, camera=camera, noise=0.01, missing=0.05, random_state=0
-    )
+    options = {"camera": camera, "noise": 0.01, "missing": 0.05}
+    truth = make_nonrigid_tracks(80, 40, 2, **options, random_state=0)
     model = AffineNRSfM(2, camera=camera, refinement=refinement, random_state=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
@@ -1029,9 +1020,8 @@ def test_mirror_images_fit_as_well(camera, refinement):
 @pytest.mark.parametrize("camera", CALIBRATED)
 def test_models_with_calibrated_cameras_reconstruct_for_these_only(camera):
     model, truth = calibrated(camera)
-    assert_array_equal(
-        model.reconstruct(truth.data, camera=camera), model.reconstruct(truth.data)
-    )
+    shapes = model.reconstruct(truth.data)
+    assert_array_equal(model.reconstruct(truth.data, camera=camera), shapes)
     other = "orthographic" if camera == "weak_perspective" else "weak_perspective"
     with pytest.raises(ValueError, match=f"fitted with camera='{camera}'"):
         model.reconstruct(truth.data, camera=other)

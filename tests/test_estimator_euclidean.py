@@ -41,9 +41,8 @@ def frame_error(truth, shapes, scale=None):
 @pytest.fixture(scope="module")
 def exact():
     """Shapes without noise in cameras of one scale."""
-    tracks = make_nonrigid_tracks(
-        80, 40, 2, camera="orthographic", amplitude=0.2, noise=0, random_state=0
-    )
+    options = {"camera": "orthographic", "amplitude": 0.2, "noise": 0}
+    tracks = make_nonrigid_tracks(80, 40, 2, **options, random_state=0)
     return tracks, AffineNRSfM(n_components=2, random_state=0).fit(tracks.data)
 
 
@@ -110,16 +109,14 @@ class TestContract:
     def test_affine_shapes_by_default(self, faces, model):
         expected = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
         assert_allclose(model.reconstruct(faces.data), expected, atol=1e-8)
-        assert_array_equal(
-            model.reconstruct(faces.data, camera=None), model.reconstruct(faces.data)
-        )
+        shapes = model.reconstruct(faces.data)
+        assert_array_equal(model.reconstruct(faces.data, camera=None), shapes)
 
     def test_shapes_are_those_of_the_calibration(self, faces, model):
         motion, translation, alpha, _ = model.decompose(faces.data)
         metric = deformation_metric(model.motion_, model.alpha_)
-        frames = euclidean_frames(
-            metric, motion, alpha, model.mean_shape_, model.basis_
-        )
+        shapes = model.mean_shape_, model.basis_
+        frames = euclidean_frames(metric, motion, alpha, *shapes)
         weak = model.reconstruct(faces.data, camera="weak_perspective")
         assert_allclose(weak, frames.shapes)
         ortho = model.reconstruct(faces.data, camera="orthographic")
@@ -182,9 +179,8 @@ class TestContract:
             AffineNRSfM().reconstruct(faces.data, camera="orthographic")
 
     def test_warns_where_cameras_hardly_turn(self, rng):
-        tracks = make_nonrigid_tracks(
-            100, 40, 1, camera="orthographic", amplitude=0.1, noise=0, random_state=0
-        )
+        options = {"camera": "orthographic", "amplitude": 0.1, "noise": 0}
+        tracks = make_nonrigid_tracks(100, 40, 1, **options, random_state=0)
         motion = np.eye(2, 3) + np.zeros((100, 1, 1))
         motion[:, :, 2] = 0.02 * rng.standard_normal((100, 2))
         table = (tracks.shapes @ motion.transpose(0, 2, 1)).reshape(100, -1)

@@ -213,9 +213,8 @@ def test_points_may_change_places(tracks, model, variant):
 def test_default_strategies_are_invariant(load_data, name, n_components, refinement):
     # Motion capture and missing points, too.
     if name == "missing":
-        original = make_nonrigid_tracks(
-            100, 30, n_components=2, noise=0.02, missing=0.2, random_state=0
-        ).tracks
+        options = {"noise": 0.02, "missing": 0.2, "random_state": 0}
+        original = make_nonrigid_tracks(100, 30, n_components=2, **options).tracks
     else:
         original = faces(load_data, name)
     changed = with_changes(original, "frames moved", "frames turned", "frames rescaled")
@@ -243,9 +242,8 @@ def test_default_strategies_are_invariant(load_data, name, n_components, refinem
 @pytest.mark.parametrize("loss", ["cauchy", "huber"])
 def test_robust_fits_are_invariant(loss):
     # The weights stop changing at some distance from their limit.
-    original = make_nonrigid_tracks(
-        80, 25, n_components=2, noise=0.02, random_state=0
-    ).tracks
+    options = {"noise": 0.02, "random_state": 0}
+    original = make_nonrigid_tracks(80, 25, n_components=2, **options).tracks
     original[:, 3] += np.where(np.arange(80) % 9 == 0, 1.0, 0.0)[:, None]
     first = AffineNRSfM(2, loss=loss, random_state=0).fit(table_of(original))
     for changes in (
@@ -302,9 +300,8 @@ def test_axes_are_principal_axes_where_cameras_have_no_common_view(rng):
     made = make_nonrigid_tracks(400, 30, n_components=2, noise=0.01, random_state=0)
     turned = made.tracks @ rotations(angles(made.tracks, rng))
     for scale_frames in (True, False):
-        fitted = AffineNRSfM(
-            2, isa=FastISA(n_init=2), scale_frames=scale_frames, random_state=0
-        ).fit(table_of(turned))
+        options = {"isa": FastISA(n_init=2), "scale_frames": scale_frames}
+        fitted = AffineNRSfM(2, **options, random_state=0).fit(table_of(turned))
         centred = turned - turned.mean(axis=1, keepdims=True)
         sizes = np.sqrt(np.mean(centred**2, axis=(1, 2), keepdims=True))
         motion = fitted.motion_ / (sizes if scale_frames else 1.0)

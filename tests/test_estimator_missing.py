@@ -23,9 +23,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:PooledFastICA did not converge")
 
 K = 2
 REFINEMENTS = ["joint", "alternating", None]
-VARIANTS = [{"refinement": refinement} for refinement in REFINEMENTS] + [
-    {"loss": loss} for loss in LOSSES[1:]
-]
+VARIANTS = [{"refinement": refinement} for refinement in REFINEMENTS]
+VARIANTS += [{"loss": loss} for loss in LOSSES[1:]]
 
 
 def scene(seed=0, **params):
@@ -85,9 +84,8 @@ def frames_with_outliers(n_frames=24):
     There the loss has many minima, and rounding errors would decide between them.
     """
     rng = np.random.default_rng(0)
-    X = make_nonrigid_tracks(
-        n_frames=26, n_points=10, n_components=1, noise=1e-5, random_state=0
-    ).data
+    options = {"noise": 1e-5, "random_state": 0}
+    X = make_nonrigid_tracks(26, 10, 1, **options).data
     Y = np.resize(X, (n_frames, 20)).copy()
     wrong = rng.random((n_frames, 10)) < 0.2
     Y.reshape(n_frames, 10, 2)[wrong] += 3 * X.std() * rng.normal(size=(wrong.sum(), 2))
@@ -358,9 +356,8 @@ def test_rows_without_a_camera_are_nan(variant):
     for part in parts:
         finite = np.isfinite(part.reshape(len(new), -1))
         assert np.all(finite == ~unknown[:, None])
-    assert_allclose(
-        variant.transform(new)[~unknown], variant.transform(new[~unknown]), atol=1e-9
-    )
+    alpha = variant.transform(new)[~unknown]
+    assert_allclose(alpha, variant.transform(new[~unknown]), atol=1e-9)
 
 
 def test_reproject_fills_in_what_is_missing(model):
@@ -443,9 +440,8 @@ def test_robust_losses_cost_little_without_outliers(loss):
     [(0, True, 0.0), (1, True, 0.3), (0, False, 0.3), (1, False, 0.0)],
 )
 def test_noise_variance(seed, scale_frames, missing):
-    made = scene(
-        seed, n_points=40, n_frames=120, missing=missing, camera="orthographic"
-    )
+    options = {"missing": missing, "camera": "orthographic"}
+    made = scene(seed, n_points=40, n_frames=120, **options)
     fitted = estimator(scale_frames=scale_frames).fit(made.data)
     variance = made.noise_variance
     if scale_frames:  # of frames of size one

@@ -259,9 +259,8 @@ def test_frames_repeated_as_often_as_others_change_nothing():
 @pytest.mark.parametrize("isa", [FAST, PooledFastICA(n_init=2)], ids=str)
 def test_tables_of_integers(isa):
     tracks = make_face_tracks(60, n_components=2, noise=0, random_state=0).tracks
-    exact, rounded = (
-        fitted(each, 2, isa=isa) for each in (tracks, np.round(tracks).astype(int))
-    )
+    tables = tracks, np.round(tracks).astype(int)
+    exact, rounded = (fitted(each, 2, isa=isa) for each in tables)
     coarse = fitted(np.round(tracks / 40).astype(np.int8), 2, isa=isa)
     assert exact.rank_floor_ < 1e-20 < rounded.rank_floor_ < coarse.rank_floor_
     assert exact.inverse_snr_ < 0.05

@@ -88,9 +88,8 @@ def test_content_tells_a_point_distribution_model_from_shapes(export):
 def test_options_reach_what_is_written(export):
     pose = ["--camera", "none", "--origin", "lower", "--mirrored"]
     output, _, _ = export("pdm.txt", "--n-modes", "1", *pose, model=MODEL)
-    expected = point_distribution_model(
-        face_model(), n_modes=1, camera=None, origin="lower", mirrored=True
-    )
+    options = {"camera": None, "origin": "lower", "mirrored": True}
+    expected = point_distribution_model(face_model(), n_modes=1, **options)
     assert_equal(read_pdm(output), expected)
     assert len(read_pdm(export("b.txt", "--n-modes", "0.1")[0]).modes) == 1
 

@@ -37,9 +37,8 @@ def test_weights_are_coefficients(written, make):
     assert len(basis) == N_COMPONENTS
     assert read.mesh["weights"] == [0.0] * N_COMPONENTS
     # y up and z to the viewer, in a unit of its own.
-    expected = upright_basis(
-        upright_space(model, "weak_perspective", "auto", False), model
-    )
+    space = upright_space(model, "weak_perspective", "auto", False)
+    expected = upright_basis(space, model)
     factor = read.mesh["extras"]["factor"]
     turned = [factor * shape * [1, -1, -1] for shape in expected]
     assert_allclose(mean, turned[0] - turned[0].mean(axis=0), atol=1e-6)

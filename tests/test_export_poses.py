@@ -49,9 +49,8 @@ class TestFramePoses:
             assert np.isnan(frame_poses(model, truth.data).yaw_std).all()
             return
         # Frames of the model itself, with its noise
-        clean = model.inverse_transform(
-            model.alpha_, model.motion_, model.translation_
-        ).reshape(N_FRAMES, 68, 2)
+        clean = model.inverse_transform(model.alpha_, model.motion_, model.translation_)
+        clean = clean.reshape(N_FRAMES, 68, 2)
         sizes = weighting_sizes(clean - clean.mean(axis=1, keepdims=True), True)
         noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
         noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
@@ -67,9 +66,8 @@ class TestFramePoses:
 
     def test_of_the_fitted_table(self, fitted):
         truth, model = fitted
-        assert_allclose(
-            frame_poses(model)[:4], frame_poses(model, truth.data)[:4], atol=1e-4
-        )
+        expected = frame_poses(model, truth.data)[:4]
+        assert_allclose(frame_poses(model)[:4], expected, atol=1e-4)
         assert np.isnan(frame_poses(model).yaw_std).all()
 
     def test_of_fitted_frames(self, fitted):

@@ -127,9 +127,8 @@ def test_other_tables_are_shown_by_their_index(written):
     table.iloc[2] = np.nan
     data = written(model, X=table.to_numpy(), n_frames=5)
     assert data["rows"] == ["0", "1", "3", "5"]
-    assert data["count"] == (
-        "5 of 6 rows, evenly spread; 1 of them show too few points."
-    )
+    count = "5 of 6 rows, evenly spread; 1 of them show too few points."
+    assert data["count"] == count
     alpha = numbers(data["alpha"]).reshape(-1, N_COMPONENTS)
     assert_allclose(alpha, model.alpha_[[0, 1, 3, 5]], atol=1e-5)
     data = written(model, X=table, labels=list("uvwxyz"))

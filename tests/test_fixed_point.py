@@ -26,9 +26,8 @@ def white_signals(seed, n_samples=400, n_subspaces=2, size=3):
 
 
 def starts(seed, n_batch, n_signals):
-    return orthogonalise(
-        np.random.default_rng(seed).normal(size=(n_batch, n_signals, n_signals))
-    )
+    rng = np.random.default_rng(seed)
+    return orthogonalise(rng.normal(size=(n_batch, n_signals, n_signals)))
 
 
 def published_step(W, Z, size):
@@ -117,9 +116,8 @@ class TestStep:
 
     def test_shorter_steps_have_the_same_fixed_points(self):
         Z = white_signals(0)
-        W, _, converged = iterate(
-            starts(0, 1, 6), Z, 3, DENSITY, max_iter=2000, tol=1e-14
-        )
+        first, ends = starts(0, 1, 6), {"max_iter": 2000, "tol": 1e-14}
+        W, _, converged = iterate(first, Z, 3, DENSITY, **ends)
         assert converged.all()
         for length in (1.0, 0.5, 1 / 16):
             new = fixed_point_step(W, Z, 3, DENSITY, length)
@@ -171,8 +169,7 @@ class TestIterate:
 
     def test_one_subspace_has_converged_at_once(self):
         Z = white_signals(0, n_subspaces=1)
-        _, n_iter, converged = iterate(
-            starts(0, 3, 3), Z, 3, DENSITY, max_iter=100, tol=1e-4
-        )
+        first, ends = starts(0, 3, 3), {"max_iter": 100, "tol": 1e-4}
+        _, n_iter, converged = iterate(first, Z, 3, DENSITY, **ends)
         assert_array_equal(n_iter, 1)
         assert converged.all()

@@ -111,9 +111,8 @@ class TestSpace:
         B = gauge.mean_shape
         variances = np.sort(np.linalg.eigvalsh(B.T @ B / len(B)))[::-1]
         assert_allclose(variances, [1.0] * (3 - flat) + [0.0] * flat, atol=1e-9)
-        assert_allclose(
-            motion @ B.T, scene.motion @ scene.mean_shape.T, atol=1e-8 * unit
-        )
+        images = scene.motion @ scene.mean_shape.T
+        assert_allclose(motion @ B.T, images, atol=1e-8 * unit)
         assert np.isfinite(gauge.basis).all()
 
     @pytest.mark.parametrize("flat", [1, 2])
@@ -239,7 +238,6 @@ class TestReorderBlocks:
         got = reorder_blocks(matrix, order)
         for a in range(3):
             for b in range(3):
-                expected = matrix[
-                    3 * order[a] : 3 * order[a] + 3, 3 * order[b] : 3 * order[b] + 3
-                ]
+                rows, columns = (np.arange(3) + 3 * order[each] for each in (a, b))
+                expected = matrix[np.ix_(rows, columns)]
                 assert_array_equal(got[3 * a : 3 * a + 3, 3 * b : 3 * b + 3], expected)

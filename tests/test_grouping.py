@@ -73,9 +73,8 @@ class TestGains:
     def test_covariance(self, seed, size):
         C = random_covariance(seed, 12)
         for assignment in random_assignments(seed, 3, 12, size):
-            self.check(
-                covariance_gains(C), lambda z: energy_inside(C, z) / 2, assignment
-            )
+            gains = covariance_gains(C)
+            self.check(gains, lambda z: energy_inside(C, z) / 2, assignment)
 
     @pytest.mark.parametrize("seed", range(3))
     @pytest.mark.parametrize("size", [1, 2, 3, 4])

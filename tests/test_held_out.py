@@ -19,9 +19,8 @@ N_FOLDS, FOLD_SEED = 5, 0
 def scene(seed=0, n_frames=12, n_points=23):
     """Return the model of frames, its shapes, and tracks with noise."""
     rng = np.random.default_rng(seed)
-    shapes = (
-        rng.normal(size=(3, n_points, 3)) * np.array([1.0, 0.3, 0.3])[:, None, None]
-    )
+    sizes = np.array([1.0, 0.3, 0.3])[:, None, None]
+    shapes = rng.normal(size=(3, n_points, 3)) * sizes
     shapes -= shapes.mean(axis=1, keepdims=True)
     motion = np.eye(2, 3) + 0.3 * rng.normal(size=(n_frames, 2, 3))
     position = rng.normal(size=(n_frames, 2))
@@ -116,9 +115,8 @@ def test_nothing_that_can_be_held_out_has_no_energy():
 
 def table(n_components, seed, **params):
     params = {"n_frames": 70, "n_points": 34, "noise": NOISE} | params
-    return make_nonrigid_tracks(
-        n_components=n_components, random_state=seed, **params
-    ).data
+    params |= {"n_components": n_components, "random_state": seed}
+    return make_nonrigid_tracks(**params).data
 
 
 @pytest.mark.parametrize("refinement", slow_after(2, ["joint", "alternating", None]))
@@ -130,9 +128,8 @@ def test_score_is_minus_the_error_and_the_same_each_time(refinement):
     assert score < 0
     assert model.score(X) == score
     assert model.score(X, y=np.zeros(len(X))) == score
-    assert (
-        AffineNRSfM(2, refinement=refinement, random_state=0).fit(X).score(X) == score
-    )
+    again = AffineNRSfM(2, refinement=refinement, random_state=0).fit(X)
+    assert again.score(X) == score
 
 
 def test_score_weights_frames_as_the_fit_does():
@@ -160,8 +157,7 @@ def test_score_of_new_frames_is_best_at_the_true_number(n_components, seed):
     X = table(n_components, seed)
     # The nearest numbers, two of either side: fits far below the true one take long.
     tried = range(max(n_components - 2, 1), min(n_components + 2, 6) + 1)
-    search = GridSearchCV(
-        AffineNRSfM(random_state=0), {"n_components": tried}, cv=2, refit=False
-    )
+    grid = {"n_components": tried}
+    search = GridSearchCV(AffineNRSfM(random_state=0), grid, cv=2, refit=False)
     search.fit(X)
     assert search.best_params_["n_components"] == n_components

@@ -113,17 +113,15 @@ class TestSameFit:
         space = independent_gauge(*fit, independence)[1].space
         scales = np.linalg.norm(space @ fit.frames(), axis=(1, 2))
         scales /= np.linalg.norm(result.frames(), axis=(1, 2))
-        assert_allclose(
-            space @ fit.frames(), scales[:, None, None] * result.frames(), atol=1e-11
-        )
+        expected = scales[:, None, None] * result.frames()
+        assert_allclose(space @ fit.frames(), expected, atol=1e-11)
 
     def test_identity_changes_nothing(self):
         fit = random_fit()
         covariance = np.cov(np.random.default_rng(1).normal(size=(3, 9)))
         covariance = np.broadcast_to(covariance, (len(fit.alpha), 3, 3))
-        motion, alpha, deviation = FrameMap.identity(3).apply(
-            fit.motion, fit.alpha, covariance
-        )
+        found = FrameMap.identity(3).apply(fit.motion, fit.alpha, covariance)
+        motion, alpha, deviation = found
         assert_array_equal(motion, fit.motion)
         assert_array_equal(alpha, fit.alpha)
         expected = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -275,12 +273,10 @@ class TestStandardDeviations:
         covariance = root @ root.swapaxes(1, 2)
         _, _, got = frames.apply(fit.motion, fit.alpha, covariance)
         n_draws = 2000
-        drawn = fit.alpha + np.einsum(
-            "ikl,nil->nik", root, rng.normal(size=(n_draws, 60, 3))
-        )
-        alpha = np.array(
-            [frames.apply(fit.motion, each, covariance)[1] for each in drawn]
-        )
+        noise = rng.normal(size=(n_draws, 60, 3))
+        drawn = fit.alpha + np.einsum("ikl,nil->nik", root, noise)
+        results = [frames.apply(fit.motion, each, covariance) for each in drawn]
+        alpha = np.array([result[1] for result in results])
         assert_allclose(got, alpha.std(axis=0), rtol=5 / np.sqrt(2 * n_draws))
 
     def test_do_not_depend_on_the_gauge_of_the_fit(self):

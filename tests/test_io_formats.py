@@ -30,15 +30,13 @@ def tracks_of(landmarks):
     n_frames, n_points = len(points), len(landmarks.point_names)
     assert points.shape == (n_frames, 2 * n_points)
     assert (points.dtypes == np.float64).all()
-    assert len(set(points.columns) | set(frames.columns)) == 2 * n_points + len(
-        frames.columns
-    )
+    names = set(points.columns) | set(frames.columns)
+    assert len(names) == 2 * n_points + len(frames.columns)
     assert len(set(landmarks.point_names)) == n_points
     for table in (points, frames, landmarks.confidence):
         if table is not None:
-            pd.testing.assert_index_equal(
-                table.index, pd.RangeIndex(n_frames), exact=True
-            )
+            rows = pd.RangeIndex(n_frames)
+            pd.testing.assert_index_equal(table.index, rows, exact=True)
     if landmarks.confidence is not None:
         assert tuple(landmarks.confidence) == landmarks.point_names
     assert landmarks.failed.dtype == bool
@@ -88,9 +86,8 @@ def test_every_format_is_written_here_and_described():
 def test_openface_keeps_what_it_says_of_frames(tmp_path):
     success = np.array([1, 0, *[1] * 10])
     confidence = np.linspace(0, 1, 12).round(2)
-    path = files.write_openface(
-        tmp_path / "a.csv", TRACKS, success=success, confidence=confidence
-    )
+    known = {"success": success, "confidence": confidence}
+    path = files.write_openface(tmp_path / "a.csv", TRACKS, **known)
     lines = path.read_text().splitlines()
     for number, text in ((TRACKS[1, 2, 0], "inf"), (TRACKS[1, 3, 0], "-nan(ind)")):
         assert f",{number}," in lines[2]
@@ -110,18 +107,16 @@ def test_openface_keeps_what_it_says_of_frames(tmp_path):
     assert frames["frame"].dtype == frames["success"].dtype == np.int64
     assert_array_equal(landmarks.confidence, np.tile(confidence[:, None], (1, 8)))
     sure = read_landmarks(path, min_confidence=confidence[4])
-    assert_array_equal(
-        np.isnan(tracks_of(sure)).all(axis=(1, 2)), confidence < confidence[4]
-    )
+    lost = np.isnan(tracks_of(sure)).all(axis=(1, 2))
+    assert_array_equal(lost, confidence < confidence[4])
     assert_array_equal(sure.failed, landmarks.failed)
 
 
 def test_openface_without_landmarks_is_refused(tmp_path):
     path = files.write_openface(tmp_path / "a.csv", TRACKS)
     table = pd.read_csv(path)
-    table[["frame", "timestamp", "confidence", "success", "AU01_r"]].to_csv(
-        path, index=False
-    )
+    others = ["frame", "timestamp", "confidence", "success", "AU01_r"]
+    table[others].to_csv(path, index=False)
     refused(r"a\.csv cannot .* openface .*-2Dfp", read_landmarks, path)
     table["success"] = 2
     table.to_csv(path, index=False)
@@ -259,9 +254,8 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
         assert list(landmarks.frames) == ["image"]
         assert landmarks.frames["image"][0] == "labeled-data/reach/img000.png"
         h5 = files.write_deeplabcut(tmp_path / "a.h5", frame, how="fixed")
-        pd.testing.assert_frame_equal(
-            read_landmarks(h5).frames, landmarks.frames, check_dtype=False
-        )
+        found = read_landmarks(h5).frames
+        pd.testing.assert_frame_equal(found, landmarks.frames, check_dtype=False)
     refused("no confidences", read_landmarks, tmp_path / "a.csv", min_confidence=0.5)
 
 
@@ -313,9 +307,8 @@ def test_bad_deeplabcut_columns_are_named(change, message, tmp_path):
 def test_sleap_axes_are_those_that_the_file_tells(order, named, tmp_path):
     pair, frame, track = pair_with_gaps()
     scores = np.random.default_rng(0).uniform(0, 1, pair.shape[:3])
-    path = files.write_sleap(
-        tmp_path / "a.analysis.h5", pair, order=order, named=named, scores=scores
-    )
+    given = {"order": order, "named": named, "scores": scores}
+    path = files.write_sleap(tmp_path / "a.analysis.h5", pair, **given)
     landmarks = read_landmarks(path)
     assert_rows(landmarks, "ab")
     assert_array_equal(landmarks.confidence, scores[frame, track])
@@ -346,14 +339,12 @@ def test_sleap_tables_have_a_row_for_each_instance(tmp_path):
 def test_points_without_a_confidence_are_kept(tmp_path):
     scores = np.full((12, 1, 8), np.nan)
     scores[0] = 0.1
-    path = files.write_sleap(
-        tmp_path / "a.h5", TRACKS[:, None], scores=scores, names=()
-    )
+    given = {"scores": scores, "names": ()}
+    path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
     landmarks = read_landmarks(path, min_confidence=0.5)
     assert "individual" not in landmarks.frames
-    assert_array_equal(
-        np.isnan(tracks_of(landmarks)).all(axis=(1, 2)), np.arange(12) == 0
-    )
+    lost = np.isnan(tracks_of(landmarks)).all(axis=(1, 2))
+    assert_array_equal(lost, np.arange(12) == 0)
     assert not landmarks.failed.any()
 
 
@@ -397,9 +388,8 @@ def test_coco_categories_are_not_mixed(tmp_path):
     content = files.coco_annotations(TRACKS)
     hand = {"id": 2, "name": "hand", "keypoints": ["wrist", "thumb"]}
     content["categories"].append(hand)
-    content["annotations"].append(
-        {"id": 5, "image_id": 2, "category_id": 2, "keypoints": [1, 2, 2, 3, 4, 1]}
-    )
+    seen = {"id": 5, "image_id": 2, "category_id": 2}
+    content["annotations"].append(seen | {"keypoints": [1, 2, 2, 3, 4, 1]})
     path = files.write_json(tmp_path / "a.json", content)
     refused("person, hand have different keypoints", read_landmarks, path)
     people = read_landmarks(path, category="person")
@@ -625,9 +615,8 @@ def test_movement_datasets_are_read_by_the_names_of_their_axes(plural, order):
     assert landmarks.confidence.iloc[0, 1] == pytest.approx(2 / 191)
     swapped = movement_dataset(plural, order)
     swapped["position"].coords["space"].values = np.array(["y", "x"])
-    assert_array_equal(
-        tracks_of(from_movement(swapped))[..., ::-1], tracks_of(landmarks)
-    )
+    found = tracks_of(from_movement(swapped))
+    assert_array_equal(found[..., ::-1], tracks_of(landmarks))
     one = from_movement(movement_dataset(plural, order), individual="id_1")
     assert_allclose(tracks_of(one)[4:], TRACKS[4:] + 100)
     assert list(np.flatnonzero(one.failed)) == [3]
@@ -650,9 +639,8 @@ class TestSkeletons:
         nodes = files.BODYPARTS
         edges = [(nodes[0], nodes[2]), (nodes[1], nodes[2]), (nodes[2], nodes[3])]
         for shape in (edges, list(zip(*edges, strict=True))):
-            path = files.write_sleap(
-                tmp_path / "a.h5", TRACKS[:, None], names=["a"], edges=shape
-            )
+            given = {"names": ["a"], "edges": shape}
+            path = files.write_sleap(tmp_path / "a.h5", TRACKS[:, None], **given)
             found = read_landmarks(path).skeleton
             assert found.edges.tolist() == [[0, 2], [1, 2], [2, 3]]
             assert found.point_names == tuple(nodes)
@@ -675,8 +663,7 @@ class TestSkeletons:
         faces = files.scene(4, 68)
         path = files.write_openface(tmp_path / "a.csv", faces)
         assert read_landmarks(path).skeleton.name == "ibug-68"
-        table = pd.DataFrame(
-            faces.reshape(4, -1), columns=[f"{a}_{j}" for j in range(68) for a in "xy"]
-        )
+        names = [f"{a}_{j}" for j in range(68) for a in "xy"]
+        table = pd.DataFrame(faces.reshape(4, -1), columns=names)
         table.to_csv(tmp_path / "b.csv", index=False)
         assert read_landmarks(tmp_path / "b.csv", "table").skeleton is None

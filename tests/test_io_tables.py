@@ -40,9 +40,8 @@ def test_tables_survive_writing_and_reading(frame, tmp_path, suffix):
     frame.loc[2, ["x1", "y1"]] = np.nan
     path = tmp_path / f"table{suffix}"
     write_table(frame, path)
-    pd.testing.assert_frame_equal(
-        read_table(path), frame, check_dtype=False, check_exact=True
-    )
+    exactly = {"check_dtype": False, "check_exact": True}
+    pd.testing.assert_frame_equal(read_table(path), frame, **exactly)
 
 
 def test_text_stays_as_it_is_written(write):
@@ -126,9 +125,8 @@ def test_landmarks_and_other_columns_are_separated(frame):
 
 def test_result_does_not_depend_on_the_order_of_columns(frame):
     planar = NAMES[0::2] + NAMES[1::2]
-    pd.testing.assert_frame_equal(
-        landmark_table(frame[planar]).points, landmark_table(frame).points
-    )
+    expected = landmark_table(frame).points
+    pd.testing.assert_frame_equal(landmark_table(frame[planar]).points, expected)
 
 
 def test_rows_keep_their_labels_and_names_lose_their_blanks(frame):

@@ -114,9 +114,8 @@ def table_of_squares(squares, rank, n_points=20):
     vectors = np.empty((rank, n_points))
     triplets = Triplets(np.sqrt(squares[:rank]), vectors, squares[rank:].sum())
     sample = Sample(vectors, [])
-    return FactorisedTable(
-        None, None, np.full(30, n_points), None, triplets, sample, None
-    )
+    seen = np.full(30, n_points)
+    return FactorisedTable(None, None, seen, None, triplets, sample, None)
 
 
 def spectrum_of(squares, n_components, n_points):
@@ -175,9 +174,8 @@ class TestCameras:
     @pytest.mark.parametrize("n_components", [2, 4])
     def test_without_noise_few_faces_are_nearly_exact(self, n_components):
         # Faces that hardly turn: depths are determined ten to a hundred times worse.
-        faces = make_face_tracks(
-            60, n_components=n_components, noise=0.0, random_state=0
-        )
+        options = {"noise": 0.0, "random_state": 0}
+        faces = make_face_tracks(60, n_components=n_components, **options)
         model = fitted(faces.tracks, n_components)
         assert model.inverse_snr_ < EXACT**2
         assert error_of(model, faces.tracks, faces.shapes) < 5e-4
@@ -188,9 +186,8 @@ class TestCameras:
     def test_calibrated_cameras_show_true_shapes(self, camera, deviation, largest):
         # Also where the object deforms as much as it is large: the mirror image of
         # space is all that is free.
-        tracks, truth = random_table(
-            camera, deviation=deviation, amplitude=1.0, n_components=3
-        )
+        options = {"deviation": deviation, "amplitude": 1.0, "n_components": 3}
+        tracks, truth = random_table(camera, **options)
         model = fitted(tracks, 3, camera=camera)
         assert euclidean_error(model, tracks, truth) < largest
 
@@ -220,9 +217,8 @@ class TestNumberOfComponents:
     @pytest.mark.slow
     @pytest.mark.parametrize("n_components", [0, 2])
     def test_of_many_points(self, n_components):
-        tracks, _ = random_table(
-            deviation=0.02, n_frames=80, n_points=300, n_components=n_components
-        )
+        sizes = {"n_frames": 80, "n_points": 300, "n_components": n_components}
+        tracks, _ = random_table(deviation=0.02, **sizes)
         model = fitted(tracks, "auto", camera="weak_perspective")
         assert len(model.basis_) == max(n_components, 1)
 
@@ -318,9 +314,8 @@ class TestRobustLoss:
             left = np.eye(len(A)) - A @ np.linalg.solve(A.T @ W @ A + prior, A.T @ W)
             square = np.sum(left**2, axis=1).reshape(2, -1)
             expected[i] = np.sqrt(square.mean(axis=0))
-        got = residual_deviations(
-            scene.motion, scene.alpha, scene.shapes, scene.weights, variance, model
-        )
+        fit = scene.motion, scene.alpha, scene.shapes, scene.weights
+        got = residual_deviations(*fit, variance, model)
         assert_allclose(got, expected, rtol=1e-6)
 
     @ROBUST

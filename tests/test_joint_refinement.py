@@ -127,9 +127,8 @@ class TestOptimum:
     @pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
     def test_is_the_same_from_other_starts(self, kind, size):
         scene, expected = optimum(kind)
-        self.check(
-            scene, refined(scene, disturbed(scene.truth, 2, size), tol=1e-7), expected
-        )
+        start = disturbed(scene.truth, 2, size)
+        self.check(scene, refined(scene, start, tol=1e-7), expected)
 
     @pytest.mark.parametrize("factor", slow_after(1, [1e-4, 1e2]))
     def test_is_the_same_from_a_wrong_noise_variance(self, factor):
@@ -311,17 +310,15 @@ class TestHeldCameras:
         scene = random_scene(kind=kind)
         likelihood = likelihood_of(scene.tracks, scene.weights, 1.0)
         start = disturbed(scene.truth)._replace(motion=scene.truth.motion)
-        result = refine_joint(
-            likelihood, start, AffineCameras(held=True), max_iter=1000, tol=1e-10
-        )
+        held = AffineCameras(held=True)
+        result = refine_joint(likelihood, start, held, max_iter=1000, tol=1e-10)
         assert result.converged
         assert_array_equal(result.state.motion, start.motion)
         assert (np.diff(result.history) < 0).all()
         first, last = likelihood(*start), likelihood(*result.state)
         for name in ("shape_gradient", "noise_gradient"):
-            before, after = (
-                np.abs(getattr(each, name)).max() for each in (first, last)
-            )
+            pair = (getattr(each, name) for each in (first, last))
+            before, after = (np.abs(gradient).max() for gradient in pair)
             assert after < 1e-5 * before
 
 
@@ -331,9 +328,8 @@ class TestLeastNoise:
         cameras, (_, likelihood, start) = CAMERAS[camera], problem_of(camera)
         mean_square = likelihood.square / likelihood.n_seen
         least = 10 * DEVIATION**2 / mean_square
-        result = refine_joint(
-            likelihood, start, cameras, least_noise=least, max_iter=1000, tol=1e-6
-        )
+        options = {"least_noise": least, "max_iter": 1000, "tol": 1e-6}
+        result = refine_joint(likelihood, start, cameras, **options)
         assert result.converged
         assert (np.diff(result.history) < 0).all()
         assert result.state.noise == pytest.approx(10 * DEVIATION**2)

@@ -54,9 +54,8 @@ class Scene(NamedTuple):
 
 
 def random_scene(camera="orthographic", seed=0, n_frames=60, n_components=2, **options):
-    truth = make_nonrigid_tracks(
-        n_frames, N_POINTS, n_components, camera=camera, random_state=seed, **options
-    )
+    options |= {"camera": camera, "random_state": seed}
+    truth = make_nonrigid_tracks(n_frames, N_POINTS, n_components, **options)
     tracks = truth.tracks - truth.tracks.mean(axis=1, keepdims=True)
     shapes = np.concatenate([truth.mean_shape[None], truth.basis])
     rows = np.ascontiguousarray(tracks.transpose(0, 2, 1))
@@ -334,9 +333,8 @@ def test_more_basis_shapes_come_from_residuals_of_some_frames(n_frames):
     shapes -= shapes.mean(axis=2, keepdims=True)
     rows = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
     moved = rows + np.random.default_rng(1).normal(size=(n_frames, 2, 1))
-    frames = PosteriorFrames(
-        shapes[:2], 1e-3, np.zeros((0, 1)), "linear", FrameMap.identity(1)
-    )
+    still = np.zeros((0, 1)), "linear", FrameMap.identity(1)
+    frames = PosteriorFrames(shapes[:2], 1e-3, *still)
     table = SimpleNamespace(rows=FrameBlocks.of_array(moved, 64))
     start = extended(frames, table, 3)
     assert start.noise_variance == 1e-3

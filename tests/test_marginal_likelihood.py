@@ -173,9 +173,8 @@ class TestGradient:
     @PENALTIES
     def test_by_the_logarithm_of_the_noise_against_differences(self, kind, penalty):
         scene, step = random_scene(kind), 1e-5
-        above, below = (
-            scene.at(penalty, NOISE * np.exp(sign * step)).value for sign in (1, -1)
-        )
+        noises = NOISE * np.exp([step, -step])
+        above, below = (scene.at(penalty, noise).value for noise in noises)
         gradient = scene.at(penalty).noise_gradient
         assert gradient == pytest.approx((above - below) / (2 * step), rel=1e-6)
 
@@ -210,9 +209,8 @@ class TestCurvature:
         got = scene.at(penalty).motion_curvature
         moments = second_moments(scene, NOISE, penalty)
         frames = frame_by_frame(scene)
-        for i, ((E, _), (_, shapes, root, _, _)) in enumerate(
-            zip(moments, frames, strict=True)
-        ):
+        pairs = zip(moments, frames, strict=True)
+        for i, ((E, _), (_, shapes, root, _, _)) in enumerate(pairs):
             weighted = root * shapes
             A = np.einsum("kl,kaj,lbj->ab", E, weighted, weighted)
             packed = A[np.triu_indices(3)]

@@ -96,9 +96,8 @@ class TestMetricQuadric:
     def test_leaves_out_frames_without_camera(self):
         motion = noisy_cameras(np.random.default_rng(9))
         nothing = [np.full((1, 2, 3), value) for value in (np.nan, 0.0)]
-        assert_allclose(
-            metric_quadric(np.concatenate([motion, *nothing])), metric_quadric(motion)
-        )
+        more = np.concatenate([motion, *nothing])
+        assert_allclose(metric_quadric(more), metric_quadric(motion))
 
 
 class TestParts:

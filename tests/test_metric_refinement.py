@@ -108,9 +108,8 @@ class TestParts:
             assert_allclose(slope, change, atol=1e-7)
 
         # The sums over frames are those of all derivatives.
-        parts = _linearised(
-            frames_last(motion), np.tensordot(numbers, basis, 1), alpha, camera
-        )
+        strain = np.tensordot(numbers, basis, 1)
+        parts = _linearised(frames_last(motion), strain, alpha, camera)
         cost, curvature, gradient = _normal_equations(alpha, *parts)
         flat = slopes.reshape(len(slopes), -1)
         assert cost == pytest.approx(np.sum(residuals**2))
@@ -269,9 +268,8 @@ class TestRefineMetric:
     @pytest.mark.parametrize("unit", [1e-20, 1.0, 1e20])
     def test_condition_number_of_any_unit(self, unit):
         curvature = np.diag([1.0, 2.0, 3.0, 4.0, 9.0, *[1e3] * 5])
-        fit = MetricFit(
-            np.eye(3), np.zeros((1, 3, 3)), 4, 0.0, unit * curvature, np.zeros(10)
-        )
+        still = np.eye(3), np.zeros((1, 3, 3))
+        fit = MetricFit(*still, 4, 0.0, unit * curvature, np.zeros(10))
         assert fit.condition_number == pytest.approx(3.0)
         curvature[0, 0] = 1e-17
         assert fit._replace(curvature=unit * curvature).condition_number == np.inf

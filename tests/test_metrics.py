@@ -54,9 +54,8 @@ class TestInverseSNR:
         fitted = tracks + 0.1 * rng.standard_normal((6, 5, 2))
 
         def value(a, b, **more):
-            return inverse_snr(
-                a.reshape(6, -1), b.reshape(6, -1), scale_frames=scale_frames, **more
-            )
+            tables = a.reshape(6, -1), b.reshape(6, -1)
+            return inverse_snr(*tables, scale_frames=scale_frames, **more)
 
         expected = value(tracks, fitted)
         assert 0.001 < expected < 0.1
@@ -178,9 +177,8 @@ class TestBasisSimilarity:
             means["mean_shape_true"] = scene.mean_shape
             means["mean_shape"] = 3 * scene.mean_shape @ affinity.T + 4.0
             means["modulo_mean_shape"] = modulo
-        similarity, matching = basis_similarity(
-            scene.basis, estimate, return_matching=True, **means
-        )
+        given = scene.basis, estimate
+        similarity, matching = basis_similarity(*given, return_matching=True, **means)
         assert_allclose(similarity, 1, atol=1e-10)
         assert_array_equal(matching, [1, 2, 0])
         assert_array_equal(basis_similarity(scene.basis, estimate, **means), similarity)
@@ -194,9 +192,8 @@ class TestBasisSimilarity:
             np.cos(angles[0]) * basis_true[0] + np.sin(angles[0]) * basis_true[2],
             np.cos(angles[1]) * basis_true[1] - np.sin(angles[1]) * basis_true[2],
         ]
-        similarity = basis_similarity(
-            basis_true[:2], turned[::-1], mean_shape_true=mean, mean_shape=mean
-        )
+        means = {"mean_shape_true": mean, "mean_shape": mean}
+        similarity = basis_similarity(basis_true[:2], turned[::-1], **means)
         assert_allclose(similarity, np.cos(angles))
         # Without them A is free to do better, on the whole.
         free = basis_similarity(basis_true[:2], turned[::-1])
@@ -227,9 +224,8 @@ class TestBasisSimilarity:
         basis = make_face_tracks(n_components=8, random_state=0).basis
         basis[3, :, [0, 2]] = 0
         order = [4, 1, 7, 0, 2, 6, 5, 3]
-        similarity, matching = basis_similarity(
-            basis, basis[order] @ AFFINITIES[1], return_matching=True
-        )
+        other = basis[order] @ AFFINITIES[1]
+        similarity, matching = basis_similarity(basis, other, return_matching=True)
         assert_allclose(similarity, 1, atol=1e-9)
         assert_array_equal(np.array(order)[matching], np.arange(8))
 
@@ -239,9 +235,8 @@ class TestBasisSimilarity:
         estimate = (scene.basis + multiples * mean) @ affinity
         means = {"mean_shape_true": mean, "mean_shape": mean @ affinity}
         assert basis_similarity(scene.basis, estimate, **means).max() < 0.97
-        without = basis_similarity(
-            scene.basis, estimate, **means, modulo_mean_shape=True
-        )
+        means["modulo_mean_shape"] = True
+        without = basis_similarity(scene.basis, estimate, **means)
         assert_allclose(without, 1, atol=1e-10)
 
     def test_multiple_of_the_mean_shape_is_nothing_modulo_it(self, scene):
@@ -264,14 +259,12 @@ class TestBasisSimilarity:
         assert_allclose(similarity, [1, 0, 1], atol=1e-12)
 
     def test_different_numbers_of_shapes(self, scene):
-        similarity, matching = basis_similarity(
-            scene.basis, scene.basis[[2, 1]], return_matching=True
-        )
+        some = scene.basis[[2, 1]]
+        similarity, matching = basis_similarity(scene.basis, some, return_matching=True)
         assert_allclose(similarity, [0, 1, 1], atol=1e-12)
         assert_array_equal(matching, [-1, 1, 0])
-        similarity, matching = basis_similarity(
-            scene.basis[[2, 1]], scene.basis, return_matching=True
-        )
+        matched = basis_similarity(some, scene.basis, return_matching=True)
+        similarity, matching = matched
         assert_allclose(similarity, 1)
         assert_array_equal(matching, [2, 1])
 
@@ -337,9 +330,10 @@ class TestSubspaceDistance:
         for _ in range(20):
             a, b = rng.standard_normal((2, 4, 2, 5))
             pairs = [[subspace_distance(x, y, 2) for y in b] for x in a]
-            expected = min(
+            largest = (
                 max(pairs[k][p[k]] for k in range(4)) for p in permutations(range(4))
             )
+            expected = min(largest)
             distance = subspace_distance(a.reshape(8, 5), b.reshape(8, 5), 2)
             assert_allclose(distance, expected)
 

@@ -94,9 +94,8 @@ class TestDegenerateInput:
     def test_shapes_of_one_point(self, pair, nothing):
         truth, _ = pair
         shapes = np.full_like(truth, nothing)
-        assert mean_shape_error_3d(truth, shapes, convention="frame") == pytest.approx(
-            1
-        )
+        found = mean_shape_error_3d(truth, shapes, convention="frame")
+        assert found == pytest.approx(1)
         distance = np.linalg.norm(centred(truth), axis=2).mean()
         expected = distance / truth.std(axis=1).mean()
         assert mean_shape_error_3d(truth, shapes) == pytest.approx(expected)

@@ -74,9 +74,8 @@ class TestResult:
         found = orthonormal_cameras(P, noise_variance)
 
         def cost(Q):
-            return cost_of((P @ Q.reshape(-1, 3)).reshape(-1, 2, 3)) + (
-                4 * noise_variance * np.sum(Q**2)
-            )
+            price = 4 * noise_variance * np.sum(Q**2)
+            return cost_of((P @ Q.reshape(-1, 3)).reshape(-1, 2, 3)) + price
 
         Q = found.mixing.ravel()
         least = cost(Q)
@@ -149,12 +148,10 @@ class TestMixture:
     """The search from one number of columns to more."""
 
     def columns(self, n, noise=0.02):
-        truth = make_nonrigid_tracks(
-            60, 40, N_COMPONENTS, camera="orthographic", noise=noise, random_state=0
-        )
-        return principal_columns(measurement_matrix(centred_tracks(truth.tracks)[0]))[
-            :, :n
-        ]
+        options = {"camera": "orthographic", "noise": noise, "random_state": 0}
+        truth = make_nonrigid_tracks(60, 40, N_COMPONENTS, **options)
+        W = measurement_matrix(centred_tracks(truth.tracks)[0])
+        return principal_columns(W)[:, :n]
 
     @pytest.mark.parametrize("price", [0.0, 0.1])
     def test_cost_by_its_definition_is_a_minimum(self, price, rng):

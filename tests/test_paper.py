@@ -31,9 +31,8 @@ def run(W, K, isa=None, report=lambda stage: None, refinement="alternating", **o
     options = {**OPTIONS, **options}
     if refinement is None:
         options["max_iter"] = 0
-    shapes, *others = run_paper_pipeline(
-        factorise(W, K), K, isa, report=report, **options
-    )
+    found = run_paper_pipeline(factorise(W, K), K, isa, report=report, **options)
+    shapes, *others = found
     return Found(shapes[0].T, shapes[1:].transpose(0, 2, 1), *others)
 
 
@@ -69,9 +68,8 @@ def ideal_matrix(seed, K, n_points=400, n_cameras=15):
     the basis independent and heavy-tailed.
     """
     rng = np.random.default_rng(seed)
-    rows = np.hstack(
-        [rng.normal(size=(n_points, 3)), spherical_sources(seed, n_points, K)]
-    )
+    signals = spherical_sources(seed, n_points, K)
+    rows = np.hstack([rng.normal(size=(n_points, 3)), signals])
     rows -= rows.mean(axis=0)
     Z = np.linalg.qr(rows)[0].T * np.sqrt(n_points)
     Z *= np.sign(np.sum(Z * rows.T, axis=1))[:, None]

@@ -138,9 +138,8 @@ def test_displays_take_keywords_and_fitted_estimators(kind):
 
 
 def test_styles_can_be_changed():
-    drawn = [
-        kind(**given).plot(**styles) for kind, (given, _, styles) in DISPLAYS.items()
-    ]
+    kinds = DISPLAYS.items()
+    drawn = [kind(**given).plot(**styles) for kind, (given, _, styles) in kinds]
     shapes, _, choice, covariance, frames = drawn
     assert shapes.plus_[0].get_sizes() == [11]
     assert shapes.axes_[1, 0].collections[0].get_linewidths() == [3]

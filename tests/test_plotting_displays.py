@@ -93,9 +93,8 @@ def test_shapes_are_those_of_the_estimator_in_natural_proportions(faces, estimat
     # Up to a rotation and its mirror image the mean shape is the true face. Rigid
     # cameras of a deforming face are only nearly right.
     seen, truth = display.mean_shape, faces.mean_shape
-    sizes = (
-        np.linalg.svd(s, compute_uv=False) / np.linalg.norm(s) for s in (seen, truth)
-    )
+    values = (np.linalg.svd(s, compute_uv=False) for s in (seen, truth))
+    sizes = (each / np.linalg.norm(each) for each in values)
     assert_allclose(*sizes, atol=0.02)
     # Not turned in the front view, and not in depth but for the mirror image.
     for axis, least in enumerate((0.99, 0.99, 0.97)):
@@ -238,9 +237,8 @@ def test_dense_shapes_are_clouds():
 
 
 def test_shapes_without_deformation_are_drawn():
-    display = BasisShapeDisplay(
-        mean_shape=np.eye(3), basis=np.zeros((1, 3, 3)), energy_share=[0.0]
-    ).plot()
+    shapes = {"mean_shape": np.eye(3), "basis": np.zeros((1, 3, 3))}
+    display = BasisShapeDisplay(**shapes, energy_share=[0.0]).plot()
     display.figure_.canvas.draw()
     assert texts(display)[1] == "Basis shape 1 (0 % of energy)"
 
@@ -270,9 +268,8 @@ def test_numbers_are_points():
 def test_curves_have_bands_and_stop_at_gaps_and_groups():
     time = np.r_[0:10, 20:30, 0:10].astype(float)
     groups = np.repeat(["x", "y"], [20, 10])
-    display = CoefficientsDisplay(
-        alpha=ALPHA, alpha_std=0.1 + 0 * ALPHA, time=time, groups=groups
-    ).plot()
+    given = {"alpha": ALPHA, "alpha_std": 0.1 + 0 * ALPHA}
+    display = CoefficientsDisplay(**given, time=time, groups=groups).plot()
     axes = display.axes_[0]
     line, (band,) = axes.lines[0], axes.collections
     drawn = np.isfinite(line.get_ydata())
@@ -334,9 +331,8 @@ def test_errors_of_the_choice_are_in_percent_with_standard_errors():
     assert display.ax_.get_yscale() == "log"
     assert_allclose(display.chosen_.get_xydata(), [[4, 0.3]])
     # Other scores are drawn as they are; one part has no standard error.
-    display = ComponentChoiceDisplay(
-        n_components=[2, 4], scores=SCORES[:, :1], held_out_error=False
-    ).plot()
+    given = {"scores": SCORES[:, :1], "held_out_error": False}
+    display = ComponentChoiceDisplay(n_components=[2, 4], **given).plot()
     assert_allclose(display.errorbar_.lines[0].get_ydata(), SCORES[:, 0])
     assert display.ax_.get_yscale() == "linear"
     assert display.chosen_ is None
@@ -435,9 +431,8 @@ def test_share_outside_of_the_blocks(matrix, share):
 
 
 def test_points_of_frames_are_the_numbers(faces, estimator):
-    display = ReprojectionDisplay.from_estimator(
-        estimator, faces.data, frames=[7, 3, 50]
-    )
+    show, rows = ReprojectionDisplay.from_estimator, [7, 3, 50]
+    display = show(estimator, faces.data, frames=rows)
     assert_array_equal(display.frames, [7, 3, 50])
     table = estimator.reproject(faces.data).reshape(-1, 68, 2)
     for i, row in enumerate([7, 3, 50]):
@@ -539,9 +534,8 @@ def test_missing_points_are_left_out():
     observed[0, 3] = np.nan
     hidden = ReprojectionDisplay(observed=observed, reprojected=display.reprojected)
     others = np.arange(10) != 3
-    alone = ReprojectionDisplay(
-        observed=observed[:1, others], reprojected=display.reprojected[:1, others]
-    )
+    seen, fitted = observed[:1, others], display.reprojected[:1, others]
+    alone = ReprojectionDisplay(observed=seen, reprojected=fitted)
     assert hidden.inverse_snr[0] == pytest.approx(alone.inverse_snr[0])
     hidden.plot().figure_.canvas.draw()
     assert np.isfinite(hidden.axes_[0].get_xlim()).all()

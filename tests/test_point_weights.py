@@ -98,9 +98,8 @@ class TestMeaning:
         expected = estimator(layout=layout).fit(holed)
         assert_same_fit(estimator(layout=layout).fit(X, point_weight=weights), expected)
         assert expected.score(X, point_weight=weights) == expected.score(holed)
-        assert_array_equal(
-            expected.transform(X, point_weight=weights), expected.transform(holed)
-        )
+        alpha = expected.transform(X, point_weight=weights)
+        assert_array_equal(alpha, expected.transform(holed))
 
     def test_weights_of_missing_points_have_no_effect(self):
         table = noisy()
@@ -116,9 +115,8 @@ class TestMeaning:
     @pytest.mark.slow
     @CAMERAS
     def test_weights_of_two_are_two_columns_of_each_point(self, camera):
-        X = make_nonrigid_tracks(
-            N_FRAMES, N_POINTS, K, noise=0.02, random_state=3
-        ).tracks
+        options = {"noise": 0.02, "random_state": 3}
+        X = make_nonrigid_tracks(N_FRAMES, N_POINTS, K, **options).tracks
         twice = np.concatenate([X, X], axis=1).reshape(N_FRAMES, -1)
         expected = estimator(camera=camera, tol=1e-8).fit(twice)
         weights = np.full((N_FRAMES, N_POINTS), 2.0)
@@ -176,9 +174,8 @@ class TestAccuracy:
         X = (scene.tracks + noise).reshape(N_FRAMES, -1)
         weights = (0.01 / deviation) ** 2
         model = estimator().fit(X, point_weight=weights)
-        assert_allclose(
-            model.transform(X, point_weight=weights), model.alpha_, atol=1e-9
-        )
+        alpha = model.transform(X, point_weight=weights)
+        assert_allclose(alpha, model.alpha_, atol=1e-9)
         found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
         plain = estimator().fit(X).reconstruct(X)
         error = affine_shape_error(scene.shapes, found)
@@ -256,9 +253,8 @@ class TestFrames:
         weights = np.broadcast_to(counts, scene.tracks.shape[:2]).astype(float)
         found = MarginalLikelihood(JointFrames.from_repeated(rows, weights), 0.1)
         many = np.repeat(np.arange(20), counts)
-        repeated = FrameBlocks.of_array(
-            scene.centred[:, many].transpose(0, 2, 1), 7
-        ).derive(np.ascontiguousarray)
+        repeated = FrameBlocks.of_array(scene.centred[:, many].transpose(0, 2, 1), 7)
+        repeated = repeated.derive(np.ascontiguousarray)
         # Frames with weights are centred by the likelihood, others have to be.
         frames = JointFrames.from_points(repeated, False)
         expected = MarginalLikelihood(frames, 0.1)
@@ -429,20 +425,17 @@ class TestCommandLine:
         left = np.delete(np.arange(N_POINTS), [3, 7])
         found = read_landmarks(results)
         X = found.points.to_numpy().reshape(N_FRAMES, -1, 2)[:, left]
-        model = estimator().fit(
-            X.reshape(N_FRAMES, -1), point_weight=found.confidence.to_numpy()[:, left]
-        )
+        weights = found.confidence.to_numpy()[:, left]
+        model = estimator().fit(X.reshape(N_FRAMES, -1), point_weight=weights)
         alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
         assert_allclose(alpha, model.alpha_, atol=1e-6)
 
     def test_refusals(self, results, tmp_path, fails):
         options = ["--weights", "confidence", "-o", tmp_path / "out", "--no-figures"]
-        assert "--weights needs one number of basis shapes" in fails(
-            "fit", results, *options, "-k", "1-2"
-        )
+        message = fails("fit", results, *options, "-k", "1-2")
+        assert "--weights needs one number of basis shapes" in message
         table = tmp_path / "table.csv"
         names = [f"{axis}_{j}" for j in range(N_POINTS) for axis in "xy"]
         pd.DataFrame(noisy().X, columns=names).to_csv(table, index=False)
-        assert "has no confidences of all points. Their columns need" in fails(
-            "fit", table, *options, "-k", "2"
-        )
+        message = fails("fit", table, *options, "-k", "2")
+        assert "has no confidences of all points. Their columns need" in message

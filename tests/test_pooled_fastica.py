@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from groupings import GROUPINGS, energy_inside
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refused
+from refusals import refused, warned
 from scenes import random_rotation, spherical_sources
 from sklearn.exceptions import ConvergenceWarning
 
@@ -126,14 +126,11 @@ class TestComponents:
             PooledFastICA(fun="tanh").fit(independent(0)[0])
 
     def test_not_converged(self):
-        with pytest.warns(
-            ConvergenceWarning,
-            match="PooledFastICA did not converge in max_iter=1 steps in the run .*"
-            "try another fun or larger n_init or max_iter",
-        ):
-            PooledFastICA(n_init=2, max_iter=1, random_state=0).fit(
-                spherical_sources(0, 68, 9)
-            )
+        message = "PooledFastICA did not converge in max_iter=1 steps in the run .*"
+        message += "try another fun or larger n_init or max_iter"
+        isa = PooledFastICA(n_init=2, max_iter=1, random_state=0)
+        signals = spherical_sources(0, 68, 9)
+        warned(message, isa.fit, signals, category=ConvergenceWarning)
 
     def test_runs_that_are_not_kept_do_not_warn(self):
         # Only the run that is kept has to converge.
@@ -170,9 +167,8 @@ class TestCriterion:
         alone = PooledFastICA(n_init=1, random_state=0).fit(signals, covariance=C)
         assert_array_equal(isa.criteria_, 0)
         pooled = pooled_covariance(isa, C)
-        assert_allclose(
-            energy_inside(pooled, IN_ORDER) / np.sum(pooled**2), alone.criteria_[0]
-        )
+        share = energy_inside(pooled, IN_ORDER) / np.sum(pooled**2)
+        assert_allclose(share, alone.criteria_[0])
 
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_run_with_the_largest_sum_is_kept(self, sign):

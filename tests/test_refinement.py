@@ -130,9 +130,8 @@ class TestOptimum:
 
     def test_energies_rise_with_every_step(self, scene):
         starts = random_starts(3, 3)
-        energies = np.array(
-            [refine(scene.rigid, scene.motion, starts, n).energy for n in range(1, 15)]
-        )
+        steps = (refine(scene.rigid, scene.motion, starts, n) for n in range(1, 15))
+        energies = np.array([step.energy for step in steps])
         assert np.all(np.diff(energies, axis=0) >= -1e-13 * energies[-1])
         assert np.all(energies[-1] > energies[0])
 
@@ -172,9 +171,8 @@ class TestInvariances:
     @pytest.mark.parametrize("unit", [1e-9, 1e9])
     def test_units(self, scene, result, unit):
         for of_rigid, of_motion in ((unit, unit), (1.0, unit), (unit, 1.0)):
-            other = refine(
-                of_rigid * scene.rigid, of_motion * scene.motion, random_starts(0, 3, 4)
-            )
+            rigid, motion = of_rigid * scene.rigid, of_motion * scene.motion
+            other = refine(rigid, motion, random_starts(0, 3, 4))
             same_up_to_sign(other.E, result.E, atol=1e-6)
             assert_allclose(other.energy / of_motion**2, result.energy)
 

@@ -86,9 +86,8 @@ class TestRelevantComponents:
         for (penalty, reached), following in zip(rounds, prices, strict=True):
             # Another basis of the same shapes, whose images are orthogonal
             assert_allclose(reached.shapes[0], state.shapes[0])
-            mixing = reached.shapes[1:].reshape(3, -1) @ np.linalg.pinv(
-                state.shapes[1:].reshape(3, -1)
-            )
+            before = np.linalg.pinv(state.shapes[1:].reshape(3, -1))
+            mixing = reached.shapes[1:].reshape(3, -1) @ before
             assert_allclose(mixing @ mixing.T, np.eye(3), atol=1e-10)
             energies = np.linalg.eigvalsh(mean_images(state))[::-1]
             assert_allclose(mean_images(reached), np.diag(energies), atol=1e-9)

@@ -85,9 +85,8 @@ class TestFrameWeights:
 
     @pytest.mark.parametrize("loss", ROBUST)
     def test_points_that_do_not_belong_to_their_frame_have_none(self, loss):
-        distance = np.array(
-            [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e200]]
-        )
+        distance = [[0.0, 3.0, 11.9, 12.1, np.inf], [0.0, 3.0, 5.9, 6.1, 1e200]]
+        distance = np.array(distance)
         weights = frame_weights(loss, distance, 0.5, np.array([2.0, 1.0]))
         expected = WEIGHTS[loss](distance[:, :3] / 0.5)
         assert_array_equal(weights, np.pad(expected, ((0, 0), (0, 2))))

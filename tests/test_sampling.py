@@ -20,9 +20,8 @@ def matrix(n_frames, n_points=20):
 
 def sample(W, block_frames=64, **options):
     rows = FrameBlocks.of_array(W.reshape(len(W) // 2, 2, -1), block_frames)
-    return sample_frames(
-        rows, W.shape[1], factorise(W, 2).rigid_shape, **{**FEW, **options}
-    )
+    shape = factorise(W, 2).rigid_shape
+    return sample_frames(rows, W.shape[1], shape, **{**FEW, **options})
 
 
 def test_parts_grow_to_half_of_the_frames():
@@ -52,9 +51,8 @@ def test_frames_are_spread_from_the_most_to_the_least_rigid_one():
     factors = factorise(W, 2)
     rest = W - factors.rigid_motion @ factors.rigid_shape
     energy = np.sum(rest.reshape(100, -1) ** 2, axis=1)
-    np.testing.assert_allclose(
-        rigid_energy(W.reshape(100, 2, -1), factors.rigid_shape), energy
-    )
+    found = rigid_energy(W.reshape(100, 2, -1), factors.rigid_shape)
+    np.testing.assert_allclose(found, energy)
     chosen = spread(np.argsort(energy), 21)
     assert len(set(chosen)) == 21
     assert (np.diff(energy[chosen]) > 0).all()

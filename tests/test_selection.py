@@ -74,9 +74,8 @@ def test_results_are_those_of_a_plain_search(fitted):
     ("camera", "missing"), [("weak_perspective", 0.1), ("orthographic", 0.0)]
 )
 def test_cameras_and_missing_points_are_those_of_a_plain_search(camera, missing):
-    made = make_nonrigid_tracks(
-        60, 25, 2, camera=camera, noise=0.01, missing=missing, random_state=0
-    )
+    options = {"camera": camera, "noise": 0.01, "missing": missing}
+    made = make_nonrigid_tracks(60, 25, 2, **options, random_state=0)
     estimator = inner(camera=camera)
     search = AffineNRSfMCV([1, 2, 3], estimator=estimator).fit(made.data)
     for row, k in enumerate([1, 2, 3]):
@@ -146,9 +145,8 @@ def test_lines_come_while_the_search_runs_and_parameters_stay(capsys):
 @pytest.mark.slow
 def test_names_of_columns_are_kept():
     names = [f"{axis}_{i}" for i in range(20) for axis in "xy"]
-    search = AffineNRSfMCV((1, 2), estimator=inner()).fit(
-        pd.DataFrame(X, columns=names)
-    )
+    table = pd.DataFrame(X, columns=names)
+    search = AffineNRSfMCV((1, 2), estimator=inner()).fit(table)
     assert_array_equal(search.feature_names_in_, names)
     search.fit(X)
     assert not hasattr(search, "feature_names_in_")
@@ -246,9 +244,8 @@ def test_fewest_basis_shapes_are_fitted():
         return scores[len(estimator.basis_)] + 0.0015 * np.sign(X[0, 0] - first)
 
     first = np.median(X[[0, 30], 0])
-    search = AffineNRSfMCV(
-        (1, 2, 3), estimator=inner(), cv=2, scoring=scorer, select="one_standard_error"
-    ).fit(X)
+    options = {"cv": 2, "scoring": scorer, "select": "one_standard_error"}
+    search = AffineNRSfMCV((1, 2, 3), estimator=inner(), **options).fit(X)
     assert search.n_components_ == len(search.best_estimator_.basis_) == 2
 
 
@@ -276,9 +273,8 @@ def test_the_largest_number_is_checked_before_any_fit(monkeypatch):
 
 def test_the_limit_of_the_parts_is_named():
     few = X[:14]  # nine frames are fitted in a part, enough for three basis shapes
-    refused(
-        r"9 frames, enough for n_components=3 at most", AffineNRSfMCV((3, 5)).fit, few
-    )
+    message = r"9 frames, enough for n_components=3 at most"
+    refused(message, AffineNRSfMCV((3, 5)).fit, few)
     hidden = X.copy()
     hidden[6:, :2] = np.nan  # five of the six rows that show it are held out
     with pytest.raises(ValueError, match=r"split 0 of cv fits .* needs every point"):
@@ -334,7 +330,6 @@ def test_held_out_rows_are_not_fitted_without_joint_refinement():
 def test_the_best_mean_score_ranks_first_and_unknown_ones_last():
     means = [-0.5, np.nan, -0.2, -0.5, -0.9]
     ones = np.ones(2)
-    rows = [
-        Row(k, mean * ones, ones, ones, 0.0, 0) for k, mean in enumerate(means, start=1)
-    ]
+    scores = enumerate((mean * ones for mean in means), start=1)
+    rows = [Row(k, score, ones, ones, 0.0, 0) for k, score in scores]
     assert_array_equal(results_of(rows)["rank_test_score"], [2, 5, 1, 2, 4])

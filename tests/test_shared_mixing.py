@@ -84,9 +84,8 @@ class TestRecovery:
         [(2, 68, 0.97), (5, 68, 0.95), (9, 500, 0.99)],
     )
     def test_basis_shapes(self, n_components, n_points, least, seed):
-        truth = make_nonrigid_tracks(
-            n_frames=10, n_points=n_points, n_components=n_components, random_state=seed
-        ).basis
+        sizes = {"n_points": n_points, "n_components": n_components}
+        truth = make_nonrigid_tracks(10, **sizes, random_state=seed).basis
         mixed = np.tensordot(random_mixing(seed, n_components), truth, 1)
         assert cosines(truth, unmix(mixed)).min() > least
 
@@ -226,9 +225,8 @@ class TestDensities:
     @pytest.mark.parametrize("tail", TAILS)
     def test_integral_by_quadrature(self, tail, size, sphere):
         def radial(r):
-            return r ** (size - 1) * np.exp(
-                _shared_mixing._log_density(np.array(r * r), np.array(tail), size)
-            )
+            given = np.array(r * r), np.array(tail), size
+            return r ** (size - 1) * np.exp(_shared_mixing._log_density(*given))
 
         integral = sum(quad(radial, *ends)[0] for ends in ((0, 5), (5, 50), (50, 400)))
         value = _shared_mixing._log_integral(tail, size)
@@ -238,9 +236,8 @@ class TestDensities:
     @pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
     def test_tail_and_scale_are_found(self, size, scale, rng):
         shape = (1, 20_000, size)
-        student = rng.normal(size=shape) / np.sqrt(
-            rng.chisquare(8, size=(1, 20_000, 1)) / 8
-        )
+        chi_square = rng.chisquare(8, size=(1, 20_000, 1))
+        student = rng.normal(size=shape) / np.sqrt(chi_square / 8)
         uniform = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, size=shape)
         Z = scale * np.concatenate([student, uniform])
         _, tails, variance, _ = _shared_mixing._fit_densities(np.eye(2), Z)

@@ -257,9 +257,8 @@ def test_names_in_another_order_are_the_layout_in_that_order():
 
 def test_edges_of_names():
     names = ["snout", "LeftEar", "RightEar", "tail", "left"]
-    mouse = skeleton_of_names(
-        [("snout", "LeftEar"), ("RightEar", "snout")], names, name="mouse", source="me"
-    )
+    edges = [("snout", "LeftEar"), ("RightEar", "snout")]
+    mouse = skeleton_of_names(edges, names, name="mouse", source="me")
     assert_array_equal(mouse.edges, [[0, 1], [2, 0]])
     assert (mouse.left, mouse.right) == ((1,), (2,))
     with pytest.raises(ValueError, match="an edge of 'mouse' should be a pair"):

@@ -223,9 +223,8 @@ class TestKeepFrames:
             assert (file.name, file.parents[1]) == (f"{name[:-1]}.npy", found)
             assert_array_equal(np.load(file), array)
         assert len(list(found.iterdir())) == 1
-        assert_allclose(
-            model.diagnostics().weak_deviations, plain.diagnostics().weak_deviations
-        )
+        found, expected = (each.diagnostics() for each in (model, plain))
+        assert_allclose(found.weak_deviations, expected.weak_deviations)
 
     def test_not_at_all(self):
         X = table()

@@ -53,9 +53,8 @@ def test_summary_of_the_joint_refinement(model):
 
 @pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
 def test_summary_of_calibrated_cameras(camera):
-    table = make_nonrigid_tracks(
-        60, 16, 2, camera=camera, noise=0.02, random_state=0
-    ).data
+    options = {"camera": camera, "noise": 0.02, "random_state": 0}
+    table = make_nonrigid_tracks(60, 16, 2, **options).data
     shown = summary(estimator(camera=camera).fit(table))
     assert shown["Cameras"].startswith(f"{camera.replace('_', ' ')}; ")
     unit = "in the units of the table" if camera == "orthographic" else "s size"

@@ -368,9 +368,8 @@ def test_several_codes_are_missing_together(tracks_read):
     points, _ = tracks_read(tracks, "--missing-value", "-1", "--missing-value", "999")
     tracks[3, 2] = tracks[4, 5] = np.nan
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
-    found = landmark_table(
-        pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16]), missing=-1
-    )
+    table = pd.DataFrame([[-1, -1, -1, 4.0] * 4], columns=POINTS[:16])
+    found = landmark_table(table, missing=-1)
     assert found.points.isna().to_numpy().tolist() == [[True, True, False, False] * 4]
 
 
@@ -426,9 +425,8 @@ def of_estimators(test):
 )
 def test_whole_tables_are_no_tables_of_points(estimator, further, number, first):
     table = pd.concat([pd.DataFrame(further, index=ROWS), landmarks()], axis=1)
-    message = (
-        f"{number} .*'{first}'.* Give only the columns of points: .*landmark_table"
-    )
+    message = f"{number} .*'{first}'.* Give only the columns of points: "
+    message += ".*landmark_table"
     refused(message, estimator.fit, table)
     columns = [tuple(f"DLC {name}".split()) for name in table]
     with pytest.raises(ValueError, match=message.replace(first, f"DLC_{first}")):
@@ -461,9 +459,8 @@ def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
 def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
     tmp_path, suffix, typed
 ):
-    path = write_openface(
-        tmp_path / "a.csv", scene(), success=np.minimum(np.arange(12) % 3, 1)
-    )
+    success = np.minimum(np.arange(12) % 3, 1)
+    path = write_openface(tmp_path / "a.csv", scene(), success=success)
     further = pd.DataFrame({"subject": "007", "age": 30, "mood": "NA"}, index=range(12))
     table = pd.concat([pd.read_csv(path), further], axis=1)
     if not typed:

@@ -71,9 +71,8 @@ class TestCentring:
 class TestMissingPoints:
     @pytest.mark.parametrize("dtype", [np.float32, np.float64])
     def test_each_frame_equals_that_of_its_seen_points(self, rng, dtype):
-        tracks, seen = with_missing(
-            (5 + rng.normal(size=(30, 9, 2))).astype(dtype), 0.4
-        )
+        points = (5 + rng.normal(size=(30, 9, 2))).astype(dtype)
+        tracks, seen = with_missing(points, 0.4)
         centred, translation = centred_tracks(tracks)
         sizes = weighting_sizes(centred, scale_frames=True)
         assert_array_equal(seen_points(centred), seen)

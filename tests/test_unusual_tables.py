@@ -14,9 +14,8 @@ from isa_nrsfm.baselines import PseudoInverseNRSfM
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.metrics import inverse_snr
 
-SCENE = make_nonrigid_tracks(
-    n_frames=30, n_points=12, n_components=1, noise=0.02, random_state=0
-)
+SIZES = {"n_frames": 30, "n_points": 12, "n_components": 1}
+SCENE = make_nonrigid_tracks(**SIZES, noise=0.02, random_state=0)
 X = SCENE.data
 # Both coordinates of some points.
 HIDDEN = np.repeat(np.random.default_rng(1).random((30, 12)) < 0.05, 2, axis=1)

@@ -18,9 +18,8 @@ from isa_nrsfm.export import write_viewer
 
 pytestmark = pytest.mark.browser
 
-DRAWN = (
-    "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-)
+FRAME = "new Promise((done) => requestAnimationFrame("
+DRAWN = FRAME + "() => requestAnimationFrame(done)))"
 
 
 def show(browser, frame):
@@ -64,9 +63,8 @@ def test_sliders_move_the_points(browser, page):
     assert moved[8] > 0.05  # the chin, as the jaw opens
     assert moved[27] < moved[8] / 2
     assert browser.run("document.querySelector('output').textContent") == ""
-    assert browser.run("document.querySelector('.weight output').value") == (
-        f"{weight:.2f}"
-    )
+    shown = browser.run("document.querySelector('.weight output').value")
+    assert shown == f"{weight:.2f}"
     browser.click("reset")
     assert_allclose(browser.array("viewer.points()"), before)
 
@@ -111,9 +109,8 @@ def test_the_mouse_turns_and_zooms_the_shape(browser, page):
     assert browser.run("viewer.points()") == points
     assert browser.run("viewer.state().turn[0]") == pytest.approx(np.cos(0.6))
 
-    browser.call(
-        "Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=-300
-    )
+    wheel = {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -300}
+    browser.call("Input.dispatchMouseEvent", **wheel)
     browser.wait("viewer.state().zoom > 1.2")
     browser.click("front")
     again = browser.array("viewer.projected()")
