@@ -36,12 +36,9 @@ class Browser:
         quiet = os.open(os.devnull, os.O_RDWR)
         places = zip([quiet, quiet, *high], [1, 2, 3, 4], strict=True)
         command = [program, *FLAGS, f"--user-data-dir={profile}", "about:blank"]
-        self._process = os.posix_spawn(
-            program,
-            command,
-            os.environ,
-            file_actions=[(os.POSIX_SPAWN_DUP2, *place) for place in places],
-        )
+        moves = [(os.POSIX_SPAWN_DUP2, *place) for place in places]
+        spawn = os.posix_spawn
+        self._process = spawn(program, command, os.environ, file_actions=moves)
         for file in (theirs_in, theirs_out, quiet, *high):
             os.close(file)
         os.set_blocking(self._from, False)
@@ -138,11 +135,8 @@ class Browser:
 
     def requests(self):
         """Return the addresses that were asked for since the page was opened."""
-        return [
-            event["params"]["request"]["url"]
-            for event in self.events
-            if event["method"] == "Network.requestWillBeSent"
-        ]
+        sent = [e for e in self.events if e["method"] == "Network.requestWillBeSent"]
+        return [event["params"]["request"]["url"] for event in sent]
 
     def _send(self, method, parameters, session):
         """Send a call and return its number."""

@@ -43,10 +43,9 @@ def pytest_collection_finish():
 
 def pytest_terminal_summary(terminalreporter):
     """Say once for each reason how many tests it skipped."""
-    reasons = Counter(
-        report.longrepr[2].removeprefix("Skipped: ")
-        for report in terminalreporter.stats.get("skipped", ())
-    )
+    skipped = terminalreporter.stats.get("skipped", ())
+    texts = (report.longrepr[2] for report in skipped)
+    reasons = Counter(text.removeprefix("Skipped: ") for text in texts)
     for reason, number in reasons.items():
         terminalreporter.write_line(f"{number} skipped: {reason}")
 

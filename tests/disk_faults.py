@@ -174,8 +174,6 @@ def readable(folder):
 
 def leftovers(folder):
     """Return the names of hidden files and of links in a folder."""
-    return [
-        str(path.relative_to(folder))
-        for path in sorted(Path(folder).rglob("*"))
-        if path.name.startswith(".") or path.is_symlink()
-    ]
+    found = sorted(Path(folder).rglob("*"))
+    found = [path for path in found if path.name.startswith(".") or path.is_symlink()]
+    return [str(path.relative_to(folder)) for path in found]

@@ -54,12 +54,8 @@ def write_openface(
     for i, row in enumerate(planar(tracks)):
         head = [str(i), f"{confidence[i]:.3f}"]
         if video:
-            head = [
-                str(i + 1),
-                f"{i / 30:.3f}",
-                f"{confidence[i]:.2f}",
-                str(success[i]),
-            ]
+            head = [str(i + 1), f"{i / 30:.3f}", f"{confidence[i]:.2f}"]
+            head.append(str(success[i]))
             if separator == ",":
                 head.insert(1, "0")
         before = [f"{0.1 * (i + k):.1f}" for k in range(place - len(head))]
@@ -154,10 +150,9 @@ def deeplabcut_frame(tracks, likelihood=0.9, *, bodyparts=BODYPARTS, individuals
     names = ["scorer", "individuals", "bodyparts", "coords"]
     if not individuals:
         del levels[1], names[1]
-    return pd.DataFrame(
-        np.concatenate(values, axis=3).reshape(len(tracks), -1),
-        columns=pd.MultiIndex.from_product(levels, names=names),
-    )
+    columns = pd.MultiIndex.from_product(levels, names=names)
+    values = np.concatenate(values, axis=3).reshape(len(tracks), -1)
+    return pd.DataFrame(values, columns=columns)
 
 
 def write_deeplabcut(path, frame, *, how="table"):

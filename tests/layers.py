@@ -8,10 +8,6 @@ def slow_after(n_quick, values, together=False):
 
     With `together` each value has those of several arguments.
     """
-    return [
-        pytest.param(
-            *(value if together else [value]),
-            marks=[] if i < n_quick else pytest.mark.slow,
-        )
-        for i, value in enumerate(values)
-    ]
+    sets = [value if together else (value,) for value in values]
+    marks = [[]] * n_quick + [pytest.mark.slow] * len(sets)
+    return [pytest.param(*each, marks=m) for each, m in zip(sets, marks, strict=False)]

@@ -386,11 +386,8 @@ class TestAlignment:
         found = align_blocks(blocks, cameras)
         assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
         others = [sign * random_rotation(k) for k in range(200) for sign in (1, -1)]
-        others += [
-            polar(found + size * rng.normal(size=(3, 3)))[0]
-            for size in (1e-3, 1e-2)
-            for _ in range(20)
-        ]
+        near = (found + size * rng.normal(size=(20, 3, 3)) for size in (1e-3, 1e-2))
+        others += [polar(each)[0] for each in np.concatenate([*near])]
         assert max(map(agreement, others)) < agreement(found)
 
     @pytest.mark.parametrize("seed", range(3))
@@ -412,11 +409,9 @@ class TestAlignment:
         mixed = chain_atoms(mixing @ atoms, blocks @ np.linalg.inv(mixing), active)
         shown = mixed[0] @ np.tensordot(*mixed[1:], 1)
         assert_allclose(shown, scene.frames, atol=1e-6)
-        padded = chain_atoms(
-            np.concatenate([atoms[:1], atoms]),
-            np.concatenate([0 * blocks[:, :1], blocks], axis=1),
-            np.concatenate([0 * active[:, :1], active], axis=1).astype(bool),
-        )
+        blocks = np.concatenate([0 * blocks[:, :1], blocks], axis=1)
+        active = np.pad(active, ((0, 0), (1, 0)))
+        padded = chain_atoms(np.concatenate([atoms[:1], atoms]), blocks, active)
         assert_array_equal(padded[0], cameras)
         assert not padded[1][:, 0].any()
         assert not padded[2][0].any()

@@ -63,10 +63,8 @@ def tracks():
 
 @pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])
 def test_true_shapes_and_cameras_have_no_error(tracks, camera):
-    rotations = np.concatenate(
-        [tracks.motion, np.cross(tracks.motion[:, 0], tracks.motion[:, 1])[:, None]],
-        axis=1,
-    )
+    third = np.cross(tracks.motion[:, 0], tracks.motion[:, 1])[:, None]
+    rotations = np.concatenate([tracks.motion, third], axis=1)
     # In another orientation of space, mirrored, and of another size.
     turn = 0.5 * random_rotation(1) @ np.diag([1.0, 1.0, -1.0])
     shapes = tracks.shapes @ turn
@@ -86,11 +84,8 @@ def test_true_shapes_and_cameras_have_no_error(tracks, camera):
 
 def test_all_limits_of_a_fit_can_be_varied():
     known = set(sensitivity.STAGES) - {"fit"}
-    stages = {
-        name
-        for name, value in FitLimits()._asdict().items()
-        if hasattr(value, "_fields")
-    }
+    limits = FitLimits()._asdict().items()
+    stages = {name for name, value in limits if hasattr(value, "_fields")}
     assert known == stages
 
 
@@ -142,11 +137,8 @@ def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     stored = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     assert {r["method"] for r in stored["records"]} == {"rigid", "floor"}
     pictures = sorted(path.name for path in tmp_path.glob("*.png"))
-    assert pictures == [
-        "truth_affine_shape_error.png",
-        "truth_frame_error.png",
-        "truth_sequence_error.png",
-    ]
+    errors = "affine_shape_error", "frame_error", "sequence_error"
+    assert pictures == [f"truth_{error}.png" for error in errors]
 
     (tmp_path / "truth.md").unlink()
     command.main(["--tables-only", *output])

@@ -91,16 +91,14 @@ class TestMetricUpgrade:
         other = upgrade.mirrored()
         assert np.linalg.det(upgrade.Q) > 0 > np.linalg.det(other.Q)
         assert_allclose(np.linalg.det(other.rotations), 1)
-        distance = [
-            np.linalg.norm(motion @ u.Q - u.scales[:, None, None] * u.rotations[:, :2])
-            for u in (upgrade, other)
-        ]
+        pair = upgrade, other
+        images = (u.scales[:, None, None] * u.rotations[:, :2] for u in pair)
+        rest = (motion @ u.Q - image for u, image in zip(pair, images, strict=True))
+        distance = [np.linalg.norm(each) for each in rest]
         assert distance[0] == pytest.approx(distance[1], rel=1e-12)
         shape = np.random.default_rng(0).standard_normal((9, 3))
-        assert_allclose(
-            euclidean_shapes(shape, other.Q),
-            euclidean_shapes(shape, upgrade.Q) @ MIRROR,
-        )
+        expected = euclidean_shapes(shape, upgrade.Q) @ MIRROR
+        assert_allclose(euclidean_shapes(shape, other.Q), expected)
         again = other.mirrored()
         assert_allclose(again.Q, upgrade.Q)
         assert_allclose(again.rotations, upgrade.rotations)

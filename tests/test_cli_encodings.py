@@ -102,11 +102,8 @@ sys.exit(main(sys.argv[2:]))
 def test_interruption_while_modules_are_imported(faces, tmp_path, module):
     faces.to_csv(tmp_path / "faces.csv", index=False)
     argv = ["fit", str(tmp_path / "faces.csv"), "-o", str(tmp_path / "out"), *QUICK]
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED, module, *argv],
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-c", INTERRUPTED, module, *argv]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (130, "")
     # On a busy machine the progress is shown while modules are imported.
     progress = r"(isa-nrsfm: \d+ s: \w+\n)*"

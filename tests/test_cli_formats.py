@@ -243,10 +243,8 @@ def test_points_outside_of_the_image_are_counted(succeeds, tmp_path):
 
     path = write_shares(tmp_path, change)
     _, err = succeeds("fit", path, "-o", tmp_path / "results", *MEDIAPIPE, *QUICK)
-    expected = (
-        "warning: 2 of 840 points are outside the image, by at most 0.25 of its width "
-        "or height (point 5 in row 3)\n"
-    )
+    expected = "warning: 2 of 840 points are outside the image, by at most 0.25 of its "
+    expected += "width or height (point 5 in row 3)\n"
     assert expected in err
     assert SHARES not in err
 

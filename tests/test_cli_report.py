@@ -126,13 +126,9 @@ def test_labels_groups_and_times_are_those_of_python(run):
     model, report = load_model(folder / MODEL), report_of(folder)
     mood, age, _ = report["labels"]
     known = table["mood"].notna()
-    expected = association(
-        model.alpha_[known],
-        table["mood"][known],
-        table["person"][known],
-        time=table["seconds"][known],
-        random_state=0,
-    )
+    columns = (table[name][known] for name in ("mood", "person"))
+    options = {"time": table["seconds"][known], "random_state": 0}
+    expected = association(model.alpha_[known], *columns, **options)
     np.testing.assert_allclose(mood["values"], expected.statistic)
     np.testing.assert_allclose(mood["p_values"], expected.p_value)
     assert mood["permuted"] == expected.permuted

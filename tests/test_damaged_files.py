@@ -185,10 +185,9 @@ def read_shape_model(path):
 
 
 def write_points(path):
-    frame = pd.DataFrame(
-        files.TRACKS.reshape(len(files.TRACKS), -1),
-        columns=[f"{name}_{axis}" for name in files.BODYPARTS for axis in "xy"],
-    )
+    columns = [f"{name}_{axis}" for name in files.BODYPARTS for axis in "xy"]
+    points = files.TRACKS.reshape(len(files.TRACKS), -1)
+    frame = pd.DataFrame(points, columns=columns)
     frame.insert(0, "id", [f"00{i}" for i in range(len(frame))])
     write_table(frame, path)
     return path

@@ -60,10 +60,8 @@ class TestMinima:
     def test_value_never_rises(self, max_steps):
         problem = Wells([1.0, 4.0, 2.0])
         start = np.array([0.01, 1.2, -0.6])
-        values = [
-            problem.value(ended(problem, start, n)[0][None], problem.problem.a)
-            for n in range(max_steps + 1)
-        ]
+        ends = (ended(problem, start, n)[0] for n in range(max_steps + 1))
+        values = [problem.value(end[None], problem.problem.a) for end in ends]
         assert (np.diff(values, axis=0) <= 1e-13).all()
 
     def test_steps_that_raise_the_value_are_refused(self):

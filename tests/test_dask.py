@@ -96,11 +96,8 @@ class TestThreads:
             assert isinstance(got, array.Array)
             assert_allclose(got.compute(), getattr(plain, name)(X), atol=1e-8)
         assert model.score(chunked(X)) == pytest.approx(plain.score(X), rel=1e-8)
-        assert_allclose(
-            model.diagnostics().weak_deviations,
-            plain.diagnostics().weak_deviations,
-            rtol=1e-6,
-        )
+        found, expected = (each.diagnostics() for each in (model, plain))
+        assert_allclose(found.weak_deviations, expected.weak_deviations, rtol=1e-6)
 
     def test_chunks_of_unknown_length(self):
         X = table()
@@ -174,12 +171,8 @@ class TestJoblib:
     def test_grid_search_and_restarts(self, cluster):
         X = table()
         isa = FastISA(n_init=4, n_jobs=2)
-        search = GridSearchCV(
-            SampledNRSfM(isa=isa, refinement="alternating", random_state=0),
-            {"n_components": [1, 2]},
-            cv=2,
-            n_jobs=2,
-        )
+        model = SampledNRSfM(isa=isa, refinement="alternating", random_state=0)
+        search = GridSearchCV(model, {"n_components": [1, 2]}, cv=2, n_jobs=2)
         plain = search.fit(X).cv_results_["mean_test_score"]
         with joblib.parallel_config("dask"):
             on_cluster = search.fit(X).cv_results_["mean_test_score"]

@@ -103,12 +103,8 @@ class TestEveryMaker:
                 assert_array_equal(plain[name], other[name])
 
     def test_singular_values_of_the_cameras(self, make):
-        values = {
-            camera: np.linalg.svd(
-                make(500, camera=camera, random_state=0).motion, compute_uv=False
-            )
-            for camera in CAMERAS
-        }
+        motion = {c: make(500, camera=c, random_state=0).motion for c in CAMERAS}
+        values = {c: np.linalg.svd(M, compute_uv=False) for c, M in motion.items()}
         ratios = {camera: v[:, 1] / v[:, 0] for camera, v in values.items()}
         assert_allclose(values["orthographic"], values["orthographic"][0, 0])
         assert_allclose(ratios["weak_perspective"], 1)
@@ -344,10 +340,8 @@ class TestPeople:
     def test_poses_are_what_they_are_called(self):
         hands = make_hand_tracks(400, random_state=0)
         tips = np.linalg.norm(hands.shapes[:, [8, 12]] - hands.shapes[:, [0]], axis=2)
-        far = {
-            name: np.median(tips[hands.labels == name], axis=0)
-            for name in ("open", "fist", "point")
-        }
+        poses = "open", "fist", "point"
+        far = {name: np.median(tips[hands.labels == name], axis=0) for name in poses}
         assert (far["fist"] < 0.7 * far["open"]).all()
         assert far["point"][0] > 0.9 * far["open"][0]  # the index finger
         assert far["point"][1] < 0.7 * far["open"][1]

@@ -110,10 +110,8 @@ def muct_file(monkeypatch):
     values[1, 4] = 0  # at the edge of the image
     values[2, 7] = 3.5
     header = ["name", "tag", *(f"{a}{j:02d}" for j in range(7) for a in "xy")]
-    lines = [
-        ",".join([name, tag, *(f"{v:g}" for v in row)])
-        for name, tag, row in zip(PHOTOS, TAGS, values, strict=True)
-    ]
+    rows = zip(PHOTOS, TAGS, [[f"{v:g}" for v in row] for row in values], strict=True)
+    lines = [",".join([name, tag, *row]) for name, tag, row in rows]
     content = "\n".join([",".join(header), *lines, ""]).encode()
     name = "muct76-opencv.csv"
     remote = described(content, f"http://127.0.0.1/{name}", name)

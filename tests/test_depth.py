@@ -201,11 +201,8 @@ class TestTurnedFaces:
         assert_allclose(other.depth_uncertainty_, model.depth_uncertainty_, rtol=0.02)
         _, deviation = model.reconstruct(X, return_std=True)
         _, larger = other.reconstruct(100 * X, return_std=True)
-        assert_allclose(
-            other.scales_[:, None] * larger,
-            100 * model.scales_[:, None] * deviation,
-            rtol=0.02,
-        )
+        expected = 100 * model.scales_[:, None] * deviation
+        assert_allclose(other.scales_[:, None] * larger, expected, rtol=0.02)
 
     @pytest.mark.parametrize("error", [0.88, 0.5])
     def test_large_errors_of_depths_are_named(self, turned, error):
@@ -416,10 +413,7 @@ def swinging_body(seed, n_frames=150, turn=90):
 def test_weak_perspective_finds_what_orthographic_cameras_find():
     # Without starts of one scale its error is 1.8 times that of orthographic cameras.
     X, shapes = swinging_body(4)
-    errors = [
-        mean_shape_error_3d(
-            shapes, fitted(X, 4, camera=camera).reconstruct(X), convention="frame"
-        )
-        for camera in ("weak_perspective", "orthographic")
-    ]
+    models = (fitted(X, 4, camera=c) for c in ("weak_perspective", "orthographic"))
+    found = (model.reconstruct(X) for model in models)
+    errors = [mean_shape_error_3d(shapes, each, convention="frame") for each in found]
     assert errors[0] < 1.2 * errors[1]

@@ -143,10 +143,11 @@ class TestWeakInformation:
                     ),
                 ]
             )
-            strain = changes(
-                lambda x, M=M, a=a: images(M, 0.0, a, x.reshape(-1, 3, 3)),
-                9 * n_components,
-            )
+
+            def strained(x, M=M, a=a):
+                return images(M, 0.0, a, x.reshape(-1, 3, 3))
+
+            strain = changes(strained, 9 * n_components)
             rest = strain - free @ np.linalg.lstsq(free, strain)[0]
             expected += rest.T @ rest
         found = weak_information(shapes[0], shapes[1:], motion, alpha)
@@ -156,12 +157,8 @@ class TestWeakInformation:
         mean_shape, basis = rng.normal(size=(6, 3)), rng.normal(size=(1, 6, 3))
         motion, alpha = rng.normal(size=(1, 2, 3)), rng.normal(size=(1, 1))
         one = weak_information(mean_shape, basis, motion, alpha)
-        many = weak_information(
-            mean_shape,
-            basis,
-            np.repeat(motion, 1000, axis=0),
-            np.repeat(alpha, 1000, 0),
-        )
+        motion, alpha = np.repeat(motion, 1000, axis=0), np.repeat(alpha, 1000, 0)
+        many = weak_information(mean_shape, basis, motion, alpha)
         assert_allclose(many, 1000 * one, atol=1e-9 * np.abs(many).max())
 
 

@@ -160,13 +160,9 @@ class TestKeepFrames:
     def test_a_fit_that_fails_leaves_nothing(self, tmp_path, table, strike):
         folder = tmp_path / "kept"
         first, second = self.estimator(folder), self.estimator(folder)
-        for raised, before, operations in every_fault(
-            folder,
-            strike,
-            lambda: first.fit(table),
-            lambda: second.fit(table[:30]),
-            stride=4,
-        ):
+        fits = lambda: first.fit(table), lambda: second.fit(table[:30])
+        faults = every_fault(folder, strike, *fits, stride=4)
+        for raised, before, operations in faults:
             after = readable(folder)
             assert before.items() <= after.items()
             assert len(first.alpha_) == 40

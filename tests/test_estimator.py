@@ -31,10 +31,8 @@ from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
 N_FRAMES, N_POINTS, K = 90, 68, 3
 FACES = make_face_tracks(N_FRAMES, n_components=K, random_state=0)
 TABLE = FACES.data
-ONLY_JOINT = (
-    "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_ objective_history_ "
-    "gradient_norm_"
-).split()
+ONLY_JOINT = "alpha_std_ noise_variance_ camera_noise_ratio_ reliability_".split()
+ONLY_JOINT += ["objective_history_", "gradient_norm_"]
 
 
 # What noise is left in the table at the true number of basis shapes.
@@ -73,12 +71,9 @@ def tracks_of(table, layout="interleaved"):
 
 def model_tracks(model, motion, translation, alpha):
     """Return the tracks that the documented formula gives, frame by frame."""
-    return np.stack(
-        [
-            (model.mean_shape_ + np.tensordot(a, model.basis_, 1)) @ M.T + t
-            for M, t, a in zip(motion, translation, alpha, strict=True)
-        ]
-    )
+    shapes = model.mean_shape_ + np.tensordot(alpha, model.basis_, 1)
+    frames = zip(shapes, motion, translation, strict=True)
+    return np.stack([shape @ M.T + t for shape, M, t in frames])
 
 
 def frame_weights(tracks, scale_frames):
@@ -368,10 +363,8 @@ def test_methods_follow_the_formula(variant, which):
     assert_allclose(shapes, expected)
     expected = model_tracks(model, motion, translation, alpha)
     scale = np.abs(table).max()
-    for result in (
-        model.reproject(table),
-        model.inverse_transform(alpha, motion, translation),
-    ):
+    made = model.inverse_transform(alpha, motion, translation)
+    for result in (model.reproject(table), made):
         assert result.shape == table.shape
         found = tracks_of(result, model.layout)
         assert_allclose(found, expected, atol=1e-12 * scale, rtol=0)
@@ -854,11 +847,9 @@ def test_strategy_gets_what_it_leaves_open():
 
 
 def test_strategy_keeps_what_it_says_itself():
-    models = [
-        estimator(isa=FastISA(n_init=2, random_state=7, n_jobs=1), n_jobs=2),
-        estimator(isa=FastISA(n_init=2, random_state=7), random_state=1),
-        estimator(isa=FastISA(n_init=2, random_state=7), random_state=None),
-    ]
+    isa = FastISA(n_init=2, random_state=7)
+    models = [estimator(isa=clone(isa).set_params(n_jobs=1), n_jobs=2)]
+    models += [estimator(isa=isa, random_state=seed) for seed in (1, None)]
     alphas = [model.fit(TABLE).alpha_ for model in models]
     assert all(model.isa_.random_state == 7 for model in models)
     assert models[0].isa_.n_jobs == 1

@@ -124,11 +124,8 @@ class TestContract:
         # Cameras without scale see the orthographic shapes as the model does.
         images = ortho @ frames.rotations[:, :2].transpose(0, 2, 1)
         images += translation[:, None]
-        assert_allclose(
-            tracks_to_table(images, "interleaved"),
-            model.reproject(faces.data),
-            atol=1e-8,
-        )
+        table = tracks_to_table(images, "interleaved")
+        assert_allclose(table, model.reproject(faces.data), atol=1e-8)
 
     @both_cameras
     def test_new_frames_do_not_depend_on_each_other(self, model, camera):

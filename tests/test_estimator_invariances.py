@@ -220,12 +220,9 @@ def test_default_strategies_are_invariant(load_data, name, n_components, refinem
     changed = with_changes(original, "frames moved", "frames turned", "frames rescaled")
     rng = np.random.default_rng(0)
     frames, points = (rng.permutation(n) for n in original.shape[:2])
-    first, other = (
-        AffineNRSfM(n_components, refinement=refinement, random_state=0).fit(
-            table_of(each)
-        )
-        for each in (original, changed[frames][:, points])
-    )
+    model = AffineNRSfM(n_components, refinement=refinement, random_state=0)
+    tables = map(table_of, (original, changed[frames][:, points]))
+    first, other = (clone(model).fit(table) for table in tables)
     expected = first.alpha_[frames]
     if (name, refinement) == ("akhter_drink", "joint"):
         # The valley of the objective is flat: along it rounding errors grow in the

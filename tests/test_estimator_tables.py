@@ -422,10 +422,8 @@ def test_joint_refinement_of_frames_that_are_lines_or_tiny(loss, scale_frames):
     tracks = lines_and_tiny_frames()
     model = jointly(tracks, 2, loss=loss, scale_frames=scale_frames)
     others = np.setdiff1d(np.arange(60), [3, 5, 7])
-    errors = [
-        each.reproject(table_of(tracks))[others] - table_of(tracks)[others]
-        for each in (model, of_unit(1.0, "joint"))
-    ]
+    models, table = (model, of_unit(1.0, "joint")), table_of(tracks)
+    errors = [each.reproject(table)[others] - table[others] for each in models]
     assert np.median(np.abs(errors[0])) < 2 * np.median(np.abs(errors[1]))
 
 
@@ -465,13 +463,10 @@ def test_inverse_snr_of_tables(load_data, name, n_components, params, percent, s
 def test_one_basis_shape_needs_no_independence(load_data, name):
     # There is one subspace only: neither strategy nor seed have a say.
     table = table_of(real_tracks(load_data, name))
-    values = [
-        AffineNRSfM(1, isa=isa, refinement="alternating", random_state=seed)
-        .fit(table)
-        .inverse_snr_
-        for isa in (PooledFastICA(n_init=2), FastISA(n_init=2))
-        for seed in (0, 1)
-    ]
+    strategies = PooledFastICA(n_init=2), FastISA(n_init=2)
+    models = [AffineNRSfM(1, isa=isa, refinement="alternating") for isa in strategies]
+    models = (m.set_params(random_state=seed) for m in models for seed in (0, 1))
+    values = [model.fit(table).inverse_snr_ for model in models]
     assert_allclose(values, values[0], rtol=1e-5)
 
 
@@ -481,12 +476,8 @@ def test_calibrated_cameras_have_more_basis_shapes_than_the_factorisation(tmp_pa
     bodies = make_body_tracks(200, camera="orthographic", random_state=0)
     fitted = AffineNRSfM(4, camera="orthographic", random_state=0)
     few, many = fitted.fit(bodies.data), clone(fitted).set_params(n_components=12)
-    errors = [
-        mean_shape_error_3d(
-            bodies.shapes, model.reconstruct(bodies.data), convention="frame"
-        )
-        for model in (few, many.fit(bodies.data))
-    ]
+    found = [each.reconstruct(bodies.data) for each in (few, many.fit(bodies.data))]
+    errors = [mean_shape_error_3d(bodies.shapes, S, convention="frame") for S in found]
     assert errors[1] < 0.6 * errors[0]
     assert many.basis_.shape == (12, 17, 3)
     assert many.singular_values_.shape == (16,)

@@ -54,10 +54,8 @@ class TestFramePoses:
         sizes = weighting_sizes(clean - clean.mean(axis=1, keepdims=True), True)
         noise = np.sqrt(model.noise_variance_) * sizes[:, None, None]
         noisy = clean + noise * np.random.default_rng(0).normal(size=clean.shape)
-        wanted, found = (
-            frame_poses(model),
-            frame_poses(model, noisy.reshape(N_FRAMES, -1)),
-        )
+        wanted = frame_poses(model)
+        found = frame_poses(model, noisy.reshape(N_FRAMES, -1))
         for name in ("yaw", "pitch", "roll"):
             off = getattr(found, name) - getattr(wanted, name)
             ratio = np.sqrt(np.mean((off / getattr(found, f"{name}_std")) ** 2))

@@ -73,10 +73,8 @@ class TestInvariances:
     @pytest.mark.slow
     def test_n_jobs_change_no_bit(self):
         signals = few_samples()
-        one, two = (
-            FastISA(n_init=18, random_state=0, n_jobs=n_jobs).fit(signals)
-            for n_jobs in (1, 2)
-        )
+        kwargs = {"n_init": 18, "random_state": 0}
+        one, two = (FastISA(**kwargs, n_jobs=n).fit(signals) for n in (1, 2))
         assert_array_equal(two.components_, one.components_)
         assert_array_equal(two.log_likelihoods_, one.log_likelihoods_)
         assert_array_equal(two.n_iters_, one.n_iters_)

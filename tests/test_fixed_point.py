@@ -102,10 +102,9 @@ class TestStep:
 
     def test_shorter_steps_turn_less(self):
         Z, W = white_signals(0), starts(0, 4, 6)
-        angles = [
-            np.sqrt(subspace_change(W, fixed_point_step(W, Z, 3, DENSITY, length), 3))
-            for length in (1.0, 0.5, 0.25, 1 / 16)
-        ]
+        lengths = 1.0, 0.5, 0.25, 1 / 16
+        steps = (fixed_point_step(W, Z, 3, DENSITY, length) for length in lengths)
+        angles = [np.sqrt(subspace_change(W, step, 3)) for step in steps]
         assert np.all(np.diff(angles, axis=0) < 0)
 
     def test_length_for_each_start(self):

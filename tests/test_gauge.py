@@ -173,11 +173,8 @@ class TestBasis:
         alpha = coefficients(scene, gauge)
         before = compose(scene.mean_shape, scene.basis, scene.alpha)
         after = compose(gauge.mean_shape, gauge.basis, alpha)
-        assert_allclose(
-            project(after, motion, np.zeros(2)),
-            project(before, scene.motion, np.zeros(2)),
-            atol=1e-10,
-        )
+        expected = project(before, scene.motion, np.zeros(2))
+        assert_allclose(project(after, motion, np.zeros(2)), expected, atol=1e-10)
 
     def test_coefficients_have_unit_variance_and_are_skewed_to_the_positive_side(self):
         scene = Scene()
@@ -190,10 +187,9 @@ class TestBasis:
         scene = Scene()
         gauge, motion = scene.canonical()
         alpha = coefficients(scene, gauge)
-        energies = [
-            np.sum((alpha[:, k, None, None] * (motion @ gauge.basis[k].T)) ** 2)
-            for k in range(3)
-        ]
+        moved = (motion @ gauge.basis[k].T for k in range(3))
+        pairs = zip(alpha.T, moved, strict=True)
+        energies = [np.sum((a[:, None, None] * images) ** 2) for a, images in pairs]
         assert_array_equal(np.argsort(energies)[::-1], [0, 1, 2])
         assert sorted(gauge.order) == [0, 1, 2]
 

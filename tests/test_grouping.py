@@ -20,10 +20,8 @@ DENSITY = SqrtDensity()
 
 
 def likelihood(signals, assignment):
-    return sum(
-        np.mean(DENSITY.log_density(np.sum(signals[assignment == k] ** 2, axis=0)))
-        for k in range(assignment.max() + 1)
-    )
+    groups = (signals[assignment == k] for k in range(assignment.max() + 1))
+    return sum(np.mean(DENSITY.log_density(np.sum(s**2, axis=0))) for s in groups)
 
 
 def random_covariance(seed, n=9, dof=12):

@@ -27,13 +27,8 @@ def scene(seed=0, n_frames=12, n_points=23):
     alpha = rng.normal(size=(n_frames, 2))
     tracks = project(compose(shapes[0], shapes[1:], alpha), motion, position)
     tracks += NOISE * rng.normal(size=tracks.shape)
-    frames = PosteriorFrames(
-        shapes.transpose(0, 2, 1),
-        NOISE**2,
-        np.zeros((0, 2)),
-        "linear",
-        FrameMap.identity(2),
-    )
+    others = NOISE**2, np.zeros((0, 2)), "linear", FrameMap.identity(2)
+    frames = PosteriorFrames(shapes.transpose(0, 2, 1), *others)
     return frames, shapes, tracks
 
 

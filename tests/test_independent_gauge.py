@@ -69,11 +69,8 @@ def regauged(fit, seed=1, shift=0.05):
     rng = np.random.default_rng(seed)
     space = random_rotation(seed) + 0.3 * rng.normal(size=(3, 3))
     alpha, scale = remixed(fit.alpha, mixing)
-    return Fit(
-        space @ np.tensordot(mixing, fit.shapes, 1),
-        scale[:, None, None] * fit.motion @ np.linalg.inv(space),
-        alpha,
-    )
+    motion = scale[:, None, None] * fit.motion @ np.linalg.inv(space)
+    return Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
 
 
 def canonical(fit, *options):
@@ -253,11 +250,8 @@ class TestCalibratedCameras:
             mixing[1:, 0] = 0.0
         space = random_rotation(1)
         alpha, scale = remixed(fit.alpha, mixing)
-        other = Fit(
-            space @ np.tensordot(mixing, fit.shapes, 1),
-            scale[:, None, None] * fit.motion @ space.T,
-            alpha,
-        )
+        motion = scale[:, None, None] * fit.motion @ space.T
+        other = Fit(space @ np.tensordot(mixing, fit.shapes, 1), motion, alpha)
         assert_allclose(other.images(), fit.images(), atol=1e-10)
         expected, _ = canonical(fit, independence, camera)
         assert_same(canonical(other, independence, camera)[0], expected)
@@ -285,11 +279,9 @@ class TestStandardDeviations:
         mixing = random_mixing(1, 4)
         root = np.random.default_rng(3).normal(size=(60, 3, 3))
         step = 1e-6
-        slopes = [
-            remixed(fit.alpha + step * e, mixing)[0]
-            - remixed(fit.alpha - step * e, mixing)[0]
-            for e in np.eye(3)
-        ]
+        ends = (fit.alpha + sign * step * e for e in np.eye(3) for sign in (1, -1))
+        ends = [remixed(alpha, mixing)[0] for alpha in ends]
+        slopes = np.subtract(ends[::2], ends[1::2])
         moved = np.stack(slopes, axis=2) / (2 * step) @ root
         other = regauged(fit)
         deviations = [

@@ -243,10 +243,9 @@ def test_deeplabcut_labels_have_images_and_no_likelihood(tmp_path):
     frame.iloc[3, :2] = np.nan
     expected = TRACKS.copy()
     expected[3, 0] = np.nan
-    for index in (
-        pd.Index([f"labeled-data/reach/{name}" for name in names]),
-        pd.MultiIndex.from_product([["labeled-data"], ["reach"], names]),
-    ):
+    paths = [f"labeled-data/reach/{name}" for name in names]
+    levels = pd.MultiIndex.from_product([["labeled-data"], ["reach"], names])
+    for index in (pd.Index(paths), levels):
         frame.index = index
         landmarks = read_landmarks(files.write_deeplabcut(tmp_path / "a.csv", frame))
         assert_allclose(tracks_of(landmarks), expected)
@@ -572,11 +571,8 @@ class Variable:
 
     def __init__(self, values, dims, coords):
         self.values, self.dims = np.asarray(values), tuple(dims)
-        self.coords = {
-            name: SimpleNamespace(values=np.asarray(coords[name]))
-            for name in dims
-            if name in coords
-        }
+        known = {name: np.asarray(coords[name]) for name in dims if name in coords}
+        self.coords = {name: SimpleNamespace(values=v) for name, v in known.items()}
 
     def transpose(self, *dims):
         axes = [self.dims.index(dim) for dim in dims]
@@ -588,12 +584,8 @@ def movement_dataset(plural, order=(0, 1, 2, 3)):
     """Return a dataset of two mice, as movement names it now and did before."""
     keypoint, individual = "keypoint" + "s" * plural, "individual" + "s" * plural
     dims = ["time", "space", keypoint, individual]
-    coords = {
-        "time": np.arange(12) / 30,
-        "space": ["x", "y"],
-        keypoint: files.BODYPARTS,
-        individual: ["id_0", "id_1"],
-    }
+    coords = {"time": np.arange(12) / 30, "space": ["x", "y"]}
+    coords |= {keypoint: files.BODYPARTS, individual: ["id_0", "id_1"]}
     pair = np.stack([TRACKS, TRACKS + 100], axis=3).transpose(0, 2, 1, 3)
     pair[3, :, :, 1] = np.nan
     position = pair.transpose(order)

@@ -155,11 +155,8 @@ def rewritten(fitted, path):
 
 def parts(estimator):
     """Return public attributes by name; strategies and densities are None."""
-    return {
-        name: None if hasattr(value, "get_params") else value
-        for name, value in vars(estimator).items()
-        if not name.startswith("_")
-    }
+    public = {name: v for name, v in vars(estimator).items() if name[0] != "_"}
+    return {n: None if hasattr(v, "get_params") else v for n, v in public.items()}
 
 
 def assert_same(loaded, saved):

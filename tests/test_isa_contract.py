@@ -18,11 +18,8 @@ from isa_nrsfm.io import load_model, save_model
 from isa_nrsfm.isa._base import BaseSubspaceAnalysis, whiten
 from isa_nrsfm.metrics import subspace_distance
 
-KINDS = [
-    kind
-    for kind in (getattr(strategies, name) for name in strategies.__all__)
-    if issubclass(kind, BaseSubspaceAnalysis)
-]
+KINDS = [getattr(strategies, name) for name in strategies.__all__]
+KINDS = [kind for kind in KINDS if issubclass(kind, BaseSubspaceAnalysis)]
 STRATEGIES = [kind(n_init=2, random_state=0) for kind in KINDS]
 ALL_STRATEGIES = pytest.mark.parametrize("isa", STRATEGIES, ids=lambda isa: str(isa))
 
@@ -137,10 +134,9 @@ class TestStrategies:
     @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
     def test_seeds(self, isa):
         few = spherical_sources(0, 68, 4)
-        first, same, generator, other = (
-            clone(isa).set_params(random_state=seed).fit(few).components_
-            for seed in (0, 0, np.random.RandomState(0), 3)
-        )
+        seeds = 0, 0, np.random.RandomState(0), 3
+        models = (clone(isa).set_params(random_state=seed) for seed in seeds)
+        first, same, generator, other = (each.fit(few).components_ for each in models)
         assert_array_equal(same, first)
         assert_array_equal(generator, first)
         assert np.abs(other - first).max() > 1e-3

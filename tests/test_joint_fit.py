@@ -237,12 +237,8 @@ class TestNoiseVariance:
         ],
     )
     def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
-        tracks, _ = random_table(
-            "orthographic",
-            n_frames=n_frames,
-            n_points=n_points,
-            n_components=n_components,
-        )
+        sizes = {"n_frames": n_frames, "n_points": n_points}
+        tracks, _ = random_table("orthographic", n_components=n_components, **sizes)
         model = fitted(tracks, n_components, loss=loss, scale_frames=False)
         assert abs(model.noise_variance_ / DEVIATION**2 - 1) < largest
 
@@ -256,10 +252,8 @@ class TestLargeTables:
     @EACH
     @pytest.mark.parametrize("gaps", slow_after(1, [False, True]))
     def test_end_where_small_ones_do(self, gaps, camera):
-        tracks, truth = random_table(
-            "orthographic" if camera == "orthographic" else "weak_perspective",
-            n_frames=200,
-        )
+        seen_by = camera if camera == "orthographic" else "weak_perspective"
+        tracks, truth = random_table(seen_by, n_frames=200)
         tracks = with_gaps(tracks, 0.1) if gaps else tracks
         options = {"tol": 1e-3, "camera": camera}
         sampled = fitted(tracks, kind=SampledNRSfM, **options)

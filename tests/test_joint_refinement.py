@@ -259,11 +259,9 @@ class TestCameras:
             step = rng.normal(size=(cameras.n_parameters, len(motion)))
             rises = []
             for size in (-1e-3, 1e-3):
-                after = likelihood(
-                    shapes + size * change,
-                    moved(cameras, motion, size * step),
-                    noise * np.exp(size),
-                )
+                motions = moved(cameras, motion, size * step)
+                noises = noise * np.exp(size)
+                after = likelihood(shapes + size * change, motions, noises)
                 rises.append(after.value - result.history[-1])
             assert min(rises) > 0
             assert_allclose(rises[0], rises[1], rtol=0.1)

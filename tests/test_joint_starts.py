@@ -157,10 +157,8 @@ class TestLiftedShapes:
         # With more frames than coordinates, and with fewer.
         scene = random_scene(camera, n_frames=n_frames)
         shapes = lifted_shapes(scene.rows, scene.motion, 3)
-        lifted = [
-            (np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel()
-            for W, M in zip(scene.rows, scene.motion, strict=True)
-        ]
+        pairs = zip(scene.rows, scene.motion, strict=True)
+        lifted = [(np.linalg.pinv(M) @ (W - M @ shapes[0])).ravel() for W, M in pairs]
         _, S, Vt = np.linalg.svd(np.array(lifted), full_matrices=False)
         flat = shapes[1:].reshape(3, -1)
         assert_allclose(np.linalg.norm(flat, axis=1), S[:3] / np.sqrt(n_frames))
@@ -273,10 +271,9 @@ class TestAffineStart:
         paper = paper_shapes(scene.factors)
         state = affine_start(problem_of(scene), scene.W, paper)
         for before, after in zip(paper[1:], state.shapes[1:], strict=True):
-            alpha = [
-                np.vdot(M @ before, W) / np.sum((M @ before) ** 2)
-                for M, W in zip(state.motion, scene.rows, strict=True)
-            ]
+            images = state.motion @ before
+            norms = np.sum(images**2, axis=(1, 2))
+            alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
             assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
     def test_basis_shapes_that_no_camera_sees_are_zero(self):
@@ -354,20 +351,16 @@ def test_the_better_given_start_is_taken_whatever_the_order():
     scene = random_scene(noise=0.02)
     good = Start(scene.shapes, 1e-3)
     poor = Start(scene.shapes * np.array([1, 1, 0])[:, None, None], 1e-3)
-    ends = [
-        _continued_fit(problem_of(scene), starts)[0].value
-        for starts in ([good], [good, poor], [poor, good])
-    ]
+    several = [good], [good, poor], [poor, good]
+    ends = [_continued_fit(problem_of(scene), each)[0].value for each in several]
     assert_allclose(ends[1:], ends[0], rtol=1e-4)
 
 
 def test_the_likeliest_fit_of_the_starts_counts():
     scene = random_scene(amplitude=0.6, noise=0.02)
     problem, factors = problem_of(scene), scene.factors
-    ends = [
-        _calibrated_fit(problem, state, CAMERAS["orthographic"]).value
-        for state in started(scene, "orthographic", problem)
-    ]
+    camera, states = CAMERAS["orthographic"], started(scene, "orthographic", problem)
+    ends = [_calibrated_fit(problem, state, camera).value for state in states]
     table = FactorisedTable(*[None] * 5, Sample(scene.W, []), factors)
     fit, _ = _first_fit(problem, table, paper_shapes(factors))
     assert max(ends) > min(ends)

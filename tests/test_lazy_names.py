@@ -52,12 +52,9 @@ def for_type_checkers(package):
 
 def loaded_by(code, **environment):
     """Return the modules that a program has loaded at its end."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, **environment},
-    )
+    program = [sys.executable, "-c", f"{code}\nimport sys\nprint(*sys.modules)"]
+    environment = {**os.environ, **environment}
+    done = subprocess.run(program, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.splitlines()[-1].split())
 

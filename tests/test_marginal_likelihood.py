@@ -131,19 +131,16 @@ class TestValue:
         likelihood = likelihood_of(scene.tracks, scene.weights, 0.0)
         assert likelihood.n_frames == len(scene.tracks)
         assert likelihood.n_seen == np.isfinite(scene.tracks).sum()
-        energy = sum(
-            np.sum((root * points.T) ** 2)
-            for points, _, root, _, _ in frame_by_frame(scene)
-        )
+        parts = ((root * points.T) for points, _, root, _, _ in frame_by_frame(scene))
+        energy = sum(np.sum(part**2) for part in parts)
         assert likelihood.square == pytest.approx(energy, rel=1e-13)
 
     def test_without_basis_shapes_it_is_the_likelihood_of_rigid_frames(self):
         scene = random_scene("complete")
         rigid = scene._replace(shapes=scene.shapes[:1])
-        energy = sum(
-            np.sum((points.T - M @ shapes[0]) ** 2)
-            for points, shapes, _, M, _ in frame_by_frame(scene)
-        )
+        frames = frame_by_frame(scene)
+        rest = (points.T - M @ shapes[0] for points, shapes, _, M, _ in frames)
+        energy = sum(np.sum(each**2) for each in rest)
         expected = scene.tracks.size * np.log(NOISE) + energy / NOISE
         assert rigid.at(PENALTY).value == pytest.approx(expected, rel=1e-12)
 
@@ -154,18 +151,14 @@ class TestGradient:
     @pytest.mark.parametrize("name", ["shapes", "motion"])
     def test_against_differences(self, kind, penalty, name):
         scene = random_scene(kind)
-        gradient = getattr(
-            scene.at(penalty),
-            {"shapes": "shape", "motion": "motion"}[name] + "_gradient",
-        )
+        field = {"shapes": "shape_gradient", "motion": "motion_gradient"}[name]
+        gradient = getattr(scene.at(penalty), field)
         rng = np.random.default_rng(1)
         for _ in range(5):
             change = rng.normal(size=gradient.shape)
             step = 1e-5
-            above, below = (
-                scene._replace(**{name: getattr(scene, name) + sign * step * change})
-                for sign in (1, -1)
-            )
+            moved = (getattr(scene, name) + s * step * change for s in (1, -1))
+            above, below = (scene._replace(**{name: value}) for value in moved)
             slope = (above.at(penalty).value - below.at(penalty).value) / (2 * step)
             assert slope == pytest.approx(np.vdot(gradient, change), rel=1e-6)
 
@@ -235,10 +228,8 @@ class TestCurvature:
             M = scene.motion[i]
             N += np.kron(E, M.T @ M)
             R += np.kron(c[:, None], M.T) @ W
-        step = np.linalg.solve(
-            passed.shape_curvature[0],
-            NOISE / 2 * passed.shape_gradient.reshape(len(N), -1),
-        )
+        slopes = NOISE / 2 * passed.shape_gradient.reshape(len(N), -1)
+        step = np.linalg.solve(passed.shape_curvature[0], slopes)
         moved = scene.shapes.reshape(len(N), -1) - step
         assert_allclose(moved, np.linalg.solve(N, R), atol=1e-10)
 
@@ -282,18 +273,14 @@ class TestWeights:
         weights[:, 2], tracks[:, 2] = 0.0, hidden
         kept = np.arange(weights.shape[1]) != 2
         got = scene._replace(weights=weights, tracks=tracks).at(PENALTY)
-        fewer = scene._replace(
-            tracks=scene.tracks[:, kept],
-            weights=scene.weights[:, kept],
-            shapes=scene.shapes[:, :, kept],
-        )
+        tracks, weights = scene.tracks[:, kept], scene.weights[:, kept]
+        shapes = scene.shapes[:, :, kept]
+        fewer = scene._replace(tracks=tracks, weights=weights, shapes=shapes)
         expected = fewer.at(PENALTY)
         assert_allclose(got.shape_gradient[:, :, 2], 0, atol=1e-12)
         assert_allclose(got.shape_curvature[2], 0, atol=1e-12)
-        got = got._replace(
-            shape_gradient=got.shape_gradient[:, :, kept],
-            shape_curvature=got.shape_curvature[kept],
-        )
+        slopes, curvature = got.shape_gradient[:, :, kept], got.shape_curvature[kept]
+        got = got._replace(shape_gradient=slopes, shape_curvature=curvature)
         assert_same(got, expected)
 
 

@@ -86,10 +86,8 @@ class TestMetricQuadric:
 
     def test_extreme_stretches_are_refused(self):
         motion = weak_perspective(np.random.default_rng(8))
-        for stretch, found in (
-            (0.9 * LARGEST_STRETCH, True),
-            (2 * LARGEST_STRETCH, False),
-        ):
+        largest = LARGEST_STRETCH
+        for stretch, found in ((0.9 * largest, True), (2 * largest, False)):
             Q = metric_quadric(motion @ np.diag([1, 1, stretch]))
             assert (Q is not None) == found
 
@@ -121,7 +119,5 @@ class TestParts:
         matrix = root @ root.T
         got = symmetric_power(matrix, power)
         assert_allclose(got, got.T)
-        assert_allclose(
-            np.linalg.matrix_power(got, 2 if abs(power) == 0.5 else 1),
-            matrix if power > 0 else np.linalg.inv(matrix),
-        )
+        found = np.linalg.matrix_power(got, 2 if abs(power) == 0.5 else 1)
+        assert_allclose(found, matrix if power > 0 else np.linalg.inv(matrix))

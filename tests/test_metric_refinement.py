@@ -136,10 +136,9 @@ class TestParts:
         scale = np.abs(whole.curvature).max()
         assert_allclose(whole.curvature, turned.curvature, atol=1e-12 * scale)
         assert_allclose(whole.gradient, turned.gradient, atol=1e-12 * scale)
-        first, rest = (
-            fit_at(motion[part], alpha[part], np.eye(3), strain, camera)
-            for part in (slice(BLOCK_FRAMES), slice(BLOCK_FRAMES, None))
-        )
+        parts = slice(BLOCK_FRAMES), slice(BLOCK_FRAMES, None)
+        frames = ((motion[part], alpha[part]) for part in parts)
+        first, rest = (fit_at(*each, np.eye(3), strain, camera) for each in frames)
         assert whole.cost == pytest.approx(first.cost + rest.cost, rel=1e-12)
         both = first.curvature + rest.curvature, first.gradient + rest.gradient
         assert_allclose(whole.curvature, both[0], atol=1e-12 * scale)
@@ -186,10 +185,8 @@ class TestRefineMetric:
     @both_cameras
     def test_result_does_not_depend_on_the_start(self, camera):
         motion = noisy_cameras(0, camera)
-        costs = [
-            refined(motion, safe_start(motion, bad_start(s), camera), camera).cost
-            for s in range(10)
-        ]
+        many = (safe_start(motion, bad_start(s), camera) for s in range(10))
+        costs = [refined(motion, start, camera).cost for start in many]
         assert costs[0] > 0.1
         assert_allclose(costs, costs[0], rtol=1e-10)
 

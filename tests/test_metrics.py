@@ -330,10 +330,8 @@ class TestSubspaceDistance:
         for _ in range(20):
             a, b = rng.standard_normal((2, 4, 2, 5))
             pairs = [[subspace_distance(x, y, 2) for y in b] for x in a]
-            largest = (
-                max(pairs[k][p[k]] for k in range(4)) for p in permutations(range(4))
-            )
-            expected = min(largest)
+            orders = permutations(range(4))
+            expected = min(max(pairs[k][p[k]] for k in range(4)) for p in orders)
             distance = subspace_distance(a.reshape(8, 5), b.reshape(8, 5), 2)
             assert_allclose(distance, expected)
 

@@ -44,11 +44,8 @@ class TestDefinitions:
     def test_as_written_in_the_docstring(self, pair):
         truth, shapes = map(centred, pair)
         turn, _ = self.procrustes(truth.reshape(-1, 3), shapes.reshape(-1, 3))
-        distance = [
-            np.linalg.norm(s - turn @ x)
-            for S, X in zip(truth, shapes, strict=True)
-            for s, x in zip(S, X, strict=True)
-        ]
+        pairs = zip(np.concatenate(truth), np.concatenate(shapes), strict=True)
+        distance = [np.linalg.norm(s - turn @ x) for s, x in pairs]
         sigma = np.mean([S.std(axis=0) for S in truth])
         expected = np.mean(distance) / sigma
         assert mean_shape_error_3d(*pair) == pytest.approx(expected, rel=1e-9)

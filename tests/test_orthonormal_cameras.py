@@ -115,12 +115,8 @@ class TestNoise:
         Q = rng.normal(size=(5, 3))
         P = cameras.reshape(-1, 3) @ np.linalg.pinv(Q)
         deviation = 1e-3
-        costs = [
-            cost_of(
-                ((P + deviation * rng.normal(size=P.shape)) @ Q).reshape(cameras.shape)
-            )
-            for _ in range(20)
-        ]
+        noisy = (P + deviation * rng.normal(size=P.shape) for _ in range(20))
+        costs = [cost_of((each @ Q).reshape(cameras.shape)) for each in noisy]
         expected = NOISE_PRICE * deviation**2 * np.sum(Q**2)
         assert np.mean(costs) == pytest.approx(expected, rel=0.03)
 

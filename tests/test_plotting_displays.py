@@ -57,11 +57,9 @@ def upside_down(faces):
 
 def random_shapes(n_points=20, **kw):
     rng = np.random.default_rng(0)
-    return BasisShapeDisplay(
-        mean_shape=rng.standard_normal((n_points, 3)),
-        basis=0.1 * rng.standard_normal((3, n_points, 3)),
-        **kw,
-    )
+    mean_shape = rng.standard_normal((n_points, 3))
+    basis = 0.1 * rng.standard_normal((3, n_points, 3))
+    return BasisShapeDisplay(mean_shape=mean_shape, basis=basis, **kw)
 
 
 def random_frames(n_points=10, **kw):
@@ -110,11 +108,9 @@ def test_shapes_of_calibrated_cameras_are_only_turned(camera):
     error = f"depth error {100 * model.depth_uncertainty_:.2g} %"
     assert [side.get_xlabel() for side in display.axes_[:, 1]] == 3 * [error]
     scale = np.median(model.scales_)
-    for drawn, shape in zip(
-        [display.mean_shape, *display.basis],
-        [model.mean_shape_, *model.basis_],
-        strict=True,
-    ):
+    shown = [display.mean_shape, *display.basis]
+    shapes = [model.mean_shape_, *model.basis_]
+    for drawn, shape in zip(shown, shapes, strict=True):
         drawn, shape = (each / np.linalg.norm(scale * shape) for each in (drawn, shape))
         assert_allclose(drawn @ drawn.T, scale**2 * shape @ shape.T, atol=1e-6)
     # Points in no known order are seen as the mean camera does.
@@ -141,10 +137,8 @@ def test_points_and_arrows_are_the_shapes(estimator):
             assert_allclose(drawn.get_offsets(), mean)
         for k in range(2):
             drift = 1.5 * display.basis[k][:, columns]
-            plus, minus, arrows = (
-                artists[2 * k + view]
-                for artists in (display.plus_, display.minus_, display.arrows_)
-            )
+            drawn = display.plus_, display.minus_, display.arrows_
+            plus, minus, arrows = (artists[2 * k + view] for artists in drawn)
             assert plus.axes is display.axes_[k + 1, view]
             assert_allclose(plus.get_offsets(), mean + drift)
             assert_allclose(minus.get_offsets(), mean - drift)
@@ -369,11 +363,9 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     share = f"{percent(display.off_block_share)} outside the diagonal blocks"
     assert display.ax_.get_title() == f"{share}\n(0 % if uncorrelated)"
     display = ModeCovarianceDisplay(mode_covariance=covariance(3)).plot()
-    assert_array_equal(
-        display.boundaries_.get_segments(),
-        [[[c, -0.5], [c, 8.5]] for c in (2.5, 5.5)]
-        + [[[-0.5, c], [8.5, c]] for c in (2.5, 5.5)],
-    )
+    lines = [[[c, -0.5], [c, 8.5]] for c in (2.5, 5.5)]
+    lines += [[[-0.5, c], [8.5, c]] for c in (2.5, 5.5)]
+    assert_array_equal(display.boundaries_.get_segments(), lines)
     for axis in (display.ax_.xaxis, display.ax_.yaxis):
         assert_array_equal(axis.get_ticklocs(), [1, 4, 7])
         assert [label.get_text() for label in axis.get_ticklabels()] == ["1", "2", "3"]
@@ -457,10 +449,9 @@ def test_points_of_frames_are_the_numbers(faces, estimator):
 
 
 def test_random_frames(faces, estimator):
-    one, same, other = (
-        ReprojectionDisplay.from_estimator(estimator, faces.data, random_state=seed)
-        for seed in (0, 0, 1)
-    )
+    show = ReprojectionDisplay.from_estimator
+    drawn = (show(estimator, faces.data, random_state=seed) for seed in (0, 0, 1))
+    one, same, other = drawn
     assert len(one.frames) == 6
     assert_array_equal(one.frames, np.unique(one.frames))
     assert_array_equal(one.frames, same.frames)

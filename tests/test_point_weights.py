@@ -235,10 +235,8 @@ class TestFrames:
         assert likelihood.n_seen == pytest.approx(2 * weights.sum())
         at = likelihood(scene.shapes, scene.motion, 0.01)
         turn, step = rng.normal(size=scene.shapes.shape), 1e-6
-        values = [
-            likelihood(scene.shapes + s * turn, scene.motion, 0.01).value
-            for s in (step, -step)
-        ]
+        moved = (scene.shapes + s * turn for s in (step, -step))
+        values = [likelihood(shapes, scene.motion, 0.01).value for shapes in moved]
         slope = (values[0] - values[1]) / (2 * step)
         assert slope == pytest.approx(np.vdot(at.shape_gradient, turn), rel=1e-5)
         noises = 0.01 * np.exp([step, -step])

@@ -135,10 +135,8 @@ def test_lines_come_while_the_search_runs_and_parameters_stay(capsys):
     assert estimator.n_components == 5
     assert not hasattr(estimator, "alpha_")
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        "[AffineNRSfMCV] n_components=1",
-        "[AffineNRSfMCV] n_components=2",
-    ]
+    names = [f"[AffineNRSfMCV] n_components={k}" for k in (1, 2)]
+    assert [line.split(":")[0] for line in lines] == names
     assert all("held-out error" in line and line.endswith(" s") for line in lines)
 
 

@@ -93,12 +93,9 @@ class TestRecovery:
     @pytest.mark.parametrize(("n_frames", "least"), [(400, 0.96), (1500, 0.99)])
     @pytest.mark.parametrize("seed", range(3))
     def test_coefficients(self, n_components, n_frames, least, seed):
-        truth = make_nonrigid_tracks(
-            n_frames=n_frames,
-            n_components=n_components,
-            coefficients="heavy_tailed",
-            random_state=seed,
-        ).alpha
+        sizes = {"n_frames": n_frames, "n_components": n_components}
+        options = {"coefficients": "heavy_tailed", "random_state": seed}
+        truth = make_nonrigid_tracks(**sizes, **options).alpha
         mixed = truth @ random_mixing(seed, n_components).T
         found = mixed @ independent_coefficients(mixed).T
         assert cosines(truth.T[..., None], found.T[..., None]).min() > least
@@ -200,10 +197,8 @@ class TestOptimality:
         gains = []
         for seed in range(4):
             Z = white(sources(["gaussian"] * 5, seed, 68, 3))
-            few, many = (
-                _shared_mixing._fit_densities(shared_mixing(Z, n_starts=n), Z)[0]
-                for n in (1, 8)
-            )
+            mixings = (shared_mixing(Z, n_starts=n) for n in (1, 8))
+            few, many = (_shared_mixing._fit_densities(W, Z)[0] for W in mixings)
             gains.append(many - few)
         assert np.max(gains) > 1e-3
         assert np.mean(gains) > 0.0

@@ -242,11 +242,9 @@ def test_names_in_another_order_are_the_layout_in_that_order():
     assert found.point_names == tuple(names)
 
     def by_names(skeleton):
-        return {
-            tuple(skeleton.point_names[j] for j in edge)
-            for part in (skeleton.edges, skeleton.up, skeleton.front, skeleton.across)
-            for edge in np.asarray(part).tolist()
-        }
+        parts = skeleton.edges, skeleton.up, skeleton.front, skeleton.across
+        edges = (edge for part in parts for edge in np.asarray(part).tolist())
+        return {tuple(skeleton.point_names[j] for j in edge) for edge in edges}
 
     assert by_names(found) == by_names(coco)
     assert [names[j] for j in found.left] == [coco.point_names[j] for j in coco.left]

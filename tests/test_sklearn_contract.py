@@ -108,10 +108,8 @@ def test_extra_checks_on_landmark_tables(name, searched, landmark_tables):
 
 def test_missing_points_are_allowed():
     # The checks leave NaN alone for estimators that say so.
-    assert all(
-        each.__sklearn_tags__().input_tags.allow_nan
-        for each in (joint(), alternating(), search(None))
-    )
+    all_of_them = joint(), alternating(), search(None)
+    assert all(e.__sklearn_tags__().input_tags.allow_nan for e in all_of_them)
 
 
 @pytest.mark.parametrize("searched", [False, True])

@@ -226,11 +226,8 @@ def test_whole_numbers_are_classes_in_their_order(asked):
 
 def test_labels_of_parquet_files_keep_their_type(asked):
     days = pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))
-    columns = {
-        "day": days,
-        "mood": ["1", "b"] * (N // 2),
-        "ok": [True, False] * (N // 2),
-    }
+    columns = {"day": days, "mood": ["1", "b"] * (N // 2)}
+    columns["ok"] = [True, False] * (N // 2)
     options = ["--label", "day", "--label", "mood", "--label", "ok"]
     found = asked(columns, *options, suffix=".parquet").labels
     assert [each.kind for each in found] == ["classes"] * 3
@@ -286,10 +283,8 @@ def test_texts_of_tables_are_no_mathematics():
     shown = CoefficientsDisplay(alpha=alpha, y=y).plot()
     shown.figure_.canvas.draw()
     ticks = shown.axes_[-1].get_xticklabels()
-    assert [(tick.get_text(), tick.get_parse_math()) for tick in ticks] == [
-        ("$a_$b", False),
-        ("c", False),
-    ]
+    found = [(tick.get_text(), tick.get_parse_math()) for tick in ticks]
+    assert found == [("$a_$b", False), ("c", False)]
     plt.close(shown.figure_)
 
 

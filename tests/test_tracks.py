@@ -125,10 +125,8 @@ class TestFrames:
         place = unit * rng.normal(size=(50, 1, 2))
         noise = rng.normal(size=(50, 9, 2)) * np.linalg.norm(place, axis=2)[..., None]
         eps = np.finfo(dtype).eps
-        near, far = (
-            report_frames((place + size * eps * noise).astype(dtype)).in_one_place
-            for size in (0.5, 40)
-        )
+        many = ((place + size * eps * noise).astype(dtype) for size in (0.5, 40))
+        near, far = (report_frames(frames).in_one_place for frames in many)
         assert near.all()
         assert not far.any()
 
