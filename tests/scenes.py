@@ -55,9 +55,8 @@ def random_scene(
     The points are "complete", "weighted", or "missing": weighted, and NaN at some.
     """
     rng = np.random.default_rng(seed)
-    shapes = rng.normal(size=(n_components + 1, 3, n_points)) * np.reshape(
-        extent, (3, 1)
-    )
+    shapes = rng.normal(size=(n_components + 1, 3, n_points))
+    shapes *= np.reshape(extent, (3, 1))
     shapes[1:] *= deformation
     shapes -= shapes.mean(axis=2, keepdims=True)
     motion = rng.normal(size=(n_frames, 2, 3))

@@ -296,12 +296,9 @@ class TestWithinGroups:
         assert_allclose(got, expected)
 
     def test_groups_without_neutral_frames_are_refused(self):
-        with pytest.raises(
-            ValueError, match=r"neutral frame: 2 of 3 \(first: b, c.*mark one"
-        ):
-            WithinGroups().fit(
-                self.alpha, groups=self.people, neutral=self.people == "a"
-            )
+        groups = {"groups": self.people, "neutral": self.people == "a"}
+        message = r"neutral frame: 2 of 3 \(first: b, c.*mark one"
+        refused(message, WithinGroups().fit, self.alpha, **groups)
 
     def test_single_frames_are_told(self):
         with pytest.warns(UserWarning, match="a single frame: 1 of"):

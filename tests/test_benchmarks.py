@@ -56,9 +56,8 @@ def test_cells_say_median_range_and_failures():
 
 @pytest.fixture(scope="module")
 def tracks():
-    return make_nonrigid_tracks(
-        60, 30, 2, camera="orthographic", noise=0.01, random_state=0
-    )
+    options = {"camera": "orthographic", "noise": 0.01, "random_state": 0}
+    return make_nonrigid_tracks(60, 30, 2, **options)
 
 
 @pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])

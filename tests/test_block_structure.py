@@ -23,9 +23,8 @@ def direction(D):
     """Return matrices of unit norm, of a sign that depends only on the direction."""
     flat = D.reshape(len(D), 9) / np.linalg.norm(D, axis=(1, 2))[:, None]
     largest = np.abs(flat).argmax(axis=1)
-    return (flat * np.sign(flat[np.arange(len(flat)), largest])[:, None]).reshape(
-        D.shape
-    )
+    signs = np.sign(flat[np.arange(len(flat)), largest])
+    return (flat * signs[:, None]).reshape(D.shape)
 
 
 def block(scene, k):

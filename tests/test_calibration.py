@@ -30,11 +30,10 @@ def affinity_of(rng, *stretch):
 def scene(seed, camera, n_frames=20, spread=None, stretch=(0.2, 1.0, 3.0)):
     """Return affine cameras, their rotations and scales, and the affinity of space."""
     rng = np.random.default_rng(seed)
-    turns = (
-        Rotation.random(n_frames, random_state=seed)
-        if spread is None
-        else Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3)))
-    ).as_matrix()
+    turns = Rotation.random(n_frames, random_state=seed).as_matrix()
+    if spread is not None:
+        vectors = spread * rng.standard_normal((n_frames, 3))
+        turns = Rotation.from_rotvec(vectors).as_matrix()
     scales = np.full(n_frames, 1.7)
     if camera == "weak_perspective":
         scales = rng.uniform(0.2, 5, n_frames)

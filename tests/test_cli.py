@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 from fit_runs import FIGURES, FILES as FIT_FILES, MODEL
 from layers import slow_after
+from refusals import refused
 
 from isa_nrsfm import AffineNRSfM, __version__
 from isa_nrsfm._compat.whole_files import files_together
@@ -220,9 +221,8 @@ def test_calibrated_cameras(run, tmp_path, camera):
     cameras = pd.read_csv(folder / "cameras.csv")
     M = cameras.filter(regex="^m[01][012]$").to_numpy().reshape(-1, 2, 3)
     scales = model.scales_[:, None, None] ** 2
-    np.testing.assert_allclose(
-        M @ M.transpose(0, 2, 1), scales * np.eye(2), atol=1e-6 * scales.max()
-    )
+    gram, atol = M @ M.transpose(0, 2, 1), 1e-6 * scales.max()
+    np.testing.assert_allclose(gram, scales * np.eye(2), atol=atol)
     page = (folder / "viewer.html").read_text(encoding="utf-8")
     assert f"{camera.replace('_', '-')} cameras" in page
 
@@ -659,9 +659,8 @@ FIT = "fit t.csv -o d"
     ],
 )
 def test_wrong_usage_ends_with_code_2(argv, message, capsys):
-    with pytest.raises(SystemExit) as error:
-        main(argv.split(" ") if argv else [])
-    assert error.value.code == 2
+    argv = argv.split(" ") if argv else []
+    assert refused(None, main, argv, error=SystemExit).code == 2
     shown = capsys.readouterr().err
     assert "usage: isa-nrsfm" in shown
     assert message in shown
@@ -670,9 +669,7 @@ def test_wrong_usage_ends_with_code_2(argv, message, capsys):
 def test_version_and_help(capsys):
     commands = ("fit", "transform", "export", "demo")
     for argv in (["--version"], ["--help"], *([name, "--help"] for name in commands)):
-        with pytest.raises(SystemExit) as error:
-            main(argv)
-        assert error.value.code == 0
+        assert refused(None, main, argv, error=SystemExit).code == 0
         out = capsys.readouterr().out
         assert (f"isa-nrsfm {__version__}\n" == out) == (argv == ["--version"])
         assert ("example" in out) == (argv != ["--version"])

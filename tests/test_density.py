@@ -28,9 +28,8 @@ class TestDerivatives:
     def test_second(self, eps, energy):
         density = SqrtDensity(eps=eps)
         step = 1e-6 * (energy + eps)
-        numerical = approx_fprime(
-            np.array([energy]), lambda u: density.derivatives(u)[0][0], step
-        )
+        derivative = lambda u: density.derivatives(u)[0][0]  # noqa: E731
+        numerical = approx_fprime(np.array([energy]), derivative, step)
         assert_allclose(density.derivatives(energy)[1], numerical[0], rtol=1e-5)
 
 

@@ -275,9 +275,8 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
 
     def error(rows, loss="cauchy"):
         starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
-        frames = PosteriorFrames(
-            shapes, noise**2, starts, loss, gauge, camera="weak_perspective"
-        )
+        options = {"camera": "weak_perspective"}
+        frames = PosteriorFrames(shapes, noise**2, starts, loss, gauge, **options)
         return depth_certainty(frames, FrameBlocks.of_array(rows, 8)).total
 
     expected = error(hidden)
@@ -335,11 +334,9 @@ class TestJackknife:
         common = Rotation.random(None, rng)
         turned = (Rotation.from_rotvec(w) * rotations * common).as_matrix()
         mirror = np.array([1.0, 1.0, -1.0 if mirrored else 1.0])
-        fit = SimpleNamespace(
-            kept=kept,
-            depths=mirror[2] * (part + off),
-            rotations=mirror[:, None] * turned * mirror,
-        )
+        turns = mirror[:, None] * turned * mirror
+        depths = mirror[2] * (part + off)
+        fit = SimpleNamespace(kept=kept, depths=depths, rotations=turns)
         whole = SimpleNamespace(depths=z, rotations=rotations.as_matrix())
         total, turns, points = jackknife._Refit.errors(fit, whole)
         assert total == pytest.approx(np.sum(off**2) / np.sum(part**2))

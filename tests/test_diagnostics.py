@@ -308,9 +308,8 @@ def test_outliers_are_named_by_rows_and_most_frequent_points(share):
     if share == 5e-4:
         assert advice == ""
     else:
-        assert advice.startswith(
-            "the table has outliers: 4 points (0.06 %) in 3 frames"
-        )
+        told = "the table has outliers: 4 points (0.06 %) in 3 frames"
+        assert advice.startswith(told)
         assert advice.endswith(
             "more than 8 standard deviations from the model, in the rows 10, 13, 17, "
             "most often the points c, a, b"

@@ -139,9 +139,8 @@ def test_files_that_are_protected_stay(tmp_path):
     path = tmp_path / "a.csv"
     path.write_bytes(OLD)
     path.chmod(0o440)
-    with pytest.raises(PermissionError) as error:
-        write_table(TABLE, path)
-    assert error.value.filename == str(path)
+    error = refused(None, write_table, TABLE, path, error=PermissionError)
+    assert error.filename == str(path)
     assert path.read_bytes() == OLD
 
 
@@ -197,9 +196,8 @@ class TestKeepFrames:
         refused(r"frames_folder should be .* got ''", self.estimator("").fit, table)
         (tmp_path / "file").write_bytes(OLD)
         for bad in (tmp_path / "file", tmp_path / "file" / "folder"):
-            with pytest.raises(OSError) as error:  # noqa: PT011
-                self.estimator(bad).fit(table)
-            assert error.value.filename == str(bad)
+            error = refused(None, self.estimator(bad).fit, table, error=OSError)
+            assert error.filename == str(bad)
         with (
             disk_faults(tmp_path / "no", "disk full", 2) as faults,
             pytest.raises(OSError) as error,  # noqa: PT011
@@ -254,13 +252,12 @@ class TestFit:
         prepare = (lambda: None) if figures else (lambda: copied(old_run, folder))
         options = [] if figures else ["--no-figures"]
         codes, found = [], set()
-        for raised, before, operations in every_fault(
-            folder,
-            strike,
-            prepare,
-            lambda: codes.append(fit(landmarks, folder, 2, *options)),
-            7,
-        ):
+
+        def act():
+            codes.append(fit(landmarks, folder, 2, *options))
+
+        faults = every_fault(folder, strike, prepare, act, 7)
+        for raised, before, operations in faults:
             err = capsys.readouterr().err
             assert raised is None
             assert strike == "killed" or leftovers(folder) == [], operations[-3:]

@@ -57,12 +57,9 @@ class TestWhiten:
     def test_dependent_signals(self, unit, n_samples, n_signals, rng):
         signals = unit * rng.normal(size=(n_samples, n_signals))
         signals[:, -1] = signals[:, :-1] @ rng.normal(size=n_signals - 1)
-        with pytest.raises(
-            ValueError,
-            match=f"{n_signals} linearly independent signals are needed; got rank "
-            f"{n_signals - 1} in n_samples={n_samples} samples",
-        ):
-            whiten(signals - signals.mean(axis=0))
+        message = f"{n_signals} linearly independent signals are needed; got rank "
+        message += f"{n_signals - 1} in n_samples={n_samples} samples"
+        refused(message, whiten, signals - signals.mean(axis=0))
 
     @pytest.mark.parametrize("constant", [0.0, 0.1, 1e6 / 3])
     def test_a_constant_among_the_signals(self, signals, constant):
@@ -97,12 +94,8 @@ class TestStrategies:
         assert list(isa.get_feature_names_out()) == [f"{prefix}{i}" for i in range(6)]
 
     def test_wrong_number_of_signals(self, isa, signals):
-        with pytest.raises(
-            ValueError,
-            match="number of signals must be a multiple of subspace_size=3; got "
-            "n_features=5",
-        ):
-            isa.fit(signals[:, :5])
+        message = "number of signals must be a multiple of subspace_size=3; got "
+        refused(message + "n_features=5", isa.fit, signals[:, :5])
         refused("minimum of 3 is required", isa.fit, signals[:, :2])
 
     def test_dependent_signals(self, isa, signals):

@@ -81,9 +81,7 @@ def test_case_and_prefix_separate_sets():
 
 def test_several_sets_are_refused_with_the_ways_to_choose():
     names = [f" {name}" for name in openface_names()]
-    with pytest.raises(ValueError, match="more than one set") as error:
-        find_landmark_columns(names)
-    message = str(error.value)
+    message = str(refused("more than one set", find_landmark_columns, names))
     assert "'x_#,y_#' (68 points: x_0 to x_67)" in message
     assert "'eye_lmk_x_#,eye_lmk_y_#' (56 points: " in message
     assert "'X_#,Y_#' (68 points, with a z each: X_0 to X_67)" in message

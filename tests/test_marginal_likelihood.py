@@ -86,10 +86,9 @@ class TestValue:
     @PENALTIES
     def test_penalty_adds_the_energies_of_the_basis_shapes(self, kind, penalty):
         scene = random_scene(kind)
-        energies = sum(
-            np.sum((root * (M @ shapes[1:])) ** 2, axis=(1, 2))
-            for _, shapes, root, M, _ in frame_by_frame(scene)
-        )
+        frames = frame_by_frame(scene)
+        images = (root * (M @ shapes[1:]) for _, shapes, root, M, _ in frames)
+        energies = sum(np.sum(image**2, axis=(1, 2)) for image in images)
         added = scene.at(penalty).value - scene.at().value
         assert added == pytest.approx(np.sum(penalty * energies), rel=1e-12)
 

@@ -37,11 +37,9 @@ def axes_and_stretch(rng, *stretch):
 def exact_cameras(seed, camera, n_frames=20, spread=None):
     """Return Euclidean cameras in affine coordinates, and these coordinates."""
     rng = np.random.default_rng(seed)
-    turns = (
-        Rotation.random(n_frames, random_state=seed)
-        if spread is None
-        else Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3)))
-    )
+    turns = Rotation.random(n_frames, random_state=seed)
+    if spread is not None:
+        turns = Rotation.from_rotvec(spread * rng.standard_normal((n_frames, 3)))
     scales = np.ones(n_frames)
     if camera == "weak_perspective":
         scales = rng.uniform(0.2, 5, n_frames)
@@ -119,9 +117,8 @@ class TestParts:
     def test_derivative_where_there_is_no_strain(self):
         # Equal eigenvalues, whose divided difference is a derivative.
         cameras = np.random.default_rng(0).standard_normal((2, 3, 4))
-        _, slopes, own_slopes = _linearised(
-            cameras, np.zeros((1, 3, 3)), np.ones((1, 4)), "weak_perspective"
-        )
+        still = np.zeros((1, 3, 3)), np.ones((1, 4))
+        _, slopes, own_slopes = _linearised(cameras, *still, "weak_perspective")
         assert_allclose(slopes, own_slopes)
 
     @both_cameras

@@ -80,11 +80,9 @@ class TestResult:
         Q = found.mixing.ravel()
         least = cost(Q)
         assert np.abs(approx_fprime(Q, cost, 1e-7)).max() < 1e-5 * np.abs(P).max()
-        assert all(
-            cost(Q + size * np.abs(Q).max() * rng.normal(size=Q.shape)) > least
-            for size in (1e-3, 1e-2, 1e-1)
-            for _ in range(20)
-        )
+        sizes = np.abs(Q).max() * np.repeat([1e-3, 1e-2, 1e-1], 20)
+        steps = (size * rng.normal(size=Q.shape) for size in sizes)
+        assert all(cost(Q + step) > least for step in steps)
 
     def test_more_columns_never_cost_more(self):
         P, _ = scene(0, noise=0.05)
@@ -161,11 +159,9 @@ class TestMixture:
         assert cost == pytest.approx(value(Q))
         gradient = approx_fprime(Q.ravel(), lambda q: value(q.reshape(9, 3)), 1e-7)
         assert np.abs(gradient).max() < 1e-4
-        assert all(
-            value(Q + size * rng.normal(size=Q.shape)) > cost
-            for size in (1e-2, 1e-1)
-            for _ in range(20)
-        )
+        sizes = np.repeat([1e-2, 1e-1], 20)
+        steps = (size * rng.normal(size=Q.shape) for size in sizes)
+        assert all(value(Q + step) > cost for step in steps)
 
 
 class TestPrincipalColumns:

@@ -19,13 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 CORE = {"numpy", "scipy", "scikit-learn", "joblib"}
 # Files of the package that are no Python code.
-DATA = {
-    "isa_nrsfm/py.typed",
-    "isa_nrsfm/cli/report.html",
-    "isa_nrsfm/datasets/face_model.csv",
-    "isa_nrsfm/export/viewer.html",
-    "isa_nrsfm/export/viewer.js",
-}
+DATA = "py.typed cli/report.html datasets/face_model.csv export/viewer.html"
+DATA = {f"isa_nrsfm/{name}" for name in [*DATA.split(), "export/viewer.js"]}
 FOUND_AT_IMPORT = """
 import sys, sklearn.decomposition
 before = set(sys.modules)

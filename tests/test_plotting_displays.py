@@ -184,11 +184,9 @@ def test_titles_have_names_energies_and_drifts(estimator):
     assert texts(named)[1] == f"jaw ({share} of energy)"
     display = random_shapes().plot(n_std=3)
     assert texts(display)[1:] == [f"Basis shape {k}" for k in (1, 2, 3)]
-    assert legend_of(display) == [
-        "mean shape",
-        "\N{MINUS SIGN}3 standard deviations",
-        "+3 standard deviations",
-    ]
+    drift = "3 standard deviations"
+    shown = ["mean shape", f"\N{MINUS SIGN}{drift}", f"+{drift}"]
+    assert legend_of(display) == shown
     display = random_shapes().plot(components=[2, 0])
     assert_array_equal(display.components_, [2, 0])
     assert texts(display)[1:] == ["Basis shape 3", "Basis shape 1"]

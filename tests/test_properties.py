@@ -107,11 +107,9 @@ def test_tables_that_are_too_small_are_refused(n_frames, n_points, n_components,
     largest = (n_points - 4) // 3
     smallest = int(np.ceil(8 * (n_components + 2) / 5))
     if n_components > largest:
-        message = (
-            f"largest possible n_components is {largest}$"
-            if largest > 0
-            else "at least 7 points are needed for n_components=1$"
-        )
+        message = "at least 7 points are needed for n_components=1$"
+        if largest > 0:
+            message = f"largest possible n_components is {largest}$"
         refused(message, fit, tracks, n_components)
     elif n_frames < smallest:
         refused(f"at least {smallest} frames", fit, tracks, n_components)

@@ -278,10 +278,8 @@ def test_the_skeleton_of_deeplabcut(tmp_path):
     refused("no list of pairs of bodyparts", read_skeleton, config, ["a", "b"])
     for damaged in (b"a: [", b"skeleton:\n- [a, b\xe9]\n"):
         config.write_bytes(damaged)
-        with pytest.raises(
-            ValueError, match=r"config.yaml cannot be read as a configuration"
-        ):
-            read_skeleton(config, ["a", "b"])
+        message = r"config.yaml cannot be read as a configuration"
+        refused(message, read_skeleton, config, ["a", "b"])
 
 
 @pytest.mark.parametrize(

@@ -43,9 +43,8 @@ def search(refinement):
 
     The checks seed an estimator that they are given, but not one inside of it.
     """
-    estimator = AffineNRSfM(
-        isa=FastISA(n_init=2), refinement=refinement, max_iter=3, random_state=0
-    )
+    options = {"isa": FastISA(n_init=2), "max_iter": 3, "random_state": 0}
+    estimator = AffineNRSfM(refinement=refinement, **options)
     return AffineNRSfMCV((1, 2), estimator=estimator, cv=2)
 
 

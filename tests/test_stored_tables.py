@@ -134,9 +134,8 @@ class TestFit:
         clean = estimator(limits).fit(table(0.1))
         seen = np.isfinite(X) & ~wrong
         seen[40, :2] = False
-        errors = [
-            np.abs(model.reproject(X) - table(0.1))[seen] for model in (expected, clean)
-        ]
+        models, clean = (expected, clean), table(0.1)
+        errors = [np.abs(model.reproject(X) - clean)[seen] for model in models]
         assert np.median(errors[0]) < 1.2 * np.median(errors[1])
 
     @pytest.mark.parametrize("n_points", slow_after(1, [100, 400]))

@@ -66,7 +66,7 @@ def test_summary_of_calibrated_cameras(camera):
 def test_rows_without_points_are_told():
     table = TABLE.copy()
     table[[3, 8]] = np.nan
-    shown = warned("2 of 60", summary, estimator(scale_frames=False).fit(table))
+    shown = summary(warned("2 of 60", estimator(scale_frames=False).fit, table))
     assert shown["Frames"] == "58, 2 rows without points"
     assert shown["Noise"].endswith("in the units of the table")
 

@@ -32,12 +32,9 @@ class TestHalfPoints:
     def test_the_other_coordinate_is_dropped_with_a_warning(self, rng):
         tracks = self.half(rng)
         before = tracks.copy()
-        with pytest.warns(
-            UserWarning,
-            match=r"in 2 of 6 rows points have only one of their two coordinates \(3 "
-            r"in all; first: point 7 in row 1\). They count as missing$",
-        ):
-            clean = clean_tracks(tracks)
+        message = r"in 2 of 6 rows points have only one of their two coordinates \(3 "
+        message += r"in all; first: point 7 in row 1\). They count as missing$"
+        clean = warned(message, clean_tracks, tracks)
         assert_array_equal(tracks, before)
         seen = ~np.isnan(tracks).any(axis=2)
         assert_array_equal(clean[seen], tracks[seen])
@@ -226,12 +223,9 @@ class TestOtherLayout:
     )
     def test_the_other_layout_is_warned_of(self, faces, true, given, scale_frames):
         X = tracks_to_table(faces, true)
-        with pytest.warns(
-            UserWarning,
-            match=rf"layout='{true}' explains the table much better than "
-            rf"layout='{given}': its non-rigid part has 0\.\d+ times the energy",
-        ):
-            warn_if_other_layout(X, given, scale_frames)
+        message = rf"layout='{true}' explains the table much better than "
+        message += rf"layout='{given}': its non-rigid part has 0\.\d+ times the energy"
+        warned(message, warn_if_other_layout, X, given, scale_frames)
 
     # The object has size 1 and may be far away from the corner of the image.
     @pytest.mark.parametrize("scale_frames", [True, False])

@@ -18,13 +18,10 @@ TIMES = 10.0
 # What the words of the page's table are worth for a table that is ten times as large.
 FACTORS = {"1": 1.0, "unit": TIMES, "unit^2": TIMES**2}
 # The settings that have a column of the page's table, in its order.
-COLUMNS = [
-    {"camera": "affine", "scale_frames": True},
-    {"camera": "affine", "scale_frames": False},
-    {"camera": "weak_perspective", "scale_frames": True},
-    {"camera": "weak_perspective", "scale_frames": False},
-    {"camera": "orthographic"},
-]
+SCALED = [{"scale_frames": True}, {"scale_frames": False}]
+COLUMNS = [{"camera": "affine"} | each for each in SCALED]
+COLUMNS += [{"camera": "weak_perspective"} | each for each in SCALED]
+COLUMNS.append({"camera": "orthographic"})
 OF_JOINT_FIT = {
     *("alpha_std_", "noise_variance_", "camera_noise_ratio_", "depth_uncertainty_"),
     *("reliability_", "objective_history_", "gradient_norm_"),
