@@ -301,5 +301,4 @@ WRITERS = {
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
 EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
-EXPECTED |= {"pyfeat-parquet": MESH, "pts-file": TRACKS[:1]}
-EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}
+EXPECTED |= {"pts-file": TRACKS[:1], "wflw": WFLW, "wflw-test": WFLW}

@@ -28,8 +28,9 @@ class TestDerivatives:
     def test_second(self, eps, energy):
         density = SqrtDensity(eps=eps)
         step = 1e-6 * (energy + eps)
-        derivative = lambda u: density.derivatives(u)[0][0]  # noqa: E731
-        numerical = approx_fprime(np.array([energy]), derivative, step)
+        numerical = approx_fprime(
+            np.array([energy]), lambda u: density.derivatives(u)[0][0], step
+        )
         assert_allclose(density.derivatives(energy)[1], numerical[0], rtol=1e-5)
 
 

@@ -275,8 +275,8 @@ def test_outliers_are_left_out_with_a_robust_loss(rng):
 
     def error(rows, loss="cauchy"):
         starts, gauge = np.zeros((0, 1)), FrameMap.identity(1)
-        options = {"camera": "weak_perspective"}
-        frames = PosteriorFrames(shapes, noise**2, starts, loss, gauge, **options)
+        given = shapes, noise**2, starts, loss, gauge
+        frames = PosteriorFrames(*given, camera="weak_perspective")
         return depth_certainty(frames, FrameBlocks.of_array(rows, 8)).total
 
     expected = error(hidden)
