@@ -48,8 +48,8 @@ class TestRigidCameras:
         B, W = centred_shape(rng), rng.normal(size=(12, 15))
         expected = rigid_cameras(W, B)
         A = rng.normal(size=(3, 3))
-        expected = expected @ np.linalg.inv(A)
-        assert_allclose(rigid_cameras(W, B @ A.T), expected, atol=1e-12)
+        changed = expected @ np.linalg.inv(A)
+        assert_allclose(rigid_cameras(W, B @ A.T), changed, atol=1e-12)
         turned = rigid_cameras(rotate_frames(W, 1), B).reshape(12, 3)
         assert_allclose(turned, rotate_frames(expected.reshape(12, 3), 1), atol=1e-13)
 
