@@ -14,9 +14,7 @@ EAGER = "EAGER_IMPORT"
 
 
 def lazy_names(
-    package: str,
-    names: Mapping[str, Sequence[str]],
-    subpackages: Sequence[str] = (),
+    package: str, names: Mapping[str, Sequence[str]], subpackages: Sequence[str] = ()
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 

@@ -60,11 +60,7 @@ class CoefficientPosterior(NamedTuple):
 
 
 def coefficient_posterior(
-    products: FrameSums,
-    M: NDArray,
-    noise: NDArray | float,
-    *,
-    refined: bool = False,
+    products: FrameSums, M: NDArray, noise: NDArray | float, *, refined: bool = False
 ) -> CoefficientPosterior:
     """Return the posterior of the coefficients of frames for cameras M (2, 3, n).
 

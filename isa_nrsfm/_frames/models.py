@@ -19,11 +19,7 @@ from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations, rigid_camer
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.point_sums import FrameTracks
 from isa_nrsfm._frames.projection import distances
-from isa_nrsfm._frames.search import (
-    FramePosterior,
-    FrameSearch,
-    largest_objective,
-)
+from isa_nrsfm._frames.search import FramePosterior, FrameSearch, largest_objective
 from isa_nrsfm._frames.single_frame import SingleSearch
 from isa_nrsfm._linalg.small_matrices import frames_last, in_lanes
 from isa_nrsfm._prepare.robust import distant_points, frame_weights, robust_sizes
@@ -342,10 +338,7 @@ class PosteriorFrames:
         return sizes[:, None] * np.sqrt(variances)
 
     def posterior(
-        self,
-        tracks: NDArray,
-        covariances: bool = True,
-        weights: NDArray | None = None,
+        self, tracks: NDArray, covariances: bool = True, weights: NDArray | None = None
     ) -> FramePosterior:
         """Return the fit of tracks of frames of size one, before the gauge.
 
@@ -387,9 +380,7 @@ class PosteriorFrames:
             if not len(changing):
                 break
             refit = fitted(
-                tracks[changing],
-                weights=weights[changing],
-                initial=fit.alpha[changing],
+                tracks[changing], weights=weights[changing], initial=fit.alpha[changing]
             )
             # If the model does not explain a frame, its weights can become so unequal
             # that they determine no camera. Such a frame keeps its fit.

@@ -26,11 +26,7 @@ def reprojection_error(
 
 
 def _energies(
-    rows: NDArray,
-    motion: NDArray,
-    position: NDArray,
-    alpha: NDArray,
-    shapes: NDArray,
+    rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
 ) -> tuple[float, float]:
     """Return the energies of the residuals of a block, and of its centred frames."""
     rows = rows.astype(np.float64, copy=False)

@@ -10,11 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import (
-    REVERSED,
-    SAME_WELL,
-    calibrated_starts,
-)
+from isa_nrsfm._frames.calibrated_newton import REVERSED, SAME_WELL, calibrated_starts
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.search import LARGEST_DAMPING, MAX_STEPS
 

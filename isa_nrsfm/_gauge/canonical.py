@@ -71,11 +71,7 @@ def euclidean_space(
 
 
 def canonical_gauge(
-    mean_shape: NDArray,
-    basis: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    space: NDArray,
+    mean_shape: NDArray, basis: NDArray, motion: NDArray, alpha: NDArray, space: NDArray
 ) -> Gauge:
     """Return the canonical shapes among those that fit equally well, in a space (3, 3).
 

@@ -67,10 +67,7 @@ def independent_gauge(
 
 
 def _centred(
-    shapes: NDArray,
-    motion: NDArray,
-    alpha: NDArray,
-    camera: str,
+    shapes: NDArray, motion: NDArray, alpha: NDArray, camera: str
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return the shifts u and v as a matrix (n, n), the new cameras and coefficients.
 

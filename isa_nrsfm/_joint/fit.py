@@ -190,10 +190,7 @@ def _first_fit(
     fit = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
     # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, table.sample.W, paper_shapes)
-    states = [
-        problem.aligned(fit.state, "affine"),
-        settled(problem, rigid, affine),
-    ]
+    states = [problem.aligned(fit.state, "affine"), settled(problem, rigid, affine)]
     max_iter = settings.max_iter
     if camera != "affine":  # only compared
         max_iter = min(max_iter, 60)

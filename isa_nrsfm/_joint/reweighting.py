@@ -120,11 +120,7 @@ def _positions(
 
 
 def _weighted(
-    rows: NDArray,
-    *fit: NDArray,
-    shapes: NDArray,
-    loss: str,
-    deviation: float,
+    rows: NDArray, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
 ) -> WeightedRows:
     """Return frames (n, 2, J) with the weights of their residuals from a fit."""
     *model, sizes = fit

@@ -13,10 +13,7 @@ STEP = 3
 
 
 def orthonormal_mixture(
-    basis: NDArray,
-    mixing: NDArray,
-    penalty: NDArray | None = None,
-    max_iter: int = 200,
+    basis: NDArray, mixing: NDArray, penalty: NDArray | None = None, max_iter: int = 200
 ) -> tuple[NDArray, float]:
     """Mix columns such that rows are most nearly orthonormal; return Q (n, 3) and cost.
 

@@ -103,5 +103,5 @@ def warn_if_degenerate(condition_number: float) -> None:
             f"the cameras hardly determine the metric of space: its condition number "
             f"is {condition_number:.3g}, above {LARGEST_CONDITION:g}. Euclidean shapes "
             "may have wrong depth and angles. Take frames that are seen from more "
-            "sides, or more frames, or affine shapes",
+            "sides, or more frames, or affine shapes"
         )

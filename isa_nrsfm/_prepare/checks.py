@@ -268,7 +268,7 @@ def warn_if_other_layout(
     if given > OF_DIFFERENCES and swapped < 0.6 * given:
         warn_caller(
             f"layout={other!r} explains the table much better than layout={layout!r}: "
-            f"its non-rigid part has {swapped / given:.2g} times the energy",
+            f"its non-rigid part has {swapped / given:.2g} times the energy"
         )
 
 

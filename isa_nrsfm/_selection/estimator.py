@@ -8,12 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 from sklearn import get_config
-from sklearn.base import (
-    BaseEstimator,
-    MetaEstimatorMixin,
-    TransformerMixin,
-    clone,
-)
+from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, clone
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import check_cv
 from sklearn.utils import get_tags, indexable
@@ -49,10 +44,7 @@ from isa_nrsfm._transformer import CoefficientNamesMixin
 
 
 class AffineNRSfMCV(
-    CoefficientNamesMixin,
-    TransformerMixin,
-    MetaEstimatorMixin,
-    BaseEstimator,
+    CoefficientNamesMixin, TransformerMixin, MetaEstimatorMixin, BaseEstimator
 ):
     """
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.

@@ -18,11 +18,7 @@ from sklearn.base import (
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.blas_threads import one_blas_thread
-from isa_nrsfm._compat.scikit_learn import (
-    Interval,
-    StrOptions,
-    fit_context,
-)
+from isa_nrsfm._compat.scikit_learn import Interval, StrOptions, fit_context
 from isa_nrsfm._frames.models import Decomposition, frame_search
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation

@@ -6,11 +6,7 @@ from typing import Any
 
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm.cli._options import NONE, SUFFIXES, TABLE_OPTIONS, flag_of
-from isa_nrsfm.cli._outputs import (
-    missing_values_of_fit,
-    read_model,
-    refuse_overwriting,
-)
+from isa_nrsfm.cli._outputs import missing_values_of_fit, read_model, refuse_overwriting
 from isa_nrsfm.cli._reading import (
     as_fitted,
     cells_of,

@@ -174,10 +174,7 @@ def _seconds(clock: dict[str, float]) -> dict[str, float]:
 
 
 def _fitted(
-    args: Namespace,
-    frames: Frames,
-    groups: NDArray | None,
-    clock: dict[str, float],
+    args: Namespace, frames: Frames, groups: NDArray | None, clock: dict[str, float]
 ) -> tuple[AffineNRSfM, AffineNRSfMCV | None]:
     """Return the model that the options ask for, and the search for its K."""
     isa = None

@@ -306,10 +306,7 @@ def _missing_values(args: Namespace) -> list[float]:
 
 
 def _tracks(
-    args: Namespace,
-    table: "pd.DataFrame",
-    columns: LandmarkColumns,
-    kept: NDArray,
+    args: Namespace, table: "pd.DataFrame", columns: LandmarkColumns, kept: NDArray
 ) -> NDArray:
     """Return the points of all rows of the table, NaN where missing or not kept."""
     tracks = np.full((len(table), len(columns.points), 2), np.nan)

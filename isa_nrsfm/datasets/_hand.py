@@ -35,10 +35,7 @@ SIZES, BONES, HELD = 0.06, 0.05, 0.12
 
 
 @checked_parameters(
-    {
-        **PARAMETERS,
-        "n_people": [Interval(Integral, 1, None, closed="left")],
-    }
+    {**PARAMETERS, "n_people": [Interval(Integral, 1, None, closed="left")]}
 )
 def make_hand_tracks(
     n_frames: int = 400,

@@ -34,10 +34,7 @@ DESCR = f"{__doc__}\nSource: free for non-commercial use, {JAWS.url}\n"
 
 
 @checked_parameters(
-    {
-        "data_home": [str, os.PathLike, None],
-        "download_if_missing": ["boolean"],
-    }
+    {"data_home": [str, os.PathLike, None], "download_if_missing": ["boolean"]}
 )
 def fetch_shark(
     *, data_home: DataHome = None, download_if_missing: bool = True

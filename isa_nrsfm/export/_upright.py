@@ -62,11 +62,7 @@ class UprightSpace(NamedTuple):
 
 
 def upright_space(
-    model: Any,
-    camera: Camera,
-    origin: Origin,
-    mirrored: bool,
-    edges: Any = "auto",
+    model: Any, camera: Camera, origin: Origin, mirrored: bool, edges: Any = "auto"
 ) -> UprightSpace:
     """Find the upright space of a fitted model, or raise.
 

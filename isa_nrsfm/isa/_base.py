@@ -20,10 +20,7 @@ from isa_nrsfm._tables.sources import unmasked
 
 
 class BaseSubspaceAnalysis(
-    ClassNamePrefixFeaturesOutMixin,
-    TransformerMixin,
-    BaseEstimator,
-    metaclass=ABCMeta,
+    ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator, metaclass=ABCMeta
 ):
     """Validation, whitening and projection. Subclasses implement `_unmix`."""
 
