@@ -452,13 +452,8 @@ def _joint_frames(
         *posteriors.map(last_pass, table.sizes, table.n_seen, weight), strict=True
     )
     shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
-    estimator._model = _table_model(
-        estimator,
-        table,
-        frames,
-        gauge.mean_shape.astype(table.dtype),
-        gauge.basis.astype(table.dtype),
-    )
+    mean_shape, basis = (each.astype(table.dtype) for each in gauge[:2])
+    estimator._model = _table_model(estimator, table, frames, mean_shape, basis)
     cameras = shown.motion / table.sizes[:, None, None]
     estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
     unit = estimator._model.unit or 1.0

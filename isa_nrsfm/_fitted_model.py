@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.models import (
     Decomposition,
     LinearisedFrames,
@@ -26,6 +27,16 @@ from isa_nrsfm._tables.tracks import (
     weighted_sizes,
     without_half_points,
 )
+
+
+class UncertainShapes(NamedTuple):
+    """Shapes (n, n_points, 3), and standard deviations of their depths (n, n_points).
+
+    Both are in units of the shapes.
+    """
+
+    shapes: NDArray
+    depth_std: NDArray
 
 
 class TableModel(NamedTuple):
@@ -53,8 +64,9 @@ class TableModel(NamedTuple):
 
         Weights (n, n_points) are zero where points are missing, by default one.
         """
-        usable, centred, translation, sizes = self._ready(self._tracks(rows), weights)
-        weights = None if weights is None else weights[usable]
+        usable, centred, translation, sizes, weights = self._ready(
+            self._tracks(rows), weights
+        )
         fit = self.frames.fit(centred, sizes, deviations, weights)
         fit = fit._replace(translation=fit.translation + translation)
         dtype = rows.dtype if dtype is None else dtype
@@ -63,7 +75,7 @@ class TableModel(NamedTuple):
     def posterior(self, rows: NDArray) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
         whole = FramePosterior.unknown(len(rows), len(self.basis))
         whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
         return whole
@@ -71,7 +83,7 @@ class TableModel(NamedTuple):
     def linearised(self, rows: NDArray) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, translation, sizes = self._ready(self._tracks(rows))
+        usable, centred, translation, sizes, _ = self._ready(self._tracks(rows))
         fit = self.frames.linearised(centred, sizes)
         fit = fit._replace(translation=fit.translation + translation)
         return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
@@ -101,12 +113,17 @@ class TableModel(NamedTuple):
         sizes = found.scales[:, None, None] if scaled else 1.0
         return (sizes * found.shapes).astype(fit.alpha.dtype, copy=False)
 
-    def depth_deviations(self, rows: NDArray) -> NDArray:
-        """Return standard deviations of the depths of points (n, n_points)."""
+    def uncertain_shapes(self, rows: NDArray) -> UncertainShapes:
+        """Return the shapes of frames and standard deviations of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        fit = self.decompose(rows, deviations=False)
+        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
         found = self.frames.depth_deviations(centred, sizes)
-        return of_all_rows(found, usable).astype(rows.dtype, copy=False)
+        deviations = of_all_rows(found, usable).astype(rows.dtype, copy=False)
+        _, scales = full_rotations(fit.motion)
+        return UncertainShapes(
+            self.shapes(fit, None, scaled=False), deviations / scales[:, None]
+        )
 
     def reproject(self, rows: NDArray) -> NDArray:
         """Return the images of the fitted shapes, in the layout of the table."""
@@ -116,7 +133,7 @@ class TableModel(NamedTuple):
 
     def distances(self, rows: NDArray) -> NDArray:
         """Return lengths of residuals (n, n_points) of frames of size one."""
-        usable, centred, _, sizes = self._ready(self._tracks(rows))
+        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
         fit = self.frames.fit(centred, sizes, False)
         shapes = compose(self.mean_shape, self.basis, fit.alpha)
         off = centred - project(shapes, fit.motion, fit.translation)
@@ -125,8 +142,7 @@ class TableModel(NamedTuple):
     def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
         """Return the energies (1, 2) of `held_out_energies`."""
         tracks = self._tracks(rows)
-        usable, _, _, sizes = self._ready(tracks, weights)
-        weights = None if weights is None else weights[usable]
+        usable, _, _, sizes, weights = self._ready(tracks, weights)
         return np.array([self.held_out_energies(tracks[usable], sizes, weights)])
 
     def held_out_energies(
@@ -148,6 +164,8 @@ class TableModel(NamedTuple):
         """
         folds = np.random.RandomState(0).permutation(tracks.shape[1]) % 5
         seen = seen_points(tracks)
+        counts = np.ones(seen.shape) if weights is None else weights
+        counts = counts * sizes[:, None] ** -2.0
         # Complete frames are fitted without these points, others with NaN instead.
         frames = self.frames
         complete = isinstance(frames, PosteriorFrames) and frames.loss == "linear"
@@ -177,9 +195,7 @@ class TableModel(NamedTuple):
             )
             part = tracks[usable]
             centre = np.nanmean(part, axis=1, keepdims=True)
-            weight = sizes[usable, None, None] ** -2.0
-            if weights is not None:
-                weight = weight * weights[np.ix_(usable, held)][..., None]
+            weight = counts[np.ix_(usable, held)][..., None]
             counted = seen[np.ix_(usable, held)] & np.isfinite(predicted).all(axis=2)
             some = ~seen[usable].all(axis=1)
             # Effect of the threshold 2: in 12 scenes of 120 frames, two frames that
@@ -204,8 +220,8 @@ class TableModel(NamedTuple):
 
     def _ready(
         self, tracks: NDArray, weights: NDArray | None = None
-    ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return a mask of usable tracks; these centred, their centres and sizes."""
+    ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
+        """Return a mask of usable tracks; these centred, centres, sizes and weights."""
         centred, report = centred_frames(tracks)
         usable = report.usable
         if not usable.all():
@@ -217,10 +233,11 @@ class TableModel(NamedTuple):
             centred, translation = robustly_centred(tracks[usable])
             sizes = robust_sizes(centred)
         if weights is not None:
-            sizes = weighted_sizes(centred, weights[usable])
+            weights = weights[usable]
+            sizes = weighted_sizes(centred, weights)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
-        return usable, centred, translation, sizes
+        return usable, centred, translation, sizes, weights
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:

@@ -19,8 +19,7 @@ from isa_nrsfm._frames.dynamics import smoothed_frames
 from isa_nrsfm._frames.models import MIRROR, Decomposition, PosteriorFrames
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.deforming import deformation_metric
-from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS
-from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
+from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS, JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import check_table, validated_table
 from isa_nrsfm._prepare.point_weights import weighted_table
 from isa_nrsfm._summary import summary_html
@@ -393,9 +392,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         already. They are not rotated, so that `scales_` and `rotations_` are those of
         their cameras.
         """
-        if camera is not None and camera not in CAMERA_MODELS:
+        if camera is not None and camera not in CALIBRATED_CAMERAS:
             raise ValueError(
-                f"camera must be None or one of {CAMERA_MODELS}; got {camera!r}"
+                f"camera must be None or one of {CALIBRATED_CAMERAS}; got {camera!r}"
             )
         check_is_fitted(self)
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
@@ -424,13 +423,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         if decomposed:
             return self._model.shapes(X, metric, scaled)
         table = self._opened(X)
-        shapes = table.collect(
+        if return_std:
+            return tuple(table.collect(self._model.uncertain_shapes))
+        return table.collect(
             partial(self._model.reconstruct, metric=metric, scaled=scaled)
         )
-        if not return_std:
-            return shapes
-        _, scales = full_rotations(table.joined(self._model.decompose).motion)
-        return shapes, table.collect(self._model.depth_deviations) / scales[:, None]
 
     def mirrored(self) -> Self:
         """

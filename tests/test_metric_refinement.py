@@ -8,11 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._linalg.small_matrices import frames_last
-from isa_nrsfm._metric_upgrade.quadric import (
-    CAMERA_MODELS,
-    metric_quadric,
-    strain_basis,
-)
+from isa_nrsfm._metric_upgrade.quadric import metric_quadric, strain_basis
 from isa_nrsfm._metric_upgrade.refinement import (
     STRETCH_OF_START,
     MetricFit,
@@ -24,9 +20,10 @@ from isa_nrsfm._metric_upgrade.refinement import (
     refine_metric,
     safe_start,
 )
+from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES
 
-both_cameras = pytest.mark.parametrize("camera", CAMERA_MODELS)
+both_cameras = pytest.mark.parametrize("camera", CALIBRATED_CAMERAS)
 
 
 def axes_and_stretch(rng, *stretch):

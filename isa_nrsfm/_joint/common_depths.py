@@ -67,7 +67,9 @@ def common_coordinates(
             fit, shrinking = _principal(shapes, s2)
             slope = R @ (fit - shapes) / s2
             gradient[np.ix_(frames, np.arange(3), points)] += slope
-            weights = _blocks((_centring(len(points)) - shrinking) / s2)
+            n = len(points)
+            weights = (np.kron(np.eye(3), np.eye(n) - 1.0 / n) - shrinking) / s2
+            weights = weights.reshape(3, n, 3, n).transpose(0, 2, 1, 3).reshape(9, n, n)
             block = np.ix_(points, points)
             for axis, precision in zip(axes, precisions, strict=True):
                 turn = np.zeros((3, 3, n_frames))
@@ -97,17 +99,6 @@ def _principal(shapes: NDArray, s2: float) -> tuple[NDArray, NDArray]:
     U = vectors[:, kept]
     shrinking = (U * (1.0 - s2 / values[kept])) @ U.T
     return mean + (off @ shrinking).reshape(shapes.shape), shrinking
-
-
-def _centring(n: int) -> NDArray:
-    """Return the matrix (3n, 3n) that subtracts the mean of n points."""
-    return np.kron(np.eye(3), np.eye(n) - 1.0 / n)
-
-
-def _blocks(matrix: NDArray) -> NDArray:
-    """Return the blocks (9, n, n) of a matrix (3n, 3n)."""
-    n = len(matrix) // 3
-    return matrix.reshape(3, n, 3, n).transpose(0, 2, 1, 3).reshape(9, n, n)
 
 
 def _of_group(Y: NDArray, frames: NDArray, points: NDArray) -> NDArray:

@@ -72,7 +72,11 @@ class JointFrames:
     @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
         """Return frames by points, from blocks of `WeightedRows`."""
-        return cls(weighted.derive(_weighted_frames))
+        return cls(
+            weighted.derive(
+                lambda b: frame_tracks(b.rows.transpose(0, 2, 1), b.weights)
+            )
+        )
 
     @classmethod
     def from_repeated(cls, rows: FrameBlocks, weights: NDArray) -> Self:
@@ -98,7 +102,10 @@ class JointFrames:
         """Return some of the frames, in the order of the table."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        taken = [part for part in self.blocks.map(_taken, chosen) if len(part.weight)]
+        parts = self.blocks.map(
+            lambda block, kept: block.take(np.flatnonzero(kept)), chosen
+        )
+        taken = [part for part in parts if len(part.weight)]
         blocks = FrameBlocks.of_blocks(taken, [len(part.weight) for part in taken])
         return replace(self, blocks=blocks.regrouped(joined_frames, BLOCK_FRAMES))
 
@@ -118,11 +125,6 @@ def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:
     return frame_tracks(tracks, None if complete else seen_points(tracks) * 1.0)
 
 
-def _weighted_frames(block: WeightedRows) -> FrameTracks:
-    """Return frames with weights."""
-    return frame_tracks(block.rows.transpose(0, 2, 1), block.weights)
-
-
 def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
     """Return complete frames (I, 2, J) with directions in the place of points."""
     n_frames, _, n_points = rows.shape
@@ -134,8 +136,3 @@ def _compressed_frames(rows: NDArray, directions: NDArray) -> FrameTracks:
         np.full(n_frames, float(n_points)),
         energies(rows),
     )
-
-
-def _taken(block: FrameTracks, chosen: NDArray) -> FrameTracks:
-    """Return the frames of a block for which chosen (n_frames,) is true."""
-    return block.take(np.flatnonzero(chosen))

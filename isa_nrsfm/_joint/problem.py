@@ -12,7 +12,6 @@ from isa_nrsfm._frames.calibrated_newton import CalibratedSearch
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.models import frame_search
 from isa_nrsfm._frames.point_sums import FrameTracks, frame_sums
-from isa_nrsfm._frames.search import FrameSearch
 from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
@@ -92,10 +91,13 @@ class JointProblem:
         shapes = state.shapes
         if self.frames.directions is None:
             shapes = shapes - shapes.mean(axis=2, keepdims=True)
-        aligned = partial(
-            _aligned_cameras, search=frame_search(camera, shapes), noise=state.noise
+        search = frame_search(camera, shapes)
+        motion = self.frames.blocks.joined(
+            lambda block: (
+                search.fit(block, state.noise, covariances=False, rough=True).motion
+            )
         )
-        return JointState(shapes, self.frames.blocks.joined(aligned), state.noise)
+        return JointState(shapes, motion, state.noise)
 
     def reversed_back(
         self, state: JointState, cameras: CameraModel
@@ -151,8 +153,3 @@ def _reversed_back(
     ]
     cameras, better = map(np.concatenate, zip(*found, strict=True))
     return cameras, better
-
-
-def _aligned_cameras(block: FrameTracks, search: FrameSearch, noise: float) -> NDArray:
-    """Return nearly optimal cameras (n_frames, 2, 3) for the shapes of a search."""
-    return search.fit(block, noise, covariances=False, rough=True).motion

@@ -34,7 +34,7 @@ def reweighted(
     """
     settings = problem.settings
     cameras = CAMERAS[settings.camera]
-    sizes = rows.joined(_sizes)
+    sizes = rows.joined(lambda block: robust_sizes(block.transpose(0, 2, 1)))
     weighted = rows.derive(WeightedRows.without, left_out)
     # Estimate the noise from the residuals of at most about 2,000 frames.
     few = representative_frames(rows, 2000)
@@ -100,11 +100,6 @@ def residual_deviations(
         square = (1.0 - 2.0 * leverage + spread).reshape(-1, 2, n_points).mean(axis=1)
         deviations[part] = np.sqrt(np.maximum(square, OF_DISTANCES))
     return deviations
-
-
-def _sizes(rows: NDArray) -> NDArray:
-    """Return the robust sizes (n,) of frames (n, 2, J)."""
-    return robust_sizes(rows.transpose(0, 2, 1))
 
 
 def _positions(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +36,15 @@ def posterior_blocks(
 ) -> FrameBlocks:
     """Return the fits of all frames in blocks of FramePosterior, before the gauge."""
     if model.loss != "linear":
-        return rows.derive(partial(_row_posterior, model=model))
+        return rows.derive(lambda block: model.posterior(block.transpose(0, 2, 1)))
     shapes = frames.coordinates(model.shapes)
     return frames.blocks.derive(replace(model, shapes=shapes).prepared_posterior)
 
 
-def _row_posterior(rows: NDArray, model: PosteriorFrames) -> FramePosterior:
-    """Return the fit of scaled frames (n_frames, 2, n_points)."""
-    return model.posterior(rows.transpose(0, 2, 1))
-
-
 def posterior_moments(posteriors: FrameBlocks) -> tuple[NDArray, NDArray, NDArray]:
     """Return cameras, coefficients, and their mean covariance (n_components, ...)."""
-    motion, alpha, covariance = zip(*posteriors.map(_moments), strict=True)
+    parts = posteriors.map(lambda fit: (fit.motion, fit.alpha, fit.covariance.sum(0)))
+    motion, alpha, covariance = zip(*parts, strict=True)
     total = np.sum(covariance, axis=0) / posteriors.n_frames
     return np.concatenate(motion), np.concatenate(alpha), total
 
@@ -103,8 +98,3 @@ def shown_frames(
     own = np.einsum("ira,irka->ik", motion, Z.reshape(*Z.shape[:2], -1, 3))[:, 1:]
     shift = np.einsum("i,ikl,il->ik", weight * noise, posterior.covariance, own)
     return frames.shown(posterior, sizes), alpha.T @ shift, float(noise.sum())
-
-
-def _moments(posterior: FramePosterior) -> tuple[NDArray, NDArray, NDArray]:
-    """Return cameras, coefficients and the sum of their covariances of a block."""
-    return posterior.motion, posterior.alpha, posterior.covariance.sum(axis=0)

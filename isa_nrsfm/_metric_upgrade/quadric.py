@@ -20,7 +20,6 @@ from isa_nrsfm._linalg.rounding import OF_RANKS
 LARGEST_STRETCH = 20.0
 
 CalibratedCamera = Literal["orthographic", "weak_perspective"]
-CAMERA_MODELS = ("orthographic", "weak_perspective")
 
 
 def unit_cameras(motion: NDArray) -> NDArray:

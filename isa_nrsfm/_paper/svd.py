@@ -53,7 +53,7 @@ def block_triplets(
     """
     n_rows, n_columns = shape
     if min(shape) > max(dense, 4 * k):
-        energy = sum(blocks.map(_energy))
+        energy = sum(blocks.map(lambda block: float(energies(block).sum())))
         V = _leading_subspace(blocks, n_columns, k, energy)
         _, S, rotation = np.linalg.svd(_triangle(blocks, k, V), full_matrices=False)
         return Triplets(S, rotation @ V.T, max(float(energy - S @ S), 0.0))
@@ -68,11 +68,6 @@ def block_triplets(
 def _matrix(block: NDArray) -> NDArray:
     """Return the rows (n_rows, n_columns) of a block (n_frames, ..., n_columns)."""
     return block.reshape(-1, block.shape[-1])
-
-
-def _energy(block: NDArray) -> float:
-    """Return the sum of the squares of a block."""
-    return float(energies(block).sum())
 
 
 def _triangle(blocks: FrameBlocks, width: int, V: NDArray | None = None) -> NDArray:

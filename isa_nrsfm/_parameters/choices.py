@@ -7,7 +7,8 @@ BLOCK_RECOVERIES = ("generalized_eigen", "eigen", "irls")
 REFINEMENTS = ("joint", "consensus", "alternating")
 # Refinements that begin with the joint fit.
 JOINT_REFINEMENTS = ("joint", "consensus")
-CAMERA_NAMES = ("affine", "weak_perspective", "orthographic")
+CALIBRATED_CAMERAS = ("weak_perspective", "orthographic")
+CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS)
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
 # The layouts in `isa_nrsfm.skeletons.SKELETONS`, in that order.

@@ -33,7 +33,7 @@ def weighted_table(
     weights = checked_weights(point_weight, (table.n_frames, n_columns // 2))
     visible = table.derive(partial(_visible_rows, layout=layout), weights)
     visible.empty = table.empty
-    seen = visible.joined(partial(_seen, layout=layout))
+    seen = visible.joined(lambda rows: seen_points(table_to_tracks(rows, layout)))
     weights = np.where(seen, weights, 0.0)
     return visible, None if (weights == seen).all() else weights
 
@@ -70,11 +70,6 @@ def _visible_rows(rows: NDArray, weights: NDArray, layout: Layout) -> NDArray:
     tracks = table_to_tracks(rows, layout)
     nan = rows.dtype.type(np.nan)
     return tracks_to_table(np.where(hidden[..., None], nan, tracks), layout)
-
-
-def _seen(rows: NDArray, layout: Layout) -> NDArray:
-    """Return a mask (n, n_points) of the visible points of rows of a table."""
-    return seen_points(table_to_tracks(rows, layout))
 
 
 def check_weights(weights: NDArray, n_components: int, camera: str | None) -> None:

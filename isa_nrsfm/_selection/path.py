@@ -145,7 +145,7 @@ def _check_part(
 ) -> None:
     """Refuse a part of a table that is not enough for so many basis shapes."""
     n_frames, names = len(part.sizes), getattr(estimator, "feature_names_in_", None)
-    visible = part.rows.joined(_visible)
+    visible = part.rows.joined(lambda rows: visible_points(rows.transpose(0, 2, 1)))
 
     def refused(k: int) -> ValueError | None:
         try:
@@ -161,11 +161,6 @@ def _check_part(
             f"{name} of cv fits {n_frames} frames, enough for n_components="
             f"{next(allowed, 0)} at most: {error}"
         ) from error
-
-
-def _visible(rows: NDArray) -> NDArray:
-    """Return the packed `visible_points` of some rows (n_frames, 2, n_points)."""
-    return visible_points(rows.transpose(0, 2, 1))
 
 
 def _fitted(

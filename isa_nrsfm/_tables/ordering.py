@@ -1,7 +1,5 @@
 """Orders of frames that stay the same when the rows of a table are permuted."""
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,19 +44,9 @@ def representative_frames(rows: FrameBlocks, most: int) -> NDArray:
     chosen = np.zeros(len(order), dtype=bool)
     chosen[spread(order, most)] = True
     fewest = min(200, most // 5)
-    shown = sum(rows.map(_numbers_shown, chosen))
+    shown = sum(rows.map(lambda b, kept: (~np.isnan(b[kept, 0])).sum(axis=0), chosen))
     for point in np.flatnonzero(shown < fewest).tolist():
-        seen = rows.joined(partial(_shows, point=point))
-        showing = order[seen[order]]
+        shows = rows.joined(lambda block, j=point: ~np.isnan(block[:, 0, j]))
+        showing = order[shows[order]]
         chosen[spread(showing, min(fewest, len(showing)))] = True
     return np.flatnonzero(chosen)
-
-
-def _numbers_shown(rows: NDArray, chosen: NDArray) -> NDArray:
-    """Return the number of chosen frames that show each point (n_points,)."""
-    return np.sum(~np.isnan(rows[chosen, 0]), axis=0)
-
-
-def _shows(rows: NDArray, point: int) -> NDArray:
-    """Return a mask (n_frames,) of the frames of a block that show a point."""
-    return ~np.isnan(rows[:, 0, point])

@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._metric_upgrade.quadric import CAMERA_MODELS, CalibratedCamera
+from isa_nrsfm._metric_upgrade.quadric import CalibratedCamera
 from isa_nrsfm._metric_upgrade.rigid import (
     fit_metric,
     nearest_rotations,
@@ -13,6 +13,7 @@ from isa_nrsfm._metric_upgrade.rigid import (
     usable_cameras,
     warn_if_degenerate,
 )
+from isa_nrsfm._parameters.choices import CALIBRATED_CAMERAS
 from isa_nrsfm._tables.tracks import of_all_rows
 
 
@@ -153,8 +154,8 @@ def metric_upgrade(
     array([1.502, 0.781, 0.781])
     """
     cameras, usable = usable_cameras(motion)
-    if camera not in CAMERA_MODELS:
-        raise ValueError(f"camera must be one of {CAMERA_MODELS}; got {camera!r}")
+    if camera not in CALIBRATED_CAMERAS:
+        raise ValueError(f"camera must be one of {CALIBRATED_CAMERAS}; got {camera!r}")
     fit = fit_metric(cameras[usable], camera)
     _, Q = symmetric_upgrade(fit.Q, cameras[usable])
     rotations, stretches = nearest_rotations(cameras[usable] @ Q)
