@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn import get_config
 from sklearn.utils import check_array
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
 
 # Range of the coordinates of a frame: squares beyond it leave the range of double
@@ -100,7 +100,7 @@ def column_sample(X: Any) -> Any:
     empty = np.empty((0, X.shape[1] if X.ndim == 2 else 0))
     if getattr(X, "columns", None) is None:
         return empty
-    return import_optional("pandas", extra="io").DataFrame(empty, columns=X.columns)
+    return pd.DataFrame(empty, columns=X.columns)
 
 
 class StoredTable:

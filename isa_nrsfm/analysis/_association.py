@@ -1,7 +1,7 @@
 """Association of coefficients with a label: a class or a number for each frame."""
 
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.utils import check_array, check_random_state, check_scalar
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._tables.frame_columns import checked_column, checked_times, group_numbers
 from isa_nrsfm.analysis._labels import kind_of, refuse_infinite
 from isa_nrsfm.analysis._permutations import (
@@ -27,9 +27,6 @@ from isa_nrsfm.analysis._permutations import (
     dependent_blocks,
     permuted_energies,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 class Association(NamedTuple):
@@ -76,7 +73,6 @@ class Association(NamedTuple):
         ImportError
             If pandas is not installed.
         """
-        pd = import_optional("pandas", extra="io")
         name = "eta_squared" if self.kind == "classes" else "spearman"
         index = pd.RangeIndex(1, len(self.statistic) + 1, name="component")
         return pd.DataFrame(

@@ -2,15 +2,15 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.decomposition import PCA
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.frame_columns import (
     checked_times,
@@ -30,9 +30,6 @@ from isa_nrsfm.cli._reading import Frames, cells_of, column_named
 from isa_nrsfm.cli._times import read_times, time_unit, video_times
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.export._poses import point_numbers
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 class Label(NamedTuple):
@@ -61,7 +58,6 @@ class Columns(NamedTuple):
 
 def asked_columns(args: Namespace, frames: Frames) -> Columns:
     """Return the columns that the options name; raise if they cannot be used."""
-    pd = import_optional("pandas", extra="io")
     table, names = frames.other[frames.usable], frames.columns.points
     labels = [_label(table, text) for text in args.label]
     groups = None if args.group is None else _groups(table, args.group)
@@ -168,7 +164,6 @@ def _numbered(
 
 def _label(table: "pd.DataFrame", text: str) -> Label:
     """Return the label of COLUMN, COLUMN:classes or COLUMN:number."""
-    pd = import_optional("pandas", extra="io")
     name, colon, kind = text.rpartition(":")
     if not colon or kind not in ("classes", "number"):
         name, kind = text, "auto"
@@ -211,7 +206,6 @@ def _groups(table: "pd.DataFrame", name: str) -> NDArray:
 
 def _names(known: "pd.Series") -> "pd.Series":
     """Return texts as they are, or as numbers if these are written the same."""
-    pd = import_optional("pandas", extra="io")
     if known.dtype.kind in "mM":  # dates
         return known.astype(str)
     numbers = pd.to_numeric(known, errors="coerce")

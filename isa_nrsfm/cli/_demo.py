@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.cli._fit import fit_table
 from isa_nrsfm.cli._options import PROGRAM, build_parser
 from isa_nrsfm.cli._reading import drawing_options
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
     """Fit artificial faces with the numbers of basis shapes to try; report truths."""
-    pd = import_optional("pandas", extra="io")
     faces = make_face_tracks(
         400, n_components=3, camera="weak_perspective", random_state=0
     )

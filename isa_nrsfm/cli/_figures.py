@@ -5,11 +5,12 @@ from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import write_whole
@@ -28,9 +29,6 @@ from isa_nrsfm.plotting import (
 )
 from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
 from isa_nrsfm.plotting._page import VIEWS, add_legend, block_limits, new_page
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 class Fit(NamedTuple):

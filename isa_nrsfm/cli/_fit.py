@@ -7,13 +7,14 @@ from argparse import Namespace
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA, PooledFastICA
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import (
@@ -45,9 +46,6 @@ from isa_nrsfm.cli._sections import fit_text, write_report
 from isa_nrsfm.export._viewer import MOST_LABELS
 from isa_nrsfm.io import write_table
 from isa_nrsfm.io._tables import TABLE_SUFFIXES
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Parts of the table that are held out in turn: blocks of rows, because neighbours are
 # often alike.
@@ -219,7 +217,6 @@ def _old_figures(folder: Path, new: list[str]) -> list[str]:
 
 def _first_classes(asked: Columns, X: "pd.DataFrame") -> "pd.Series | None":
     """Return the first label of few classes, which colours the frames in the viewer."""
-    pd = import_optional("pandas", extra="io")
     for label in asked.labels:
         if label.is_of_classes(MOST_LABELS):
             values = pd.Series(None, index=X.index, dtype=object, name=label.name)

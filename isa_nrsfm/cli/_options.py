@@ -38,14 +38,21 @@ SUFFIXES = {
 }
 
 
-def _reader(expected: str, read: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return a function that reads a value, and shows what is expected if it fails."""
+def _reader(
+    expected: str,
+    read: Callable[[str], Any],
+    is_allowed: Callable[[Any], bool] = lambda value: True,
+) -> Callable[[str], Any]:
+    """Return a function that reads allowed values, and names others in its error."""
 
     def reader(text: str) -> Any:
         try:
-            return read(text)
+            value = read(text)
         except ValueError:
-            raise _wrong(expected, repr(text)) from None
+            value = None
+        if value is None or not is_allowed(value):
+            raise _wrong(expected, repr(text))
+        return value
 
     return reader
 
@@ -64,14 +71,8 @@ def _path(text: str) -> str:
 
 def _whole_number(smallest: int, largest: int = 2**31 - 1) -> Callable[[str], int]:
     """Return a function that reads a whole number in a range."""
-
-    def read(text: str) -> int:
-        number = int(text)
-        if not smallest <= number <= largest:
-            raise ValueError
-        return number
-
-    return _reader(f"a whole number from {smallest} to {largest}", read)
+    expected = f"a whole number from {smallest} to {largest}"
+    return _reader(expected, int, range(smallest, largest + 1).__contains__)
 
 
 def _numbers_of_shapes(text: str) -> tuple[int | str, ...]:
@@ -91,36 +92,16 @@ def _numbers_of_shapes(text: str) -> tuple[int | str, ...]:
     return tuple(sorted(numbers))
 
 
-def _number_of_modes(text: str) -> float:
-    """Read a whole number above zero, or a share between 0 and 1."""
+def _share_or_number(text: str) -> float:
+    """Read a number, a whole one as int."""
     number = float(text)
-    if not (0 < number < 1 or (number >= 1 and number.is_integer())):
-        raise ValueError
-    return number if number < 1 else int(number)
+    return int(number) if number.is_integer() else number
 
 
-def _positive_number(text: str) -> float:
-    """Read a finite number above zero."""
-    number = float(text)
-    if not 0 < number < float("inf"):
-        raise ValueError
-    return number
-
-
-def _finite_number(text: str) -> float:
-    """Read a finite number."""
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError
-    return number
-
-
-def _image_size(text: str) -> tuple[int, int]:
+def _image_size(text: str) -> tuple[int, int] | None:
     """Read WIDTHxHEIGHT."""
     match = re.fullmatch(r"([1-9]\d*)[xX]([1-9]\d*)", text.strip())
-    if match is None:
-        raise ValueError
-    return int(match[1]), int(match[2])
+    return (int(match[1]), int(match[2])) if match else None
 
 
 def _row_rule(text: str) -> tuple[str, re.Pattern[str]]:
@@ -136,19 +117,9 @@ def _row_rule(text: str) -> tuple[str, re.Pattern[str]]:
         ) from error
 
 
-def _point_pair(text: str) -> tuple[str, ...]:
-    """Read two points with a comma between them."""
-    first, second = _names(text)
-    if not (first and second):
-        raise ValueError
-    return first, second
-
-
-def _skeleton(text: str) -> str:
-    """Read the name of a layout, or the path of a configuration of DeepLabCut."""
-    if text not in SKELETON_NAMES and Path(text).suffix.lower() not in CONFIGURATIONS:
-        raise ValueError
-    return text
+def _is_skeleton(text: str) -> bool:
+    """Return whether a text names a layout, or a configuration of DeepLabCut."""
+    return text in SKELETON_NAMES or Path(text).suffix.lower() in CONFIGURATIONS
 
 
 def _names(text: str) -> list[str]:
@@ -163,18 +134,26 @@ TYPES: dict[str, Callable[[str], Any]] = {
     "CONFIDENCE": float,
     "K": _numbers_of_shapes,
     "LAYOUT": _reader(
-        f"one of {', '.join(SKELETON_NAMES)}, or a .yaml file", _skeleton
+        f"one of {', '.join(SKELETON_NAMES)}, or a .yaml file", str, _is_skeleton
     ),
-    "MODES": _reader("a whole number or a share between 0 and 1", _number_of_modes),
+    "MODES": _reader(
+        "a whole number or a share between 0 and 1",
+        _share_or_number,
+        lambda number: 0 < number < 1 or (isinstance(number, int) and number >= 1),
+    ),
     "N": int,
     "NAMES": _names,
-    "NUMBER": _reader("a number above zero", _positive_number),
+    "NUMBER": _reader(
+        "a number above zero", float, lambda number: 0 < number < math.inf
+    ),
     "POINT,POINT": _reader(
-        "two points with a comma between them, such as 48,54", _point_pair
+        "two points with a comma between them, such as 48,54",
+        lambda text: tuple(_names(text)),
+        lambda pair: len(pair) == 2 and all(pair),
     ),
     "SEED": _whole_number(0, 2**32 - 1),
     "STARTS": _whole_number(1),
-    "VALUE": _reader("a number, such as -1", _finite_number),
+    "VALUE": _reader("a number, such as -1", float, math.isfinite),
     "WIDTHxHEIGHT": _reader("WIDTHxHEIGHT, such as 1920x1080", _image_size),
 }
 

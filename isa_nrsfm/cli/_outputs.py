@@ -8,23 +8,20 @@ import json
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM, SmoothedCoefficients, export
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._tables.column_names import names_of_points
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import load_model, save_model, write_table
 from isa_nrsfm.metrics._reprojection import frame_energies
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 PAGE = "report.html"
 REPORT = "report.json"
@@ -86,7 +83,6 @@ def write_alpha(
     Frames that could not be fitted have empty coefficients. Results with the name of
     another column get an underscore.
     """
-    pd = import_optional("pandas", extra="io")
     names = names_of_components(None, alpha.shape[1])
     results = pd.DataFrame(alpha, index=frames.X.index, columns=names)
     if std is not None:
@@ -124,7 +120,6 @@ def write_results(
 
     The cameras have a row for each frame, empty if it could not be fitted.
     """
-    pd = import_optional("pandas", extra="io")
     X, motion = frames.X, estimator.motion_
     cameras = pd.DataFrame(
         np.hstack([motion.reshape(-1, 6), estimator.translation_]),

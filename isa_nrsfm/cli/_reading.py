@@ -3,15 +3,15 @@
 from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
 from isa_nrsfm._tables.tracks import (
@@ -41,9 +41,6 @@ from isa_nrsfm.skeletons import (
     get_skeleton,
     read_skeleton,
 )
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 INNER, WITHOUT = "inner", "without:"
 # Words for an empty cell in the column of a label or a group. "None" is a class, such
@@ -102,7 +99,6 @@ def read_frames(
     not_used: dict[str, int] = {}
     args.format = _format(args) if table is None else TABLE
     if args.format != TABLE:
-        pd = import_optional("pandas", extra="io")
         options = {} if args.image_size is None else {"image_size": args.image_size}
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
@@ -157,7 +153,6 @@ def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
 
 def cells_of(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
     """Return a column, missing where its text is empty or a word for missing."""
-    pd = import_optional("pandas", extra="io")
     column = column_named(table, name, option)
     if isinstance(column.dtype, pd.CategoricalDtype):
         column = column.astype(object)
@@ -250,7 +245,6 @@ def _frames(
     confidence: "pd.DataFrame | None",
 ) -> Frames:
     """Take the frames of a table; failed marks rows in which tracking failed."""
-    pd = import_optional("pandas", extra="io")
     kept, left_out = _rows_to_keep(args, table)
     rows, names = np.flatnonzero(kept), columns.interleaved
     stripped = [name.strip() for name in names]

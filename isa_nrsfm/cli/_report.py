@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm import AffineNRSfM, __version__
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._diagnostics import (
     Diagnostics,
     camera_advice,
@@ -87,7 +87,6 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
     for message in () if found is None else found.messages:
         warn_caller(message)
     complete = estimator.loss == "linear" and not X.isna().any(axis=None)
-    pd = import_optional("pandas", extra="io")
     coefficients = pd.DataFrame(
         {
             "name": names_of_components(None, alpha.shape[1]),

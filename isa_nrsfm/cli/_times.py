@@ -2,15 +2,11 @@
 
 import re
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.optional import import_optional
-
-if TYPE_CHECKING:
-    import pandas as pd
+from isa_nrsfm._compat import pandas as pd
 
 _MINUTES, _ALL_THREE, _HOURS = _DURATIONS = ("%M:%S", "%H:%M:%S", "%H:%M")
 _DURATION = r"(?:(\d+):(?=[0-5]?\d:))?(\d+):([0-5]\d(?:\.\d+)?)"
@@ -32,7 +28,6 @@ def read_times(column: "pd.Series", format: str | None) -> NDArray:
 
     All cells are read in one format, which is given, or the only one that reads all.
     """
-    pd = import_optional("pandas", extra="io")
     types = pd.api.types
     if types.is_timedelta64_dtype(column):
         return np.asarray(column.dt.total_seconds())
@@ -82,7 +77,6 @@ def read_times(column: "pd.Series", format: str | None) -> NDArray:
 
 def time_unit(column: "pd.Series", times: NDArray) -> str:
     """Return the unit of the times of a column that `read_times` has read."""
-    pd = import_optional("pandas", extra="io")
     numbers = pd.to_numeric(column.astype(str), errors="coerce")
     if times.dtype.kind == "M" or numbers.isna().all():
         return "seconds"
@@ -96,7 +90,6 @@ def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
 
     It is the number of the frame, or of the image among all. Otherwise rows count.
     """
-    pd = import_optional("pandas", extra="io")
     for expression in (_NUMBER, _IMAGE):
         for name in table.columns:
             if not re.fullmatch(expression, str(name).strip(), re.IGNORECASE):
@@ -118,7 +111,6 @@ def video_times(
     `name` is the column that has them. Without one they are those of rows, which must
     follow one another.
     """
-    pd = import_optional("pandas", extra="io")
     found = pd.DataFrame({"image": numbers, "group": 0 if groups is None else groups})
     again = found.duplicated()
     if again.any():
@@ -150,7 +142,6 @@ def _read(cells: "pd.Series", format: str) -> "pd.Series":
 
     Minutes and seconds may have hours before them in some rows.
     """
-    pd = import_optional("pandas", extra="io")
     if format not in _DURATIONS:
         dates = pd.to_datetime(cells, format=format, errors="coerce", utc=True)
         return dates.dt.tz_localize(None)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils import Bunch
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.scikit_learn import checked_parameters
 from isa_nrsfm._tables.tracks import table_to_tracks
 from isa_nrsfm.datasets._remote import DataHome, RemoteFile, fetch_file
@@ -200,7 +200,6 @@ def _read(path: Path, n_columns: int) -> dict[str, NDArray]:
 
 def _put_in_frames(faces: Bunch) -> None:
     """Make the table and the target of pandas, and add a frame of all columns."""
-    pd = import_optional("pandas", extra="io")
     faces.data = pd.DataFrame(faces.data, columns=faces.feature_names)
     faces.target = pd.Series(faces.subjects, name="subject")
     labels = {

@@ -3,11 +3,11 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.io._landmark_columns import (
     LandmarkColumns,
@@ -16,9 +16,6 @@ from isa_nrsfm.io._landmark_columns import (
 )
 from isa_nrsfm.io._landmarks import Landmarks, assemble
 from isa_nrsfm.io._separated_values import header_names, read_columns
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # OpenFace names points in space, in millimetres, by capital letters.
 _OPENFACE_NOT_READ = re.compile(r"eye_lmk_[xyXYZ]_\d+|[XYZ]_\d+")

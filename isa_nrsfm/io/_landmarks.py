@@ -3,17 +3,14 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.skeletons import Skeleton, find_skeleton
 from isa_nrsfm.skeletons._recognition import LAYOUTS_OF_READERS, numbered
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +107,6 @@ def assemble(
     frame. The skeleton is by default that of the layout that the format or the names of
     the points determine.
     """
-    pd = import_optional("pandas", extra="io")
     n_frames, n_points, _ = tracks.shape
     if n_frames == 0:
         raise ValueError("there are no frames in it")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from isa_nrsfm._compat.optional import import_optional
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm.io._landmarks import Landmarks, assemble, assemble_individuals
 
 _MEDIAPIPE_PARTS = ("face_landmarks", "hand_landmarks", "pose_landmarks")
@@ -58,7 +58,6 @@ def from_mediapipe(results: Iterable[Any], image_sizes: ArrayLike) -> Landmarks:
     >>> landmarks.failed
     array([False,  True])
     """
-    pd = import_optional("pandas", extra="io")
     results = list(results)
     parts = {part for result in results for part in _parts(result)}
     if len(parts) > 1:

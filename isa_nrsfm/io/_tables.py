@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
 from isa_nrsfm._compat.whole_files import whole_file
@@ -18,7 +19,6 @@ from isa_nrsfm.io._separated_values import SEPARATORS, checked_rows, read_parque
 if TYPE_CHECKING:
     import os
 
-    import pandas as pd
 
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = ("", "na", "nan", "n/a", "null", "none")
@@ -180,7 +180,6 @@ def landmark_table(
     >>> list(other)
     ['id']
     """
-    pd = import_optional("pandas", extra="io")
     if not isinstance(frame, pd.DataFrame):
         raise ValueError(
             f"a pandas DataFrame is needed; got {type(frame).__name__} "
@@ -247,7 +246,6 @@ def confidences_in(
     frame: "pd.DataFrame", x: Iterable[str], y: Iterable[str]
 ) -> "pd.DataFrame | None":
     """Return the confidences (n_frames, n_points) of points of x and y columns."""
-    pd = import_optional("pandas", extra="io")
     found = {name: _as_numbers(frame[name]) for name in confidence_columns(frame, x, y)}
     return pd.DataFrame(found, index=frame.index) if found else None
 
@@ -264,7 +262,6 @@ def table_suffix(path: "str | os.PathLike[str]") -> str:
 
 def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     """Read a file of separated values."""
-    pd = import_optional("pandas", extra="io")
     rows = checked_rows(path, separator)
     header = next(rows, None)
     if header is None:
@@ -316,7 +313,6 @@ def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
 
 def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
     """Return a landmark column as finite numbers and NaN."""
-    pd = import_optional("pandas", extra="io")
     types = pd.api.types
     if types.is_bool_dtype(column) or types.is_complex_dtype(column):
         raise ValueError(
