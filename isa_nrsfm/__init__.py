@@ -33,24 +33,13 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
-            "isa_nrsfm._estimator": ["AffineNRSfM"],
-            "isa_nrsfm._selection.estimator": ["AffineNRSfMCV"],
-            "isa_nrsfm._frames.models": ["Decomposition"],
-            "isa_nrsfm._transformer": ["SmoothedCoefficients"],
-            "isa_nrsfm.analysis": ["WithinGroups", "association"],
-            "isa_nrsfm.isa": ["FastISA", "PooledFastICA"],
+            "_estimator": "AffineNRSfM",
+            "_selection.estimator": "AffineNRSfMCV",
+            "_frames.models": "Decomposition",
+            "_transformer": "SmoothedCoefficients",
+            "analysis": "WithinGroups association",
+            "isa": "FastISA PooledFastICA",
         },
-        subpackages=[
-            "analysis",
-            "baselines",
-            "calibration",
-            "cli",
-            "datasets",
-            "export",
-            "io",
-            "isa",
-            "metrics",
-            "plotting",
-            "skeletons",
-        ],
+        subpackages="analysis baselines calibration cli datasets export io isa metrics "
+        "plotting skeletons",
     )

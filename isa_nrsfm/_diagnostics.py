@@ -1,11 +1,12 @@
 """Diagnostics of a fit: figures, and messages that interpret them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._frames.depth import LARGEST_SHARE
 from isa_nrsfm._linalg.rounding import OF_RANKS
 from isa_nrsfm._linalg.small_matrices import polar
@@ -218,8 +219,8 @@ def outlier_advice(found: Diagnostics, rows: Any, names: Sequence[str]) -> str:
         f"the table has outliers: {len(found.outliers)} points "
         f"({100 * found.outlier_share:.2g} %) in {len(frames)} frames are more than "
         f"{GROSS:g} standard deviations from the model, in the rows "
-        f"{listed(rows[i] for i in frames)}, most often the points "
-        f"{listed(names[j] for j in most)}"
+        f"{first_items((rows[i] for i in frames), 5)}, most often the points "
+        f"{first_items((names[j] for j in most), 5)}"
     )
 
 
@@ -257,44 +258,34 @@ def _of_coefficients(
 ) -> list[str]:
     """Return messages on coefficients that a handful of frames or the pose decide."""
     messages = []
-    n_frames, effective = (
-        np.count_nonzero(~np.isnan(alpha[:, 0])),
-        found.effective_frames,
-    )
+    n_frames = np.count_nonzero(~np.isnan(alpha[:, 0]))
+    effective = found.effective_frames
     # Smallest numbers without outliers, on the tables named at GROSS: 20 of 307 to 320
     # of 1000 frames. With outliers: 1 to 20.
     few = (effective > 0) & (effective < min(10.0, 0.1 * n_frames))
     if (found.reliability < LEAST_RELIABILITY).any():
         few[:] = False  # noise
     if few.any():
-        shown = listed(
+        shown = [
             f"alpha_{k + 1} ({effective[k]:.1f} effective frames, most row "
             f"{rows[np.nanargmax(np.abs(alpha[:, k]))]})"
             for k in np.flatnonzero(few)
-        )
+        ]
         messages.append(
-            f"a few of the {n_frames} frames determine {shown}. Look for wrong "
-            "landmarks in the frames with the largest coefficients, or use fewer basis "
-            "shapes"
+            f"a few of the {n_frames} frames determine {first_items(shown, 5)}. Look "
+            "for wrong landmarks in the frames with the largest coefficients, or use "
+            "fewer basis shapes"
         )
     large = np.flatnonzero(~few & (found.pose_share > MOST_POSE))
     if layout is not None and layout.contour and len(large):
-        shown = listed(
-            f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large
-        )
+        shown = [f"{100 * found.pose_share[k]:.0f} % of alpha_{k + 1}" for k in large]
         messages.append(
-            f"the pose predicts {shown}: {len(layout.contour)} points of {layout.name} "
-            "follow the visible outline, which slides over the surface as the head "
-            "turns. Fit the other points alone (--points inner; in Python the columns "
-            f"get_skeleton({layout.name!r}).inner_columns)"
+            f"the pose predicts {first_items(shown, 5)}: {len(layout.contour)} points "
+            f"of {layout.name} follow the visible outline, which slides over the "
+            "surface as the head turns. Fit the other points alone (--points inner; in Python "
+            f"the columns get_skeleton({layout.name!r}).inner_columns)"
         )
     return messages
-
-
-def listed(items: Iterable[Any]) -> str:
-    """Return the first items as text."""
-    texts = [str(item) for item in items]
-    return ", ".join(texts[:5]) + ", ..." * (len(texts) > 5)
 
 
 def camera_meaning(ratio: float) -> str:

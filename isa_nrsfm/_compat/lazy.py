@@ -5,7 +5,7 @@ An ``__init__.py`` lists them under `TYPE_CHECKING` and for `lazy_names`.
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
@@ -14,18 +14,19 @@ EAGER = "EAGER_IMPORT"
 
 
 def lazy_names(
-    package: str, names: Mapping[str, Sequence[str]], subpackages: Sequence[str] = ()
+    package: str, names: Mapping[str, str], subpackages: str = ""
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
-    `names` maps modules to their public names; `subpackages` are folders. Errors of
-    imports are raised unchanged, and at once if `EAGER_IMPORT` is set.
+    `names` maps modules of the package to their public names, and `subpackages` are
+    folders, with blanks between them. Errors of imports are raised unchanged, and at
+    once if `EAGER_IMPORT` is set.
     """
-    namespace = vars(sys.modules[package])
-    modules = {name: module for module in names for name in names[module]}
+    namespace, folders = vars(sys.modules[package]), subpackages.split()
+    modules = {name: module for module in names for name in names[module].split()}
 
     def imported(name: str) -> Any:
-        if name in subpackages:
+        if name in folders:
             return import_module(f"{package}.{name}")
         if name not in modules:
             raise AttributeError(
@@ -33,13 +34,13 @@ def lazy_names(
                 name=name,
                 obj=sys.modules[package],
             )
-        namespace[name] = getattr(import_module(modules[name]), name)
+        namespace[name] = getattr(import_module(f"{package}.{modules[name]}"), name)
         return namespace[name]
 
     def listed() -> list[str]:
-        return sorted({*namespace, *modules, *subpackages})
+        return sorted({*namespace, *modules, *folders})
 
     if os.environ.get(EAGER):
-        for name in (*modules, *subpackages):
+        for name in (*modules, *folders):
             imported(name)
     return imported, listed, list(modules)

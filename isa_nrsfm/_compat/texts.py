@@ -1,7 +1,15 @@
-"""Names of files: their order, and those that UTF-8 cannot hold."""
+"""Texts of messages, and names of files."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+
+def first_items(items: Iterable[Any], most: int = 4) -> str:
+    """Return the first items with commas between them, and dots if there are more."""
+    texts = [str(item) for item in items]
+    return ", ".join(texts[:most]) + ", ..." * (len(texts) > most)
 
 
 def by_number(path: Path) -> tuple[list[str | int], str]:

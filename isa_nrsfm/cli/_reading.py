@@ -12,6 +12,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.texts import first_items
 from isa_nrsfm._parameters.choices import SKELETON_NAMES
 from isa_nrsfm._tables.column_names import names_of_points, parse_coordinate
 from isa_nrsfm._tables.tracks import (
@@ -23,6 +24,7 @@ from isa_nrsfm._tables.tracks import (
 )
 from isa_nrsfm.cli._options import CONFIGURATIONS, NONE
 from isa_nrsfm.cli._times import image_numbers
+from isa_nrsfm.export._drawing import edges_of
 from isa_nrsfm.io import FORMATS, find_format, read_landmarks, read_table
 from isa_nrsfm.io._formats import TABLE
 from isa_nrsfm.io._landmark_columns import (
@@ -146,7 +148,7 @@ def column_named(table: "pd.DataFrame", name: str, option: str) -> "pd.Series":
         names = [each for each in by_name if each]
         raise ValueError(
             f"{option}: the table has no column {name!r}; its columns are "
-            f"{_shortened(names, 8) or 'none'}"
+            f"{first_items(names, 8) or 'none'}"
         )
     return table[by_name[name.strip()]]
 
@@ -444,7 +446,7 @@ def _columns_of_model(
     first = {*coordinates[: len(names)]}
     if absent or (surplus and chosen is not None and first == {*names}):
         differences = [
-            f"{len(some)} columns are only in the {where} ({_shortened(some)})"
+            f"{len(some)} columns are only in the {where} ({first_items(some)})"
             for some, where in ((absent, "model"), (surplus, "table"))
             if some
         ]
@@ -569,10 +571,7 @@ def _edges(
     if args.edges is not None:
         all_points = getattr(args, "points", None) is None
         links = _read_edges(args.edges, names, numbered=all_points)
-        if surfaces or links.shape[1] == 2:
-            return links
-        sides = links[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        return np.unique(np.sort(sides, axis=1), axis=0)
+        return links if surfaces else edges_of(links)
     # With --points, --skeleton is the layout of all points, and `stored` of the rest.
     some_points = stored is not None and getattr(args, "points", None) is not None
     if args.skeleton is not None and not some_points:
@@ -610,8 +609,3 @@ def _read_edges(path: str, names: Sequence[str], numbered: bool) -> NDArray:
     if not edges:
         raise ValueError(f"{path} has no edges; use --edges none to draw only points")
     return np.array(edges)
-
-
-def _shortened(names: Sequence[str], most: int = 4) -> str:
-    """List the first names."""
-    return ", ".join(names[:most]) + ", ..." * (len(names) > most)

@@ -33,24 +33,11 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
-            "isa_nrsfm.export._gltf": ["write_glb"],
-            "isa_nrsfm.export._point_distribution": [
-                "PointDistributionModel",
-                "point_distribution_model",
-                "read_pdm",
-                "write_pdm",
-            ],
-            "isa_nrsfm.export._poses": [
-                "FramePoses",
-                "frame_poses",
-                "point_distances",
-                "pose_function",
-            ],
-            "isa_nrsfm.export._shape_arrays": [
-                "ShapeArrays",
-                "shape_arrays",
-                "write_shapes",
-            ],
-            "isa_nrsfm.export._viewer": ["write_viewer"],
+            "_gltf": "write_glb",
+            "_point_distribution": "PointDistributionModel point_distribution_model "
+            "read_pdm write_pdm",
+            "_poses": "FramePoses frame_poses point_distances pose_function",
+            "_shape_arrays": "ShapeArrays shape_arrays write_shapes",
+            "_viewer": "write_viewer",
         },
     )

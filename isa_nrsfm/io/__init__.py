@@ -28,21 +28,11 @@ else:
     __getattr__, __dir__, __all__ = lazy_names(
         __name__,
         {
-            "isa_nrsfm.io._formats": [
-                "FORMATS",
-                "LandmarkFormat",
-                "find_format",
-                "read_landmarks",
-            ],
-            "isa_nrsfm.io._landmarks": ["Landmarks"],
-            "isa_nrsfm.io._models": ["load_model", "save_model"],
-            "isa_nrsfm.io._results": ["from_mediapipe", "from_movement"],
-            "isa_nrsfm.io._stored_tables": ["open_table"],
-            "isa_nrsfm.io._tables": [
-                "LandmarkTable",
-                "landmark_table",
-                "read_table",
-                "write_table",
-            ],
+            "_formats": "FORMATS LandmarkFormat find_format read_landmarks",
+            "_landmarks": "Landmarks",
+            "_models": "load_model save_model",
+            "_results": "from_mediapipe from_movement",
+            "_stored_tables": "open_table",
+            "_tables": "LandmarkTable landmark_table read_table write_table",
         },
     )
