@@ -282,8 +282,8 @@ def _of_coefficients(
         messages.append(
             f"the pose predicts {first_items(shown, 5)}: {len(layout.contour)} points "
             f"of {layout.name} follow the visible outline, which slides over the "
-            "surface as the head turns. Fit the other points alone (--points inner; in Python "
-            f"the columns get_skeleton({layout.name!r}).inner_columns)"
+            "surface as the head turns. Fit the other points alone (--points inner; in "
+            f"Python the columns get_skeleton({layout.name!r}).inner_columns)"
         )
     return messages
 
