@@ -14,12 +14,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM
-from isa_nrsfm._compat.scikit_learn import (
-    Interval,
-    is_pandas_na,
-    number_of_rows,
-    taken_rows,
-)
+from isa_nrsfm._compat.scikit_learn import Interval, number_of_rows, taken_rows
 from isa_nrsfm._compat.stored_arrays import array_in
 from isa_nrsfm.datasets import make_face_tracks
 
@@ -34,8 +29,6 @@ def test_rows_of_arrays_and_dataframes():
     X = np.arange(12.0).reshape(6, 2)
     assert number_of_rows(X) == number_of_rows(pd.DataFrame(X)) == 6
     assert_array_equal(taken_rows(pd.DataFrame(X), [1, 4]), X[[1, 4]])
-    assert is_pandas_na(pd.NA)
-    assert not is_pandas_na(None)
 
 
 def half_missing():

@@ -4,35 +4,16 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from sklearn.base import BaseEstimator, _fit_context
-from sklearn.utils import _safe_indexing as taken_rows
-from sklearn.utils._missing import is_pandas_na
-from sklearn.utils._param_validation import (
-    HasMethods,
-    Interval as _Interval,
-    StrOptions,
-    validate_params,
-)
-from sklearn.utils.parallel import _get_threadpool_controller as threadpool_controller
-from sklearn.utils.validation import _num_samples as number_of_rows
+from sklearn.utils import _param_validation, _safe_indexing, parallel, validation
 
-__all__ = [
-    "HasMethods",
-    "Interval",
-    "ShownEstimator",
-    "StrOptions",
-    "check_parameters",
-    "checked_parameters",
-    "fit_context",
-    "is_pandas_na",
-    "number_of_rows",
-    "taken_rows",
-    "threadpool_controller",
-]
+HasMethods, StrOptions = _param_validation.HasMethods, _param_validation.StrOptions
+threadpool_controller = parallel._get_threadpool_controller
+taken_rows, number_of_rows = _safe_indexing, validation._num_samples
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class Interval(_Interval):
+class Interval(_param_validation.Interval):
     """Numbers of a type between two bounds, without True and False."""
 
     def is_satisfied_by(self, value: Any) -> bool:
@@ -65,13 +46,7 @@ def checked_parameters(
     constraints: dict[str, list[Any]],
 ) -> Callable[[Function], Function]:
     """Return a decorator that checks parameters of a function against constraints."""
-    decorate: Callable[[Function], Function] = validate_params(
+    decorate: Callable[[Function], Function] = _param_validation.validate_params(
         constraints, prefer_skip_nested_validation=True
     )
     return decorate
-
-
-def check_parameters(estimator: Any) -> None:
-    """Check the parameters of an estimator, if it has constraints for them."""
-    if hasattr(estimator, "_parameter_constraints"):
-        estimator._validate_params()

@@ -15,7 +15,7 @@ def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
             f"{name} must have one entry for each of the {n_frames} frames; "
             f"got {len(column)}"
         )
-    missing = np.flatnonzero([_is_missing(each) for each in column])
+    missing = np.flatnonzero([is_missing(each) for each in column])
     if len(missing):
         raise ValueError(
             f"{name} must be known for all frames; it is missing in {len(missing)} of "
@@ -28,7 +28,7 @@ def checked_column(name: str, values: Any, n_frames: int) -> NDArray:
     return column.astype(str)
 
 
-def _is_missing(value: Any) -> bool:
+def is_missing(value: Any) -> bool:
     """Return whether an entry of a column is None, NaN, NaT or NA."""
     try:
         return value is None or not bool(value == value)

@@ -3,9 +3,10 @@
 import shlex
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from sklearn.utils import Bunch
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
@@ -15,9 +16,6 @@ from isa_nrsfm.cli._reading import drawing_options
 from isa_nrsfm.cli._sections import fit_text, text_of
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.metrics import affine_shape_error, basis_similarity
-
-if TYPE_CHECKING:
-    from sklearn.utils import Bunch
 
 
 def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
@@ -58,7 +56,7 @@ def run(args: Namespace, warned: list[str], tried: str = "1-5") -> str:
     return f"{fit_text(report, folder)}\n\n{text_of('', ending)}"
 
 
-def _compare(faces: "Bunch", estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
+def _compare(faces: Bunch, estimator: AffineNRSfM, X: Any) -> dict[str, Any]:
     """Compare a fitted model with the truth."""
     shapes = estimator.reconstruct(X)
     rigid = np.broadcast_to(estimator.mean_shape_, shapes.shape)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_array
 
-from isa_nrsfm._compat.scikit_learn import is_pandas_na, number_of_rows, taken_rows
+from isa_nrsfm._compat.scikit_learn import number_of_rows, taken_rows
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._tables.frame_columns import checked_times
+from isa_nrsfm._tables.frame_columns import checked_times, is_missing
 from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.export._drawing import Links, choose_drawing, edges_of
 from isa_nrsfm.export._names import frames_of_table, names_of_components, suffix_of
@@ -258,7 +258,7 @@ def _codes(labels: Any, n_rows: int) -> tuple[NDArray[np.intp], list[str]]:
         )
     texts, order = [], {}
     for value in values.tolist():
-        missing = value is None or is_pandas_na(value) or value != value
+        missing = is_missing(value)
         text = UNLABELLED if missing else str(value)
         number = isinstance(value, Real)
         order[text] = (missing, not number, value if number else 0, text)
