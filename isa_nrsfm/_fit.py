@@ -214,8 +214,7 @@ def _count_components(
     estimator: TableTransformer, source: FrameBlocks, weights: NDArray | None
 ) -> int:
     """Return the number of basis shapes that a table supports, of at most twelve."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the fit itself warns again
+    with warnings.catch_warnings(action="ignore"):  # the fit itself warns again
         table = ready_table(estimator, source, 1, weights)
     possible = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(12, possible)
@@ -227,8 +226,7 @@ def _count_components(
     # Down-weighted outliers look like basis shapes: fit again with the final weights.
     while found > 1 and estimator.loss != "linear":
         trial = copy.copy(trial)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             fit_ready_table(trial, table, found, NoProgress())
         n_supported = int(np.sum(trial.reliability_ >= LEAST_RELIABILITY))
         if n_supported == found:

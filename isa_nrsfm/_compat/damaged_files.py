@@ -1,4 +1,4 @@
-"""One kind of error for files that other libraries cannot read."""
+"""Errors that name their file, and one kind of error for damaged files."""
 
 import contextlib
 import os
@@ -33,3 +33,12 @@ def reading(
             f"{os.fspath(path)} cannot be read as {what}: {said}"
             + (f". Expected {expected}" if expected else "")
         ) from error
+
+
+@contextlib.contextmanager
+def errors_of(what: str) -> Iterator[None]:
+    """Put a text before the messages of ValueErrors."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error

@@ -69,7 +69,11 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
     said = names_layout(names)
     if said in (None, layout):
         return
-    others = [str(name) for name in names if not _is_x_or_y(name)]
+    others = [
+        str(name)
+        for name in names
+        if (coordinate := parse_coordinate(name)) is None or coordinate.axis > 1
+    ]
     if others:
         raise ValueError(
             f"{len(others)} of the {len(names)} columns are not named as the x or "
@@ -86,12 +90,6 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
         f"layout={layout!r} contradicts the column names ({shown}, ...), "
         f"whose order is {order}"
     )
-
-
-def _is_x_or_y(name: Hashable) -> bool:
-    """Return whether a column is named as the x or y of a point."""
-    coordinate = parse_coordinate(name)
-    return coordinate is not None and coordinate.axis < 2
 
 
 def largest_n_components(n_points: int, camera: str | None = None) -> int:

@@ -54,15 +54,6 @@ class CompletionModel(NamedTuple):
         return max(self.noise, OF_STEPS)
 
 
-class _Posterior(NamedTuple):
-    """Posterior of the coefficients z and the translations t of frames."""
-
-    z: NDArray  # (n_frames, 2, rank), means
-    t: NDArray  # (n_frames, 2, 1), means
-    covariance: NDArray  # (n_patterns, rank, rank) of z, over the noise variance
-    cross: NDArray  # (n_patterns, rank), that of z with -t
-
-
 def complete_rows(
     rows: FrameBlocks, n_points: int, n_components: int, model_frames: int
 ) -> FrameBlocks:
@@ -100,9 +91,8 @@ def completion_model(
 
 def filled_in(rows: NDArray, model: CompletionModel) -> NDArray:
     """Return frames (n_frames, 2, n_points), NaN filled in by the model, centred."""
-    posterior = _posterior(_Frames.of_rows(rows), model)
-    expected = posterior.z @ model.B + posterior.t
-    filled = np.where(np.isnan(rows), expected, rows)
+    z, t, *_ = _posterior(_Frames.of_rows(rows), model)
+    filled = np.where(np.isnan(rows), z @ model.B + t, rows)
     return filled - filled.mean(axis=2, keepdims=True)
 
 
@@ -124,9 +114,14 @@ def _principal_axes(rows: NDArray, rank: int) -> CompletionModel:
     return CompletionModel(B - B.mean(axis=1, keepdims=True), noise)
 
 
-def _posterior(frames: _Frames, model: CompletionModel) -> _Posterior:
-    """
-    Return the posterior of coefficients and translations.
+def _posterior(
+    frames: _Frames, model: CompletionModel
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return the posterior of coefficients z and translations t.
+
+    The means of z (n_frames, 2, rank) and t (n_frames, 2, 1), the covariance of z
+    (n_patterns, rank, rank), and that of z with -t (n_patterns, rank), both over the
+    noise variance.
 
     Let B_c be the seen columns of B, its rows centred over them. Then ``C = (B_c B_c^T
     + ridge I)^-1`` is the posterior covariance over the noise variance, and ``z = w B^T
@@ -144,7 +139,7 @@ def _posterior(frames: _Frames, model: CompletionModel) -> _Posterior:
     covariance = np.linalg.inv(gram)
     cross = (covariance @ means[:, :, None])[:, :, 0]
     z = (rows @ B.T) @ covariance[pattern]
-    return _Posterior(z, -(z @ means[pattern][:, :, None]), covariance, cross)
+    return z, -(z @ means[pattern][:, :, None]), covariance, cross
 
 
 def _em_step(model: CompletionModel, frames: _Frames) -> tuple[CompletionModel, float]:

@@ -177,8 +177,8 @@ def _fitted(
     """
     since = time.perf_counter()
     estimator, X, table, split = part
-    with warnings.catch_warnings(record=True) as unconverged:
-        warnings.simplefilter("ignore")  # the last fit warns
+    # The last fit warns.
+    with warnings.catch_warnings(record=True, action="ignore") as unconverged:
         warnings.simplefilter("always", ConvergenceWarning)
         if estimator.refinement == "joint":
             starts = []

@@ -11,6 +11,7 @@ from sklearn.decomposition import PCA
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.caller import warn_caller
+from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.frame_columns import (
     checked_times,
@@ -65,12 +66,10 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
     if args.time_format is not None and args.time is None:
         raise ValueError("--time-format needs --time")
     if args.time is not None:
-        try:
+        with errors_of(f"--time {args.time}"):
             cells = cells_of(table, args.time, "--time")
             times = read_times(cells, args.time_format)
             unit_of_times = time_unit(cells, times)
-        except ValueError as error:
-            raise ValueError(f"--time {args.time}: {error}") from error
     elif args.fps is not None:
         images, name = frames.images
         numbers = pd.Series(images, frames.other.index)[frames.usable]
@@ -156,10 +155,8 @@ def _numbered(
     pair: tuple[str, str], names: Sequence[str], option: str
 ) -> tuple[int, int]:
     """Return the numbers of two points."""
-    try:
+    with errors_of(f"{option} {','.join(pair)}"):
         return point_numbers(pair, names)
-    except ValueError as error:
-        raise ValueError(f"{option} {','.join(pair)}: {error}") from error
 
 
 def _label(table: "pd.DataFrame", text: str) -> Label:
@@ -184,10 +181,8 @@ def _label(table: "pd.DataFrame", text: str) -> Label:
     if values.dtype.kind not in "biuf":
         values = values.astype(str)
     refuse_infinite(f"--label {text}", values, table.index[known].to_numpy())
-    try:
+    with errors_of(f"--label {text}"):
         return Label(name, kind_of(values, kind), values, known.to_numpy())
-    except ValueError as error:
-        raise ValueError(f"--label {text}: {error}") from error
 
 
 def _groups(table: "pd.DataFrame", name: str) -> NDArray:

@@ -52,8 +52,7 @@ def _warnings_as_lines(args: Namespace) -> Iterator[list[str]]:
             warned.append(text)
             _say(f"warning: {text}")
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(action="always"):
         for category in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", category)
         warnings.showwarning = show

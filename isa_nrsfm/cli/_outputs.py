@@ -131,8 +131,7 @@ def write_results(
     shown["camera"] = None
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", UserWarning)
+            with warnings.catch_warnings(action="error", category=UserWarning):
                 poses = export.frame_poses(estimator, X, **drawn)
             columns = pd.DataFrame(poses._asdict(), index=X.index)
             columns = columns.dropna(axis="columns", how="all")

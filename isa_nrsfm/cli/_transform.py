@@ -71,8 +71,7 @@ def run(args: Namespace, warned: list[str]) -> str:
 def _write_viewer(path: Path, estimator: Any, **options: Any) -> None:
     """Write the viewer, with affine shapes if the cameras do not determine others."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", UserWarning)
+        with warnings.catch_warnings(action="error", category=UserWarning):
             export.write_viewer(estimator, path, **options)
     except (ValueError, UserWarning) as error:
         warn_caller(f"{path.name} has affine shapes: {error}")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm.io._landmarks import Landmarks, assemble
 from isa_nrsfm.io._separated_values import first_lines
@@ -45,10 +46,8 @@ def read_pts(path: Path) -> Landmarks:
             raise ValueError("there are no .pts files in the folder")
     tracks = []
     for file in files:
-        try:
+        with errors_of(file.name):
             tracks.append(_points_of(file.read_bytes().decode("utf-8-sig")))
-        except ValueError as error:
-            raise ValueError(f"{file.name}: {error}") from error
         if len(tracks[-1]) != len(tracks[0]):
             raise ValueError(
                 f"{files[0].name} has {len(tracks[0])} points, {file.name} has "
@@ -89,10 +88,8 @@ def read_wflw(path: Path) -> Landmarks:
                     f"line {number} has {len(fields)} fields; all must have "
                     f"{' or all '.join(map(str, _WFLW_LENGTHS))}"
                 )
-            try:
+            with errors_of(f"line {number}"):
                 rows.append(_floats(fields[:-1]))
-            except ValueError as error:
-                raise ValueError(f"line {number}: {error}") from error
             images.append(fields[-1])
     if not rows:
         raise ValueError("there are no lines in it")

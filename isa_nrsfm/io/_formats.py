@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from isa_nrsfm._compat.damaged_files import reading
+from isa_nrsfm._compat.damaged_files import errors_of, reading
 
 if TYPE_CHECKING:
     import os
@@ -204,10 +204,8 @@ def read_landmarks(
     landmarks = FORMATS[name].read(path, **options)
     if min_confidence is None:
         return landmarks
-    try:
+    with errors_of(str(path)):
         return landmarks.without_unsure_points(min_confidence)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def find_format(path: "str | os.PathLike[str]") -> str:

@@ -217,8 +217,7 @@ class PooledFastICA(BaseSubspaceAnalysis):
             tol=self.tol,
             w_init=start,
         )
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as caught:
             ica.fit(Z.T)
         converged = not any(w.category is ConvergenceWarning for w in caught)
         return orthogonalise(ica.components_[None])[0], ica.n_iter_, converged
