@@ -12,21 +12,8 @@ CAMERA_NAMES = ("affine", *CALIBRATED_CAMERAS)
 INDEPENDENCE = ("shapes", "coefficients")
 LOSSES = ("linear", "huber", "cauchy")
 # The layouts in `isa_nrsfm.skeletons.SKELETONS`, in that order.
-SKELETON_NAMES = (
-    "ibug-68",
-    "ibug-51",
-    "xm2vts-68",
-    "xm2vts-53",
-    "muct-76",
-    "muct-61",
-    "wflw-98",
-    "wflw-65",
-    "mediapipe-face-468",
-    "mediapipe-face-478",
-    "hand-21",
-    "coco-17",
-    "h36m-17",
-    "body-25",
-    "mediapipe-pose-33",
-    "coco-wholebody-133",
+SKELETON_NAMES = tuple(
+    "ibug-68 ibug-51 xm2vts-68 xm2vts-53 muct-76 muct-61 wflw-98 wflw-65 "
+    "mediapipe-face-468 mediapipe-face-478 hand-21 coco-17 h36m-17 body-25 "
+    "mediapipe-pose-33 coco-wholebody-133".split()
 )

@@ -424,22 +424,15 @@ class AffineNRSfMCV(
         MetadataRouter
             From `fit` to the splitter and the scorer, from `score` to the scorer.
         """
-        both = MethodMapping().add(caller="fit", callee="score")
-        return (
-            MetadataRouter(owner=self)
-            .add(
-                estimator=self._estimator(),
-                method_mapping=MethodMapping().add(caller="fit", callee="fit"),
-            )
-            .add(
-                splitter=self._splitter(),
-                method_mapping=MethodMapping().add(caller="fit", callee="split"),
-            )
-            .add(
-                scorer=self._scorer(),
-                method_mapping=both.add(caller="score", callee="score"),
-            )
+        fit, split, score = (
+            MethodMapping().add(caller="fit", callee=callee)
+            for callee in ("fit", "split", "score")
         )
+        score.add(caller="score", callee="score")
+        router = MetadataRouter(owner=self)
+        router.add(estimator=self._estimator(), method_mapping=fit)
+        router.add(splitter=self._splitter(), method_mapping=split)
+        return router.add(scorer=self._scorer(), method_mapping=score)
 
     def __sklearn_tags__(self) -> Any:
         """Return the tags of the estimator that is fitted."""

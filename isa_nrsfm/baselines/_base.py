@@ -24,7 +24,7 @@ from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._gauge.canonical import canonical_rotation
 from isa_nrsfm._prepare.checks import validated_table
 from isa_nrsfm._prepare.scaling import scaled_table
-from isa_nrsfm._tables.sources import checked_range, open_table
+from isa_nrsfm._tables.sources import CHECKS, checked_range, open_table
 from isa_nrsfm._tables.tracks import (
     LAYOUTS,
     Layout,
@@ -269,8 +269,7 @@ class ShapeSequenceNRSfM(
             self,
             X,
             self.layout,
-            dtype=[np.float64, np.float32],
-            ensure_all_finite="allow-nan",
+            **CHECKS,
             ensure_min_samples=fewest,
             ensure_min_features=fewest,
             reset=reset,

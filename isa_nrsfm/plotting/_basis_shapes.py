@@ -340,9 +340,7 @@ class BasisShapeDisplay:
                 for artists, offset, colour, label in shapes:
                     style = {"color": colour, "label": label} | points
                     shape = (mean + offset)[:, view]
-                    artists.append(
-                        self._draw(axis, shape, style, edges, sided=not block)
-                    )
+                    artists.append(self._draw(axis, shape, style, edges, not block))
                 if block and not is_dense(mean):
                     start, offset = mean[:, view], drift[block - 1][:, view]
                     arrows = axis.quiver(*start.T, *offset.T, **arrow_kw)
@@ -357,13 +355,7 @@ class BasisShapeDisplay:
         return self
 
     def _draw(
-        self,
-        axis: Any,
-        points: NDArray,
-        style: dict[str, Any],
-        edge_kw: dict[str, Any],
-        *,
-        sided: bool,
+        self, axis: Any, points: NDArray, style: Any, edge_kw: Any, sided: bool
     ) -> Any:
         """Draw one shape in one view, the mean shape with colours of the sides."""
         if self.skeleton is not None:

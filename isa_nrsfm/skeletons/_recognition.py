@@ -23,10 +23,8 @@ LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "openface": ("ibug-68", "ibug-51"),
         "pyfeat": ("ibug-68", "ibug-51", "mediapipe-face-478"),
         "mediapipe": (
-            "mediapipe-face-468",
-            "mediapipe-face-478",
-            "hand-21",
-            "mediapipe-pose-33",
+            *("mediapipe-face-468", "mediapipe-face-478"),
+            *("hand-21", "mediapipe-pose-33"),
         ),
         "pts": ("ibug-68", "ibug-51"),
         "wflw": ("wflw-98", "wflw-65"),
