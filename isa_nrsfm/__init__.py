@@ -30,16 +30,4 @@ if TYPE_CHECKING:
     )
     from isa_nrsfm.isa import FastISA as FastISA, PooledFastICA as PooledFastICA
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "_estimator": "AffineNRSfM",
-            "_selection.estimator": "AffineNRSfMCV",
-            "_frames.models": "Decomposition",
-            "_transformer": "SmoothedCoefficients",
-            "analysis": "WithinGroups association",
-            "isa": "FastISA PooledFastICA",
-        },
-        subpackages="analysis baselines calibration cli datasets export io isa metrics "
-        "plotting skeletons",
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -95,13 +95,21 @@ def test_a_name_is_asked_for_once(monkeypatch):
     assert vars(isa_nrsfm)["FastISA"] is FastISA
 
 
-def test_the_error_of_an_import_comes_through(monkeypatch):
+def test_the_error_of_an_import_comes_through(tmp_path, monkeypatch):
+    package = tmp_path / "of_absent_names"
+    package.mkdir()
+    text = "if __name__ == '':\n    from of_absent_names._absent import Absent\n"
+    (package / "__init__.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delenv("EAGER_IMPORT", raising=False)
-    find, _, _ = lazy_names("isa_nrsfm.isa", {"_absent": "Absent"})
-    refused(r"isa_nrsfm\.isa\._absent", find, "Absent", error=ModuleNotFoundError)
+    importlib.import_module(package.name)
+    find, _, names = lazy_names(package.name)
+    assert names == ["Absent"]
+    absent = r"of_absent_names\._absent"
+    refused(absent, find, "Absent", error=ModuleNotFoundError)
     monkeypatch.setenv("EAGER_IMPORT", "1")
-    with pytest.raises(ModuleNotFoundError, match=r"isa_nrsfm\.isa\._absent"):
-        lazy_names("isa_nrsfm.isa", {"_absent": "Absent"})
+    refused(absent, lazy_names, package.name, error=ModuleNotFoundError)
+    del sys.modules[package.name]
 
 
 @pytest.mark.subprocess

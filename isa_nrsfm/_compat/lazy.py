@@ -1,11 +1,12 @@
 """Public names that are imported when they are first used (SPEC 1).
 
-An ``__init__.py`` lists them under `TYPE_CHECKING` and for `lazy_names`.
+An ``__init__.py`` imports them under `TYPE_CHECKING`, which `lazy_names` reads.
 """
 
+import ast
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -14,33 +15,40 @@ EAGER = "EAGER_IMPORT"
 
 
 def lazy_names(
-    package: str, names: Mapping[str, str], subpackages: str = ""
+    package: str,
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package with lazy names.
 
-    `names` maps modules of the package to their public names, and `subpackages` are
-    folders, with blanks between them. Errors of imports are raised unchanged, and at
-    once if `EAGER_IMPORT` is set.
+    Names that are imported from the package itself are folders. Errors of imports are
+    raised unchanged, and at once if `EAGER_IMPORT` is set.
     """
-    namespace, folders = vars(sys.modules[package]), subpackages.split()
-    modules = {name: module for module in names for name in names[module].split()}
+    namespace = vars(sys.modules[package])
+    source = ast.parse(namespace["__loader__"].get_source(package))
+    modules = {
+        alias.name: str(node.module)
+        for block in source.body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
 
     def imported(name: str) -> Any:
-        if name in folders:
-            return import_module(f"{package}.{name}")
         if name not in modules:
             raise AttributeError(
                 f"module {package!r} has no attribute {name!r}",
                 name=name,
                 obj=sys.modules[package],
             )
-        namespace[name] = getattr(import_module(f"{package}.{modules[name]}"), name)
+        if modules[name] == package:
+            return import_module(f"{package}.{name}")
+        namespace[name] = getattr(import_module(modules[name]), name)
         return namespace[name]
 
     def listed() -> list[str]:
-        return sorted({*namespace, *modules, *folders})
+        return sorted({*namespace, *modules})
 
     if os.environ.get(EAGER):
-        for name in (*modules, *folders):
+        for name in modules:
             imported(name)
-    return imported, listed, list(modules)
+    return imported, listed, [name for name in modules if modules[name] != package]

@@ -30,14 +30,4 @@ if TYPE_CHECKING:
     )
     from isa_nrsfm.export._viewer import write_viewer as write_viewer
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "_gltf": "write_glb",
-            "_point_distribution": "PointDistributionModel point_distribution_model "
-            "read_pdm write_pdm",
-            "_poses": "FramePoses frame_poses point_distances pose_function",
-            "_shape_arrays": "ShapeArrays shape_arrays write_shapes",
-            "_viewer": "write_viewer",
-        },
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -25,14 +25,4 @@ if TYPE_CHECKING:
         write_table as write_table,
     )
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "_formats": "FORMATS LandmarkFormat find_format read_landmarks",
-            "_landmarks": "Landmarks",
-            "_models": "load_model save_model",
-            "_results": "from_mediapipe from_movement",
-            "_stored_tables": "open_table",
-            "_tables": "LandmarkTable landmark_table read_table write_table",
-        },
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

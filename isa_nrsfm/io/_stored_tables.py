@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._compat.damaged_files import reading
 from isa_nrsfm._compat.optional import import_optional
-from isa_nrsfm._compat.texts import by_number
+from isa_nrsfm._compat.texts import by_number, first_items
 from isa_nrsfm._tables.blocks import read_rows
 from isa_nrsfm._tables.sources import StoredTable
 
@@ -70,8 +70,7 @@ def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
     if len(kinds) > 1 or not kinds <= set(SUFFIXES):
         raise ValueError(
             f"{path} must be or hold files of one kind, {' or '.join(SUFFIXES)}; got "
-            + ", ".join(file.name for file in files[:4])
-            + (", ..." if len(files) > 4 else "")
+            f"{first_items(file.name for file in files)}"
         )
     if kinds == {".parquet"}:
         return _open_parquet(files)

@@ -299,10 +299,9 @@ class ReprojectionDisplay:
         self.reprojected_: list[Any] = []
         self.errors_: list[Any] = []
         self.edges_: list[Any] = []
+        styles = [style or {} for style in (observed_kw, reprojected_kw, edge_kw)]
         for i, axes in enumerate(self.axes_):
-            self._plot_frame(
-                axes, i, observed_kw or {}, reprojected_kw or {}, edge_kw or {}
-            )
+            self._plot_frame(axes, i, *styles)
         if new_figure:
             add_legend(
                 self.figure_,
@@ -321,15 +320,9 @@ class ReprojectionDisplay:
         aspect = np.divide(height, width, out=np.ones_like(width), where=width > 0)
         return PANEL_WIDTH * float(np.clip(np.median(aspect), 0.4, 1.3))
 
-    def _plot_frame(
-        self,
-        axes: Any,
-        i: int,
-        observed_kw: dict[str, Any],
-        reprojected_kw: dict[str, Any],
-        edge_kw: dict[str, Any],
-    ) -> None:
+    def _plot_frame(self, axes: Any, i: int, *styles: dict[str, Any]) -> None:
         """Draw one frame."""
+        observed_kw, reprojected_kw, edge_kw = styles
         observed, reprojected = self.observed[i], self.reprojected[i]
         if self.skeleton is not None:
             colours = side_colours(self.skeleton.edge_sides, PLUS_COLOUR)
