@@ -178,7 +178,7 @@ def fit_ready_table(
             ConvergenceWarning,
         )
     # 6. Measures of the fit
-    unit, fit = estimator._model.unit or 1.0, estimator._model
+    unit, fit = table.unit or 1.0, estimator._model
     estimator.mean_shape_, estimator.basis_ = fit.mean_shape, fit.basis
     estimator.camera_, estimator._n_features_out = estimator.camera, len(fit.basis)
     estimator.rank_floor_ = factorised.triplets.rest_share
@@ -359,7 +359,7 @@ def _paper_frames(
 
     def fitted(mean_shape: NDArray, basis: NDArray) -> TableModel:
         frames = RigidFrames(mean_shape, basis, estimator.camera)
-        return _table_model(estimator, table, frames, mean_shape, basis)
+        return TableModel(frames, mean_shape, basis, estimator.layout, table.unit)
 
     # Frames are fitted with the stored (rounded) shapes, so that transform agrees.
     gauge, frames = rigid_gauge(
@@ -436,7 +436,7 @@ def _joint_frames(
         alpha,
         estimator.independence,
         estimator.camera,
-        float(table.sizes[0]) if estimator.camera == "orthographic" else None,
+        table.unit if estimator.camera == "orthographic" else None,
     )
     certainty = frames.certainty
     if estimator.refinement == "consensus":
@@ -451,24 +451,13 @@ def _joint_frames(
     )
     shown = Decomposition(*map(np.concatenate, zip(*parts, strict=True)))
     mean_shape, basis = (each.astype(table.dtype) for each in gauge[:2])
-    estimator._model = _table_model(estimator, table, frames, mean_shape, basis)
+    estimator._model = TableModel(
+        frames, mean_shape, basis, estimator.layout, table.unit
+    )
     cameras = shown.motion / table.sizes[:, None, None]
     estimator.mode_covariance_ = mode_covariance(cameras, shown.alpha)
-    unit = estimator._model.unit or 1.0
-    estimator.noise_variance_ = unit**2 * frames.noise_variance
+    estimator.noise_variance_ = (table.unit or 1.0) ** 2 * frames.noise_variance
     estimator.reliability_ = reliabilities(
         alpha, covariance, *(sum(part) for part in chance)
     )
     return shown._replace(translation=shown.translation + table.translation)
-
-
-def _table_model(
-    estimator: TableTransformer,
-    table: ScaledTable,
-    frames: RigidFrames | PosteriorFrames,
-    mean_shape: NDArray,
-    basis: NDArray,
-) -> TableModel:
-    """Return the fitted model for the rows of a table."""
-    unit = None if estimator.frames_scaled_ else float(table.sizes[0])
-    return TableModel(frames, mean_shape, basis, estimator.layout, unit)

@@ -89,10 +89,7 @@ class TableModel(NamedTuple):
         return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
 
     def reconstruct(
-        self,
-        rows: NDArray,
-        metric: DeformationMetric | None = None,
-        scaled: bool = False,
+        self, rows: NDArray, metric: DeformationMetric | None, scaled: bool
     ) -> NDArray:
         """Return the shapes (n, n_points, 3) of frames.
 

@@ -37,12 +37,7 @@ class FitProgress:
     """
 
     def __init__(
-        self,
-        estimator: Any,
-        stages: Sequence[str],
-        *,
-        stepwise: Sequence[str],
-        **data: Any,
+        self, estimator: Any, stages: list[str], *, stepwise: Sequence[str], **data: Any
     ):
         self.about = {"estimator": estimator, **data}
         self.left = list(stages)

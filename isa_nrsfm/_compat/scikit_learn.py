@@ -4,11 +4,15 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from sklearn.base import BaseEstimator, _fit_context
-from sklearn.utils import _param_validation, _safe_indexing, parallel, validation
+from sklearn.utils import _param_validation, _safe_indexing as taken_rows
+from sklearn.utils._param_validation import (
+    HasMethods as HasMethods,
+    StrOptions as StrOptions,
+)
+from sklearn.utils.parallel import _get_threadpool_controller as threadpool_controller
+from sklearn.utils.validation import _num_samples as number_of_rows
 
-HasMethods, StrOptions = _param_validation.HasMethods, _param_validation.StrOptions
-threadpool_controller = parallel._get_threadpool_controller
-taken_rows, number_of_rows = _safe_indexing, validation._num_samples
+__all__ = ["number_of_rows", "taken_rows", "threadpool_controller"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

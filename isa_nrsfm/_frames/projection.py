@@ -9,18 +9,14 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 
 
 def reprojection_error(
-    rows: FrameBlocks,
-    shapes: NDArray,
-    motion: NDArray,
-    position: NDArray,
-    alpha: NDArray,
+    W: FrameBlocks, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> float:
     """Return the inverse SNR ``||W - W_hat||_F^2 / ||W||_F^2`` over the visible points.
 
     Frames of W, blocks (n, 2, J), are below centred. Motion (n, 2, 3), position (n, 2)
     and alpha (n, K) are those of all frames, shapes (K + 1, 3, J).
     """
-    found = rows.map(partial(_energies, shapes=shapes), motion, position, alpha)
+    found = W.map(partial(_energies, shapes=shapes), motion, position, alpha)
     noise, signal = np.sum(list(found), axis=0)
     return float(noise / signal)
 
@@ -43,15 +39,11 @@ def _sum_of_squares(values: NDArray) -> float:
 
 
 def distances(
-    tracks: NDArray,
-    shapes: NDArray,
-    motion: NDArray,
-    translation: NDArray,
-    alpha: NDArray,
+    tracks: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
     """Return distances (n, J) of points (n, J, 2) from a model, NaN if missing."""
     stacked = shapes.transpose(0, 2, 1)
-    model = project(compose(stacked[0], stacked[1:], alpha), motion, translation)
+    model = project(compose(stacked[0], stacked[1:], alpha), motion, position)
     return np.linalg.norm(tracks - model, axis=2)
 
 

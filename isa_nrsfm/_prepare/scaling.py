@@ -37,6 +37,7 @@ class ScaledTable(NamedTuple):
     rows: blocks (I, 2, J) of centred frames of size one, NaN where not seen.
     sizes, n_seen (I,): divisors of the frames, and their numbers of visible points.
     translation (I, 2): centroids of visible points, or medians with a robust loss.
+    unit: the common size of all frames, None if each has its own.
     precision: rounding error of the coordinates of the table, relative to its frames.
     dtype: number type of the given table.
     weights (I, J): numbers of observations of the points, zero where not seen; None
@@ -50,6 +51,7 @@ class ScaledTable(NamedTuple):
     translation: NDArray
     n_seen: NDArray
     n_points: int
+    unit: float | None
     precision: float
     dtype: Any
     weights: NDArray | None = None
@@ -148,6 +150,7 @@ def scaled_table(
         translation,
         n_seen,
         n_points,
+        None if scale_frames else float(size[0]),
         float(np.sqrt(np.mean((spacing / size) ** 2))),
         dtype,
         weights,

@@ -119,12 +119,11 @@ class ShapeSequenceNRSfM(
             column names that contradict `layout`.
         """
         X = self._checked(X, reset=True)
-        names = getattr(self, "feature_names_in_", None)
         table = scaled_table(
             open_table(X),
             self.n_components,
             layout=self.layout,
-            names=names,
+            names=getattr(self, "feature_names_in_", None),
             scale_frames=self.scale_frames,
             robust=False,
         )
@@ -145,7 +144,7 @@ class ShapeSequenceNRSfM(
         self.inverse_snr_ = float(error / np.mean(W**2))
 
         # Without the scaling of frames the shapes have the unit of the table.
-        self._unit = 1.0 if self.scale_frames else float(sizes[0])
+        self._unit = table.unit or 1.0
         scales = (sizes / self._unit)[:, None, None]
         dtype = X.dtype
         self.mean_shape_ = (self._unit * mean_shape).astype(dtype)
