@@ -189,8 +189,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         Returns
         -------
         ndarray of shape (n_frames, n_components)
-            Coefficients; those of the fitted table are `alpha_`. NaN for rows with too
-            few visible points.
+            Coefficients; `alpha_` for the fitted table. NaN for rows with too few
+            visible points.
         """
         table, weights = self._weighted(X, point_weight)
         coefficients = partial(self._model.decompose, deviations=False)
@@ -358,9 +358,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         Returns
         -------
         shapes : ndarray of shape (n_frames, n_points, 3)
-            Shapes in their own axes, not those of the camera. NaN for rows with too few
-            visible points. If `camera` is given for an affine model, each shape is
-            rotated as near as possible to the mean shape.
+            Shapes in their own axes, not in the axes of the camera. NaN for rows with
+            too few visible points. If `camera` is given for an affine model, each shape
+            is rotated as near as possible to the mean shape.
         depth_std : ndarray of shape (n_frames, n_points)
             Only with `return_std`. Standard deviations of the coordinates of the points
             along the viewing direction of their frame, in the units of the shapes. They

@@ -87,7 +87,7 @@ def _held(
 ) -> tuple[NDArray, NDArray]:
     """Return packed ``H + s2 I`` (n_pairs, n) and minus half the gradient (K, n).
 
-    T and the cameras M are those of `affine_cameras` for alpha (K, n).
+    T and the cameras M come from `affine_cameras` for alpha (K, n).
     """
     Q = camera_gram(M)
     held = problem.products.gram.energies(Q)[len(T) :]

@@ -86,7 +86,7 @@ class CalibratedSearch(FrameSearch):
     def start(self, problem: FrameProblem, alpha: NDArray) -> NDArray:
         """Return calibrated cameras (2, 3, n) near the affine ones for alpha (K, n).
 
-        The better one of the nearest camera and that of `_completed` is taken.
+        The better of the nearest and the `_completed` camera is taken.
         """
         M = affine_cameras(problem.products, with_one(alpha))[2]
         starts = calibrated_starts(self.model, M)
@@ -190,7 +190,7 @@ class CalibratedSearch(FrameSearch):
 
 
 def calibrated_starts(model: CameraModel, M: NDArray) -> list[NDArray]:
-    """Return the nearest cameras and those of `_completed`, of affine M (2, 3, n)."""
+    """Return the nearest and the `_completed` cameras of affine cameras M (2, 3, n)."""
     rows, scales = nearest_calibrated(frames_first(M))
     starts = (frames_last(rows), scales), _completed(M)
     return [scale * rows if model.scaled else rows for rows, scale in starts]

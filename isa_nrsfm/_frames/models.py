@@ -118,7 +118,7 @@ class RigidFrames(NamedTuple):
 
     Shapes are centred, ``B_k B_l^T = 0`` (3x3) for different k and l, with the mean
     shape as B_0. If no point is missing, each coefficient is then fitted by itself.
-    Calibrated cameras are the nearest to those of the rigid fit.
+    Calibrated cameras are the nearest to the cameras of the rigid fit.
     """
 
     mean_shape: NDArray

@@ -127,7 +127,7 @@ class State(NamedTuple):
         return type(self)(*(of_frames(each, frames) for each in self))
 
     def inverse(self) -> NDArray:
-        """Return inverse Hessians (p, p, n), where indefinite those of `definite`."""
+        """Return inverse Hessians (p, p, n), or of `definite` where indefinite."""
         inverse, positive = invert_positive(self.hessian)
         bad = in_lanes(np.flatnonzero(~positive))
         if len(bad):
@@ -269,7 +269,7 @@ class FrameSearch:
     ) -> FramePosterior:
         """Return the minima that chosen frames reach from coefficients (n_chosen, K).
 
-        Rough cameras need not be those of the lowest minimum.
+        Rough cameras may belong to a higher minimum.
         """
         fits = FramePosterior.unknown(len(chosen), initial.shape[1], covariances)
         # Enough frames to be worth the calls, few enough for the cache

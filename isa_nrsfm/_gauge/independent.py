@@ -35,7 +35,7 @@ def independent_gauge(
 ) -> tuple[Gauge, FrameMap]:
     """Return the independent basis of a fit as a gauge, and the map of frames to it.
 
-    Shapes (K + 1, 3, J) are centred, cameras (I, 2, 3) those of frames of size one.
+    Shapes (K + 1, 3, J) are centred. Cameras (I, 2, 3) belong to frames of size one.
     "shapes" makes basis shapes independent over the points, "coefficients" makes
     coefficients independent over the frames. None takes the principal axes. `unit` is
     the size in `euclidean_space`.

@@ -341,10 +341,10 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
 
 
 def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:
-    """Return coordinates (I, 3, n) of all points, merged from those of the groups.
+    """Merge the coordinates of the groups into those of all points (I, 3, n).
 
-    Depths by least squares, each group up to its mean. x and y are those of the images,
-    less a share of the residual. Missing points have those of the groups.
+    Depths are found by least squares, each group up to its mean. x and y are taken from
+    the images, less a share of the residual; for missing points, from the groups.
     """
     n_frames, _, n_points = scene.first.shape
     # The joint fit is a further group of small weight.

@@ -89,7 +89,7 @@ def shown_frames(
     motion, alpha = posterior.motion, posterior.alpha
     X = stacked_motion(motion, alpha).reshape(len(alpha), 2, -1)
     Z = X @ uncertainty
-    # Degrees of freedom of the residual, minus those of the shapes
+    # Degrees of freedom of the residual, without the parameters of the shapes
     leverage = np.einsum("irp,irp->i", X, Z)
     n_pose = 2 + CAMERAS[frames.camera].n_parameters
     mean = weight / n_seen

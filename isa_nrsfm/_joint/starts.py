@@ -85,7 +85,7 @@ def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
     """Return shapes (K + 1, 3, J) that fit calibrated cameras and rows (I, 2, J).
 
     The mean shape solves the least squares problem ``(sum_i M_i^T M_i) B_0 = sum_i
-    M_i^T W_i``. The others are those of `extended_shapes`.
+    M_i^T W_i``. `extended_shapes` computes the basis shapes.
     """
     gram = np.einsum("ira,irb->ab", motion, motion)
     right = np.einsum("ira,irj->aj", motion, rows)

@@ -44,8 +44,8 @@ def block_triplets(
     """
     Return the k leading triplets of a matrix in blocks of frames (n, ..., n_columns).
 
-    The right singular vectors of a tall matrix are those of its triangular factor,
-    joined from those of the blocks (Demmel, Grigori, Hoemmen, Langou,
+    The right singular vectors of a tall matrix equal those of its triangular factor,
+    which is assembled from the factors of the blocks (Demmel, Grigori, Hoemmen, Langou,
     "Communication-optimal parallel and sequential QR and LU factorizations", 2012). For
     a matrix with many rows and columns, a block Krylov method finds the leading right
     subspace (Golub, Van Loan, "Matrix computations", 2013, section 10.3.6). As ``W^T

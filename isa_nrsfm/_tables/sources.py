@@ -13,7 +13,7 @@ from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._tables.blocks import DaskBlocks, FrameBlocks
 
 # Range of the coordinates of a frame: squares beyond it leave the range of double
-# precision. Fits at both ends agree with those of sizes about one.
+# precision. Fits at both ends agree with fits of sizes about one.
 LARGEST, SMALLEST = 2e153, 1e-150
 # What `check_array` checks in a table.
 CHECKS: dict[str, Any] = {

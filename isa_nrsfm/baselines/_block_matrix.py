@@ -124,8 +124,8 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as returned by `transform`: those of the
-        principal components, with the cameras of `decompose`.
+        Coefficients of the principal components for the fitted table, as returned by
+        `transform`, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)

@@ -136,7 +136,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         Price of a block when frames are coded, as a share of the energy of the frame,
         up to 0.25. An atom that would explain less than four times this share is not
         used. With a small one the residual is least, but frames are split into atoms
-        that nearly cancel, of which no cameras can be made unless the shapes are truly
+        that nearly cancel, which yield no cameras unless the shapes are truly
         sparse.
     max_iter : int, default=20
         The most sweeps of dictionary learning.
@@ -155,7 +155,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         the rotation of the camera from the frame before; if False, signs are chosen to
         make the shapes similar.
     random_state : int, RandomState instance or None, default=None
-        Draws the first atoms and, if there are more than 1000 frames, those of the
+        Draws the first atoms and, if there are more than 1000 frames, the frames of the
         relaxed problem. The result depends on it; an int makes it reproducible.
 
     Attributes
@@ -167,8 +167,8 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as returned by `transform`: those of the
-        principal components, with the cameras of `decompose`.
+        Coefficients of the principal components for the fitted table, as returned by
+        `transform`, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)
@@ -203,7 +203,7 @@ class CompressibleNRSfM(ShapeSequenceNRSfM):
 
     Notes
     -----
-    The steps are those of the publication: a group-sparse factorisation by the
+    The steps follow the publication: a group-sparse factorisation by the
     alternating direction method of multipliers, block K-SVD with reweighted ridge
     regression as its sparse coding, one 3x3 matrix for each atom from an eigenvector,
     orthogonal Procrustes problems along a chain of atoms, and shapes from the blocks

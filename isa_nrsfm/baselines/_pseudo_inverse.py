@@ -11,9 +11,9 @@ from isa_nrsfm.calibration import orthonormal_cameras
 
 
 def orthographic_cameras(W: NDArray, rank: int) -> NDArray:
-    """Return cameras (I, 2, 3) of W, the nearest to those of `orthonormal_cameras`.
+    """Return the orthographic cameras (I, 2, 3) nearest to `orthonormal_cameras` of W.
 
-    These are in the span of the first ``3 * rank`` left singular vectors.
+    The latter are in the span of the first ``3 * rank`` left singular vectors.
     """
     S, Vt, rest = leading_triplets(W, 3 * rank)
     n_columns = int(np.sum(S > OF_RANKS * S[0]))
@@ -77,8 +77,8 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
         Principal components of `shapes_`, by decreasing variance; one standard
         deviation each.
     alpha_ : ndarray of shape (n_frames, n_components)
-        Coefficients of the fitted table, as returned by `transform`: those of the
-        principal components, with the cameras of `decompose`.
+        Coefficients of the principal components for the fitted table, as returned by
+        `transform`, with the cameras of `decompose`.
     motion_ : ndarray of shape (n_frames, 2, 3)
         Cameras: orthonormal rows, with `scale_frames` times the size of the frame.
     translation_ : ndarray of shape (n_frames, 2)

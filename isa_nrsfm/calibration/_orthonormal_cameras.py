@@ -53,12 +53,12 @@ def orthonormal_cameras(
     Parameters
     ----------
     motion : array-like of shape (2 * n_frames, n_columns)
-        P, for each frame the row of x, then of y. At least three columns, those of most
-        energy first, such as left singular vectors of W. Without noise their scales do
-        not matter.
+        P, for each frame the row of x, then of y. At least three columns, by decreasing
+        energy, such as left singular vectors of W. Without noise their scales do not
+        matter.
     noise_variance : float, default=0.0
-        Variance of the errors of the entries of P. It is that of the entries of W if P
-        is its left singular vectors times its singular values.
+        Variance of the errors of the entries of P. It equals the variance for the
+        entries of W if P has its left singular vectors times its singular values.
     max_iter : int, default=2000
         Maximum number of steps for each number of columns.
 

@@ -15,7 +15,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv : sequence of str, optional
-        The arguments. By default those of the process.
+        The arguments. By default the arguments of the process.
 
     Returns
     -------

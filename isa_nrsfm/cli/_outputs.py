@@ -25,7 +25,7 @@ from isa_nrsfm.metrics._reprojection import frame_energies
 
 PAGE = "report.html"
 REPORT = "report.json"
-# The files of every fit and their contents, of which the text has the first clause.
+# The files of every fit and their contents. The text shows the first clause.
 RESULTS = {
     PAGE: "this report with its figures, for any browser",
     "model.npz": "the fitted model, for isa-nrsfm transform",
@@ -116,7 +116,7 @@ def write_results(
     drawn: dict[str, Any],
     **shown: Any,
 ) -> None:
-    """Write cameras, shapes, the viewer with what it shows, and the model.
+    """Write cameras, shapes, the viewer with the `shown` data, and the model.
 
     The cameras have a row for each frame, empty if it could not be fitted.
     """
@@ -206,7 +206,7 @@ def entry_of_report(folder: Path, name: str) -> dict[str, Any]:
 
 
 def digests_of(folder: Path, names: Iterable[str]) -> dict[str, str]:
-    """Return the digests of those of the files that are in a folder."""
+    """Return the digests of the named files that exist in a folder."""
     found = {}
     for name in names:
         if (folder / name).is_file():

@@ -1,4 +1,4 @@
-"""The report of a run as data, of which text, JSON and HTML are made."""
+"""The report of a run as data, rendered as text, JSON and HTML."""
 
 import contextlib
 import platform

@@ -86,7 +86,7 @@ def time_unit(column: "pd.Series", times: NDArray) -> str:
 
 
 def image_numbers(table: "pd.DataFrame") -> tuple[NDArray, str | None]:
-    """Return the number of the image of each row, and the column that tells it.
+    """Return the number of the image of each row, and the column that has it.
 
     It is the number of the frame, or of the image among all. Otherwise rows count.
     """

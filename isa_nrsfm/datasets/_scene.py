@@ -73,7 +73,7 @@ def observe(
     missing: float,
     layout: Layout,
 ) -> dict[str, Any]:
-    """Return the table of shapes seen by cameras, and what is true of it."""
+    """Return the table of shapes seen by cameras, and its ground truth."""
     clean = shapes @ motion.transpose(0, 2, 1) + translation[:, None]
     centred = clean - clean.mean(axis=1, keepdims=True)
     noise_variance = noise**2 * np.mean(centred**2)

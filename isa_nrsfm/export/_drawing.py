@@ -18,7 +18,7 @@ def choose_drawing(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return pairs of points or triangles to draw, and the side (n_points,) of points.
 
-    They are those of `edges`, otherwise those of the layout.
+    `edges` takes precedence over the layout.
     """
     links = np.empty((0, 2), dtype=np.intp)
     if edges is None or layout is None:

@@ -28,8 +28,8 @@ from isa_nrsfm.skeletons._skeleton import LEFT, MIDDLE, RIGHT, sides_of_edges
 FLOATS, SHORTS, INTEGERS = 5126, 5123, 5125
 VERTICES, INDICES = 34962, 34963
 POINTS, LINES, TRIANGLES = 0, 1, 4
-# Matt materials, seen from both sides: those of points and edges in the middle, on the
-# left and on the right, and that of surfaces.
+# Matt materials, seen from both sides: for points and edges in the middle, on the left
+# and on the right, and for surfaces.
 SURFACE = 3
 MATERIALS = [
     {

@@ -70,9 +70,8 @@ def write_viewer(
     path : str or path-like
         The file, with the suffix ``.html``. An existing file is replaced.
     X : array-like of shape (n_rows, 2 * n_points), default=None
-        The table whose frames are shown; by default the one that the model was fitted
-        to. Frames are named by their number, from 0, or by the index of a pandas
-        DataFrame.
+        The table whose frames are shown; by default the fitted table. Frames are named
+        by their number, from 0, or by the index of a pandas DataFrame.
     labels : array-like of shape (n_rows,), default=None
         Labels of the rows of the table, text or numbers, at most 30 different ones.
         They determine the colours of frames. Rows with None or NaN have no label.

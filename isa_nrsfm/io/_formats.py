@@ -66,7 +66,7 @@ class LandmarkFormat:
         Returns
         -------
         bool
-            Whether suffix and beginning are those of the format.
+            Whether suffix and beginning of the file match the format.
 
         Raises
         ------

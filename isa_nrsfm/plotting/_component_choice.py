@@ -27,8 +27,8 @@ class ComponentChoiceDisplay:
     chosen : int, default=None
         The number that was chosen, which is marked.
     held_out_error : bool, default=True
-        Whether scores are those of `AffineNRSfM.score`, that is, minus the held-out
-        errors. If True, the errors are drawn in percent.
+        Whether `AffineNRSfM.score` computed the scores, which are then minus the
+        held-out errors. If True, the errors are drawn in percent.
 
     Attributes
     ----------

@@ -38,7 +38,7 @@ IBUG_68 = Skeleton(
 
 
 def _without_contour(face: Skeleton, name: str, up: Pairs, front: Pairs) -> Skeleton:
-    """Return a face without its contour; pairs of points are those of the whole."""
+    """Return a face without its contour, with pairs of points of the whole face."""
     inner = replace(face, up=up, front=front).subset(face.inner)
     return replace(inner, name=name)
 
@@ -80,7 +80,7 @@ _XM2VTS_INNER: dict[str, Pairs] = {
 }
 XM2VTS_53 = _without_contour(XM2VTS_68, "xm2vts-53", **_XM2VTS_INNER)
 
-# Eight points more, between those of the eyelids.
+# Eight more points, between the points of the eyelids.
 _MUCT_EYES = (
     (27, 68, 28, 69, 29, 70, 30, 71, 27),
     (32, 72, 33, 73, 34, 74, 35, 75, 32),
@@ -130,7 +130,7 @@ WFLW_65 = _without_contour(
     WFLW_98, "wflw-65", up=((85, 51),), front=((60, 54), (72, 54))
 )
 
-# The contours of the mesh: those of the right side, and in the same order the left.
+# The contours of the mesh: the right side, and in the same order the left side.
 _RIGHT = (
     (33, 7, 163, 144, 145, 153, 154, 155, 133),  # lower and upper lid
     (33, 246, 161, 160, 159, 158, 157, 173, 133),
@@ -143,7 +143,7 @@ _LEFT = (
     (276, 283, 282, 295, 285),
     (300, 293, 334, 296, 336),
 )
-# Halves of those that go across, from the middle to the right, and to the left.
+# Halves of curves across the face, from the middle to the right, and to the left.
 _RIGHT_HALVES = (
     # The oval from the forehead to the chin.
     (

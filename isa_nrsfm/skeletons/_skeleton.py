@@ -22,15 +22,15 @@ class Skeleton:
     """
     A layout of landmarks: names, lines between points, left and right, the pose.
 
-    Points are named by their index in the layout. Left and right are those of the
-    person or animal, not of the viewer.
+    Points are named by their index in the layout. Left and right are
+    sides of the person or animal, not of the viewer.
 
     Parameters
     ----------
     name : str
         Name of the layout.
     kind : {"face", "hand", "body", "whole body", "other"}
-        What the points are on.
+        The object on which the points lie.
     n_points : int
         Number of points.
     curves : tuple of tuples of int
@@ -232,7 +232,7 @@ class Skeleton:
 
 
 def sides_of_edges(sides: NDArray, edges: NDArray) -> NDArray[np.intp]:
-    """Return the side of each edge by those of its ends; the middle where they differ.
+    """Return the side of each edge: the common side of its ends, otherwise the middle.
 
     An edge from the middle to a side is on that side.
     """
