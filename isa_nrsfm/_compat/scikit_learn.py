@@ -29,7 +29,7 @@ class ShownEstimator(BaseEstimator):
     """Estimators that notebooks show by `_html_repr`, also with scikit-learn 1.6."""
 
     def _repr_html_inner(self) -> str:
-        """Return what `_repr_html_` returns."""
+        """Return the text of `_repr_html_`."""
         return self._html_repr()
 
     def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:

@@ -253,8 +253,8 @@ def refine_metric(
 
     Cameras (I, 2, 3) are finite and not zero, alpha is (I, K).
     """
-    # The unknowns of a step are coordinates in this basis: of E_0, which is zero at each
-    # iterate, and of the strains E_k.
+    # The unknowns of a step are coordinates in this basis: of E_0, which is zero at
+    # each iterate, and of the strains E_k.
     basis = strain_basis(camera)
     size = len(basis)
     ridges = np.repeat([0.0, ridge], [size, size * alpha.shape[1]])

@@ -1,6 +1,6 @@
 """Tables of landmarks, their tracks, and the visible points of frames.
 
-A *table* has one row a frame and two columns a point, shape ``(n_frames,
+A *table* has one row per frame and two columns per point, shape ``(n_frames,
 2 * n_points)``, in either layout of the columns. *Tracks* are the same numbers as
 ``(n_frames, n_points, 2)``. A point that is not seen in a frame is NaN.
 """

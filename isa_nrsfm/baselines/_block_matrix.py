@@ -81,7 +81,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
     Block matrix method of non-rigid structure from motion.
 
     The method finds orthographic cameras R_i, then shapes S_i that reproduce the images
-    and are mixtures of few shapes: their matrix S, one row a frame, has the least
+    and are mixtures of few shapes: their matrix S, one row per frame, has the least
     nuclear norm ``||S||_*``. Row i, reshaped to (n_points, 2), is modelled as::
 
         shapes_[i] @ motion_[i].T + translation_[i]
@@ -132,7 +132,7 @@ class BlockMatrixNRSfM(ShapeSequenceNRSfM):
         Centroids of the frames, in the units of the table.
     shapes_ : ndarray of shape (n_frames, n_points, 3)
         Shapes of the frames, centred, of rank ``n_components + 1`` as a matrix with
-        one row a frame. In the units of the table or, with `scale_frames`, of frames
+        one row per frame. In the units of the table or, with `scale_frames`, of frames
         of size one.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled

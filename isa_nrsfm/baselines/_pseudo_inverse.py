@@ -34,7 +34,7 @@ def least_norm_shapes(W: NDArray, cameras: NDArray) -> NDArray:
 
 
 def truncate_rank(shapes: NDArray, rank: int) -> NDArray:
-    """Return the nearest shapes whose matrix, one row a frame, has this rank."""
+    """Return the nearest shapes whose matrix, one row per frame, has this rank."""
     U, S, Vt = np.linalg.svd(shapes.reshape(len(shapes), -1), full_matrices=False)
     return ((U[:, :rank] * S[:rank]) @ Vt[:rank]).reshape(shapes.shape)
 
@@ -85,7 +85,7 @@ class PseudoInverseNRSfM(ShapeSequenceNRSfM):
         Centroids of the frames, in the units of the table.
     shapes_ : ndarray of shape (n_frames, n_points, 3)
         Shapes of the frames, centred, of rank ``n_components + 1`` as a matrix with
-        one row a frame. In the units of the table or, with `scale_frames`, of frames
+        one row per frame. In the units of the table or, with `scale_frames`, of frames
         of size one.
     inverse_snr_ : float
         ``||W - What||_F^2 / ||W||_F^2``, a fraction, with W the centred tracks, scaled

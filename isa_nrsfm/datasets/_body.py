@@ -69,7 +69,7 @@ def make_body_tracks(
     camera : {"weak_perspective", "affine", "orthographic"}, default="weak_perspective"
         Camera model. The camera moves smoothly around the person within 80, 20 and 8
         degrees of yaw, pitch and roll to either side. Weak-perspective and affine
-        cameras have 0.2 to 0.5 pixels a millimetre, orthographic cameras their
+        cameras have 0.2 to 0.5 pixels per millimetre, orthographic cameras their
         geometric mean. Affine cameras also stretch each image, see `make_face_tracks`.
     noise : float, default=0.005
         Standard deviation of the Gaussian noise that is added to every coordinate,
@@ -92,7 +92,7 @@ def make_body_tracks(
             The table in pixels, with noise, NaN where a point is not seen. y points
             down.
         tracks : ndarray of shape (n_frames, 17, 2)
-            The same numbers, one (x, y) pair a point.
+            The same numbers, one (x, y) pair per point.
         clean : ndarray of shape (n_frames, 17, 2)
             The tracks without noise, complete.
         visible : ndarray of shape (n_frames, 17), dtype=bool
@@ -105,7 +105,7 @@ def make_body_tracks(
             Their mean. The shapes are no linear function of a few coefficients: joints
             turn.
         motion : ndarray of shape (n_frames, 2, 3)
-            The cameras, in pixels a millimetre.
+            The cameras, in pixels per millimetre.
         translation : ndarray of shape (n_frames, 2)
             The centroids in pixels.
         angles : ndarray of shape (n_frames, 3)
@@ -115,7 +115,7 @@ def make_body_tracks(
         groups : ndarray of shape (n_frames,), dtype=int
             The number of the person, from 0. Each has lengths of bones of their own.
         time : ndarray of shape (n_frames,)
-            Seconds since the person was first seen, at 25 frames a second.
+            Seconds since the person was first seen, at 25 frames per second.
         noise_variance : float
             Variance of the noise in one coordinate, in squared pixels.
         feature_names : list of str

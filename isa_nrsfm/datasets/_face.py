@@ -90,7 +90,7 @@ def make_face_tracks(
             The table in pixels, with noise, NaN where a point is not seen. y points
             down.
         tracks : ndarray of shape (n_frames, 68, 2)
-            The same numbers, one (x, y) pair a point.
+            The same numbers, one (x, y) pair per point.
         clean : ndarray of shape (n_frames, 68, 2)
             The tracks without noise, complete.
         visible : ndarray of shape (n_frames, 68), dtype=bool
@@ -107,7 +107,7 @@ def make_face_tracks(
             The coefficients, independent of each other; each has zero mean and unit
             variance over the frames.
         motion : ndarray of shape (n_frames, 2, 3)
-            The cameras, in pixels a millimetre.
+            The cameras, in pixels per millimetre.
         translation : ndarray of shape (n_frames, 2)
             The centroids of the faces in pixels, uniform in x from 320 to 960 and y
             from 240 to 720.
@@ -129,10 +129,10 @@ def make_face_tracks(
         labels : ndarray of shape (n_frames,), dtype=str
             The strongest expression of each face, "rest" where there is none.
         groups : ndarray of shape (n_frames,), dtype=int
-            The number of the person: 0, it is always the same one.
+            The number of the person, which is always 0.
         time : ndarray of shape (n_frames,)
-            Seconds, of a video with 25 frames a second. The faces do not depend on it:
-            they are in no order.
+            Seconds of a video with 25 frames per second. The faces are in no order and
+            do not depend on it.
         angles : ndarray of shape (n_frames, 3)
             Yaw, pitch and roll in degrees, the rotations about the y, x and z axes
             that are applied in this order. Positive yaw turns the nose to the left of

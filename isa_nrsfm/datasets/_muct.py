@@ -96,7 +96,7 @@ def fetch_muct(
         target : ndarray or Series of shape (n_frames,)
             The same as `subjects`.
         tracks : ndarray of shape (n_frames, 68, 2)
-            The same numbers as in `data`, one (x, y) pair a point.
+            The same numbers as in `data`, one (x, y) pair per point.
         visible : ndarray of shape (n_frames, 68), dtype=bool
             False where a point is missing.
         subjects : ndarray of shape (n_frames,), dtype=int

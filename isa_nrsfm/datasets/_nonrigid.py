@@ -105,7 +105,7 @@ def make_nonrigid_tracks(
         data : ndarray of shape (n_frames, 2 * n_points)
             The table, with noise, NaN where a point is not seen.
         tracks : ndarray of shape (n_frames, n_points, 2)
-            The same numbers, one (x, y) pair a point.
+            The same numbers, one (x, y) pair per point.
         clean : ndarray of shape (n_frames, n_points, 2)
             The tracks without noise, complete.
         visible : ndarray of shape (n_frames, n_points), dtype=bool

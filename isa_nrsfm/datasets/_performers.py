@@ -54,7 +54,8 @@ def film(
 ) -> tuple[NDArray, NDArray, NDArray]:
     """Return yaw, pitch and roll in degrees, the motion and translation of a path.
 
-    The path (n, 6) is between -1 and 1, `scales` are the least and most pixels a unit.
+    The path (n, 6) is between -1 and 1. `scales` are the smallest and the largest
+    number of pixels per unit.
     """
     angles = path[:, :3] * largest_angles
     shortest, longest = np.log(scales)
@@ -69,7 +70,7 @@ def film(
 
 def wander(time: NDArray, n: int, rng: RandomState) -> NDArray[np.float64]:
     """Return n smooth functions of time, (len(time), n), between -1 and 1."""
-    frequency = rng.uniform(0.08, 0.35, (2, n))  # waves a second
+    frequency = rng.uniform(0.08, 0.35, (2, n))  # waves per second
     phase = rng.uniform(0, 2 * np.pi, (2, n))
     waves = np.sin(2 * np.pi * frequency * time[:, None, None] + phase)
     return 0.6 * waves[:, 0] + 0.4 * waves[:, 1]

@@ -64,7 +64,7 @@ def fetch_shark(
         data : ndarray of shape (240, 182)
             The table x_0, y_0, x_1, ..., in the units of `shapes`.
         tracks : ndarray of shape (240, 91, 2)
-            The same numbers, one (x, y) pair a point.
+            The same numbers, one (x, y) pair per point.
         shapes : ndarray of shape (240, 91, 3)
             The true points of every frame in the coordinates of its camera, not
             centred: `tracks` are the first two of them. They turn with the camera, so

@@ -18,7 +18,7 @@ class Landmarks:
     """
     Landmarks read from a file or from the results of another program.
 
-    All tables have one row a frame and the same index, 0, 1, .... Where a frame shows
+    All tables have one row per frame and the same index, 0, 1, .... Where a frame shows
     several individuals, each has a row of its own.
 
     Parameters

@@ -31,7 +31,7 @@ class LandmarkTable(NamedTuple):
     Parameters
     ----------
     points : DataFrame of shape (n_frames, 2 * n_points)
-        The landmarks, float64, one row a frame, columns x0, y0, x1, y1, ... under
+        The landmarks, float64, one row per frame, columns x0, y0, x1, y1, ... under
         their names in the table. NaN marks a missing point.
     other : DataFrame of shape (n_frames, n_other)
         All other columns as they were.

@@ -127,11 +127,11 @@ def find_skeleton(
     n_points : int
         Number of points.
     names : sequence of length n_points, default=None
-        Names of the points. They are compared without regard to upper and lower case
-        and to what is neither letter nor digit; LShoulder is left_shoulder. Points that
-        are numbered in turn, such as 0, 1, ... or kp1, kp2, ..., have no names.
+        Names of the points. Only their letters and digits are compared, without regard
+        to case; LShoulder is left_shoulder. Points that are numbered in turn, such as
+        0, 1, ... or kp1, kp2, ..., have no names.
     reader : str, default=None
-        What has read the points, one of `io.FORMATS`.
+        Format of the file that the points were read from, one of `io.FORMATS`.
     shape : array-like of shape (n_points, 2) or (n_points, 3), default=None
         The points in an image, or of a mean shape in true proportions. Layouts whose
         edges would be long there do not fit; of two layouts of faces that would fit

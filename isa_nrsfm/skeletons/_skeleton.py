@@ -48,8 +48,8 @@ class Skeleton:
     front : tuple of pairs of int, default=()
         A point and one in front of it, likewise.
     across : tuple of pairs of int, default=()
-        Pairs of a right and a left point that determine the axis across, if not all of
-        `right` and `left` are to be taken, as those of arms and legs.
+        Pairs of a right and a left point that determine the axis across. By default all
+        pairs of `right` and `left`, which is wrong for points of arms and legs.
     contour : tuple of int, default=()
         Points that annotators place on the visible outline, such as the jaw of a face.
         They slide over the surface as the head turns: the pose changes their place on
