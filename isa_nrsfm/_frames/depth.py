@@ -45,9 +45,8 @@ class DepthCertainty(NamedTuple):
     @property
     def turning_deviation(self) -> float:
         """Standard deviation of the rotations out of the image plane, in radians."""
-        return (
-            np.nan if self.turns is None else float(self.turns[:2, :2].trace() ** 0.5)
-        )
+        turns = self.turns
+        return np.nan if turns is None else float(turns[:2, :2].trace() ** 0.5)
 
     @property
     def determined(self) -> bool:

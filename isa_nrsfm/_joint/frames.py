@@ -112,11 +112,10 @@ class JointFrames:
 
 def _totals(block: FrameTracks, repeated: bool) -> tuple[float, float]:
     """Return the number of observed coordinates of a block, and its energy."""
-    weights = block.weights
-    if repeated or weights is None:
-        return 2.0 * block.weight.sum(), block.energy.sum()
-    points = np.count_nonzero(weights)
-    return 2.0 * points, block.energy.sum()
+    n_seen = block.weight.sum()
+    if block.weights is not None and not repeated:
+        n_seen = np.count_nonzero(block.weights)
+    return 2.0 * n_seen, block.energy.sum()
 
 
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:

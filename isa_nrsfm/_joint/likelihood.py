@@ -87,8 +87,11 @@ class MarginalLikelihood:
     ) -> LikelihoodTerms:
         """Return the terms at shapes (n, 3, J), motion (I, 2, 3), noise variance s2."""
         terms = self._sums(shapes, motion, noise)
-        curvature = _kronecker_matrices(terms.shape_curvature, len(shapes))
-        columns = shapes.reshape(3 * len(shapes), -1).T[:, :, None]
+        # Matrices (n, size, size) from the sums, packed by shapes and by axes
+        size, packed = 3 * len(shapes), terms.shape_curvature
+        curvature = unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3)
+        curvature = curvature.reshape(-1, size, size)
+        columns = shapes.reshape(size, -1).T[:, :, None]
         pulled = (curvature @ columns)[:, :, 0].T.reshape(shapes.shape)
         value = terms.value + self.n_seen * np.log(noise)
         shape_gradient = terms.shape_gradient + (2 / noise) * pulled
@@ -204,9 +207,3 @@ def _frame_terms(
         motion_curvature=motion_curvature,
         alpha=alpha,
     )
-
-
-def _kronecker_matrices(packed: NDArray, n_shapes: int) -> NDArray:
-    """Return matrices (n, 3 n_shapes, 3 n_shapes), packed by shapes and by axes."""
-    size = 3 * n_shapes
-    return unpack3(unpacked(packed)).transpose(4, 0, 2, 1, 3).reshape(-1, size, size)

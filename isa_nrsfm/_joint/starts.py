@@ -183,9 +183,8 @@ def best_starts(
             before = trials[-1][0]
     # The best ones, with their cameras freed
     freed = []
-    for _, state, motion in sorted(trials, key=itemgetter(0))[
-        : None if thorough else 1
-    ]:
+    trials.sort(key=itemgetter(0))
+    for _, state, motion in trials if thorough else trials[:1]:
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
         motion[few] = fit.state.motion

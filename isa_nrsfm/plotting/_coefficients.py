@@ -211,11 +211,7 @@ class CoefficientsDisplay:
             ax = grid(n_components, 1, sharex=True, figsize=size)
         self.axes_ = check_axes(ax, n_components, "one for each basis shape")
         self.figure_ = self.axes_[0].figure
-        draw = {
-            "classes": self._draw_classes,
-            "number": self._draw_number,
-            "time": self._draw_time,
-        }[found]
+        draw = getattr(self, f"_draw_{found}")
         for k, axes in enumerate(self.axes_):
             draw(axes, k)
             axes.set_ylabel(self.component_names[k])
