@@ -3,6 +3,7 @@
 Readers are imported when a file is read: the help of the command line must not wait.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -13,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 from isa_nrsfm._compat.damaged_files import errors_of, reading
 
 if TYPE_CHECKING:
-    import os
-
     from isa_nrsfm.io._landmarks import Landmarks
 
 # A table with named columns, which any program may have written.
@@ -54,7 +53,7 @@ class LandmarkFormat:
     reader: str = field(repr=False)
     options: tuple[str, ...] = ()
 
-    def matches(self, path: "str | os.PathLike[str]") -> bool:
+    def matches(self, path: str | os.PathLike[str]) -> bool:
         """
         Return whether a file begins like one of this format.
 
@@ -86,7 +85,7 @@ class LandmarkFormat:
         )
         return found
 
-    def read(self, path: "str | os.PathLike[str]", **options: Any) -> "Landmarks":
+    def read(self, path: str | os.PathLike[str], **options: Any) -> "Landmarks":
         """
         Read a file of this format.
 
@@ -129,7 +128,7 @@ class LandmarkFormat:
 
 
 def read_landmarks(
-    path: "str | os.PathLike[str]",
+    path: str | os.PathLike[str],
     format: str = "auto",
     *,
     min_confidence: float | None = None,
@@ -208,7 +207,7 @@ def read_landmarks(
         return landmarks.without_unsure_points(min_confidence)
 
 
-def find_format(path: "str | os.PathLike[str]") -> str:
+def find_format(path: str | os.PathLike[str]) -> str:
     """
     Find the one format that a file is of.
 

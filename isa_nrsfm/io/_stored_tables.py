@@ -1,8 +1,9 @@
 """Tables in files that are read block by block, as they are needed."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,11 @@ from isa_nrsfm._compat.texts import by_number, first_items
 from isa_nrsfm._tables.blocks import read_rows
 from isa_nrsfm._tables.sources import StoredTable
 
-if TYPE_CHECKING:
-    import os
-
 SUFFIXES = (".npy", ".parquet")
 PARQUET = "a parquet file"
 
 
-def open_table(path: "str | os.PathLike[str]") -> "StoredTable | NDArray":
+def open_table(path: str | os.PathLike[str]) -> "StoredTable | NDArray":
     """
     Open a table that need not fit into memory.
 

@@ -1,8 +1,9 @@
 """Read tables of 2D landmarks from files, and take the landmarks out of them."""
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +16,6 @@ from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
 from isa_nrsfm.io._separated_values import SEPARATORS, checked_rows, read_parquet
-
-if TYPE_CHECKING:
-    import os
-
 
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
 _MISSING = ("", "na", "nan", "n/a", "null", "none")
@@ -41,7 +38,7 @@ class LandmarkTable(NamedTuple):
     other: "pd.DataFrame"
 
 
-def read_table(path: "str | os.PathLike[str]") -> "pd.DataFrame":
+def read_table(path: str | os.PathLike[str]) -> "pd.DataFrame":
     r"""
     Read a table from a csv, tsv or parquet file.
 
@@ -100,7 +97,7 @@ def parse_table(path: Path) -> "pd.DataFrame":
     return _read_text(path, SEPARATORS[suffix])
 
 
-def write_table(frame: "pd.DataFrame", path: "str | os.PathLike[str]") -> None:
+def write_table(frame: "pd.DataFrame", path: str | os.PathLike[str]) -> None:
     """
     Write a table to a csv, tsv or parquet file, without its index.
 
@@ -250,7 +247,7 @@ def confidences_in(
     return pd.DataFrame(found, index=frame.index) if found else None
 
 
-def table_suffix(path: "str | os.PathLike[str]") -> str:
+def table_suffix(path: str | os.PathLike[str]) -> str:
     """Return the suffix of a file, or raise if it is not that of a table."""
     suffix = Path(path).suffix
     if suffix.lower() not in TABLE_SUFFIXES:
