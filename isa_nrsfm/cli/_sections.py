@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from isa_nrsfm._compat.texts import as_utf8
+from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm._compat.whole_files import write_whole
 from isa_nrsfm._selection.choice import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
@@ -98,7 +98,7 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
         f"{table['n_points']} points in the columns {listed}",
     ]
     if table["absent_numbers"]:
-        absent = _listed(table["absent_numbers"], MOST_LISTED)
+        absent = first_items(table["absent_numbers"], MOST_LISTED)
         parts.append(f"the table has no points with the numbers {absent}")
     if table["coordinates_not_used"]:
         not_used = table["coordinates_not_used"].items()
@@ -388,7 +388,7 @@ def _class_means(label: dict[str, Any], names: Sequence[str]) -> list[str]:
         if means and p < 0.05:
             order = sorted(means, key=lambda each: -abs(means[each]))
             listed = [f"{each} {means[each]:+.1f}" for each in order]
-            shown = _listed(listed, MOST_CLASSES)
+            shown = first_items(listed, MOST_CLASSES)
             rest = " (all in report.json)" * (len(listed) > MOST_CLASSES)
             lines.append(f"{name}: {shown}{rest}.")
     return lines
@@ -414,7 +414,7 @@ def _time(time: dict[str, Any]) -> Section:
     fading = scales[np.isfinite(scales)]
     found = []
     if len(fading):
-        listed = _listed([f"{each:.3g}" for each in fading])
+        listed = first_items(f"{each:.3g}" for each in fading)
         found.append(f"changes of the shape fade within {listed} {time['unit']}")
     if lasting := len(scales) - len(fading):
         found.append(f"changes last in {lasting} of {len(scales)} directions")
@@ -428,11 +428,6 @@ def _shapes(model: dict[str, Any]) -> str:
     """Return how many basis shapes a model has."""
     n_components = model["n_components"]
     return f"{n_components} basis shape{'s' * (n_components != 1)}"
-
-
-def _listed(items: Sequence[Any], most: int = 4) -> str:
-    """List the first items."""
-    return ", ".join(map(str, items[:most])) + ", ..." * (len(items) > most)
 
 
 def _sentence(text: str) -> str:
