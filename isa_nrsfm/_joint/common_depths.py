@@ -30,8 +30,9 @@ from isa_nrsfm._linalg.small_matrices import (
 # 600 steps the error of yoga is .0119, .0114, .0110, .0106, .0106. With the share 1
 # instead of 0.2, and 60 steps, that of drink is .0063 instead of .0053.
 STEPS, LAST_SHARE = 100, 0.2
-# Weight of the first coordinates, or of the joint fit, among the groups. It only
-# matters for points that no group determines.
+# Weight of the first coordinates, or of the joint fit, among the groups. It matters
+# for points that no group determines. With 1e-2, 1e-3 and 1e-4 the error of yoga is
+# .0118, .0116, .0115.
 WEIGHT_OF_WHOLE = 1e-3
 
 
