@@ -48,18 +48,23 @@ def observed(x, rng, noise=0.3):
     half = rng.normal(size=(n_steps, n, n))
     precision = half @ half.swapaxes(1, 2) / noise**2
     root = np.linalg.cholesky(np.linalg.inv(precision))
-    seen = x + (root @ rng.normal(size=(n_steps, n, 1)))[..., 0]
+    off = (root @ rng.normal(size=(n_steps, n, 1)))[..., 0]
     change = np.diff(x, axis=0, prepend=0.0) + 0.1 * rng.normal(size=x.shape)
     change[:, :K] = 0.0
-    information = (precision @ (seen - np.cumsum(change, axis=0))[..., None])[..., 0]
-    return Observations(precision, information, change)
+    seen = x + off - np.cumsum(change, axis=0)
+    # The fits of frames by themselves have the prior N(0, I) of the coefficients.
+    posterior = precision + np.diag(np.arange(n) < K)
+    fit = np.linalg.solve(posterior, precision @ seen[..., None])[..., 0]
+    # Parameters of cameras are relative to these fits.
+    change[:, K:] += np.diff(fit[:, K:], axis=0, prepend=0.0)
+    fit[:, K:] = 0.0
+    return Observations(precision, fit, change)
 
 
 def alone(x, rng, noise=0.3):
     """Return frames by themselves of coefficients (n_frames, K), without cameras."""
-    precision, information, _ = observed(x, rng, noise)
+    precision, alpha, _ = observed(x, rng, noise)
     covariance = np.linalg.inv(precision + np.eye(K))
-    alpha = (covariance @ information[..., None])[..., 0]
     blank = np.zeros((len(x), 2, 3)), np.zeros((len(x), 2))
     return LinearisedFrames(
         *blank, alpha, covariance, precision, np.zeros((len(x), K, 2))
@@ -74,7 +79,7 @@ def without_cameras():
 def dense_posterior(data, dynamics):
     """Return mean, covariance and log-likelihood of all steps as one normal density."""
     F, Q, first, shown = dynamics.matrices()
-    n_steps, (n, size) = len(data.information), shown.shape
+    n_steps, (n, size) = len(data.fit), shown.shape
     prior, offset = np.zeros((n_steps, size, n_steps, size)), np.zeros(size)
     mean = np.zeros((n_steps, n))
     cov = first
@@ -91,13 +96,13 @@ def dense_posterior(data, dynamics):
     L = np.zeros((n_steps, n, n_steps, n))
     for t in range(n_steps):
         L[t, :, t] = data.precision[t]
-    L, mean, h = L.reshape(prior.shape), mean.ravel(), data.information.ravel()
+    L, far, fit = L.reshape(prior.shape), (mean - data.fit).ravel(), data.fit.ravel()
     growth = np.eye(len(prior)) + L @ prior
     covariance = np.linalg.solve(growth.T, prior.T).T
-    off = h - L @ mean
-    likelihood = mean @ (h + off) + off @ covariance @ off
+    off = fit - L @ far
+    likelihood = far @ (fit + off) + off @ covariance @ off
     likelihood = 0.5 * (likelihood - np.linalg.slogdet(growth)[1])
-    mean = (mean + covariance @ off).reshape(n_steps, n)
+    mean += (covariance @ off).reshape(n_steps, n)
     return mean, covariance.reshape(n_steps, n, n_steps, n), likelihood
 
 
@@ -155,9 +160,10 @@ class TestSmoother:
 
 
 class TestEstimation:
-    def test_finds_the_rates(self):
+    @pytest.mark.parametrize("noise", [0.2, 1e-6])
+    def test_finds_the_rates(self, noise):
         rng, true = np.random.default_rng(0), some_dynamics(1)
-        data = [observed(simulated(300, rng, true), rng, 0.2) for _ in range(3)]
+        data = [observed(simulated(300, rng, true), rng, noise) for _ in range(3)]
         found = estimated_dynamics(data, K, False, 100, 0.1)
         assert_allclose(found.rates, true.rates, atol=0.3)
         assert_allclose(found.walks, true.walks, atol=0.3)

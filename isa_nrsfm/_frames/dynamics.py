@@ -19,10 +19,11 @@ Parameters of cameras are integrated random walks, ``(w, v)_t+1 = (w + v, v)_t``
 noise of the covariance ``q [[1/3, 1/2], [1/2, 1]]``. They are relative to the camera of
 each frame by itself.
 
-A frame is observed through its likelihood as a function of its coefficients and camera,
-a normal density with the precision L_t and the information vector h_t. All rates, b and
-q maximise the likelihood of the sequences. Its gradient is the expected gradient of the
-joint density of states and frames (Fisher's identity).
+A frame is observed through its likelihood as a function of its coefficients and camera.
+Near the fit ``f_t = (alpha_t, 0)`` of the frame by itself, its logarithm at ``f_t + d``
+is ``f_t^T d - d^T L_t d / 2``: the gradients of likelihood and prior cancel there. All
+rates, b and q maximise the likelihood of the sequences. Its gradient is the expected
+gradient of the joint density of states and frames (Fisher's identity).
 
 References: Hartikainen, Sarkka, "Kalman filtering and smoothing solutions to temporal
 Gaussian process regression models", 2010; Rauch, Tung, Striebel, "Maximum likelihood
@@ -55,9 +56,9 @@ STRONG_EVIDENCE = 3.0
 # Least and largest rates per step. At the largest one, the correlation of neighbouring
 # frames is below 0.001. At the least one, the variance of w_t is above rounding errors.
 LEAST_RATE, LARGEST_RATE = 1e-3, 10.0
-# Prior variance of the camera of the first frame, in units of the posterior variance of
-# the camera of a frame by itself: not informative, and above rounding errors.
-UNKNOWN = 1e6
+# Prior variance of the camera of the first frame and of its change, in units of their
+# mean squares: not informative, and above rounding errors.
+UNKNOWN = 1e2
 # Logarithm of the rate from which the search starts.
 FIRST_RATE = np.log(0.3)
 # Covariance of an integrated random walk after one step
@@ -67,12 +68,12 @@ WALK = np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
 class Observations(NamedTuple):
     """Likelihoods of the frames of a sequence, coefficients first, then cameras.
 
-    L_t (n_steps, p, p), h_t (n_steps, p), and the changes (n_steps, p) of the origin of
-    the parameters from the frame before.
+    L_t (n_steps, p, p) and f_t (n_steps, p), zero for unseen frames, and the changes
+    (n_steps, p) of the origin of the parameters from the frame before.
     """
 
     precision: NDArray
-    information: NDArray
+    fit: NDArray
     change: NDArray
 
 
@@ -167,13 +168,18 @@ def smoothed_frames(
     known = np.isfinite(alone.alpha).all(axis=1)
     if not known.any():
         return None
-    # Parameters of cameras in units of their conditional standard deviations
-    precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
-    precision[:K] = 1.0
-    scale = 1.0 / np.sqrt(np.where(precision > 0, precision, 1.0))
     origins, observed = zip(
-        *(_observations(alone, camera, scale, known, *each) for each in sequences),
-        strict=True,
+        *(_observations(alone, camera, known, *each) for each in sequences), strict=True
+    )
+    # Parameters of cameras in units of their changes and deviations
+    precision = np.median(np.diagonal(alone.precision[known], 0, 1, 2), axis=0)
+    square = np.mean(np.concatenate([each.change for each in observed]) ** 2, axis=0)
+    square += np.divide(1.0, precision, where=precision > 0, out=0.0 * precision)
+    square[:K], square[square == 0] = 1.0, 1.0
+    scale = np.sqrt(square)
+    observed = tuple(
+        Observations(scale[:, None] * L * scale, fit / scale, change / scale)
+        for L, fit, change in observed
     )
     # Differences between groups are not taken for dynamics.
     intercepts = numbers is not None and bool(numbers.any())
@@ -198,7 +204,6 @@ def smoothed_frames(
 def _observations(
     alone: LinearisedFrames,
     camera: CameraModel,
-    scale: NDArray,
     known: NDArray,
     rows: NDArray,
     steps: NDArray,
@@ -207,7 +212,7 @@ def _observations(
 
     The origin is the last known row, before the first one the first one.
     """
-    n_steps, n, K = steps[-1] + 1, len(scale), alone.alpha.shape[1]
+    n_steps, (_, n, _), K = steps[-1] + 1, alone.precision.shape, alone.alpha.shape[1]
     data = Observations(
         np.zeros((n_steps, n, n)), np.zeros((n_steps, n)), np.zeros((n_steps, n))
     )
@@ -215,36 +220,31 @@ def _observations(
     chosen, at = rows[seen], steps[seen]
     if not len(chosen):
         return rows, data
-    precision, alpha = alone.precision[chosen], alone.alpha[chosen]
-    # At the posterior mode the likelihood has the gradient alpha.
-    information = np.einsum("ipk,ik->ip", precision[:, :, :K], alpha)
-    information[:, :K] += alpha
-    data.precision[at] = scale[:, None] * precision * scale
-    data.information[at] = scale * information
+    data.precision[at], data.fit[at, :K] = alone.precision[chosen], alone.alpha[chosen]
     if len(chosen) > 1:
         motion = frames_last(alone.motion[chosen])
         between = camera.steps_between(motion[..., :-1], motion[..., 1:])
-        data.change[at[1:], K:] = between.T / scale[K:]
+        data.change[at[1:], K:] = between.T
     return chosen[np.maximum(np.cumsum(seen) - 1, 0)], data
 
 
 def smoothed(observed: Observations, dynamics: Dynamics) -> Smoothed:
     """Return the posterior of a sequence: Kalman filter and smoother."""
     F, Q, first, shown = dynamics.matrices()
-    n_steps, n = observed.information.shape
+    n_steps, n = observed.fit.shape
     mean, covariance = np.empty((n_steps, len(F))), np.empty((n_steps, *F.shape))
     change = observed.change @ np.eye(n, len(F))
     m, P, log_likelihood = np.zeros(len(F)), first, 0.0
     # Filter: prediction, then update by ``P - P H^T (I + L S)^-1 L H P``, S = H P H^T
-    for t, (L, h, _) in enumerate(zip(*observed, strict=True)):
+    for t, (L, fit, _) in enumerate(zip(*observed, strict=True)):
         if t:
             m, P = F @ m - change[t], F @ P @ F.T + Q
-        across, seen = shown @ P, shown @ m
-        growth, off = np.eye(n) + L @ across @ shown.T, h - L @ seen
+        across, far = shown @ P, shown @ m - fit
+        growth, off = np.eye(n) + L @ across @ shown.T, fit - L @ far
         solved = np.linalg.solve(growth, np.column_stack([L @ across, off]))
         step = across.T @ solved[:, -1]
-        # Integral of exp(h^T x - x^T L x / 2) over the predicted density
-        square = seen @ (h + off) + off @ shown @ step
+        # Integral of the likelihood over the predicted density
+        square = far @ (fit + off) + off @ shown @ step
         log_likelihood += 0.5 * float(square - np.linalg.slogdet(growth)[1])
         m, P = m + step, _symmetric(P - across.T @ solved[:, :-1])
         mean[t], covariance[t] = m, P
@@ -278,7 +278,7 @@ def estimated_dynamics(
     tol: float,
 ) -> Dynamics | None:
     """Return the most likely dynamics of sequences; None without strong evidence."""
-    n_walks = sequences[0].information.shape[1] - n_components
+    n_walks = sequences[0].fit.shape[1] - n_components
     lengths = n_components, n_walks, n_components * intercepts
     splits = np.cumsum(lengths)[:-1]
 
@@ -293,7 +293,7 @@ def estimated_dynamics(
     found = []
     for least in np.log([LEAST_RATE, LARGEST_RATE]):
         start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
-        limits = [(least, np.log(LARGEST_RATE)), (-14.0, 14.0), (-7.0, 7.0)]
+        limits = [(least, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
         bounds = [limits[i] for i in np.repeat([0, 1, 2], lengths)]
         options = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
         found.append(
