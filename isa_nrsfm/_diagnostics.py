@@ -304,7 +304,7 @@ def camera_meaning(ratio: float) -> str:
             "the cameras are probably not calibrated: the images were stretched, or "
             "there are far too few basis shapes"
         )
-    return f"{what} (noise variance {ratio:.3g} times that of affine cameras)"
+    return f"{what} (noise variance {ratio:#.3g} times that of affine cameras)"
 
 
 def camera_advice(camera: str, ratio: float, determined: bool) -> str:
