@@ -581,7 +581,7 @@ BAD_TABLES = {
     ),
     "one frame": (TABLE[:1], "minimum of 2 is required|at least 8 frames"),
     "one dimension": (TABLE[0], "Expected 2D array, got 1D array"),
-    "three dimensions": (FACES.tracks, r"one row a frame .*: give X\.reshape"),
+    "three dimensions": (FACES.tracks, r"one row per frame .*: give X\.reshape"),
     "text": (np.full(TABLE.shape, "a"), "could not convert|not compatible"),
     "complex numbers": (TABLE + 1j, "Complex data not supported"),
 }

@@ -439,7 +439,7 @@ def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
         table = eval(way, {"X": X})
         np.testing.assert_array_equal(table, expected.reshape(N, -1))
     for X in (tracks[None], np.zeros((30, 12, 3))):
-        refused(r"one row a frame .* got the shape .*\)$", estimator.fit, X)
+        refused(r"one row per frame .* got the shape .*\)$", estimator.fit, X)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet"])

@@ -42,8 +42,8 @@ def check_table(X: Any, layout: Layout) -> None:
         order = ".swapaxes(1, 2)" * ((layout == "planar") != (shape[-1] != 2))
         way = f": give X{order}.reshape(len(X), -1)"
         raise ValueError(
-            "X must be a table with one row a frame and two columns a point; got the "
-            f"shape {shape}{way if len(shape) == 3 and 2 in shape[1:] else ''}"
+            "X must be a table with one row per frame and two columns per point; got "
+            f"the shape {shape}{way if len(shape) == 3 and 2 in shape[1:] else ''}"
         )
     names = getattr(X, "columns", None)
     if names is not None:

@@ -33,7 +33,7 @@ def open_table(
     if X.ndim != 2:
         raise ValueError(
             f"Expected 2D array, got {X.ndim}D array instead: a table has one row "
-            "a frame and two columns a point"
+            "per frame and two columns per point"
         )
     n_columns = max(X.shape[1], 1)
     if is_on_dask(X):
