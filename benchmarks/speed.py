@@ -101,7 +101,19 @@ def measured(X, scale_frames):
 
 def heading(rows, candidate, reference):
     """Print the heading of a table of ratios."""
-    print(f"{rows:22}{'min':>8}{'median':>8}{'max':>8}{candidate:>10}{reference:>9}")
+    print(f"{rows:30}{'min':>8}{'median':>8}{'max':>8}{candidate:>10}{reference:>9}")
+
+
+def compare(title, candidate, reference, n_pairs, against="", measure=seconds):
+    """Print the ratios of a candidate to a reference, and their milliseconds."""
+    least, median, most, own, other = paired_ratio(
+        candidate, reference, n_pairs, measure=measure
+    )
+    print(
+        f"{title:30}{least:8.2f}{median:8.2f}{most:8.2f}"
+        f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {against}".rstrip(),
+        flush=True,
+    )
 
 
 def fits(options):
@@ -119,38 +131,24 @@ def fits(options):
                 scale_frames=case.scale_frames,
                 random_state=0,
             )
-            least, median, most, fit, svd = paired_ratio(
+            compare(
+                case.title,
                 lambda model=model, X=X: model.fit(X),
                 lambda W=W: np.linalg.svd(W, full_matrices=False),
                 options.pairs,
-            )
-            print(
-                f"{case.title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
-                f"{1e3 * fit:10.1f}{1e3 * svd:9.1f}",
-                flush=True,
             )
 
 
 def large(options):
     """Fits of large tables: many frames, and many points with and without gaps."""
     heading("", "fit ms", "ms of")
-
-    def line(title, candidate, reference, what):
-        least, median, most, own, other = paired_ratio(
-            candidate, reference, options.pairs
-        )
-        print(
-            f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
-            f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {what}",
-            flush=True,
-        )
-
     X = make_nonrigid_tracks(8000, 68, n_components=9, noise=0.02, random_state=0).data
     W, model = measured(X, True), AffineNRSfM(9, random_state=0)
-    line(
+    compare(
         "8000 x 68, K=9",
         partial(model.fit, X),
         partial(np.linalg.svd, W, full_matrices=False),
+        options.pairs,
         "thin SVD",
     )
     X = make_nonrigid_tracks(
@@ -158,16 +156,18 @@ def large(options):
     ).data
     W, model = measured(X, True), AffineNRSfM(8, random_state=0)
     for dtype in (np.float64, np.float32):
-        line(
+        compare(
             f"2500 x 7308, {np.dtype(dtype)}",
             partial(model.fit, X.astype(dtype)),
             partial(randomized_svd, W.astype(dtype), 27, n_iter=4, random_state=0),
+            options.pairs,
             "randomized_svd",
         )
-    line(
+    compare(
         "5 % missing",
         partial(model.fit, with_holes(X, 0.05)),
         partial(model.fit, X),
+        options.pairs,
         "complete",
     )
 
@@ -233,15 +233,7 @@ def frames(options):
     """
     n_pairs = max(options.pairs, FRAME_PAIRS)
 
-    def line(title, candidate, reference, unit):
-        least, median, most, own, other = paired_ratio(candidate, reference, n_pairs)
-        print(
-            f"{title:26}{least:8.2f}{median:8.2f}{most:8.2f}"
-            f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {unit}",
-            flush=True,
-        )
-
-    heading(f"{N_FRAMES:<26}", "ms", "ms of")
+    heading(f"{N_FRAMES}", "ms", "ms of")
     for camera in ("weak_perspective", "affine"):
         X = make_nonrigid_tracks(
             N_FRAMES, 68, n_components=9, noise=0.02, camera=camera, random_state=0
@@ -252,12 +244,13 @@ def frames(options):
         svd = partial(np.linalg.svd, measured(X, True), full_matrices=False)
         for title, table in tables.items():
             title, transform = f"{camera[:6]} {title}", partial(model.transform, table)
-            line(title, transform, svd, "SVD")
-            line(f"{title}, 2 jobs", partial(two.transform, table), transform, "1 job")
+            compare(title, transform, svd, n_pairs, "SVD")
+            other = partial(two.transform, table)
+            compare(f"{title}, 2 jobs", other, transform, n_pairs, "1 job")
     for title, table in tables.items():
         rows = [table[i : i + 1] for i in range(SINGLE)]
         singles = partial(each, model.transform, rows)
-        line(f"{SINGLE} single, {title}", singles, svd, "SVD")
+        compare(f"{SINGLE} single, {title}", singles, svd, n_pairs, "SVD")
     growth, peak = heap_after_stream(model, tables["20 % missing"], STREAM)
     print(
         f"stream of {STREAM} frames: {growth} bytes kept, {peak / 1e3:.0f} kB at most"
@@ -494,14 +487,7 @@ def start(options):
             ("fit --help", [*package, "fit", "--help"], "python", nothing),
             ("transform, one frame", transform, "imports", imports),
         ):
-            least, median, most, own, other = paired_ratio(
-                command, reference, options.pairs, measure=process_seconds
-            )
-            print(
-                f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
-                f"{1e3 * own:10.1f}{1e3 * other:9.1f}  {against}",
-                flush=True,
-            )
+            compare(title, command, reference, options.pairs, against, process_seconds)
 
 
 def threads(options):
@@ -523,18 +509,41 @@ def threads(options):
                 ("transform", lambda: model.transform(X)),
                 ("BlockMatrixNRSfM", lambda: BlockMatrixNRSfM(4).fit(body)),
             ):
-                least, median, most, two, one = paired_ratio(
+                compare(
+                    title,
                     partial(with_threads, 2, function),
                     partial(with_threads, 1, function),
                     options.pairs,
                 )
-                print(
-                    f"{title:22}{least:8.2f}{median:8.2f}{most:8.2f}"
-                    f"{1e3 * two:10.1f}{1e3 * one:9.1f}",
-                    flush=True,
-                )
         finally:
             busy.kill()
+
+
+def jobs(options):
+    """Two jobs, relative to one."""
+    heading("", "two, ms", "one, ms")
+    X = make_nonrigid_tracks(8000, 68, n_components=9, noise=0.02, random_state=0).data
+    dense = make_nonrigid_tracks(2500, 7308, 8, noise=0.02, random_state=0).data
+    long, model = np.tile(X, (40, 1)), AffineNRSfM(9, random_state=0)
+    cases = [
+        ("transform, 320,000 x 68", model.fit(X), "transform", long),
+        ("fit, 320,000 x 68", model, "fit", long),
+        ("fit, 2500 x 7308", AffineNRSfM(8, random_state=0), "fit", dense),
+    ]
+    yoga = load_table(YOGA)
+    if yoga is not None:
+        body = AffineNRSfM(
+            "auto", camera="orthographic", refinement="consensus", random_state=0
+        )
+        cases.append(("consensus, yoga", body, "fit", yoga))
+    for title, one, method, table in cases:
+        one, two = (copy.copy(one).set_params(n_jobs=number) for number in (1, 2))
+        compare(
+            title,
+            partial(getattr(two, method), table),
+            partial(getattr(one, method), table),
+            options.pairs,
+        )
 
 
 SECTIONS = {
@@ -548,6 +557,7 @@ SECTIONS = {
     "optima": optima,
     "fastisa": fastisa_iteration,
     "threads": threads,
+    "jobs": jobs,
 }
 
 if __name__ == "__main__":
