@@ -57,9 +57,9 @@ class SmoothedCoefficients(NamedTuple):
     alpha_std : ndarray of shape (n_frames, n_components)
         Posterior standard deviations.
     time_scales : ndarray of shape (n_components,) or (0,)
-        Time scales T of the coefficients, the longest first, in the units of `time`:
-        the correlation after a time t is ``(1 + t / T) exp(-t / T)``. Infinite for 1000
-        frames or more. Empty if the frames show no dynamics.
+        Time scales T of directions of the coefficients, the longest first, in the units
+        of `time`: the correlation after a time t is ``(1 + t / T) exp(-t / T)``.
+        Infinite for 1000 steps or more. Empty if the coefficients show no dynamics.
     decomposition : Decomposition
         Smoothed cameras, positions and coefficients, for `AffineNRSfM.reconstruct` and
         exports. Cameras are filled in, positions are NaN if too few points are visible.
@@ -231,8 +231,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
 
         Coefficients are Gaussian processes in time, cameras are integrated random
         walks, both estimated from the table. Each frame has the weight of its
-        likelihood: frames with few visible points have little weight. The fit of the
-        shapes does not depend on the order of the frames: smoothing is a step after it.
+        likelihood: frames with few visible points have little weight, with less than
+        six none. The fit of the shapes does not depend on the order of the frames:
+        smoothing is a step after it.
 
         Parameters
         ----------
@@ -245,8 +246,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             If None, consecutive frames are one step apart.
         groups : array-like of shape (n_frames,), default=None
             Person, video or scene of each frame. Smoothing does not cross groups.
-            Each has its own intercept, so that differences between people are not taken
-            for dynamics. None for one group.
+            Each sequence has its own intercept, so that differences between people are
+            not taken for dynamics. None for one group.
         max_gap : int, default=30
             Largest gap, in steps, across which coefficients are smoothed.
         max_iter : int, default=100
@@ -272,9 +273,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         The processes have the Matern covariance of order 3/2 (Hartikainen, Sarkka,
         2010). Coefficients and camera of a frame are observed through its likelihood,
         linearised at the fit of `transform` (Rauch, Tung, Striebel, 1965). Time scales
-        and variances maximise the likelihood. If the evidence for dynamics is weak, as
-        for photos in any order, the result is that of `transform`. With groups, the
-        likelihood is compared with that of groups with intercepts alone.
+        and variances maximise the likelihood. If the evidence for dynamics of the
+        coefficients is weak, as for photos in any order, the result is that of
+        `decompose`: the likelihood is compared with that of intercepts alone.
         """
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)

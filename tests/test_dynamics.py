@@ -3,6 +3,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
+from scipy.special import logit
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
@@ -24,10 +25,10 @@ K = 3
 OPTIONS = {"max_gap": 10, "max_iter": 100, "tol": 0.1}
 
 
-def some_dynamics(n_walks=0, intercepts=False):
+def some_dynamics(n_walks=0, share=0.3, n_shares=K):
     """Return dynamics of K coefficients, and of parameters of cameras."""
     rates, walks = np.log([0.05, 0.3, 2.0]), np.linspace(-1.0, 1.0, n_walks)
-    return Dynamics(rates, walks, np.array([-1.0, 0.0, 0.5])[: K * intercepts])
+    return Dynamics(rates, walks, np.full(n_shares, logit(share)))
 
 
 def simulated(n_steps, rng, dynamics=None):
@@ -108,7 +109,7 @@ def dense_posterior(data, dynamics):
 
 class TestDynamics:
     def test_coefficients_have_the_matern_covariance(self):
-        dynamics = some_dynamics()
+        dynamics = some_dynamics(n_shares=0)
         rate = np.exp(dynamics.rates)
         F, Q, first, shown = dynamics.matrices()
         assert_allclose(F @ first @ F.T + Q, first, atol=1e-15)
@@ -119,17 +120,20 @@ class TestDynamics:
             across = F @ across
 
     def test_intercepts_keep_variance_one(self):
-        _, _, first, shown = some_dynamics(2, intercepts=True).matrices()
+        _, _, first, shown = some_dynamics(2).matrices()
         assert_allclose((shown @ first @ shown.T)[:K, :K], np.eye(K))
 
 
 class TestSmoother:
     @pytest.mark.parametrize("gaps", [False, True])
-    @pytest.mark.parametrize(("n_walks", "intercepts"), [(0, False), (2, True)])
+    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
     def test_is_the_posterior_of_the_joint_normal_distribution(
-        self, gaps, n_walks, intercepts
+        self, gaps, n_walks, n_shares
     ):
-        rng, dynamics = np.random.default_rng(0), some_dynamics(n_walks, intercepts)
+        rng, dynamics = (
+            np.random.default_rng(0),
+            some_dynamics(n_walks, n_shares=n_shares),
+        )
         data = observed(rng.normal(size=(9, K + n_walks)), rng)
         if gaps:
             for each in data[:2]:
@@ -143,9 +147,12 @@ class TestSmoother:
         assert_allclose(got.covariance, expected, atol=atol)
         assert_allclose(got.log_likelihood, likelihood)
 
-    @pytest.mark.parametrize(("n_walks", "intercepts"), [(0, False), (2, True)])
-    def test_gradient_is_that_of_the_likelihood(self, n_walks, intercepts):
-        rng, dynamics = np.random.default_rng(1), some_dynamics(n_walks, intercepts)
+    @pytest.mark.parametrize(("n_walks", "n_shares"), [(0, 0), (2, K)])
+    def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares):
+        rng, dynamics = (
+            np.random.default_rng(1),
+            some_dynamics(n_walks, n_shares=n_shares),
+        )
         data = observed(rng.normal(size=(9, K + n_walks)), rng)
         splits = np.cumsum([len(each) for each in dynamics])[:-1]
 
@@ -162,7 +169,7 @@ class TestSmoother:
 class TestEstimation:
     @pytest.mark.parametrize("noise", [0.2, 1e-6])
     def test_finds_the_rates(self, noise):
-        rng, true = np.random.default_rng(0), some_dynamics(1)
+        rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
         data = [observed(simulated(300, rng, true), rng, noise) for _ in range(3)]
         found = estimated_dynamics(data, K, False, 100, 0.1)
         assert_allclose(found.rates, true.rates, atol=0.3)
@@ -185,6 +192,14 @@ class TestPeople:
         frames = alone(x, rng)
         assert (
             smoothed_frames(frames, without_cameras(), None, person, **OPTIONS) is None
+        )
+
+    @pytest.mark.parametrize("groups", [None, np.zeros(150)])
+    def test_photos_of_one_unusual_person_have_none(self, groups):
+        rng = np.random.default_rng(0)
+        frames = alone(1.5 + 0.4 * rng.normal(size=(150, K)), rng)
+        assert (
+            smoothed_frames(frames, without_cameras(), None, groups, **OPTIONS) is None
         )
 
     def test_videos_of_people_are_smoothed(self):
@@ -343,6 +358,20 @@ class TestSmooth:
         mixed = np.argsort(np.tile(np.arange(80), 2), kind="stable")
         other = model.smooth(table[mixed], groups=groups[mixed], max_iter=5, tol=0.0)
         assert_allclose(other.alpha, found.alpha[mixed], atol=1e-10)
+
+    def test_frames_of_four_points_have_no_weight(self, waving):
+        model, table = waving
+        few, blank = table.copy(), table.copy()
+        few.reshape(160, 20, 2)[50, 4:], blank[50] = np.nan, np.nan
+        assert_allclose(model.smooth(few).alpha, model.smooth(blank).alpha, atol=1e-12)
+
+    def test_groups_without_points_have_no_coefficients(self, waving):
+        model, table = waving
+        groups = np.repeat([0, 1], [120, 40])
+        unseen = np.where(groups[:, None] == 1, np.nan, table)
+        found = model.smooth(unseen, groups=groups)
+        assert found.time_scales.shape == (2,)
+        assert_allclose(np.isnan(found.alpha).any(axis=1), groups == 1)
 
     @pytest.mark.parametrize("n_seen", [0, 1])
     def test_too_few_frames_stay_as_they_are(self, waving, n_seen):

@@ -10,10 +10,10 @@ It is the first entry of the state ``(x, y)``, y the scaled derivative of x, wit
     (x, y)_t+1 = F (x, y)_t + w_t,  F = exp(-l) [[1 + l, l], [-l, 1 - l]],
     w_t ~ N(0, I - F F^T),  (x, y)_1 ~ N(0, I).
 
-So frames by themselves have the prior N(0, I) of the fit. With sequences of several
-people a coefficient is ``x_t + u``. The variance of the process is 1 - b then, and the
-intercept u of a sequence is drawn from N(0, b): differences between people are not
-taken for dynamics.
+A coefficient is ``x_t + u``. The intercept u of a sequence is drawn from N(0, b), and
+the variance of the process is 1 - b: frames by themselves have the prior N(0, I) of the
+fit. So differences between people are not taken for dynamics. A single sequence has an
+intercept in the alternative without dynamics only.
 
 Parameters of cameras are integrated random walks, ``(w, v)_t+1 = (w + v, v)_t`` plus
 noise of the covariance ``q [[1/3, 1/2], [1/2, 1]]``. They are relative to the camera of
@@ -94,8 +94,8 @@ class Dynamics(NamedTuple):
         rate, one = np.exp(self.rates), np.eye(2)[:, :, None]
         F = np.array([[1 + rate, rate], [-rate, 1 - rate]]) * np.exp(-rate)
         Q = one - np.einsum("abk,cbk->ack", F, F)
-        within = 1.0 - self.between if len(self.shares) else 1.0
-        processes = np.stack([F, within * Q, within * one * np.ones_like(rate)])
+        within = 1.0 - self.between if len(self.shares) else np.ones_like(rate)
+        processes = np.stack([F, within * Q, within * one])
         parts = np.array([[[1.0, 1.0], [0.0, 1.0]], WALK, UNKNOWN * np.eye(2)])
         walks = np.repeat(parts[..., None], len(self.walks), axis=3)
         walks[1] *= np.exp(self.walks)
@@ -106,15 +106,15 @@ class Dynamics(NamedTuple):
 
         States (D,) are x and w (p,), y and v (p,), u (K,) or (0,). The map is (p, D).
         """
-        n, n_intercepts = len(self.rates) + len(self.walks), len(self.shares)
-        rest = np.ones(n_intercepts), np.zeros(n_intercepts), self.between
+        K, n = len(self.shares), len(self.rates) + len(self.walks)
+        rest = np.ones(K), np.zeros(K), self.between
         F, Q, first = (
             block_diag(
                 np.block([[np.diag(b) for b in row] for row in each]), np.diag(r)
             )
             for each, r in zip(self.blocks(), rest, strict=True)
         )
-        shown = np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, n_intercepts)])
+        shown = np.hstack([np.eye(n), np.zeros((n, n)), np.eye(n, K)])
         return F, Q, first, shown
 
 
@@ -136,8 +136,8 @@ class SmoothedFrames(NamedTuple):
     """Frames, given all frames of their sequences, before the gauge.
 
     alpha (I, K) and its covariance (I, K, K), cameras (I, 2, 3) and positions (I, 2) in
-    the units of the table, NaN where no frame of a sequence has one, and time scales
-    (K,), the longest first.
+    the units of the table, and time scales (K,), the longest first. Sequences without a
+    known frame stay as they are.
     """
 
     alpha: NDArray
@@ -165,7 +165,7 @@ def smoothed_frames(
     n_frames, K = alone.alpha.shape
     times, numbers = checked_times(time, n_frames), group_numbers(groups, n_frames)
     sequences, unit = sequences_of(times, numbers, max_gap)
-    known = np.isfinite(alone.alpha).all(axis=1)
+    known = np.isfinite(alone.precision[:, 0, 0])
     if not known.any():
         return None
     origins, observed = zip(
@@ -181,14 +181,15 @@ def smoothed_frames(
         Observations(scale[:, None] * L * scale, fit / scale, change / scale)
         for L, fit, change in observed
     )
-    # Differences between groups are not taken for dynamics.
     intercepts = numbers is not None and bool(numbers.any())
     dynamics = estimated_dynamics(observed, K, intercepts, max_iter, tol)
     if dynamics is None:
         return None
-    alpha, covariance = np.empty((n_frames, K)), np.empty((n_frames, K, K))
+    alpha, covariance = alone.alpha.copy(), alone.covariance.copy()
     motion, translation = alone.motion.copy(), alone.translation.copy()
     for (rows, steps), origin, each in zip(sequences, origins, observed, strict=True):
+        if not known[rows].any():
+            continue
         found = smoothed(each, dynamics)
         mean = scale * found.mean[steps]
         alpha[rows], covariance[rows] = mean[:, :K], found.covariance[steps, :K, :K]
@@ -196,6 +197,7 @@ def smoothed_frames(
         motion[rows] = frames_first(moved)
         mean[:, :K] -= alone.alpha[rows]
         translation[rows] -= np.einsum("ip,ipr->ir", mean, alone.slope[rows])
+        translation[rows[~known[rows]]] = np.nan
     rates = np.exp(np.sort(dynamics.rates))
     scales = np.where(rates > LEAST_RATE * (1 + 1e-6), unit / rates, np.inf)
     return SmoothedFrames(alpha, covariance, motion, translation, scales)
@@ -279,8 +281,7 @@ def estimated_dynamics(
 ) -> Dynamics | None:
     """Return the most likely dynamics of sequences; None without strong evidence."""
     n_walks = sequences[0].fit.shape[1] - n_components
-    lengths = n_components, n_walks, n_components * intercepts
-    splits = np.cumsum(lengths)[:-1]
+    found, splits = [], (n_components, n_components + n_walks)
 
     def minus_log_likelihood(parameters: NDArray) -> tuple[float, NDArray]:
         dynamics = Dynamics(*np.split(parameters, splits))
@@ -290,20 +291,20 @@ def estimated_dynamics(
         slope = expected_gradient(dynamics, moments, n_pairs, len(ends))
         return -sum(each.log_likelihood for each in ends), -slope
 
-    found = []
-    for least in np.log([LEAST_RATE, LARGEST_RATE]):
+    # With dynamics, and independent frames with an intercept
+    for rate, shares in (LEAST_RATE, intercepts), (LARGEST_RATE, True):
+        least = np.log(rate)
+        lengths = n_components, n_walks, n_components * shares
         start = np.repeat([max(least, FIRST_RATE), 0.0, 0.0], lengths)
         limits = [(least, np.log(LARGEST_RATE)), (-40.0, 10.0), (-7.0, 7.0)]
-        bounds = [limits[i] for i in np.repeat([0, 1, 2], lengths)]
-        options = {"maxiter": max_iter, "gtol": tol, "ftol": 1e-12}
         found.append(
             minimize(
                 minus_log_likelihood,
                 start,
                 jac=True,
                 method="L-BFGS-B",
-                bounds=bounds,
-                options=options,
+                bounds=[limits[i] for i in np.repeat([0, 1, 2], lengths)],
+                options={"maxiter": max_iter, "gtol": tol, "ftol": 1e-12},
             )
         )
     # Akaike's criterion: one rate for each coefficient
@@ -350,11 +351,9 @@ def expected_log_density(
     noise = late - across - across.swapaxes(0, 1)
     noise += np.einsum("abk,bck,dck->adk", F, early, F)
     density = _log_density(noise, Q, n_pairs) + _log_density(start, first, n_sequences)
-    if len(dynamics.shares):
-        K, b = len(dynamics.shares), dynamics.between
-        square = np.diagonal(moments[3])[2 * n :]
-        density[:K] -= 0.5 * (n_sequences * np.log(b) + square / b)
-    return density
+    b, square = dynamics.between, np.diagonal(moments[3])[2 * n :]
+    density[: len(b)] -= 0.5 * (n_sequences * np.log(b) + square / b)
+    return density  # b is empty without intercepts
 
 
 def _log_density(moments: NDArray, covariance: NDArray, number: int) -> NDArray:

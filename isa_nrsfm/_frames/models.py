@@ -29,6 +29,12 @@ from isa_nrsfm._tables.tracks import measurement_matrix, seen_points
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
+# Least number of visible points for which the likelihood is normal near the fit. With
+# 4, 5 and 6 points the 3D errors of such frames, smoothed, are .35, .05 and .01, and
+# .02, .01 and .01 without their own points.
+LEAST_POINTS = 6
+
+
 class Decomposition(NamedTuple):
     """
     Camera and coefficients of each frame of a table; NaN if too few points are seen.
@@ -101,8 +107,8 @@ class LinearisedFrames(NamedTuple):
     motion (n, 2, 3), translation (n, 2), in the units of the table. alpha (n, K) and
     its posterior covariance (n, K, K). precision (n, K + p, K + p): curvature of minus
     the log-likelihood by coefficients and the p parameters of the camera, the position
-    eliminated. slope (n, K + p, 2): derivatives of the mean of the image of the visible
-    points by them.
+    eliminated; NaN for frames with less than `LEAST_POINTS`. slope (n, K + p, 2):
+    derivatives of the mean of the image of the visible points by them.
     """
 
     motion: NDArray
@@ -301,12 +307,14 @@ class PosteriorFrames:
         T -= slope[..., None]
         T *= np.sqrt(weights / self.noise_variance)[:, None, None]
         T = T.reshape(*T.shape[:2], 2 * tracks.shape[1]) / sizes[:, None, None]
+        precision = T @ T.transpose(0, 2, 1)
+        precision[np.count_nonzero(weights, axis=1) < LEAST_POINTS] = np.nan
         return LinearisedFrames(
             motion,
             found.translation * sizes[:, None],
             found.alpha,
             found.covariance,
-            T @ T.transpose(0, 2, 1),
+            precision,
             slope,
         )
 

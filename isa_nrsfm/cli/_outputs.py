@@ -135,12 +135,12 @@ def write_results(
                 poses = export.frame_poses(estimator, X, **drawn)
             columns = pd.DataFrame(poses._asdict(), index=X.index)
             columns = columns.dropna(axis="columns", how="all")
-            cameras = cameras.join(columns)
             shown["camera"] = "weak_perspective" if len(columns.columns) else None
-            if smooth is not None and shown["camera"]:
+            if smooth is not None:
                 poses = export.frame_poses(estimator, smooth.decomposition, **drawn)
-                for name in ("yaw", "pitch", "roll"):
-                    cameras[f"{name}_smooth"] = getattr(poses, name)
+                for name in columns.columns.intersection(["yaw", "pitch", "roll"]):
+                    columns[f"{name}_smooth"] = getattr(poses, name)
+            cameras = cameras.join(columns)
         except (ValueError, UserWarning) as error:
             warn_caller(
                 f"viewer.html has affine shapes, and cameras.csv has no angles: {error}"
