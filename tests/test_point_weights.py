@@ -101,6 +101,11 @@ class TestMeaning:
         alpha = expected.transform(X, point_weight=weights)
         assert_array_equal(alpha, expected.transform(holed))
 
+    def test_memory_order_changes_no_bit(self):
+        table = noisy()
+        X, weights = (np.asfortranarray(each) for each in (table.X, table.weights))
+        assert_same_fit(estimator().fit(X, point_weight=weights), fitted())
+
     def test_weights_of_missing_points_have_no_effect(self):
         table = noisy()
         X = table.X.copy()

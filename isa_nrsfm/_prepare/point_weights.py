@@ -43,6 +43,7 @@ def checked_weights(point_weight: Any, shape: tuple[int, int]) -> NDArray:
     weights = check_array(
         unmasked(point_weight),
         dtype=np.float64,
+        order="C",
         input_name="point_weight",
         ensure_min_samples=0,
     )
