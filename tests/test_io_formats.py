@@ -476,7 +476,7 @@ def test_unknown_files_are_told_what_was_expected(tmp_path):
     path = tmp_path / "a.slp"
     refused(None, read_landmarks, path, error=FileNotFoundError)
     path.write_bytes(b"x")
-    refused(r"a\.slp is of no known format.*sleap: the", read_landmarks, path)
+    refused(r"a\.slp is of no known format.*sleap \(\.h5", read_landmarks, path)
     refused(r"expected the datasets", read_landmarks, path, "sleap")
     for name in ("a.txt", "a.json", "a.h5"):
         (tmp_path / name).write_text("1 2 3\n")

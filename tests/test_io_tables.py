@@ -78,8 +78,8 @@ def test_unnamed_index_column_is_kept(write):
         ("x0,y0\n\n1,2,3\n", "line 3 has 3 values, but the header has 2 names"),
         ("x0,x0\n1,2\n", "more than one column is called 'x0'"),
         ("x0, x0\n1,2\n", "more than one column is called 'x0'"),
-        ("x0;y0\n1;2\n", "separated by semicolons; commas are needed"),
-        ("x0\ty0\n1\t2\n", "separated by tabs"),
+        ("x0;y0\n1;2\n", "separated by ';'; ',' is needed"),
+        ("x0\ty0\n1\t2\n", r"end with '.t': rename it to \*\.tsv"),
         ("x0,y0\n1\x002,3\n", "line 2 has a null character"),
     ],
 )

@@ -1,5 +1,6 @@
 """Tables as people write them: CONTRIBUTING lists each way and what happens."""
 
+import gzip
 import json
 import re
 import warnings
@@ -20,7 +21,7 @@ from isa_nrsfm.cli._columns import asked_columns  # noqa: E402
 from isa_nrsfm.cli._options import build_parser  # noqa: E402
 from isa_nrsfm.cli._reading import read_frames  # noqa: E402
 from isa_nrsfm.datasets import make_nonrigid_tracks  # noqa: E402
-from isa_nrsfm.io import landmark_table, open_table, read_landmarks  # noqa: E402
+from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table  # noqa: E402
 from isa_nrsfm.skeletons import read_skeleton  # noqa: E402
 
 N = 24
@@ -503,6 +504,7 @@ def test_skeletons_are_read_in_bounded_time(tmp_path):
 
 
 WIDE = landmarks(2).round(1)
+TEXT = WIDE.to_csv(index=False)
 LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in range(16))
 
 
@@ -511,10 +513,38 @@ LONG = "frame,point,x,y\n" + "".join(f"{i // 8},{i % 8},{i},{-i}\n" for i in ran
     [
         ("a.csv", LONG, r"one row for each point, .* table\.pivot\("),
         ("a.csv", WIDE.to_csv(index=False, header=False), "line with column names"),
-        ("a.csv", WIDE.to_csv(index=False, sep=";"), "separated by semicolons; commas"),
-        ("a.tsv", WIDE.to_csv(index=False, sep="\t", decimal=","), "with a point$"),
+        ("a.tsv", WIDE.to_csv(index=False, sep="\t", decimal=","), r"like 1234\.5"),
+        ("a.csv", WIDE.to_csv(index=False, sep="\t"), r"rename it to \*\.tsv"),
+        ("a.tsv", WIDE.to_csv(index=False), r"rename it to \*\.csv"),
         ("a.csv", WIDE.to_csv(index=False).encode("utf-16"), "Save it as UTF-8"),
         ("a.xlsx", b"PK", r"spreadsheet: save it as \.csv"),
+        ("a.csv", b"PK\3\4", r"a spreadsheet or .*: save it as \.csv"),
+        (
+            "a.csv",
+            gzip.compress(TEXT.encode()),
+            "a compressed file, in spite .* unpack",
+        ),
+        ("a.csv.gz", gzip.compress(TEXT.encode()), "known .* Unpack compressed files"),
+        ("a.npy", b"\x93NUMPY", r"Save tables and arrays as \.csv, in pandas: "),
+        ("a.txt", TEXT, r"table: a line of names .* in \.csv or \.tsv"),
+        ("a.csv", "my experiment of May\n" + TEXT, "line 2 .* delete titles"),
+        ("a.csv", "# made by T, version 2\n" + TEXT, "line 2 .* delete .* comments"),
+        (
+            "a.csv",
+            re.sub("(?m)^([0-9])", r'"1",\1', TEXT),
+            "line 2 .* that of row names",
+        ),
+        ("a.csv", re.sub("(?m)^(.*)$", r'"\1"', TEXT), "quotation marks: remove them"),
+        ("a.csv", ",".join("xy" * 12) + TEXT[TEXT.index("\n") :], "called 'x': each"),
+        (
+            "a.csv",
+            TEXT.replace("\n", "\n" + ",".join(["px"] * 24) + "\n", 1),
+            "of units",
+        ),
+        ("a.csv", "p,,q,\nx,y,x,y\n1,2,3,4\n", "two lines; .* nose_y is needed$"),
+        ("a.csv", TEXT + TEXT, r"row 2 .* 'x0'\. .* repeated names"),
+        ("a.csv", WIDE.astype(str).add("%").to_csv(index=False), r"like 1234\.5"),
+        ("a.csv", WIDE.map("1,{:.1f}".format).to_csv(index=False), r"like 1234\.5"),
     ],
 )
 def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, message):
@@ -526,8 +556,9 @@ def test_tables_of_another_form_are_told_the_way(tmp_path, name, contents, messa
         read_frames(build_parser().parse_args(["fit", str(path), "-o", "out"]))
 
 
-def test_the_way_from_one_row_a_point_is_right(tmp_path):
-    (tmp_path / "a.csv").write_text(LONG)
+@pytest.mark.parametrize("names", ["x,y", "X,Y"])
+def test_the_way_from_one_row_a_point_is_right(tmp_path, names):
+    (tmp_path / "a.csv").write_text(LONG.replace("x,y", names))
     table = pd.read_csv(tmp_path / "a.csv")
     told = str(refused("In pandas: ", landmark_table, table))
     code = told.partition("In pandas: ")[2].split(", and ")
@@ -535,5 +566,97 @@ def test_the_way_from_one_row_a_point_is_right(tmp_path):
     for line in code:
         exec(line, scope)
     points = landmark_table(scope["wide"]).points
-    np.testing.assert_array_equal(points["x_3"], [3, 11])
-    np.testing.assert_array_equal(points["y_3"], [-3, -11])
+    np.testing.assert_array_equal(points.iloc[:, 6], [3, 11])
+    np.testing.assert_array_equal(points.iloc[:, 7], [-3, -11])
+
+
+LEVELS = WIDE.set_axis(
+    pd.MultiIndex.from_product([[f"p{j}" for j in range(12)], ["x", "y"]]), axis=1
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        WIDE.to_csv(index=False, sep=";", decimal=","),
+        WIDE.to_csv(index=False, sep=";"),
+        "\ufeff" + WIDE.to_csv(index=False, sep=";", decimal=","),
+        WIDE.to_csv(index=False, sep="|"),
+        WIDE.to_csv(index=False, sep=" "),
+        LEVELS.to_csv(),
+        LEVELS.to_csv(index=False),
+    ],
+)
+def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.csv").write_text(text)
+    told = str(refused("In pandas: ", read_table, "a.csv"))
+    scope = {"pd": pd}
+    for line in told.partition("In pandas: ")[2].split(", and "):
+        exec(line, scope)
+    new = tmp_path / "new.csv"
+    if not new.exists():
+        scope["table"].to_csv(new, index=False)
+    np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
+
+
+def test_the_way_from_several_levels_of_names_is_right():
+    told = str(refused("In pandas: ", landmark_table, LEVELS))
+    scope = {"table": LEVELS.copy()}
+    exec(told.partition("In pandas: ")[2], scope)
+    np.testing.assert_array_equal(landmark_table(scope["table"]).points, WIDE)
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern"),
+    [
+        ("{a}[{j}]", "x[#],y[#]"),
+        ("LM{j}{a}", "LM#x,LM#y"),
+        ("lm_{j}_{a}_px", "lm_#_x_px,lm_#_y_px"),
+        ("eye{letter}:{a}", "*x,*y"),
+        ("{a}@{letter}", "x*,y*"),
+        ("('{letter}', '{a}')", "*x'),*y')"),
+    ],
+)
+def test_names_of_another_form_are_told_their_pattern(name, pattern):
+    names = [
+        name.format(a=axis, j=j, letter="abcdefghijkl"[j])
+        for j in range(12)
+        for axis in "xy"
+    ]
+    told = str(refused("--columns", landmark_table, WIDE.set_axis(names, axis=1)))
+    assert told.endswith(f"such as {pattern!r}")
+    found = landmark_table(WIDE.set_axis(names, axis=1), columns=pattern).points
+    np.testing.assert_array_equal(found, WIDE)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        TEXT.replace("\n", "\r\n"),
+        "\ufeff" + TEXT,
+        WIDE.to_csv(),  # an index without a name
+        TEXT.replace("\n", ",,\n"),
+        TEXT + "\n\n",
+        TEXT.replace(",", ", "),
+        WIDE.to_csv(index=False, quoting=1),
+        "# " + TEXT,  # as numpy.savetxt writes a header
+        WIDE[sorted(WIDE)].to_csv(index=False),
+        WIDE.map("{:.6e}".format).to_csv(index=False),
+    ],
+)
+def test_tables_of_many_programs_are_read(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text, newline="")
+    np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, WIDE)
+
+
+@pytest.mark.parametrize(
+    "word", ["NaN", "NAN", "Na", "#N/A", "<NA>", "-nan", "-nan(ind)", "None", '""']
+)
+def test_words_for_missing_points_are_missing(tmp_path, word):
+    table = WIDE.copy()
+    table.iloc[1, 4:6] = np.nan
+    (tmp_path / "a.csv").write_text(
+        table.to_csv(index=False, na_rep="@").replace("@", word)
+    )
+    np.testing.assert_array_equal(read_landmarks(tmp_path / "a.csv").points, table)

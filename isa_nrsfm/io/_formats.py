@@ -246,11 +246,18 @@ def find_format(path: str | os.PathLike[str]) -> str:
         return TABLE
     if _suffix(path) in (".xlsx", ".xls", ".ods"):
         raise ValueError(f"{path} is a file of a spreadsheet: save it as .csv there")
+    if not possible:
+        known = (f"{each.name} ({_listed(each.suffixes)})" for each in FORMATS.values())
+        raise ValueError(
+            f"{path} is of no known format: {'; '.join(known)}. Unpack compressed "
+            "files. Save tables and arrays as .csv, in pandas: "
+            "pd.DataFrame(array, columns=names).to_csv('new.csv', index=False)"
+        )
     raise ValueError(
         f"{path} is of no known format. Expected "
         + "; ".join(
             f"{found.name}: {found.expected}, in {_listed(found.suffixes)}"
-            for found in possible or FORMATS.values()
+            for found in (*possible, FORMATS[TABLE])
         )
     )
 

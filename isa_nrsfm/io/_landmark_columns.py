@@ -4,6 +4,7 @@ In patterns ``#`` is a number and ``*`` is any text.
 """
 
 import re
+from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
@@ -68,19 +69,26 @@ def find_landmark_columns(
     sets = landmark_sets(names)
     candidates = {pattern: n for pattern, n in sets.items() if n >= MIN_POINTS}
     if not candidates:
-        if {"x", "y"} <= {str(name).strip().lower() for name in names}:
+        x, y = ([n for n in names if str(n).strip().lower() == axis] for axis in "xy")
+        if x and y:
             raise ValueError(
                 "the table has one row for each point, with columns x and y; one row "
                 "for each frame is needed. In pandas: wide = table.pivot("
-                "index='frame', columns='point', values=['x', 'y']), and wide.columns "
-                "= [f'{axis}_{j}' for axis, j in wide.columns]"
+                f"index='frame', columns='point', values={[x[0], y[0]]}), and "
+                "wide.columns = [f'{axis}_{j}' for axis, j in wide.columns]"
+            )
+        if any(isinstance(name, tuple) for name in names):
+            raise ValueError(
+                "the names of the columns have several levels: join them to names such "
+                "as nose_x, nose_y. In pandas: table.columns = ['_'.join(name) for "
+                "name in table.columns]"
             )
         small = "; ".join(f"{pattern!r} ({n})" for pattern, n in sets.items())
         small = f" (fewer than {MIN_POINTS} points: {small})" if small else ""
         raise ValueError(
             "no landmark columns such as x0, y0, x1, y1 or nose_x, nose_y were found"
             f"{small}; {_first_columns(names)}. If they have other names, give columns "
-            "(command line: --columns), such as 'px_#,py_#'"
+            f"(command line: --columns), such as {_likely_pattern(names)!r}"
         )
     if len(candidates) > 1:
         raise ValueError(_several_found(names, candidates))
@@ -92,6 +100,23 @@ def find_landmark_columns(
             "the same names: give every point a name of its own, such as x0, y0, x1, y1"
         )
     return _select(names, pattern.split(","))
+
+
+def _likely_pattern(names: Iterable[Hashable]) -> str:
+    """Return the pattern of most names that differ in the letters x and y alone."""
+    texts = [str(name).strip() for name in names]
+    found: Counter[str] = Counter()
+    places = [(text, i) for text in texts for i in range(len(text))]
+    for text, place in places:
+        before, letter, after = text[:place], text[place], text[place + 1 :]
+        if letter not in "xX" or f"{before}{chr(ord(letter) + 1)}{after}" not in texts:
+            continue
+        numbered = [re.sub(r"\d+", "#", part) for part in (before, after)]
+        for one, other in (numbered, ("*" if before else "", after), (before, "*")):
+            found[f"{one}{letter}{other},{one}{chr(ord(letter) + 1)}{other}"] += 1
+    likely = ((pattern, n) for pattern, n in found.items() if pattern.count(",") == 1)
+    pattern, size = max(likely, key=lambda each: each[1], default=("", 0))
+    return pattern if size >= MIN_POINTS else "px_#,py_#"
 
 
 def landmark_sets(names: Iterable[Hashable]) -> dict[str, int]:

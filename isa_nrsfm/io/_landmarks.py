@@ -190,5 +190,8 @@ def refuse_same_names(names: Sequence[str]) -> None:
     seen: set[str] = set()
     for name in map(str.strip, names):
         if name and name in seen:
-            raise ValueError(f"more than one column is called {name!r}")
+            raise ValueError(
+                f"more than one column is called {name!r}: each needs its own name, "
+                "such as x0, y0, x1, y1"
+            )
         seen.add(name)

@@ -70,9 +70,15 @@ def checked_rows(path: Path, separator: str = ",") -> Iterator[list[str]]:
                 continue
             n_columns = n_columns or len(row)
             if len(row) != n_columns:
+                advice = "the file may be truncated"
+                if n_rows == 1 and len(row) > n_columns:
+                    advice = (
+                        "delete titles and comments above the line of names, and name "
+                        "each column, also that of row names (in R: col.names = NA)"
+                    )
                 raise ValueError(
                     f"line {rows.line_num} has {len(row)} values, but the header has "
-                    f"{n_columns} names: the file may be truncated"
+                    f"{n_columns} names: {advice}"
                 )
             n_rows += 1
             yield row

@@ -15,10 +15,19 @@ from isa_nrsfm._compat.whole_files import whole_file
 from isa_nrsfm._tables.column_names import parse_coordinate, point_names
 from isa_nrsfm.io._landmark_columns import confidence_columns, find_landmark_columns
 from isa_nrsfm.io._landmarks import Landmarks, assemble, refuse_same_names
-from isa_nrsfm.io._separated_values import SEPARATORS, checked_rows, read_parquet
+from isa_nrsfm.io._separated_values import (
+    SEPARATORS,
+    checked_rows,
+    first_lines,
+    read_parquet,
+)
 
 TABLE_SUFFIXES = (*SEPARATORS, ".parquet")
-_MISSING = ("", "na", "nan", "n/a", "null", "none")
+_MISSING = (
+    *("", "na", "nan", "n/a", "null", "none"),
+    # Of spreadsheets, pandas, and C programs on Windows.
+    *("#n/a", "<na>", "nan(ind)", "-nan(ind)"),
+)
 
 
 class LandmarkTable(NamedTuple):
@@ -94,6 +103,12 @@ def parse_table(path: Path) -> "pd.DataFrame":
     suffix = table_suffix(path)
     if suffix == ".parquet":
         return read_parquet(path)
+    with path.open("rb") as file:
+        if file.read(2) in (b"PK", b"\x1f\x8b"):
+            raise ValueError(
+                "it is a spreadsheet or a compressed file, in spite of its name: save "
+                f"it as {suffix}, or unpack it"
+            )
     return _read_text(path, SEPARATORS[suffix])
 
 
@@ -263,20 +278,28 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
     header = next(rows, None)
     if header is None:
         raise ValueError("it is empty; a first line with column names is needed")
-    for other, word in ((";", "semicolons"), ("\t", "tabs"), (",", "commas")):
-        if len(header) == 1 and other in header[0]:
-            raise ValueError(
-                f"its columns are separated by {word}; commas are needed in a .csv "
-                "file and tabs in a .tsv file"
-            )
+    if len(header) == 1:
+        _refuse_one_column(path, separator, header[0])
     if _parsed(pd.Series(header)) is not None:
         raise ValueError(
             "its first line has numbers; a first line with column names is needed, "
             "such as x0, y0, x1, y1"
         )
+    second = [cell.strip().lower() for cell in next(rows)]
+    if second.count("x") == second.count("y") > 1:
+        index = "" if second[0] in ("x", "y") else ", index_col=0"
+        way = (
+            f". In pandas: table = pd.read_csv({path.name!r}, header=[0, 1]{index}), "
+            "and table.columns = ['_'.join(name) for name in table.columns]"
+        )
+        raise ValueError(
+            "its header has two lines; one line of names such as nose_x, nose_y is "
+            "needed" + way * ("" not in header[1:])
+        )
     for _ in rows:  # checks them
         pass
     refuse_same_names(header)
+    header[0] = header[0].removeprefix("# ")  # of numpy.savetxt
     frame = pd.read_csv(
         path,
         sep=separator,
@@ -292,6 +315,23 @@ def _read_text(path: Path, separator: str) -> "pd.DataFrame":
             if values is not None:
                 frame[name] = values
     return frame
+
+
+def _refuse_one_column(path: Path, separator: str, line: str) -> None:
+    """Raise if the first line of a file is one cell, but has other separators."""
+    if separator in line:
+        raise ValueError("each line is in quotation marks: remove them")
+    for suffix, other in SEPARATORS.items():
+        if other in line:
+            raise ValueError(f"its columns end with {other!r}: rename it to *{suffix}")
+    following = first_lines(path, 2)[-1]
+    for other, pattern in ((";", "';'"), ("|", "'|'"), (" ", r"r'\s+'")):
+        if 0 < line.count(other) == following.count(other):
+            raise ValueError(
+                f"its columns are separated by {other!r}; {separator!r} is needed. In "
+                f"pandas: table = pd.read_csv({path.name!r}, sep={pattern}, decimal="
+                "','), and table.to_csv('new.csv', index=False)"
+            )
 
 
 def _parsed(column: "pd.Series") -> NDArray[np.float64] | None:
@@ -324,9 +364,9 @@ def _as_numbers(column: "pd.Series") -> NDArray[np.float64]:
             bad = next(i for i in range(len(text)) if _parsed(text.iloc[[i]]) is None)
             raise ValueError(
                 f"column {column.name!r} should hold numbers, but in row "
-                f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}"
-                + "; decimals are written with a point"
-                * ("," in text.iloc[bad])
+                f"{text.index[bad]} (counted from 0) it has {text.iloc[bad]!r}. Write "
+                "numbers like 1234.5, leave the cells of missing points empty, and "
+                "delete rows of units, means or repeated names"
             )
         values = found
     if np.isinf(values).any():
