@@ -4,7 +4,7 @@ import argparse
 import os
 from pathlib import Path
 
-from benchmarks._data import data_path
+from benchmarks._data import data_folder, data_path
 from benchmarks._figures import draw_reprojections
 from benchmarks._jobs import Limits, run_jobs
 from benchmarks._markdown import footnote, number
@@ -89,7 +89,7 @@ def check(parser, kind, names, known):
 
 
 def chosen_jobs(section, options):
-    """Return the jobs of a section; sets that are absent are skipped by name."""
+    """Return the jobs of a section; absent sets are named and skipped."""
     what = SECTIONS[section]
     names = what.sets
     if options.sets:
@@ -100,13 +100,15 @@ def chosen_jobs(section, options):
     if options.methods:
         known = (*what.methods, *what.other_methods)
         methods = [name for name in known if name in options.methods]
-    present = []
-    for name in names:
-        if is_present(name):
-            present.append(name)
-        else:
-            file = data_path(SETS[name].case).name
-            print(f"{section} {name}: skipped, no {file} in the folder ISA_NRSFM_DATA")
+    present = [name for name in names if is_present(name)]
+    if absent := [name for name in names if name not in present]:
+        files = ", ".join(data_path(SETS[name].case).name for name in absent)
+        print(
+            f"{section}: {len(absent)} of {len(names)} sets are skipped, because "
+            f"{data_folder()} (ISA_NRSFM_DATA) has no {files}. Measured: "
+            f"{', '.join(present) or 'nothing'}",
+            flush=True,
+        )
     return what.jobs(section, present, methods, options.repeats)
 
 
