@@ -53,9 +53,9 @@ PRINTED = {
         "ways to find the block end at the same error (below). Conventions do not "
         "explain the printed one: relative to the energy before centring, PI has "
         "the printed error, but ISA is only 5 % lower. With scaled frames ISA "
-        "is within 5 % of the printed error, but PI is not. The joint refinement with affine cameras has the "
-        "lowest error in the images and a large one in 3D: the cameras absorb the "
-        "deformation.",
+        "is within 5 % of the printed error, but PI is not. The joint refinement "
+        "with affine cameras has the lowest error in the images and a large one "
+        "in 3D: the cameras absorb the deformation.",
     ),
     "flag": Printed(
         "Balloon",

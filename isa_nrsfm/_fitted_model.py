@@ -72,31 +72,44 @@ class TableModel(NamedTuple):
         dtype = rows.dtype if dtype is None else dtype
         return Decomposition(*(of_all_rows(each, usable).astype(dtype) for each in fit))
 
-    def posterior(self, rows: NDArray) -> FramePosterior:
+    def posterior(
+        self, rows: NDArray, weights: NDArray | None = None
+    ) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
+        usable, centred, _, sizes, weights = self._ready(self._tracks(rows), weights)
         whole = FramePosterior.unknown(len(rows), len(self.basis))
-        whole.put(usable, self.frames.posterior(centred / sizes[:, None, None]))
+        unit = centred / sizes[:, None, None]
+        whole.put(usable, self.frames.posterior(unit, weights=weights))
         return whole
 
-    def linearised(self, rows: NDArray) -> LinearisedFrames:
+    def linearised(
+        self, rows: NDArray, weights: NDArray | None = None
+    ) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         assert isinstance(self.frames, PosteriorFrames)
-        usable, centred, translation, sizes, _ = self._ready(self._tracks(rows))
-        fit = self.frames.linearised(centred, sizes)
+        usable, centred, translation, sizes, weights = self._ready(
+            self._tracks(rows), weights
+        )
+        fit = self.frames.linearised(centred, sizes, weights)
         fit = fit._replace(translation=fit.translation + translation)
         return LinearisedFrames(*(of_all_rows(each, usable) for each in fit))
 
     def reconstruct(
-        self, rows: NDArray, metric: DeformationMetric | None, scaled: bool
+        self,
+        rows: NDArray,
+        weights: NDArray | None = None,
+        *,
+        metric: DeformationMetric | None,
+        scaled: bool,
     ) -> NDArray:
         """Return the shapes (n, n_points, 3) of frames.
 
         A metric of space makes them Euclidean. `scaled` multiplies each by the scale of
         its camera, as orthographic cameras need.
         """
-        return self.shapes(self.decompose(rows, deviations=False), metric, scaled)
+        fit = self.decompose(rows, weights, deviations=False)
+        return self.shapes(fit, metric, scaled)
 
     def shapes(
         self, fit: Decomposition, metric: DeformationMetric | None, scaled: bool
@@ -110,12 +123,14 @@ class TableModel(NamedTuple):
         sizes = found.scales[:, None, None] if scaled else 1.0
         return (sizes * found.shapes).astype(fit.alpha.dtype, copy=False)
 
-    def uncertain_shapes(self, rows: NDArray) -> UncertainShapes:
+    def uncertain_shapes(
+        self, rows: NDArray, weights: NDArray | None = None
+    ) -> UncertainShapes:
         """Return the shapes of frames and standard deviations of their depths."""
         assert isinstance(self.frames, PosteriorFrames)
-        fit = self.decompose(rows, deviations=False)
-        usable, centred, _, sizes, _ = self._ready(self._tracks(rows))
-        found = self.frames.depth_deviations(centred, sizes)
+        fit = self.decompose(rows, weights, deviations=False)
+        usable, centred, _, sizes, weights = self._ready(self._tracks(rows), weights)
+        found = self.frames.depth_deviations(centred, sizes, weights)
         deviations = of_all_rows(found, usable).astype(rows.dtype, copy=False)
         _, scales = full_rotations(fit.motion)
         return UncertainShapes(

@@ -220,6 +220,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         self,
         X: Any,
         *,
+        point_weight: Any = None,
         time: Any = None,
         groups: Any = None,
         max_gap: int = 30,
@@ -240,6 +241,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one. The rows of each group are in
             temporal order.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
         time : array-like of shape (n_frames,), default=None
             Times of the frames, numbers or dates (in seconds from the first). Their
             median difference is one step. Other differences are rounded to whole steps.
@@ -280,9 +283,9 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         check_scalar(max_gap, "max_gap", Integral, min_val=1)
         check_scalar(max_iter, "max_iter", Integral, min_val=1)
         check_scalar(tol, "tol", Real, min_val=0.0)
-        table = self._opened(X)
+        table, weights = self._weighted(X, point_weight)
         frames = self._jointly_fitted("smooth")
-        alone = table.joined(self._model.linearised)
+        alone = table.joined(self._model.linearised, *weights)
         found = smoothed_frames(
             alone,
             CAMERAS[self.camera_],
@@ -300,7 +303,7 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         fit = Decomposition(*(each.astype(table.empty.dtype) for each in fit))
         return SmoothedCoefficients(fit.alpha, fit.alpha_std, scales, fit)
 
-    def rotation_covariance(self, X: Any) -> NDArray:
+    def rotation_covariance(self, X: Any, *, point_weight: Any = None) -> NDArray:
         """
         Return the posterior covariances of the rotations of calibrated cameras.
 
@@ -308,6 +311,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         ----------
         X : array-like of shape (n_frames, 2 * n_points)
             A table with the points of the fitted one.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points, as in `fit`.
 
         Returns
         -------
@@ -322,10 +327,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         ValueError
             If the model has affine cameras, or was not refined jointly.
         """
-        table = self._opened(X)
+        table, weights = self._weighted(X, point_weight)
         frames = self._jointly_fitted("rotation_covariance", calibrated=True)
         space, certainty = frames.gauge.space, frames.certainty
-        found = table.joined(self._model.posterior)
+        found = table.joined(self._model.posterior, *weights)
         covariance = space @ found.turn_covariance @ space.T
         if certainty.turns is not None:
             R, _ = full_rotations(found.motion @ space.T)
@@ -333,7 +338,12 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         return np.asarray(covariance).astype(table.empty.dtype, copy=False)
 
     def reconstruct(
-        self, X: Any, camera: str | None = None, *, return_std: bool = False
+        self,
+        X: Any,
+        camera: str | None = None,
+        *,
+        return_std: bool = False,
+        point_weight: Any = None,
     ) -> Any:
         """
         Return the 3D shape of each frame of a table.
@@ -355,6 +365,8 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         return_std : bool, default=False
             Whether to return the standard deviations of the depths, for a model with
             calibrated cameras.
+        point_weight : array-like of shape (n_frames, n_points), default=None
+            Weights of the points of a table, as in `fit`.
 
         Returns
         -------
@@ -399,6 +411,10 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
             )
         check_is_fitted(self)
         decomposed, n_components = isinstance(X, Decomposition), len(self.basis_)
+        if decomposed and point_weight is not None:
+            raise ValueError(
+                "point_weight needs the table; give it to decompose, not its result"
+            )
         if decomposed and X.alpha.shape[1:] != (n_components,):
             raise ValueError(
                 f"the decomposition must be that of a model with {n_components} basis "
@@ -423,12 +439,11 @@ class TableTransformer(CoefficientNamesMixin, TransformerMixin, ShownEstimator):
         scaled = metric is not None and camera == "orthographic"
         if decomposed:
             return self._model.shapes(X, metric, scaled)
-        table = self._opened(X)
+        table, weights = self._weighted(X, point_weight)
         if return_std:
-            return tuple(table.collect(self._model.uncertain_shapes))
-        return table.collect(
-            partial(self._model.reconstruct, metric=metric, scaled=scaled)
-        )
+            return tuple(table.collect(self._model.uncertain_shapes, *weights))
+        shapes = partial(self._model.reconstruct, metric=metric, scaled=scaled)
+        return table.collect(shapes, *weights)
 
     def mirrored(self) -> Self:
         """

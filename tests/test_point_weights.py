@@ -1,7 +1,8 @@
 """Weights of points: numbers of observations, such as confidences of a tracker."""
 
 import json
-from functools import cache
+from dataclasses import replace
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,11 +20,13 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._frames.depth import NOT_ESTIMATED
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.tracks import weighted_sizes
 from isa_nrsfm.datasets import make_nonrigid_tracks
+from isa_nrsfm.export import frame_poses
 from isa_nrsfm.io import open_table, read_landmarks
 from isa_nrsfm.metrics import affine_shape_error
 
@@ -218,6 +221,70 @@ class TestMethods:
         assert -1e-3 < model.score(X, point_weight=weights) < -1e-4
         assert model.score(X) < -0.01
         assert model.score(X, point_weight=rng.permuted(weights, axis=1)) < -0.01
+
+    @CAMERAS
+    def test_frames_with_weights_are_frames_with_repeated_points(self, camera, rng):
+        """For all that is computed of a frame: the linearisation, errors of depths."""
+        frames = fitted(camera)._model.frames
+        frames = replace(frames, certainty=NOT_ESTIMATED)
+        counts = rng.integers(0, 4, N_POINTS)
+        many = np.repeat(np.arange(N_POINTS), counts)
+        shapes = frames.shapes[:, :, many]
+        shapes = shapes - shapes.mean(axis=2, keepdims=True)
+        repeated = replace(frames, shapes=shapes)
+        tracks = noisy().X.reshape(N_FRAMES, -1, 2)[:6]
+        weights = np.tile(counts.astype(float), (6, 1))
+        holed = np.where(weights[..., None] > 0, tracks, np.nan)
+        holed = holed - np.nanmean(holed, axis=1, keepdims=True)
+        sizes = weighted_sizes(holed, weights)
+        found = frames.linearised(holed, sizes, weights)
+        expected = repeated.linearised(holed[:, many], sizes)
+        for name in ("motion", "alpha", "covariance", "precision"):
+            found_here, here = getattr(found, name), getattr(expected, name)
+            assert_allclose(found_here, here, rtol=1e-5, atol=1e-7 * np.abs(here).max())
+        if camera != "affine":
+            found = frames.depth_deviations(holed, sizes, weights)
+            expected = repeated.depth_deviations(holed[:, many], sizes)
+            assert_allclose(found[:, many], expected, rtol=1e-5)
+
+    def test_all_methods_leave_out_points_of_weight_zero(self):
+        model, X = fitted("weak_perspective"), noisy().X
+        weights = np.ones((N_FRAMES, N_POINTS))
+        weights[np.random.default_rng(1).random(weights.shape) < 0.1] = 0.0
+        holed = np.where(np.repeat(weights, 2, axis=1) > 0, X, np.nan)
+        for call in (
+            model.rotation_covariance,
+            model.reconstruct,
+            partial(model.reconstruct, return_std=True),
+            lambda *args, **options: model.smooth(*args, **options).alpha_std,
+            partial(frame_poses, model),
+        ):
+            for found, expected in zip(
+                call(X, point_weight=weights), call(holed), strict=True
+            ):
+                assert_array_equal(found, expected)
+        decomposed = model.decompose(X, point_weight=weights)
+        message = "point_weight needs the table; give it to decompose"
+        refused(message, model.reconstruct, decomposed, point_weight=weights)
+
+    def test_smoothed_coefficients_are_those_of_weighted_frames(self, rng):
+        """Frames with noise of ten times the deviation have the weight 1/100."""
+        phase = 0.1 * np.arange(150)
+        alpha = np.stack([np.sin(phase), np.cos(0.7 * phase)], axis=1)
+        scene = make_nonrigid_tracks(150, N_POINTS, K, random_state=0)
+        shapes = scene.mean_shape + np.tensordot(alpha, scene.basis, 1)
+        tracks = shapes @ scene.motion.swapaxes(1, 2)
+        deviation = np.where(rng.random(150) < 0.3, 0.2, 0.02) * tracks.std()
+        tracks += deviation[:, None, None] * rng.normal(size=tracks.shape)
+        X = tracks.reshape(150, -1)
+        weights = np.tile((deviation.min() / deviation) ** 2, (N_POINTS, 1)).T
+        model = estimator(scale_frames=False).fit(X, point_weight=weights)
+        truth = np.linalg.lstsq(model.alpha_, alpha)[0]
+        found = [
+            np.std(model.smooth(X, **options).alpha @ truth - alpha)
+            for options in ({"point_weight": weights}, {})
+        ]
+        assert found[0] < 0.8 * found[1]
 
     def test_orthographic_cameras_have_one_weighted_size(self):
         X, weights, _ = noisy()
@@ -419,10 +486,28 @@ class TestCommandLine:
         alpha = self.coefficients(tmp_path / "out" / "alpha.csv")
         assert_allclose(alpha, model.alpha_, atol=1e-6)
         assert np.abs(alpha - estimator().fit(found.points).alpha_).max() > 0.1
+        cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
+        assert_allclose(cameras.filter(regex="^m"), model.motion_.reshape(-1, 6))
         new = tmp_path / "new.csv"
         saved = tmp_path / "out" / "model.npz"
         succeeds("transform", saved, results, *options, "-o", new)
         assert_allclose(self.coefficients(new), model.alpha_, atol=1e-6)
+
+    def test_all_results_are_of_weighted_points(self, results, tmp_path, succeeds):
+        options = ["--weights", "confidence", "--camera", "weak_perspective"]
+        options += ["--fps", 25, "--std", "-o", tmp_path / "out"]
+        succeeds("fit", results, *options, *self.QUICK)
+        found = read_landmarks(results)
+        X, weights = found.points, {"point_weight": found.confidence}
+        model = estimator(camera="weak_perspective").fit(X, **weights)
+        cameras = pd.read_csv(tmp_path / "out" / "cameras.csv")
+        poses = frame_poses(model, X, **weights)
+        for name in ("yaw", "roll", "pitch_std"):
+            assert_allclose(cameras[name], getattr(poses, name), atol=1e-6)
+        table = pd.read_csv(tmp_path / "out" / "alpha.csv")
+        smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
+        assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
+        assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
 
     def test_some_points(self, results, tmp_path, succeeds):
         options = ["--weights", "confidence", "--points", "without:3,7"]

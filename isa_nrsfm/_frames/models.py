@@ -287,11 +287,14 @@ class PosteriorFrames:
         """Return the fit of prepared frames of size one, before the gauge."""
         return self._search.fit(block, self.noise_variance, starts=self.starts)
 
-    def linearised(self, tracks: NDArray, sizes: NDArray) -> LinearisedFrames:
+    def linearised(
+        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+    ) -> LinearisedFrames:
         """Return fits of tracks (n, J, 2), NaN where missing, of sizes (n,)."""
         unit = tracks / sizes[:, None, None]
-        found = self.posterior(unit)
-        weights = seen_points(tracks).astype(float)
+        found = self.posterior(unit, weights=weights)
+        if weights is None:
+            weights = seen_points(tracks).astype(float)
         if self.loss != "linear":
             distance = distances(unit, self.shapes, *found[:3])
             deviation = np.sqrt(self.noise_variance)
@@ -318,26 +321,32 @@ class PosteriorFrames:
             slope,
         )
 
-    def depth_deviations(self, tracks: NDArray, sizes: NDArray) -> NDArray:
+    def depth_deviations(
+        self, tracks: NDArray, sizes: NDArray, weights: NDArray | None = None
+    ) -> NDArray:
         """Compute the standard deviations (n, J) of depths with calibrated cameras.
 
         The variance of a depth is the sum of that of the shapes and that of the frame,
         ``Z (T^T T / s2 + diag(0, I))^-1 Z^T``. T and Z are the derivatives of image and
         depths by rotation vector, logarithm of the scale (if free) and coefficients.
+        Weights (n, J) multiply the squares.
         """
-        found = self.posterior(tracks / sizes[:, None, None], covariances=False)
+        unit = tracks / sizes[:, None, None]
+        found = self.posterior(unit, covariances=False, weights=weights)
         seen, free = seen_points(tracks), CAMERAS[self.camera].scaled
+        weights = seen.astype(float) if weights is None else weights
         variances = np.full(seen.shape, np.nan)
         rotations, scales = full_rotations(found.motion)
         prior = np.diag([0.0] * (3 + free) + [1.0] * found.alpha.shape[1])
         for i in np.flatnonzero(np.isfinite(scales)):
-            middle = self.shapes[:, :, seen[i]].mean(axis=2, keepdims=True)
+            w = weights[i, seen[i]]
+            middle = (self.shapes[:, :, seen[i]] @ w / w.sum())[..., None]
             mean_shape, basis = np.split(self.shapes - middle, [1])
             shape = mean_shape[0] + np.tensordot(found.alpha[i], basis, 1)
             turned = [np.cross(axis, shape, axisb=0, axisc=0) for axis in np.eye(3)]
             changes = np.stack([*turned, *([shape] if free else []), *basis])
             changes = scales[i] * rotations[i] @ changes
-            T = changes[:, :2, seen[i]].reshape(len(changes), -1)
+            T = (changes[:, :2, seen[i]] * np.sqrt(w)).reshape(len(changes), -1)
             information = T @ T.T / self.noise_variance + prior
             covariance = np.linalg.pinv(information, hermitian=True)
             Z = changes[:, 2]

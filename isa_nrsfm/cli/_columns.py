@@ -96,10 +96,10 @@ def asked_columns(args: Namespace, frames: Frames) -> Columns:
 
 
 def column_results(
-    args: Namespace, asked: Columns, estimator: AffineNRSfM, X: "pd.DataFrame"
+    args: Namespace, asked: Columns, estimator: AffineNRSfM, frames: Frames
 ) -> tuple[dict[str, Any], "pd.DataFrame", Any]:
     """Return entries of the report, columns of alpha.csv and smoothed coefficients."""
-    alpha, smooth = estimator.alpha_, None
+    X, alpha, smooth = frames.X, estimator.alpha_, None
     report: dict[str, Any] = {}
     columns: dict[str, NDArray] = {}
     if asked.labels:
@@ -118,7 +118,9 @@ def column_results(
         columns |= {f"alpha_{k}_within": each for k, each in enumerate(within.T, 1)}
     if asked.times is not None and estimator.refinement in JOINT_REFINEMENTS:
         show_stage("smoothing")
-        smooth = estimator.smooth(X, time=asked.times, groups=asked.groups)
+        smooth = estimator.smooth(
+            X, time=asked.times, groups=asked.groups, **frames.weighting
+        )
         found = smooth.alpha
         report["time"] = {
             "column": args.time or "seconds",

@@ -98,7 +98,7 @@ def fit_table(
         clock["read"] = time.perf_counter()
         estimator, search = _fitted(args, frames, asked.groups, clock)
         show_stage("answers")
-        answers, columns, smooth = column_results(args, asked, estimator, X)
+        answers, columns, smooth = column_results(args, asked, estimator, frames)
         show_stage("tables")
         with files_together(folder, removed=removed) as new:
             if table is not None:
@@ -107,7 +107,9 @@ def fit_table(
             write_alpha(new / "alpha.csv", frames, estimator.alpha_, std, columns)
             shown = {"labels": _first_classes(asked, X), "times": asked.times}
             if args.std and estimator.camera_ != "affine":
-                shown["depth_std"] = estimator.reconstruct(X, return_std=True)[1]
+                shown["depth_std"] = estimator.reconstruct(
+                    X, return_std=True, **frames.weighting
+                )[1]
             write_results(new, estimator, frames, smooth, drawn, **shown)
             report = {
                 "command": "fit",

@@ -132,7 +132,7 @@ def write_results(
     if frames_of(estimator).certainty.determined:  # otherwise the fit has warned
         try:
             with warnings.catch_warnings(action="error", category=UserWarning):
-                poses = export.frame_poses(estimator, X, **drawn)
+                poses = export.frame_poses(estimator, X, **frames.weighting, **drawn)
             columns = pd.DataFrame(poses._asdict(), index=X.index)
             columns = columns.dropna(axis="columns", how="all")
             shown["camera"] = "weak_perspective" if len(columns.columns) else None
@@ -157,7 +157,8 @@ def write_results(
     points.insert(0, "point", names_of_points(estimator))
     write_table(points, folder / "shapes.csv")
     export.write_shapes(estimator, folder / "shapes.npz")
-    export.write_viewer(estimator, folder / "viewer.html", X=X, **drawn, **shown)
+    shown |= {"X": X, **frames.weighting, **drawn}
+    export.write_viewer(estimator, folder / "viewer.html", **shown)
     save_model(estimator, folder / "model.npz")
 
 

@@ -80,7 +80,7 @@ class Frames(NamedTuple):
         return self.points[self.usable]
 
     @property
-    def weighting(self) -> dict[str, NDArray]:
+    def weighting(self) -> dict[str, Any]:
         """The weights of the points of X as an argument of `fit`, if asked for."""
         if self.confidence is None:
             return {}

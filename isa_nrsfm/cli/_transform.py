@@ -54,10 +54,12 @@ def run(args: Namespace, warned: list[str]) -> str:
         explained = estimator.inverse_transform(alpha, motion, translation)
         quality = quality_section(quality_report(estimator, X, explained))
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
-            drawn["depth_std"] = estimator.reconstruct(X, return_std=True)[1]
+            drawn["depth_std"] = estimator.reconstruct(
+                X, return_std=True, **frames.weighting
+            )[1]
     write_alpha(output, frames, alpha, std if args.std else None)
     if args.viewer is not None:
-        _write_viewer(outputs[1], estimator, X=X, **drawn)
+        _write_viewer(outputs[1], estimator, X=X, **frames.weighting, **drawn)
     table = table_report(args.table, args.format, frames)
     sections = {
         "Table": table_section(table, unusable="without coefficients"),

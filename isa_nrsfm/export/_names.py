@@ -27,12 +27,15 @@ def suffix_of(path: str | os.PathLike[str], suffixes: Sequence[str]) -> str:
     return suffix
 
 
-def frames_of_table(model: Any, X: Any) -> tuple[NDArray, NDArray]:
+def frames_of_table(
+    model: Any, X: Any, point_weight: Any = None
+) -> tuple[NDArray, NDArray]:
     """Return cameras and coefficients of a table or of frames that are fitted.
 
     None is the fitted table.
     """
     if X is None:
         return model.motion_, model.alpha_
-    motion, _, alpha, _ = X if isinstance(X, Decomposition) else model.decompose(X)
-    return motion, alpha
+    if not isinstance(X, Decomposition):
+        X = model.decompose(X, point_weight=point_weight)
+    return X.motion, X.alpha

@@ -60,6 +60,7 @@ def frame_poses(
     model: Any,
     X: Any = None,
     *,
+    point_weight: Any = None,
     camera: Camera = "weak_perspective",
     edges: Any = "auto",
     origin: Origin = "auto",
@@ -79,6 +80,8 @@ def frame_poses(
     X : array-like of shape (n_frames, 2 * n_points), or Decomposition, default=None
         A table with the points of the fitted one, or the result of ``model.decompose``,
         whose frames are not fitted again. By default the fitted table.
+    point_weight : array-like of shape (n_frames, n_points), default=None
+        Weights of the points of a table X, as in ``model.fit``.
     camera : {"weak_perspective"}, default="weak_perspective"
         Camera model for a model with affine cameras. Calibrated cameras have their own.
     edges : "auto", str, Skeleton or None, default="auto"
@@ -116,7 +119,7 @@ def frame_poses(
     """
     return pose_function(
         model, camera=camera, edges=edges, origin=origin, mirrored=mirrored
-    )(X)
+    )(X, point_weight)
 
 
 def pose_function(
@@ -126,7 +129,7 @@ def pose_function(
     edges: Any = "auto",
     origin: Origin = "auto",
     mirrored: bool = False,
-) -> Callable[[Any], FramePoses]:
+) -> Callable[..., FramePoses]:
     """
     Return a function that computes the poses of frames of a model.
 
@@ -149,7 +152,7 @@ def pose_function(
     -------
     callable
         Function of `X`, a table or the result of ``model.decompose``, or None for the
-        fitted table. It returns `FramePoses`.
+        fitted table, and optionally of `point_weight`. It returns `FramePoses`.
 
     Raises
     ------
@@ -176,9 +179,11 @@ def pose_function(
     return partial(_poses, space, model)
 
 
-def _poses(space: UprightSpace, model: Any, X: Any) -> FramePoses:
+def _poses(
+    space: UprightSpace, model: Any, X: Any, point_weight: Any = None
+) -> FramePoses:
     """Return the poses of frames in an upright space."""
-    motion, alpha = frames_of_table(model, X)
+    motion, alpha = frames_of_table(model, X, point_weight)
     _, rotations, scales = upright_frames(space, model, motion, alpha)
     # The fitted table must determine the depth.
     determined = frames_of(model).certainty.determined
@@ -190,7 +195,7 @@ def _poses(space: UprightSpace, model: Any, X: Any) -> FramePoses:
     deviations = np.full((3, len(scales)), np.nan)
     is_table = not (X is None or isinstance(X, Decomposition))
     if is_table and space.metric is None and model.refinement in JOINT_REFINEMENTS:
-        covariance = model.rotation_covariance(X)
+        covariance = model.rotation_covariance(X, point_weight=point_weight)
         turned = space.transform @ covariance @ space.transform.T
         deviations = np.array(angle_deviations(angles, turned))
     return FramePoses(*angles, np.asarray(scales), *deviations)

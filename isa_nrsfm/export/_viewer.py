@@ -45,6 +45,7 @@ def write_viewer(
     path: str | os.PathLike[str],
     *,
     X: Any = None,
+    point_weight: ArrayLike | None = None,
     labels: ArrayLike | None = None,
     times: ArrayLike | None = None,
     depth_std: ArrayLike | None = None,
@@ -72,6 +73,8 @@ def write_viewer(
     X : array-like of shape (n_rows, 2 * n_points), default=None
         The table whose frames are shown; by default the fitted table. Frames are named
         by their number, from 0, or by the index of a pandas DataFrame.
+    point_weight : array-like of shape (n_rows, n_points), default=None
+        Weights of the points of `X`, as in ``model.fit``.
     labels : array-like of shape (n_rows,), default=None
         Labels of the rows of the table, text or numbers, at most 30 different ones.
         They determine the colours of frames. Rows with None or NaN have no label.
@@ -145,7 +148,8 @@ def write_viewer(
     if X is None or not len(rows):
         motion, alpha = model.motion_[rows], model.alpha_[rows]
     else:
-        motion, alpha = frames_of_table(model, taken_rows(X, rows))
+        weights = None if point_weight is None else taken_rows(point_weight, rows)
+        motion, alpha = frames_of_table(model, taken_rows(X, rows), weights)
     motion, alpha = np.asarray(motion), np.asarray(alpha)
     seen = np.isfinite(alpha).all(axis=1)
     rows, motion, alpha = rows[seen], motion[seen], alpha[seen]
