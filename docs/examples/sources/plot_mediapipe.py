@@ -44,7 +44,8 @@ for points, along in zip(mesh_curves, CURVES, strict=True):
     curve = interp1d(np.arange(len(along)), faces[:, list(along)], axis=1)
     mesh[:, list(points)] = curve(place)
 
-width, height = mesh.reshape(-1, 2).max(axis=0)
+mesh -= mesh.min(axis=(0, 1))  # into the image
+width, height = mesh.max(axis=(0, 1))
 names = [f"{axis}_{j}" for j in range(478) for axis in "xy"]
 table = pd.DataFrame((mesh / [width, height]).reshape(150, -1), columns=names)
 path = Path(tempfile.mkdtemp()) / "mesh.csv"
