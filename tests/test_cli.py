@@ -149,6 +149,16 @@ def test_files_of_a_fit_are_those_of_its_model(fitted, faces):
     found, rows = model.diagnostics(X), report["alpha"]
     for name in ("pose_share", "effective_frames"):
         assert [row[name] for row in rows] == pytest.approx(getattr(found, name))
+    # The rows of the largest error and the extreme coefficients are named.
+    of_rows = np.sqrt(np.mean(off**2, axis=1))
+    row = X.index[of_rows.argmax()]
+    expected = {"row": row, "rms": pytest.approx(of_rows.max())}
+    assert report["largest_error"] == expected
+    assert f", of row {row}<" in (fitted / "report.html").read_text(encoding="utf-8")
+    for k, row in enumerate(rows):
+        for kind in ("min", "max"):
+            at = alpha.set_index("row")[f"alpha_{k + 1}"][row[f"row_of_{kind}"]]
+            assert at == pytest.approx(row[kind])
 
 
 @pytest.mark.parametrize(

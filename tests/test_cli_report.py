@@ -97,6 +97,18 @@ def test_the_text_is_as_expected(run):
     assert re.sub(" +", " ", f"{text}\n") == expected
 
 
+def test_the_arguments_repeat_the_run(run, tmp_path):
+    folder, _ = run
+    report = report_of(folder)
+    arguments = report["arguments"]
+    assert arguments[:2] == ["fit", report["table"]["path"]]
+    arguments[arguments.index("-o") + 1] = str(tmp_path / "again")
+    assert main([*arguments, "--no-figures"]) == 0
+    digests = report_of(tmp_path / "again")["sha256"]
+    same = {name for name in digests if digests[name] == report["sha256"][name]}
+    assert {*digests} - same == {"report.html"}
+
+
 def test_the_page_has_the_text_the_figures_and_nothing_else(run):
     folder, _ = run
     report = report_of(folder)

@@ -76,7 +76,8 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
     """Describe a fitted model and how well it explains its table."""
     from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
 
-    alpha = estimator.alpha_
+    alpha, explained = estimator.alpha_, fitted_table(estimator)
+    errors = np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2, axis=1))
     ratio = getattr(estimator, "camera_noise_ratio_", None)
     certainty = frames_of(estimator).certainty
     advice = certainty.advice.replace('camera="affine"', "--camera affine")
@@ -94,14 +95,17 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
             "mean": alpha.mean(axis=0),
             "std": alpha.std(axis=0),
             "min": alpha.min(axis=0),
+            "row_of_min": X.index[alpha.argmin(axis=0)],
             "max": alpha.max(axis=0),
+            "row_of_max": X.index[alpha.argmax(axis=0)],
             "effective_frames": None if found is None else found.effective_frames,
             "pose_share": None if found is None else found.pose_share,
         }
     )
     return {
         "n_components": alpha.shape[1],
-        **quality_report(estimator, X, fitted_table(estimator)),
+        **quality_report(estimator, X, explained),
+        "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "inverse_snr": estimator.inverse_snr_,
         # Known only if the fit has seen the table as it is.
         "rank_floor": estimator.rank_floor_ if complete else None,

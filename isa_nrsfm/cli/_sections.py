@@ -254,6 +254,10 @@ def _fit(report: dict[str, Any]) -> Section:
         floor = _percent(model["rank_floor"])
         remark = f" (no model with {_shapes(model)} is below {floor})"
     parts = quality_section(model, remark)
+    largest = model["largest_error"]
+    parts.append(
+        f"largest error of a row: {largest['rms']:.3g}, of row {largest['row']}"
+    )
     if model["noise_variance"] is not None:
         noise = math.sqrt(model["noise_variance"])
         size = f"{_percent(noise)} of the frame's size"
@@ -304,12 +308,15 @@ def _alpha(coefficients: list[dict[str, Any]]) -> Section:
             [
                 row["name"],
                 f"{100 * row['energy_share']:.1f} %",
-                *(f"{row[key]:z.2f}" for key in ("mean", "std", "min", "max")),
+                *(f"{row[key]:z.2f}" for key in ("mean", "std", "min")),
+                f"{row['row_of_min']}",
+                f"{row['max']:z.2f}",
+                f"{row['row_of_max']}",
                 f"{100 * max(share, 0):.0f} %" if known else "",
             ]
         )
     parts: list[str | Cells] = [
-        Cells(["", "energy", "mean", "std", "min", "max", "pose"], rows),
+        Cells(["", "energy", "mean", "std", "min", "row", "max", "row", "pose"], rows),
         "energy: share of the deformation in the images (sum of squares)",
     ]
     if any(row[-1] for row in rows):
