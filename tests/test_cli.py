@@ -209,7 +209,7 @@ def test_calibrated_cameras(run, tmp_path, camera):
     code, out, err = run("fit", path, "-o", folder, "--camera", camera, "-k", "auto")
     assert (code, err) == (0, "")
     assert all(len(line) <= 120 for line in out.splitlines())
-    assert "Choice     K = 1: determined by the table\n" in out
+    assert "Choice     K = 1: found by auto\n" in out
     assert f"Cameras    {camera.replace('_', '-')}: shapes are known up to " in out
     assert "true proportions" not in out
 

@@ -97,6 +97,13 @@ def test_the_text_is_as_expected(run):
     assert re.sub(" +", " ", f"{text}\n") == expected
 
 
+def test_layouts_of_as_many_points_are_listed(run):
+    report = report_of(run[0])
+    for n_points, listed in ((14, "LAYOUT. If"), (21, r"LAYOUT \(of 21 .*: hand-21\)")):
+        report["table"]["n_points"] = n_points
+        assert re.search(listed, " ".join(map(str, fit_sections(report)["Fit"])))
+
+
 def test_the_arguments_repeat_the_run(run, tmp_path):
     folder, _ = run
     report = report_of(folder)

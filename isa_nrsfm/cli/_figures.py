@@ -145,13 +145,16 @@ def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
-    return CoefficientsDisplay(
+    shown = CoefficientsDisplay(
         alpha=alpha,
         alpha_std=deviation,
         time=asked.times,
         groups=asked.groups,
         component_names=names_of_components(None, alpha.shape[1]),
     ).plot(kind="time")
+    if asked.time_unit == "seconds" and np.asarray(asked.times).dtype.kind != "M":
+        shown.axes_[-1].set_xlabel("time, seconds")
+    return shown
 
 
 def _shapes_by_label(label: Label, fit: Fit) -> BasisShapeDisplay:

@@ -25,6 +25,7 @@ from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED
 from isa_nrsfm.export._names import names_of_components
 from isa_nrsfm.io import FORMATS
 from isa_nrsfm.io._formats import TABLE
+from isa_nrsfm.skeletons import SKELETONS
 
 _CAMERAS = {
     "affine": "affine: shapes are known up to an affine transformation of space",
@@ -75,7 +76,7 @@ def fit_sections(report: dict[str, Any]) -> dict[str, Section]:
     if "choice" in report:
         sections["Choice"] = _choice(report["choice"])
     elif model["parameters"]["n_components"] == AUTO:
-        sections["Choice"] = [f"K = {model['n_components']}: determined by the table"]
+        sections["Choice"] = [f"K = {model['n_components']}: found by {AUTO}"]
     sections["Fit"] = _fit(report)
     sections["Cameras"] = _cameras(model)
     sections["Alpha"] = _alpha(model["alpha"])
@@ -271,9 +272,13 @@ def _fit(report: dict[str, Any]) -> Section:
     if model["skeleton"] is not None:
         parts.append(f"points recognised as {model['skeleton']}")
     elif model["n_edges"] == 0:
+        n_points = report["table"]["n_points"]
+        alike = [s.name for s in SKELETONS.values() if s.n_points == n_points]
         parts.append(
             "points of no known layout: figures and viewer have no lines between them; "
-            "give these with --edges FILE or --skeleton LAYOUT."
+            "give these with --edges FILE or --skeleton LAYOUT"
+            + (f" (of {n_points} points: {', '.join(alike)})" if alike else "")
+            + ". If they are upside down, y points up in the table: use --origin lower."
         )
     return parts
 
