@@ -225,6 +225,16 @@ def assert_rows(landmarks, names):
     assert list(landmarks.points)[:2] == ["snout_x", "snout_y"]
 
 
+def test_deeplabcut_is_read_from_tsv_as_from_csv(tmp_path):
+    path = files.write_deeplabcut(tmp_path / "a.csv", FRAME)
+    expected, again = read_landmarks(path), tmp_path / "a.tsv"
+    again.write_text(path.read_text().replace(",", "\t"))
+    found = read_landmarks(again)
+    assert found.format == "deeplabcut"
+    pd.testing.assert_frame_equal(found.points, expected.points)
+    pd.testing.assert_frame_equal(found.confidence, expected.confidence)
+
+
 def test_deeplabcut_finds_each_animal(tmp_path):
     pair, frame, _ = pair_with_gaps()
     names = ["mouse 1", "mouse 2"]

@@ -8,7 +8,12 @@ import warnings
 import numpy as np
 import pytest
 from fit_runs import fit, write_landmarks
-from landmark_files import scene, write_openface
+from landmark_files import (
+    deeplabcut_frame,
+    scene,
+    write_deeplabcut,
+    write_openface,
+)
 from refusals import refused
 
 pd = pytest.importorskip("pandas")
@@ -598,6 +603,27 @@ def test_the_way_from_another_header_or_separator_is_right(tmp_path, monkeypatch
     if not new.exists():
         scope["table"].to_csv(new, index=False)
     np.testing.assert_array_equal(read_landmarks(new).points, WIDE)
+
+
+def test_the_way_from_semicolons_keeps_texts_and_headers(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = write_deeplabcut(tmp_path / "a.csv", deeplabcut_frame(scene()))
+    expected = read_landmarks(path).points
+    text = path.read_text().replace(",", ";").replace(".", ",")
+    (tmp_path / "b.csv").write_text(text)
+    table = WIDE.assign(who=["007", "1;2"], note="a, b")
+    table.to_csv("c.csv", sep=";", decimal=",", index=False)
+    for name in ("b.csv", "c.csv"):
+        told = str(refused("In pandas: ", read_table, name))
+        scope = {"pd": pd}
+        for line in told.partition("In pandas: ")[2].split(", and "):
+            exec(line, scope)
+        if name == "b.csv":
+            np.testing.assert_array_equal(read_landmarks("new.csv").points, expected)
+    found = read_table("new.csv")
+    assert list(found["who"]) == ["007", "1;2"]
+    assert list(found["note"]) == ["a, b"] * 2
+    np.testing.assert_array_equal(found[POINTS], WIDE)
 
 
 def test_the_way_from_several_levels_of_names_is_right():

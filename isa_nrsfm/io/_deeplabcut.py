@@ -9,7 +9,7 @@ import numpy as np
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm.io._hdf5 import is_hdf5, root_groups
 from isa_nrsfm.io._landmarks import Landmarks, assemble_individuals
-from isa_nrsfm.io._separated_values import header_rows, read_columns
+from isa_nrsfm.io._separated_values import SEPARATORS, header_rows, read_columns
 from isa_nrsfm.io._stored_frames import StoredFrame, read_stored_frame
 
 _LEVELS = ["scorer", "bodyparts", "coords"]
@@ -23,20 +23,20 @@ _UNIQUE = "single"
 
 def is_deeplabcut(path: Path) -> bool:
     """Return whether the header, or the group of an h5 file, is DeepLabCut's."""
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() in SEPARATORS:
         return _levels_of(header_rows(path, 4)) is not None
     return is_hdf5(path) and _KEY in root_groups(path)
 
 
 def read_deeplabcut(path: Path) -> Landmarks:
-    """Read a csv or h5 file of DeepLabCut or Lightning Pose.
+    """Read a csv, tsv or h5 file of DeepLabCut or Lightning Pose.
 
     The columns have the levels ``scorer``, ``individuals`` (only with several animals),
     ``bodyparts`` and ``coords``: ``x``, ``y`` and, but for labels made by hand,
     ``likelihood``. The index has the number of the frame or the path of the image. The
     individual "single", for points of no animal, is left out where there are others.
     """
-    table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_h5(path)
+    table = _read_text(path) if path.suffix.lower() in SEPARATORS else _read_h5(path)
     scorers = {column[0] for column in table.columns}
     if len(scorers) > 1:
         raise ValueError(f"it has labels of {len(scorers)} scorers; one is needed")
@@ -60,8 +60,8 @@ def read_deeplabcut(path: Path) -> Landmarks:
     )
 
 
-def _read_csv(path: Path) -> StoredFrame:
-    """Read a csv file, whose first lines are the levels of the columns."""
+def _read_text(path: Path) -> StoredFrame:
+    """Read a csv or tsv file, whose first lines are the levels of the columns."""
     header = header_rows(path, 4)
     levels = _levels_of(header)
     if levels is None:

@@ -323,7 +323,7 @@ _ALL = (
         "deeplabcut",
         "DeepLabCut, Lightning Pose",
         "columns of the levels scorer, (individuals,) bodyparts, coords",
-        (".csv", ".h5", ".hdf5"),
+        (".csv", ".tsv", ".h5", ".hdf5"),
         "_deeplabcut.deeplabcut",
     ),
     LandmarkFormat(
@@ -337,7 +337,8 @@ _ALL = (
     LandmarkFormat(
         "coco",
         "COCO keypoints",
-        "images, annotations and categories with keypoints, or a list of results",
+        "images, annotations and categories with keypoints, or a list of results; "
+        "write json of other programs as a table",
         (".json",),
         "_coco.coco",
         ("category",),

@@ -329,8 +329,9 @@ def _refuse_one_column(path: Path, separator: str, line: str) -> None:
         if 0 < line.count(other) == following.count(other):
             raise ValueError(
                 f"its columns are separated by {other!r}; {separator!r} is needed. In "
-                f"pandas: table = pd.read_csv({path.name!r}, sep={pattern}, decimal="
-                "','), and table.to_csv('new.csv', index=False)"
+                f"pandas: table = pd.read_csv({path.name!r}, sep={pattern}, "
+                "header=None, dtype=str), and table.replace(r'^(-?\\d*),(\\d+)$', "
+                "r'\\1.\\2', regex=True).to_csv('new.csv', header=False, index=False)"
             )
 
 
