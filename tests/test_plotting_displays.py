@@ -379,6 +379,20 @@ def test_the_matrix_of_an_estimator_has_its_blocks(estimator):
     assert len(display.figure_.axes) == 1
 
 
+@pytest.mark.parametrize("n_components", [9, 12, 13, 40, 99])
+def test_labels_of_the_matrix_do_not_touch(n_components):
+    display = ModeCovarianceDisplay(mode_covariance=covariance(n_components)).plot()
+    display.figure_.canvas.draw()
+    for axis in (display.ax_.xaxis, display.ax_.yaxis):
+        labels = [each for each in axis.get_ticklabels() if each.get_text()]
+        assert labels[0].get_text() == "1"
+        assert len(labels) >= min(n_components, 7)
+        boxes = [label.get_window_extent() for label in labels]
+        assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+        place = int(labels[-1].get_text()) * 3 - 2
+        assert axis.get_ticklocs()[-1] == place
+
+
 @pytest.mark.parametrize("largest", [3e-7, 0.017, 1.0, 99.0])
 def test_ticks_of_the_asinh_scale(largest):
     ticks = asinh_ticks(largest, signed=True)

@@ -229,7 +229,9 @@ class ModeCovarianceDisplay:
         }
         self.im_ = self.ax_.imshow(values, **(style | (im_kw or {})))
 
-        n_modes = len(values)
+        n_modes, names = len(values), self.component_names
+        # Of 16 labels of two digits some touch in the default figure.
+        step = -(-len(names) // 12)
         cuts = np.arange(BLOCK, n_modes, BLOCK) - 0.5
         ends = [-0.5, n_modes - 0.5]
         self.boundaries_ = self.ax_.add_collection(
@@ -237,15 +239,15 @@ class ModeCovarianceDisplay:
                 [[(cut, end) for end in ends] for cut in cuts]
                 + [[(end, cut) for end in ends] for cut in cuts],
                 colors="0.35",
-                linewidths=0.6,
+                linewidths=0.6 / step,
             )
         )
-        centres = np.arange(len(self.component_names)) * BLOCK + (BLOCK - 1) / 2
+        centres = np.arange(0, len(names), step) * BLOCK + (BLOCK - 1) / 2
         self.ax_.set(
             xticks=centres,
             yticks=centres,
-            xticklabels=self.component_names,
-            yticklabels=self.component_names,
+            xticklabels=names[::step],
+            yticklabels=names[::step],
             xlabel="basis shape",
             ylabel="basis shape",
         )
@@ -253,15 +255,15 @@ class ModeCovarianceDisplay:
             title = f"{percent(self.off_block_share)} outside the diagonal blocks"
             self.ax_.set_title(f"{title}\n(0 % if uncorrelated)", fontsize="small")
         self.ax_.tick_params(length=0)
-        if max(map(len, self.component_names)) > 3:
+        if max(map(len, names)) > 3:
             plt.setp(self.ax_.get_xticklabels(), rotation=90)
         self.colorbar_ = None
         if colorbar:
             self.colorbar_ = self.figure_.colorbar(self.im_, ax=self.ax_, label=label)
             if scale == "asinh":
                 ticks = asinh_ticks(largest, signed=not absolute)
-                names = [f"{tick:g}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
-                self.colorbar_.set_ticks(ticks, labels=names)
+                texts = [f"{tick:g}".replace("-", "\N{MINUS SIGN}") for tick in ticks]
+                self.colorbar_.set_ticks(ticks, labels=texts)
                 self.colorbar_.minorticks_off()
             self.colorbar_.outline.set_linewidth(0.6)
         return self
