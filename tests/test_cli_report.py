@@ -215,6 +215,23 @@ def figure_of(run, name):
     return figures_of(Namespace(n_components=[2]), asked)[name][1](fit)
 
 
+def test_figures_show_twelve_basis_shapes():
+    X = make_nonrigid_tracks(60, 45, 13, noise=0.01, random_state=0).data
+    columns = [f"{axis}{j}" for j in range(45) for axis in "xy"]
+    X = pd.DataFrame(X, columns=columns)
+    model = AffineNRSfM(
+        13, refinement="alternating", isa=FastISA(n_init=1), random_state=0
+    ).fit(X)
+    mood = Label("mood", "classes", np.resize(["a", "b"], 60), np.ones(60, bool))
+    asked = Columns([mood], None, np.arange(60.0), "seconds", [], None)
+    fit = Fit(model, X, None, None, {"edges": None, "origin": "auto"})
+    figures = figures_of(Namespace(n_components=[13]), asked)
+    shapes = figures["basis_shapes.png"][1](fit)
+    np.testing.assert_array_equal(shapes.components_, np.arange(12))
+    for name in ("label_1.png", "time.png"):
+        assert len(figures[name][1](fit).axes_) == 12
+
+
 def test_shapes_of_classes_have_a_legend(run):
     (legend,) = figure_of(run, "label_1_shapes.png").figure_.legends
     texts = [text.get_text() for text in legend.get_texts()]

@@ -30,6 +30,10 @@ from isa_nrsfm.plotting import (
 from isa_nrsfm.plotting._axes import MEAN_COLOUR, wrap_title
 from isa_nrsfm.plotting._page import VIEWS, add_legend, block_limits, new_page
 
+# Basis shapes and coefficients that are drawn, those with most energy: as many as
+# `--n-components auto` finds with the joint fit. The panels of 40 shapes are too small.
+MOST_DRAWN = 12
+
 
 class Fit(NamedTuple):
     """A fit to draw: model, table, search, smoothed coefficients, lines to draw."""
@@ -47,8 +51,12 @@ Figures = dict[str, tuple[str, Callable[[Fit], Any]]]
 # The figures of every fit.
 ALWAYS: Figures = {
     "basis_shapes.png": (
-        "mean shape and basis shapes",
-        lambda fit: BasisShapeDisplay.from_estimator(fit.estimator, **fit.drawn),
+        f"mean shape and basis shapes; of more than {MOST_DRAWN} those of most energy",
+        lambda fit: BasisShapeDisplay.from_estimator(
+            fit.estimator,
+            components=np.arange(len(fit.estimator.basis_))[:MOST_DRAWN],
+            **fit.drawn,
+        ),
     ),
     "mode_covariance.png": (
         "whether basis shapes occur together; covariance of the deformations in the "
@@ -130,7 +138,7 @@ def _reprojections(fit: Fit) -> ReprojectionDisplay:
 
 def _by_label(label: Label, fit: Fit) -> CoefficientsDisplay:
     """Draw the coefficients by a label."""
-    alpha = fit.estimator.alpha_
+    alpha = fit.estimator.alpha_[:, :MOST_DRAWN]
     return CoefficientsDisplay(
         alpha=alpha[label.known],
         y=label.values,
@@ -145,9 +153,10 @@ def _in_time(asked: Columns, fit: Fit) -> CoefficientsDisplay:
     deviation = getattr(fit.estimator, "alpha_std_", None)
     if fit.smooth is not None:
         alpha, deviation = fit.smooth[:2]
+    alpha = alpha[:, :MOST_DRAWN]
     shown = CoefficientsDisplay(
         alpha=alpha,
-        alpha_std=deviation,
+        alpha_std=None if deviation is None else deviation[:, :MOST_DRAWN],
         time=asked.times,
         groups=asked.groups,
         component_names=names_of_components(None, alpha.shape[1]),
