@@ -46,7 +46,7 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
+from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
 from isa_nrsfm._joint.options import JointOptions
@@ -158,8 +158,12 @@ def fit_ready_table(
             model = replace(model, certainty=certainty)
             estimator.depth_uncertainty_ = model.certainty.total
         if estimator.refinement == "consensus":
-            model = _consensus_model(estimator, table, model, settings, wanted)
-            tracks = JointFrames.from_points(table.rows, table.complete)
+            # A residual below the noise of the spectrum leaves nothing for groups.
+            n_numbers, energy = tracks.totals
+            noise = Spectrum.of(factorised, n_components).noise * energy / n_numbers
+            if wanted > n_components or fitted.left > noise:
+                model = _consensus_model(estimator, table, model, settings, wanted)
+                tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)
         frames = _joint_frames(estimator, table, model, tracks)
         estimator.camera_noise_ratio_ = fitted.camera_noise_ratio
@@ -404,9 +408,10 @@ def _consensus_model(
     most = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(most, MOST_COMPONENTS)
     found = consensus(model, table.rows, settings, wanted, most, estimator.n_jobs)
+    # If the object hardly turns, groups share the errors of the depths.
     certainty = model.certainty
-    if found.variances is not None:
-        certainty = certainty._replace(points=found.variances)
+    if found.variances is not None and certainty.determined:
+        certainty = certainty._replace(points=found.variances, leverage=1.0)
     model = _frame_model(estimator, found.shapes, found.noise, found.alpha)
     return replace(model, certainty=certainty)
 
@@ -439,7 +444,7 @@ def _joint_frames(
         table.unit if estimator.camera == "orthographic" else None,
     )
     certainty = frames.certainty
-    if estimator.refinement == "consensus":
+    if certainty.leverage is not None:  # of coefficients from the images
         certainty = certainty._replace(leverage=float(leverages(alpha).mean()))
     frames = replace(frames, gauge=frame_map, certainty=certainty)
     weight = table.weight

@@ -5,8 +5,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._joint.common_depths import _principal, _turned, common_coordinates
-from isa_nrsfm._linalg.small_matrices import procrustes
+from isa_nrsfm._joint.common_depths import (
+    _principal,
+    _turns,
+    aligned_shapes,
+    common_coordinates,
+)
 
 FLOOR = 1e-5
 
@@ -99,39 +103,56 @@ def test_mean_depths_of_frames_stay():
 
 
 @pytest.mark.parametrize("s2", [1e-3, 0.05])
-def test_expectation_is_that_of_probabilistic_components(s2, rng):
-    """It is ``B (B^T B + s2 I)^-1 B^T`` for ``B = U (v - s2)^.5``."""
+def test_precision_is_that_of_probabilistic_components(s2, rng):
+    """It is ``(B B^T + s2 I)^-1`` for ``B = U (v - s2)^.5``, for centred shapes."""
     B = rng.standard_normal((12, 2))
-    shapes = (rng.standard_normal((500, 2)) @ B.T).reshape(500, 3, 4)
+    shapes = (B @ rng.standard_normal((2, 500))).reshape(4, 3, 500)
     shapes += 0.1 * rng.standard_normal(shapes.shape)
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    fit, found = _principal(shapes, s2)
-    mean = shapes.mean(axis=0)
-    values, vectors = np.linalg.eigh(np.cov(shapes.reshape(500, -1).T, bias=True))
+    shapes -= shapes.mean(axis=0)
+    found, slope = _principal(shapes, s2)
+    values, vectors = np.linalg.eigh(np.cov(shapes.reshape(12, -1), bias=True))
     kept = values > s2
     B = vectors[:, kept] * np.sqrt(values[kept] - s2)
-    expected = B @ np.linalg.solve(B.T @ B + s2 * np.eye(B.shape[1]), B.T)
-    assert_allclose(found, expected, atol=1e-12)
-    off = (shapes - mean).reshape(500, -1)
-    assert_allclose(fit, mean + (off @ expected).reshape(shapes.shape), atol=1e-12)
+    centring = np.kron(np.eye(4) - 0.25, np.eye(3))
+    expected = np.linalg.inv(B @ B.T + s2 * np.eye(12)) @ centring
+    assert_allclose(found, expected, atol=1e-9 / s2)
+    off = (shapes.mean(axis=2, keepdims=True) - shapes).reshape(12, -1)
+    assert_allclose(slope.reshape(12, -1), expected @ off, atol=1e-9 / s2)
 
 
-def test_steps_of_rotations_reach_those_of_procrustes(rng):
-    fit = rng.standard_normal((50, 3, 12))
-    own = Rotation.from_rotvec(rng.standard_normal((50, 3))).as_matrix() @ fit
-    own += 0.1 * rng.standard_normal(own.shape)
-    best = procrustes(own @ fit.transpose(0, 2, 1))
-    assert_allclose(np.linalg.det(best), 1.0)
-    R = best @ Rotation.from_rotvec(0.3 * rng.standard_normal((50, 3))).as_matrix()
-    errors = [np.linalg.norm(own - R @ fit)]
-    for _ in range(15):
-        R = _turned(R, R.transpose(0, 2, 1) @ own, fit)
-        errors.append(np.linalg.norm(own - R @ fit))
-    assert np.all(np.diff(errors) < 1e-12)
-    assert_allclose(R, best, atol=1e-12)
+def test_turns_are_gauss_newton_steps_with_the_gaussian_held(rng):
+    """They solve the normal equations of shapes that are turned, in each frame."""
+    shapes = rng.standard_normal((5, 3, 1)) + 0.1 * rng.standard_normal((5, 3, 40))
+    shapes -= shapes.mean(axis=0)
+    precision, slope, *_, w = _turns(shapes, 1e-3)
+    for i in (0, 17):
+        S, step = shapes[:, :, i], 1e-6
+        D = [
+            (S @ Rotation.from_rotvec(step * axis).as_matrix() - S).ravel() / step
+            for axis in np.eye(3)
+        ]
+        D = np.array(D).T
+        expected = np.linalg.solve(D.T @ precision @ D, D.T @ slope[:, :, i].ravel())
+        assert_allclose(w[:, i], expected, rtol=1e-4, atol=1e-6)
 
 
-def test_steps_of_rotations_leave_points_on_a_line_in_place():
-    line = np.linspace(-1, 1, 5) * np.array([[0.0], [0.0], [1.0]])
-    R = _turned(np.eye(3)[None], line[None], line[None])
-    assert_allclose(R, np.eye(3)[None], atol=1e-12)
+def test_points_on_a_line_do_not_turn_about_it():
+    line = np.linspace(-1, 1, 5)[:, None, None] * np.array([0.0, 0.0, 1.0])[:, None]
+    *_, w = _turns(line * np.array([1.0, 1.1, 0.9]), 1e-3)
+    assert_allclose(w, 0.0, atol=1e-12)
+
+
+def test_aligned_shapes_are_likelier_and_have_the_same_distances(rng):
+    base, basis = rng.standard_normal((2, 3, 6))
+    S = base + 0.3 * rng.standard_normal((50, 1, 1)) * basis
+    S -= S.mean(axis=2, keepdims=True)
+    turns = Rotation.from_rotvec(0.1 * rng.standard_normal((50, 3))).as_matrix()
+    found = aligned_shapes(turns @ S, 1e-4)
+    assert_allclose(
+        found.transpose(0, 2, 1) @ found, S.transpose(0, 2, 1) @ S, atol=1e-12
+    )
+    spread = [
+        np.linalg.svd(each.reshape(50, -1) - each.mean(axis=0).ravel())[1]
+        for each in (turns @ S, found)
+    ]
+    assert spread[1][1] < 0.05 * spread[0][1]
