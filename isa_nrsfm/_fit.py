@@ -159,9 +159,9 @@ def fit_ready_table(
             estimator.depth_uncertainty_ = model.certainty.total
         if estimator.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.
-            n_numbers, energy = tracks.totals
-            noise = Spectrum.of(factorised, n_components).noise * energy / n_numbers
-            if wanted > n_components or fitted.left > noise:
+            n_numbers, square = tracks.totals
+            share = Spectrum.of(factorised, n_components).noise
+            if wanted > n_components or fitted.left > share * square / n_numbers:
                 model = _consensus_model(estimator, table, model, settings, wanted)
                 tracks = JointFrames.from_points(table.rows, table.complete)
             progress(CONSENSUS_STAGE)

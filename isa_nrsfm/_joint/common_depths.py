@@ -73,7 +73,7 @@ def common_coordinates(
             # Without the turns, which follow the coordinates
             slope = np.einsum("abi,jbi->jai", R, slope)
             slope -= np.einsum("kjai,ki->jai", mixed, w)
-            gradient[np.ix_(points, range(3), frames)] += slope
+            gradient[np.ix_(points, np.arange(3), frames)] += slope
             following = np.einsum("kli,ljai->kjai", inverse, mixed)
             weights = precision.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
             for axis, total in zip(axes, precisions, strict=True):
@@ -141,7 +141,7 @@ def _principal(shapes: NDArray, s2: float) -> tuple[NDArray, NDArray]:
 
 def _of_group(Y: NDArray, frames: NDArray, points: NDArray) -> NDArray:
     """Return the centred coordinates (n, 3, n_frames) of a group."""
-    own = Y[np.ix_(points, range(3), frames)]
+    own = Y[np.ix_(points, np.arange(3), frames)]
     return np.asarray(own - own.mean(axis=0))
 
 
