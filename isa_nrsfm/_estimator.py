@@ -52,7 +52,7 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         as many as the table allows (joint refinement only); ``len(basis_)`` is the
         number found. With ``refinement="consensus"`` the joint fit has at most twelve,
         and the result has K principal components of the merged shapes; "auto" keeps up
-        to 40, all that exceed the noise.
+        to 60, all that exceed the noise.
     isa : object, default=None
         Strategy of independent subspace analysis, such as `FastISA` or `PooledFastICA`,
         with subspaces of size three. None is ``PooledFastICA()``, with two runs if its
@@ -74,9 +74,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         result and recovers the true shapes as far as the images determine them.
         "consensus" continues from there, with calibrated cameras: it fits overlapping
         groups of neighbouring points, with rotations of their own, and finds the
-        depths that they have in common. Bodies become more accurate by a third to a
-        half, and a fit takes 5 to 30 times as long. Set ``n_components="auto"`` or
-        about 40 with it.
+        depths that they have in common. Bodies become more accurate by a third to two
+        thirds, and a fit takes 5 to 30 times as long. Set ``n_components="auto"`` or
+        about 60 with it.
         "alternating" is the paper's alternating least squares for basis shapes and
         coefficients, with fixed rigid cameras.
     camera : {"affine", "weak_perspective", "orthographic"}, default="affine"

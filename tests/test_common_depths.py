@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._joint.common_depths import (
     _principal,
     _turns,
-    aligned_shapes,
+    aligning_rotations,
     common_coordinates,
 )
 
@@ -142,17 +142,18 @@ def test_points_on_a_line_do_not_turn_about_it():
     assert_allclose(w, 0.0, atol=1e-12)
 
 
-def test_aligned_shapes_are_likelier_and_have_the_same_distances(rng):
+def test_aligning_rotations_leave_the_deformation(rng):
+    """Shapes of rank one that were turned have rank one again."""
     base, basis = rng.standard_normal((2, 3, 6))
     S = base + 0.3 * rng.standard_normal((50, 1, 1)) * basis
     S -= S.mean(axis=2, keepdims=True)
-    turns = Rotation.from_rotvec(0.1 * rng.standard_normal((50, 3))).as_matrix()
-    found = aligned_shapes(turns @ S, 1e-4)
+    S = Rotation.from_rotvec(0.1 * rng.standard_normal((50, 3))).as_matrix() @ S
+    R = aligning_rotations(S, 1e-4)
     assert_allclose(
-        found.transpose(0, 2, 1) @ found, S.transpose(0, 2, 1) @ S, atol=1e-12
+        R @ R.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)), atol=1e-12
     )
-    spread = [
-        np.linalg.svd(each.reshape(50, -1) - each.mean(axis=0).ravel())[1]
-        for each in (turns @ S, found)
+    second = [
+        np.linalg.svd((each - each.mean(axis=0)).reshape(50, -1))[1][1]
+        for each in (S, R.transpose(0, 2, 1) @ S)
     ]
-    assert spread[1][1] < 0.05 * spread[0][1]
+    assert second[1] < 0.05 * second[0]

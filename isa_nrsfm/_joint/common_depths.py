@@ -97,14 +97,16 @@ def common_coordinates(
     return np.ascontiguousarray(Y.transpose(2, 1, 0))
 
 
-def aligned_shapes(S: NDArray, s2: float) -> NDArray:
-    """Return shapes (I, 3, n) turned to the greatest likelihood of ``N(mu, Sigma)``."""
-    Y = S.transpose(2, 1, 0)
+def aligning_rotations(S: NDArray, s2: float) -> NDArray:
+    """Return rotations R (I, 3, 3) with likeliest ``R^T S_i ~ N(mu, Sigma)``.
+
+    The shapes S (I, 3, n) are centred, and the noise variance is s2.
+    """
     R = np.repeat(np.eye(3)[:, :, None], len(S), axis=2)
     for _ in range(STEPS):
-        shapes = np.einsum("jai,abi->jbi", Y, R)
+        shapes = np.einsum("iaj,abi->jbi", S, R)
         R = rotated(R, _turns(shapes, s2)[-1])
-    return np.einsum("jai,abi->ibj", Y, R)
+    return frames_first(R)
 
 
 def _turns(shapes: NDArray, s2: float) -> tuple[NDArray, ...]:
