@@ -12,7 +12,7 @@ Neighbouring points have a simpler model, with rotations of their own:
 5. The mean and the principal components of these shapes are the new model.
 
 The mean square change of the depth of a point by step 4 estimates its squared error:
-for motion capture errors are 0.9 to 1.9 times these standard deviations.
+for motion capture errors are 0.8 to 1.7 times these standard deviations.
 """
 
 from functools import partial

@@ -122,12 +122,12 @@ for name, z in off.items():
 
 # %%
 # After a consensus, the variance of a point contains the mean square change of its
-# depth. The change is usually larger than the error that remains. Frames with large
+# depth by the last step, in which all groups are fitted together. Frames with large
 # coefficients have larger variances. The deviations distinguish uncertain points well,
 # uncertain frames less clearly.
 #
-# Each mark is a point of the body, with root mean squares over all frames. Marks below
-# the line have smaller errors than stated.
+# Each mark is a point of the body, with root mean squares over all frames. Marks above
+# the line have larger errors than stated.
 
 _, axis = plt.subplots(figsize=(4.5, 4), layout="constrained")
 for name, z in off.items():
