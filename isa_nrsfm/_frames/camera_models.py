@@ -208,9 +208,23 @@ def rotated(M: NDArray, turns: NDArray) -> NDArray:
 
 
 def nearest_calibrated(motion: NDArray) -> tuple[NDArray, NDArray]:
-    """Return the orthonormal rows (n, 2, 3) nearest to cameras, and scales (n,)."""
-    rows, values, _ = polar(motion)
-    return rows, values.mean(axis=1)
+    """Return the orthonormal rows (n, 2, 3) nearest to cameras, and scales (n,).
+
+    The root of ``G = M M^T`` with determinant d^2 is ``(G + d I) / t``, where ``t^2 =
+    tr(G) + 2 d``. If rows are nearly parallel, an SVD keeps all digits.
+    """
+    size = np.linalg.norm(motion, axis=(1, 2))
+    x, y = (motion / np.where(size > 0, size, 1.0)[:, None, None]).transpose(1, 0, 2)
+    d = np.linalg.norm(np.cross(x, y), axis=1)
+    p, q, r = np.vecdot(x, x) + d, np.vecdot(x, y), np.vecdot(y, y) + d
+    t, flat = np.sqrt(1.0 + 2.0 * d), ~(d > 0.1)
+    divisor = np.where(flat, 1.0, d * t)
+    p, q, r = ((each / divisor)[:, None] for each in (p, q, r))
+    rows, scales = np.stack([r * x - q * y, p * y - q * x], axis=1), 0.5 * t * size
+    if flat.any():
+        rows[flat], values, _ = polar(motion[flat])
+        scales[flat] = values.mean(axis=1)
+    return rows, scales
 
 
 def full_rotations(motion: NDArray) -> tuple[NDArray, NDArray]:

@@ -26,6 +26,7 @@ from isa_nrsfm._linalg.small_matrices import (
     diagonal_of,
     inverse3,
     of_frames,
+    packed_rows,
     pair_indices,
     unpack3,
     unpacked,
@@ -221,15 +222,22 @@ def _share(weight: NDArray) -> NDArray:
 class ShapeProducts:
     """Products of shapes (n_shapes, 3, J), rows centred.
 
-    rows (3 n_shapes, J): the shapes; pairs (6 n_pairs, J): the products ``b_kj b_lj^T``
-    of each point; gram: the sums of these.
+    rows (3 n_shapes, J): the shapes; gram: their Gram matrix over all points.
     """
 
     def __init__(self, shapes: NDArray):
         self.shapes = np.ascontiguousarray(shapes, dtype=np.float64)
         self.rows = self.shapes.reshape(-1, shapes.shape[-1])
-        self.pairs = _pair_products(self.shapes).reshape(-1, shapes.shape[-1])
-        self.gram = Gram(self.pairs.sum(axis=1).reshape(-1, 6))
+        n = len(shapes)
+        products = (self.rows @ self.rows.T).reshape(n, 3, n, 3).swapaxes(1, 2)
+        pairs = products[pair_indices(n)]
+        pairs = 0.5 * (pairs + pairs.swapaxes(1, 2))
+        self.gram = Gram(pairs[:, ROWS, COLUMNS])
+
+    @cached_property
+    def pairs(self) -> NDArray:
+        """Symmetric parts of ``b_kj b_lj^T`` of each point (6 n_pairs, J)."""
+        return _pair_products(self.shapes).reshape(-1, self.rows.shape[1])
 
 
 def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
@@ -251,10 +259,13 @@ def frame_sums(tracks: FrameTracks, shapes: ShapeProducts) -> FrameSums:
 
 def _pair_products(rows: NDArray) -> NDArray:
     """Return the symmetric parts of ``x_k x_l^T`` of (n, 3, m) as (n_pairs, 6, m)."""
-    first, second = (rows[index] for index in pair_indices(len(rows)))
-    products = first[:, ROWS] * second[:, COLUMNS]
-    products += first[:, COLUMNS] * second[:, ROWS]
-    products *= 0.5
+    n = len(rows)
+    products = np.empty((n * (n + 1) // 2, 6, rows.shape[2]))
+    first, second = 0.5 * rows[:, ROWS], 0.5 * rows[:, COLUMNS]
+    rows_of, columns_of = rows[:, ROWS], rows[:, COLUMNS]
+    for k, product in enumerate(packed_rows(products)):
+        np.multiply(first[k], columns_of[k:], out=product)
+        product += second[k] * rows_of[k:]
     return products
 
 

@@ -25,11 +25,15 @@ def _energies(
     rows: NDArray, motion: NDArray, position: NDArray, alpha: NDArray, shapes: NDArray
 ) -> tuple[float, float]:
     """Return the energies of the residuals of a block, and of its centred frames."""
-    rows = rows.astype(np.float64, copy=False)
-    centred = rows - np.nanmean(rows, axis=2, keepdims=True)
+    middle = rows.mean(axis=2, keepdims=True, dtype=np.float64)
+    if np.isnan(middle).any():
+        middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
+    signal = _sum_of_squares(rows - middle)
     model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
-    rest = rows - model.reshape(rows.shape) - position[:, :, None]
-    return _sum_of_squares(rest), _sum_of_squares(centred)
+    rest = model.reshape(rows.shape)
+    rest += position[:, :, None]
+    rest -= rows
+    return _sum_of_squares(rest), signal
 
 
 def _sum_of_squares(values: NDArray) -> float:

@@ -132,9 +132,10 @@ class FrameBlocks:
         """Return different frames (n_chosen,) in any order. Blocks are arrays."""
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
-        order = np.argsort(np.argsort(frames))
-        found: NDArray = self.joined(chosen_rows, chosen)[order]
-        return found
+        found: NDArray = self.joined(chosen_rows, chosen)
+        order = np.argsort(frames)
+        sorted_already = np.array_equal(order, np.arange(len(order)))
+        return found if sorted_already else found[np.argsort(order)]
 
     def whole(self) -> NDArray:
         """Return all frames. Blocks are arrays."""
