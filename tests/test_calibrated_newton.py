@@ -13,8 +13,15 @@ from scenes import with_gaps
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from isa_nrsfm._frames.calibrated_newton import CalibratedSearch, calibrated_starts
+from isa_nrsfm._frames.calibrated_newton import (
+    LARGE_RISE,
+    REVERSED,
+    CalibratedSearch,
+    _rise,
+    calibrated_starts,
+)
 from isa_nrsfm._frames.camera_models import CAMERAS
+from isa_nrsfm._frames.coefficients import coefficient_posterior
 from isa_nrsfm._frames.point_sums import frame_sums, frame_tracks
 from isa_nrsfm._linalg.small_matrices import frames_first, frames_last, unpacked
 
@@ -302,6 +309,25 @@ class TestReversal:
         assert_calibrated(found, camera)
 
     @BOTH
+    def test_reversals_are_tried_over_a_large_rise(self, camera):
+        # In a joint fit cameras can be in high minima, where the bound does not hold.
+        scene = scenes.random_scene(
+            n_frames=1500,
+            noise=0.01,
+            camera=camera,
+            deformation=0.4,
+            extent=(1.0, 0.8, 0.3),
+        )
+        search, problem, M = problem_of(scene, camera, 1e-4)
+        M = M * REVERSED
+        _, better = self.search(scene, camera, 1e-4, frames_first(M) @ search.space)
+        M, _ = search.descend(problem, search.evaluate(problem, M), 6)
+        posterior = coefficient_posterior(problem.products, M, problem.noise)
+        value = search.evaluate(problem, M).value
+        steep = _rise(problem, M, posterior) > LARGE_RISE * value
+        assert (better & steep).sum() >= 3
+
+    @BOTH
     def test_cameras_at_the_minimum_stay(self, camera):
         scene = self.scene(camera)
         expected = fitted(scene, camera, 1e-4).motion
@@ -325,6 +351,35 @@ class TestReversal:
                 np.zeros(n),
             )
             assert value(scene, i, fits.motion[i], noise) <= end.fun + 1e-6
+
+    @BOTH
+    def test_rise_on_the_way_is_that_of_the_quadratic_approximation(self, camera):
+        scene = random_scene(camera, noise=0.0, n_frames=3)
+        search, problem, M = problem_of(scene, camera, 1e-9)
+        posterior = coefficient_posterior(problem.products, M, problem.noise)
+        shapes, h = search.shared.shapes, 1e-3
+
+        def f(i, change):
+            changed = M[..., i] + change.reshape(2, 3)
+            frame = Regression.of(scene.tracks[i], shapes, changed)
+            return frame.square(frame.mean(1e-9), 1e-9)
+
+        for i, rise in enumerate(_rise(problem, M, posterior)):
+            Y = np.empty((6, 6))
+            for p, q in np.ndindex(6, 6):
+                a, b = h * np.eye(6)[p], h * np.eye(6)[q]
+                corners = f(i, a + b) + f(i, -a - b) - f(i, a - b) - f(i, b - a)
+                Y[p, q] = corners / (8 * h * h)
+            z = (M[..., i] * [0, 0, 1]).ravel()
+            assert_allclose(rise, (z @ z) ** 2 / (z @ np.linalg.solve(Y, z)), rtol=1e-3)
+
+    @BOTH
+    def test_solid_objects_are_not_reversed(self, camera, monkeypatch):
+        scene = random_scene(camera)
+        search, problem, M = problem_of(scene, camera, NOISE**2)
+        monkeypatch.setattr(search, "evaluate", None)  # no search from reversed cameras
+        converged = np.ones(len(scene.tracks), dtype=bool)
+        assert_array_equal(search.solution(problem, M, converged, 10)[0], M)
 
 
 def test_completed_starts_are_scaled_rotations_with_the_first_two_columns(rng):

@@ -66,7 +66,7 @@ class AffineSearch(FrameSearch):
         return State(position, value, slope, held, schur)
 
     def solution(
-        self, problem: FrameProblem, position: NDArray
+        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
     ) -> tuple[NDArray, NDArray, NDArray]:
         """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
         products, noise = problem
@@ -75,10 +75,10 @@ class AffineSearch(FrameSearch):
         return M, position, products.energy - explained + square
 
     def covariances(
-        self, problem: FrameProblem, position: NDArray
+        self, problem: FrameProblem, M: NDArray, alpha: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Return the covariances of coefficients (K, K, n), and NaN for rotations."""
-        inverse = self.evaluate(problem, position).inverse()
+        inverse = self.evaluate(problem, alpha).inverse()
         return problem.noise * inverse, np.full((3, 3, len(problem.noise)), np.nan)
 
 

@@ -48,6 +48,11 @@ class CoefficientPosterior(NamedTuple):
         diagonal = diagonal_of(self.inverse)[1:]
         return noise * (len(diagonal) + noise * self.inverse[diagonal].sum(axis=0))
 
+    def covaried(self, vectors: NDArray) -> NDArray:
+        """Return ``sum_l Q_kl v_l`` of vectors (K, p, I)."""
+        negative = unpacked(self.inverse[len(self.c) :])
+        return -np.einsum("kli,lpi->kpi", negative, vectors)
+
     def second_moments(self, noise: NDArray | float) -> NDArray:
         """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
         n_shapes = len(self.c)

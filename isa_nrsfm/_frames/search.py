@@ -285,13 +285,13 @@ class FrameSearch:
             problem = self.problem(products, noise[chosen[block]])
             start = self.evaluate(problem, self.start(problem, initial[block].T))
             position, converged = self.descend(problem, start, max_steps)
-            if not rough:
-                position = self.improved(problem, position, converged, max_steps)
-            M, alpha, objective = self.solution(problem, position)
+            M, alpha, objective = self.solution(
+                problem, position, converged, 0 if rough else max_steps
+            )
             motion = frames_first(M)
             spreads = fits.covariance[block], fits.turn_covariance[block]
             if covariances:
-                covariance, turns = self.covariances(problem, position)
+                covariance, turns = self.covariances(problem, M, alpha)
                 turns = self.space.T @ frames_first(turns) @ self.space
                 spreads = frames_first(covariance), turns
             found = FramePosterior(
@@ -319,22 +319,20 @@ class FrameSearch:
         raise NotImplementedError
 
     def solution(
-        self, problem: FrameProblem, position: NDArray
+        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,)."""
+        """Return cameras (2, 3, n), coefficients (K, n) and objectives (n,).
+
+        They are replaced by lower minima that are found in n_steps. `converged` is
+        updated.
+        """
         raise NotImplementedError
 
     def covariances(
-        self, problem: FrameProblem, position: NDArray
+        self, problem: FrameProblem, M: NDArray, alpha: NDArray
     ) -> tuple[NDArray, NDArray]:
         """Return covariances of coefficients (K, K, n) and rotations (3, 3, n)."""
         raise NotImplementedError
-
-    def improved(
-        self, problem: FrameProblem, position: NDArray, converged: NDArray, n_steps: int
-    ) -> NDArray:
-        """Return positions, replaced by lower minima, and update their convergence."""
-        return position
 
     def moved(self, position: NDArray, step: NDArray) -> NDArray:
         """Return the positions after steps (n_parameters, n)."""

@@ -10,7 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.calibrated_newton import REVERSED, SAME_WELL, calibrated_starts
+from isa_nrsfm._frames.calibrated_newton import (
+    LARGE_RISE,
+    REVERSED,
+    SAME_WELL,
+    calibrated_starts,
+)
 from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.search import LARGEST_DAMPING, MAX_STEPS
 
@@ -107,15 +112,16 @@ class SingleSearch:
         found = self._minimum(start, P, energy, noise)
         if found is None:
             return None
-        # A lower minimum from the reversed camera is left to the other search.
-        reversed_camera = self._camera(found.M * REVERSED.T, P, energy, noise)
-        limit = found.value - 1e-10 * (energy + noise)
-        if self._minimum(reversed_camera, P, energy, noise, found, limit) is not None:
-            return None
         _, hessian, _, through = self._derivatives(found, P, noise)
+        objective = max(found.value - noise * found.log_determinant, 0.0)
+        if not self._rise(found, P, noise) > LARGE_RISE * found.value:
+            # A lower minimum from the reversed camera is left to the other search.
+            other = self._camera(found.M * REVERSED.T, P, energy, noise)
+            limit = found.value - 1e-10 * (energy + noise)
+            if self._minimum(other, P, energy, noise, found, limit) is not None:
+                return None
         turns = np.linalg.inv(hessian)
         covariance = noise * (found.Q + through @ turns @ through.T)
-        objective = max(found.value - noise * found.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
         return SingleFit(found.M, found.alpha, covariance, turns, objective)
 
@@ -136,10 +142,8 @@ class SingleSearch:
         self, camera: _Camera, P: NDArray, noise: float
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return gradient, Hessian, its definite part, and Q times the coupling."""
-        M, c, n = camera.M, np.append(1.0, camera.alpha), self.model.n_parameters
-        E = np.outer(c, c)
-        E[1:, 1:] += noise * camera.Q
-        A = (E.ravel() @ self.pairs).reshape(3, 3)
+        M, n = camera.M, self.model.n_parameters
+        c, A, F = self._moments(camera, P, noise)
         G = M @ A - _sum(c, P)
         D = self.model.tangents(M)
         flat = D.reshape(n, 6)
@@ -148,10 +152,32 @@ class SingleSearch:
         bent = np.empty((n, n))
         bent[3:], bent[:, 3:] = gradient, gradient[:, None]
         bent[:3, :3] = 0.5 * (mixed + mixed.T) - np.trace(mixed) * np.eye(3)
-        T = (self.sums @ c).reshape(-1, 3, 3)
-        coupling = (M @ T[1:] - P[1:]).reshape(-1, 6) @ flat.T
+        coupling = F @ flat.T
         through = camera.Q @ coupling
         return gradient, definite + bent - coupling.T @ through, definite, through
+
+    def _moments(
+        self, camera: _Camera, P: NDArray, noise: float
+    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `calibrated_newton`."""
+        c = np.append(1.0, camera.alpha)
+        E = np.outer(c, c)
+        E[1:, 1:] += noise * camera.Q
+        T = (self.sums @ c).reshape(-1, 3, 3)
+        F = (camera.M @ T[1:] - P[1:]).reshape(-1, 6)
+        return c, (E.ravel() @ self.pairs).reshape(3, 3), F
+
+    def _rise(self, camera: _Camera, P: NDArray, noise: float) -> float:
+        """Return the least rise of the objective on the way to the reversed camera."""
+        _, A, F = self._moments(camera, P, noise)
+        Y = -F.T @ camera.Q @ F
+        Y[:3, :3] += A
+        Y[3:, 3:] += A
+        z = (camera.M * (REVERSED.T < 0)).ravel()
+        size = np.linalg.norm(z)
+        if size == 0 or np.linalg.eigvalsh(Y)[0] <= 0:
+            return 0.0
+        return float(size**2 / ((z / size) @ np.linalg.solve(Y, z / size)))
 
     def _minimum(
         self,
