@@ -126,4 +126,4 @@ def _leading_subspace(
 def _squared(block: NDArray, V: NDArray) -> NDArray:
     """Return ``W^T W V`` (n_columns, width) for a block W of the matrix."""
     matrix = _matrix(block)
-    return (matrix.T @ (matrix @ V.astype(matrix.dtype))).astype(np.float64)
+    return ((matrix @ V.astype(matrix.dtype)).T @ matrix).T.astype(np.float64)

@@ -36,6 +36,8 @@ def open_table(
             "per frame and two columns per point"
         )
     n_columns = max(X.shape[1], 1)
+    # Blocks large enough that products of matrices are fast
+    length = max(2**21 // n_columns, 1)
     if is_on_dask(X):
         blocks: FrameBlocks = DaskBlocks.of_chunks(X).derive(checked_rows)
     elif is_read_later(X):
@@ -43,12 +45,12 @@ def open_table(
             working_memory = get_config()["working_memory"]
         # A block needs at most eight times its own memory, copies included.
         numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
-        blocks = FrameBlocks.of_stored(X, max(int(numbers // n_columns), 1))
-        blocks = blocks.derive(checked_rows)
+        most = max(int(numbers // n_columns), 1)
+        # Row groups of other files are read whole, by each block that needs them.
+        most = min(most, length) if isinstance(X, np.memmap) else most
+        blocks = FrameBlocks.of_stored(X, most).derive(checked_rows)
     else:
-        # Blocks large enough that products of matrices are fast.
-        length = min(max(2**21 // n_columns, 1), 2048)
-        blocks = FrameBlocks.of_array(X, length, effective_n_jobs(n_jobs))
+        blocks = FrameBlocks.of_array(X, min(length, 2048), effective_n_jobs(n_jobs))
     dtype = np.float32 if X.dtype == np.float32 else np.float64
     blocks.empty = np.empty((0, X.shape[1]), dtype)
     return blocks
