@@ -441,7 +441,7 @@ def long(options):
     which must be the same for all ways.
     """
     print(f"{'':28}{'s':>8}{'MB':>8}{'ratio':>8}  noise variance")
-    ways = [("memory", 1), ("memory", 2), ("disk", 1), ("dask", 1)]
+    ways = [("memory", 1), ("memory", 2), ("disk", 1), ("disk", 2), ("dask", 1)]
     with TemporaryDirectory() as folder:
         before = {}
         for n_frames in (100_000, 1_000_000):

@@ -124,10 +124,10 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
         remove the files of earlier fits, because other models may use them. None keeps
         the arrays in memory.
     working_memory : float or None, default=None
-        Megabytes per block of a table that is not in memory (a memory map or a table of
-        `isa_nrsfm.io.open_table`). None is scikit-learn's setting `working_memory`. The
-        result does not depend on it. In addition, about 1 kB per frame is always in
-        memory.
+        Largest memory of a block, in megabytes, of a table that is not in memory (a
+        memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
+        setting `working_memory`. The result does not depend on it. In addition, about
+        1 kB per frame is always in memory.
     n_jobs : int or None, default=None
         Number of threads for the frames, in `fit` and in the methods for tables, and of
         joblib workers for strategies that use them and for the groups of the consensus.

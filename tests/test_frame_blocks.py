@@ -122,10 +122,12 @@ def test_small_blocks_are_regrouped(array, n_frames, lengths):
 @pytest.mark.parametrize(
     ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
 )
-def test_threads_are_used_for_several_blocks(array, n_threads, length, others):
-    blocks = FrameBlocks.of_array(array, length, n_threads=n_threads)
-    threads = set(blocks.map(lambda block: threading.get_ident()))
-    assert (threading.get_ident() not in threads) == others
+@pytest.mark.parametrize("make", [FrameBlocks.of_array, FrameBlocks.of_stored])
+def test_threads_are_used_for_several_blocks(array, make, n_threads, length, others):
+    blocks = make(array, length, n_threads=n_threads).derive(lambda block: block)
+    for each in (blocks, blocks.subset(np.full(N_FRAMES, True))):
+        threads = set(each.map(lambda block: threading.get_ident()))
+        assert (threading.get_ident() not in threads) == others
 
 
 def test_an_error_in_a_thread_is_raised(array):

@@ -170,11 +170,16 @@ class TestFit:
             assert_array_equal(got.feature_names_in_[:2], ["x0", "y0"])
         assert_allclose(got.transform(stored), got.alpha_, atol=1e-12)
 
-    def test_threads_make_no_difference(self):
-        X = np.tile(table(), (5, 1))
-        one, two = (estimator(SAMPLED, n_jobs=n).fit(X) for n in (1, 2))
+    @pytest.mark.parametrize("stored", [False, True])
+    def test_threads_make_no_difference(self, tmp_path, stored):
+        X = np.tile(table(), (15, 1))  # two blocks in memory
+        if stored:
+            X = memmap(X, tmp_path)
+        params = {"limits": SAMPLED, "working_memory": 0.1}
+        one, two = (estimator(n_jobs=n, **params).fit(X) for n in (1, 2))
         for name in OF_SHAPES + ATTRIBUTES_OF_FRAMES:
             assert_array_equal(getattr(one, name), getattr(two, name))
+        assert_array_equal(one.transform(X), two.transform(X))
 
     @pytest.mark.parametrize(
         ("layout", "scale_frames"),

@@ -59,18 +59,23 @@ class FrameBlocks:
         return cls.of_blocks(blocks, list(map(len, blocks)), n_threads)
 
     @classmethod
-    def of_stored(cls, table: Any, block_frames: int) -> Self:
+    def of_stored(cls, table: Any, block_frames: int, n_threads: int = 1) -> Self:
         """Return blocks that are read from a table that can be sliced."""
-        return cls._read_later(partial(read_rows, table), table.shape[0], block_frames)
+        rows = partial(read_rows, table)
+        return cls._read_later(rows, table.shape[0], block_frames, n_threads)
 
     @classmethod
     def _read_later(
-        cls, rows: Callable[[slice], Any], n_frames: int, block_frames: int
+        cls,
+        rows: Callable[[slice], Any],
+        n_frames: int,
+        block_frames: int,
+        n_threads: int,
     ) -> Self:
         """Return blocks that a function of a slice of rows reads."""
         parts = block_slices(n_frames, block_frames)
         lengths = [part.stop - part.start for part in parts]
-        return cls(lambda number: rows(parts[number]), lengths, False)
+        return cls(lambda number: rows(parts[number]), lengths, False, n_threads)
 
     @property
     def n_frames(self) -> int:
@@ -79,24 +84,30 @@ class FrameBlocks:
 
     def map(self, function: Callable[..., Any], *by_frame: NDArray) -> Iterator[Any]:
         """Return the results of a function of each block, and of its rows of arrays."""
-        blocks = map(self.read, range(len(self.lengths)))
-        rows = [map(array.__getitem__, self.slices) for array in by_frame]
+        result, numbers = self._results(function, by_frame), range(len(self.lengths))
         if min(self.n_threads, len(self.lengths)) < 2:
-            return map(function, blocks, *rows)
+            return map(result, numbers)
         with ThreadPoolExecutor(self.n_threads) as pool:
-            return pool.map(function, blocks, *rows)
+            return pool.map(result, numbers)
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return blocks of the results of a function of each block (see `map`)."""
         if self.cached:
             blocks = list(self.map(function, *by_frame))
             return self.of_blocks(blocks, self.lengths, self.n_threads)
+        read = self._results(function, by_frame)
+        return type(self)(read, self.lengths, False, self.n_threads)
 
-        def read(number: int) -> Any:
+    def _results(
+        self, function: Callable[..., Any], by_frame: Sequence[NDArray]
+    ) -> Callable[[int], Any]:
+        """Return the result of a function of a block, given by its number."""
+
+        def result(number: int) -> Any:
             rows = (array[self.slices[number]] for array in by_frame)
             return function(self.read(number), *rows)
 
-        return type(self)(read, self.lengths, False)
+        return result
 
     def subset(self, frames: NDArray) -> Self:
         """Return blocks of some frames, by a mask (n_frames,). Blocks are arrays."""
@@ -115,7 +126,7 @@ class FrameBlocks:
             start = part.start - before[first]
             return np.concatenate(found)[start : start + part.stop - part.start]
 
-        return self._read_later(rows, int(before[-1]), length)
+        return self._read_later(rows, int(before[-1]), length, self.n_threads)
 
     @one_blas_thread
     def joined(self, function: Callable[..., Any], *by_frame: NDArray) -> Any:

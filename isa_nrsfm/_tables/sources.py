@@ -27,8 +27,9 @@ def open_table(
 ) -> FrameBlocks:
     """Return a table (n_frames, 2 * n_points) in blocks of float32 or float64 rows.
 
-    Arrays in memory must be checked already; `n_jobs` threads share them. Chunks of
-    dask stay on its workers. Blocks of other tables use `working_memory` megabytes.
+    Arrays in memory must be checked already. `n_jobs` threads share their blocks and
+    those of memory maps. Chunks of dask stay on its workers. Blocks of tables that are
+    read later use at most `working_memory` megabytes.
     """
     if X.ndim != 2:
         raise ValueError(
@@ -37,7 +38,7 @@ def open_table(
         )
     n_columns = max(X.shape[1], 1)
     # Blocks large enough that products of matrices are fast
-    length = max(2**21 // n_columns, 1)
+    length, n_threads = max(2**21 // n_columns, 1), effective_n_jobs(n_jobs)
     if is_on_dask(X):
         blocks: FrameBlocks = DaskBlocks.of_chunks(X).derive(checked_rows)
     elif is_read_later(X):
@@ -46,11 +47,13 @@ def open_table(
         # A block needs at most eight times its own memory, copies included.
         numbers = 2**20 * working_memory / (8 * np.dtype(float).itemsize)
         most = max(int(numbers // n_columns), 1)
-        # Row groups of other files are read whole, by each block that needs them.
-        most = min(most, length) if isinstance(X, np.memmap) else most
-        blocks = FrameBlocks.of_stored(X, most).derive(checked_rows)
+        if isinstance(X, np.memmap):
+            blocks = FrameBlocks.of_stored(X, min(most, length), n_threads)
+        else:  # row groups of parquet files are read whole for each block
+            blocks = FrameBlocks.of_stored(X, most)
+        blocks = blocks.derive(checked_rows)
     else:
-        blocks = FrameBlocks.of_array(X, min(length, 2048), effective_n_jobs(n_jobs))
+        blocks = FrameBlocks.of_array(X, min(length, 2048), n_threads)
     dtype = np.float32 if X.dtype == np.float32 else np.float64
     blocks.empty = np.empty((0, X.shape[1]), dtype)
     return blocks
