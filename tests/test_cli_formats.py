@@ -183,18 +183,26 @@ def test_confidences_of_a_plain_table_are_weights(run, tmp_path):
     table, confidence, path = with_confidences(tmp_path, "p{1}_{0}")
     confidence[3, 5] = 0.0
     points = table.columns[1:]
+    noise = np.random.default_rng(1).normal(size=(N_FRAMES, 40))
+    table[points] += noise / np.maximum(np.repeat(confidence, 2, axis=1), 0.1)
     for j in range(20):
         table[f"p{j}_conf"] = confidence[:, j]
     table.to_csv(path, index=False)
     options = ["--weights", "confidence", "-k", "1", "--no-figures"]
     some = ["--points", "without:2,7"]
-    assert run("fit", path, "-o", tmp_path / "fit", *options, *some)[0] == 0
+    code, out, _ = run("fit", path, "-o", tmp_path / "fit", *options, *some)
+    assert code == 0
     left = np.delete(np.arange(20), [2, 7])
     X = table[points].to_numpy().reshape(N_FRAMES, 20, 2)[:, left]
-    model = AffineNRSfM(1, random_state=0)
-    model.fit(X.reshape(N_FRAMES, -1), point_weight=confidence[:, left])
+    model, X = AffineNRSfM(1, random_state=0), X.reshape(N_FRAMES, -1)
+    model.fit(X, point_weight=confidence[:, left])
     alpha = pd.read_csv(tmp_path / "fit/alpha.csv")["alpha_1"]
     np.testing.assert_allclose(alpha, model.alpha_[:, 0], atol=1e-6)
+    report = json.loads((tmp_path / "fit/report.json").read_text())["model"]
+    error = -model.score(X, point_weight=confidence[:, left])
+    assert report["held_out_error"] == pytest.approx(error, rel=1e-4)
+    assert error != pytest.approx(-model.score(X), rel=0.01)
+    assert " % (weighted): the same for" in " ".join(out.split())
     table["p3_conf"] = "good"
     table.to_csv(path, index=False)
     _, _, err = run("fit", path, "-o", tmp_path / "fit", *options)

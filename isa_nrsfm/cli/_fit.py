@@ -117,7 +117,7 @@ def fit_table(
                 "finished": datetime.now(UTC).isoformat(timespec="seconds"),
                 "table": table_report(args.table, args.format, frames),
                 **({} if search is None else {"choice": choice_report(search, X)}),
-                "model": model_report(estimator, X, drawn["edges"]),
+                "model": model_report(estimator, X, frames.weighting, drawn["edges"]),
                 **answers,
                 **{name: compute(estimator, X) for name, compute in extra.items()},
                 "warnings": warned,

@@ -61,18 +61,21 @@ def table_report(path: str, format: str, frames: Frames) -> dict[str, Any]:
 
 
 def quality_report(
-    estimator: AffineNRSfM, X: Any, explained: NDArray
+    estimator: AffineNRSfM, X: Any, explained: NDArray, weighting: dict[str, Any]
 ) -> dict[str, Any]:
-    """Describe how well a model explains a table."""
+    """Describe how well a model explains a table, whose points may have weights."""
     layout, scaled = estimator.layout, estimator.frames_scaled_
     return {
         "inverse_snr": inverse_snr(X, explained, layout=layout, scale_frames=scaled),
-        "held_out_error": -estimator.score(X),
+        "held_out_error": -estimator.score(X, **weighting),
+        "held_out_error_weighted": bool(weighting),
         "rms_point_error": np.sqrt(2 * np.nanmean((explained - np.asarray(X)) ** 2)),
     }
 
 
-def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[str, Any]:
+def model_report(
+    estimator: AffineNRSfM, X: Any, weighting: dict[str, Any], edges: Any = "auto"
+) -> dict[str, Any]:
     """Describe a fitted model and how well it explains its table."""
     from isa_nrsfm.plotting._views import view_and_layout  # not needed by transform
 
@@ -104,7 +107,7 @@ def model_report(estimator: AffineNRSfM, X: Any, edges: Any = "auto") -> dict[st
     )
     return {
         "n_components": alpha.shape[1],
-        **quality_report(estimator, X, explained),
+        **quality_report(estimator, X, explained, weighting),
         "largest_error": {"row": X.index[errors.argmax()], "rms": errors.max()},
         "inverse_snr": estimator.inverse_snr_,
         # Known only if the fit has seen the table as it is.

@@ -52,7 +52,8 @@ def run(args: Namespace, warned: list[str]) -> str:
         fit = estimator.decompose(X, **frames.weighting)
         motion, translation, alpha, std = fit
         explained = estimator.inverse_transform(alpha, motion, translation)
-        quality = quality_section(quality_report(estimator, X, explained))
+        found = quality_report(estimator, X, explained, frames.weighting)
+        quality = quality_section(found)
         if args.std and args.viewer is not None and estimator.camera_ != "affine":
             drawn["depth_std"] = estimator.reconstruct(
                 X, return_std=True, **frames.weighting
