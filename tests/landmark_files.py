@@ -255,11 +255,34 @@ def write_json(path, content):
     return path
 
 
+def openpose_person(**parts):
+    """Return a person as OpenPose does, whose other parts are empty."""
+    names = [f"{part}_keypoints" for part in ("pose", "face", "hand_left")]
+    names = [*names, "hand_right_keypoints"]
+    person = {"person_id": [-1], **{f"{name}_2d": [] for name in names}}
+    person |= {
+        f"{part}_keypoints_2d": np.ravel(p).tolist() for part, p in parts.items()
+    }
+    return person | {f"{name}_3d": [] for name in names}
+
+
+def write_openpose(folder, people, first=0):
+    """Write what --write_json does: a file with the people of each frame."""
+    folder.mkdir(exist_ok=True)
+    for number, persons in enumerate(people, start=first):
+        text = json.dumps({"version": 1.3, "people": persons}, separators=(",", ":"))
+        (folder / f"video_{number:012d}_keypoints.json").write_text(text)
+    return folder
+
+
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
 FRAME = deeplabcut_frame(TRACKS)
 RESULTS = [
     {"image_id": i, "category_id": 1, "keypoints": row.ravel().tolist()}
     for i, row in enumerate(np.dstack([TRACKS, np.full((12, 8), 0.7)]))
+]
+POSES = [
+    [openpose_person(pose=row)] for row in np.dstack([TRACKS, np.full((12, 8), 0.7)])
 ]
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
@@ -296,9 +319,12 @@ WRITERS = {
     "sleap-parquet": lambda d: saved_again(WRITERS["sleap-csv"](d), ".parquet"),
     "coco": lambda d: write_json(d / "a.json", coco_annotations(TRACKS)),
     "coco-results": lambda d: write_json(d / "a.json", RESULTS),
+    "openpose": lambda d: write_openpose(d / "a", POSES),
+    "openpose-file": lambda d: next(write_openpose(d / "a", POSES[:1]).iterdir()),
     "table": lambda d: write_mesh(d / "a.csv", TRACKS, shares=False),
 }
 # The points that are not `TRACKS`.
 IN_MESH = [n for n in WRITERS if n[:9] in ("mediapipe", "pyfeat-mp")]
 EXPECTED = dict.fromkeys([*IN_MESH, "pyfeat-parquet"], MESH)
-EXPECTED |= {"pts-file": TRACKS[:1], "wflw": WFLW, "wflw-test": WFLW}
+EXPECTED |= dict.fromkeys(["pts-file", "openpose-file"], TRACKS[:1])
+EXPECTED |= {"wflw": WFLW, "wflw-test": WFLW}

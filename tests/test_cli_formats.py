@@ -49,6 +49,16 @@ def write_pts(folder):
     return files.write_pts(folder / "300W", tracks(68)), [], {"file"}, []
 
 
+def write_openpose(folder):
+    values = np.dstack([tracks(20), np.full((N_FRAMES, 20), 0.7)])
+    people = [[files.openpose_person(pose=p, face=p[:9])] for p in values]
+    people[EMPTY] = []
+    people[3].insert(0, files.openpose_person(pose=values[4], face=values[4]))
+    options = ["--part", "pose", "--skip-rows", "person=^1"]
+    path = files.write_openpose(folder / "json", people)
+    return path, options, {"file", "frame", "person"}, [EMPTY]
+
+
 def write_sleap(folder):
     pair = np.stack([tracks(20), tracks(20)], axis=1)
     pair[EMPTY], pair[20:, 1] = np.nan, np.nan
@@ -59,7 +69,10 @@ def write_sleap(folder):
 
 
 @pytest.mark.parametrize(
-    "write", slow_after(2, [write_openface, write_sleap, write_pts, write_mediapipe])
+    "write",
+    slow_after(
+        3, [write_openface, write_sleap, write_openpose, write_pts, write_mediapipe]
+    ),
 )
 def test_files_are_fitted_and_transformed(write, run, tmp_path):
     path, options, kept, empty = write(tmp_path)
@@ -96,6 +109,8 @@ def test_files_are_fitted_and_transformed(write, run, tmp_path):
             "--columns needs --format table; got --format openface",
         ),
         (write_openface, "--image-size 640x480", "--image-size needs --format mediapi"),
+        (write_openface, "--part face", "--part needs --format openpose"),
+        (write_openpose, "", "has points of pose, face: choose one with part"),
         (
             write_openface,
             "--min-confidence 1 --columns x_#,y_#",

@@ -68,7 +68,7 @@ def test_files_read_back_as_they_were_written(name, tmp_path):
 def test_files_of_other_formats_are_refused(name, tmp_path):
     path, format = WRITERS[name](tmp_path), name.partition("-")[0]
     if path.is_dir():
-        path /= "image_000.pts"
+        path = min(file for file in path.iterdir() if file.suffix != ".png")
     for wrong in {*FORMATS} - {format}:
         if not {format, wrong} & {"mediapipe", "table"}:
             refused(str(path), read_landmarks, path, wrong)
@@ -169,6 +169,94 @@ def test_pts_files_are_read_in_the_order_of_names(tmp_path):
     assert_array_equal(tracks_of(landmarks), np.roll(TRACKS, -1, axis=0))
     assert list(landmarks.frames["file"][-2:]) == ["image_011.pts", "last.PTS"]
     assert landmarks.confidence is None
+
+
+def points_of_openpose(n_points, confidence=0.5, seed=1):
+    """Return x, y and confidence of some points."""
+    return np.c_[files.scene(1, n_points, seed)[0], np.full(n_points, confidence)]
+
+
+def test_openpose_has_a_row_for_each_person(tmp_path):
+    first, second = points_of_openpose(25), points_of_openpose(25, 0.25, seed=2)
+    first[3] = 0
+    unseen = files.openpose_person(pose=np.zeros((25, 3)))
+    people = [[first], [], [second, first], [second]]
+    people = [[files.openpose_person(pose=p) for p in persons] for persons in people]
+    people[3].insert(0, unseen)
+    folder = files.write_openpose(tmp_path / "json", people, first=9)
+    (folder / "rendered.png").write_bytes(b"")
+    (folder / "._video_000000000009_keypoints.json").write_text("not one")
+    landmarks = read_landmarks(folder)
+    rows = np.stack([first, np.full((25, 3), np.nan), second, first, second])
+    expected = np.where(rows[..., 2:] == 0, np.nan, rows)[..., :2]
+    assert_array_equal(tracks_of(landmarks), expected)
+    assert_array_equal(landmarks.confidence, rows[..., 2])
+    assert list(np.flatnonzero(landmarks.failed)) == [1]
+    frames = landmarks.frames
+    assert list(frames["frame"]) == [9, 10, 11, 11, 12]
+    assert frames["file"][0] == "video_000000000009_keypoints.json"
+    assert_array_equal(frames["person"], [0, np.nan, 0, 1, 1])
+    assert landmarks.skeleton is get_skeleton("body-25")
+    # Names of photos count in their order.
+    photos = sorted(folder.glob("video*.json"))
+    for photo, name in zip(photos, "abcd", strict=True):
+        photo.rename(folder / f"{name}_keypoints.json")
+    assert list(read_landmarks(folder).frames["frame"]) == [0, 1, 2, 2, 3]
+
+
+def test_openpose_parts_are_chosen(tmp_path):
+    parts = {"pose": 25, "face": 70, "hand_left": 21}
+    parts = {part: points_of_openpose(n) for part, n in parts.items()}
+    person = files.openpose_person(**parts, hand_right=np.zeros((21, 3)))
+    folder = files.write_openpose(tmp_path / "json", [[person]])
+    several = r"json cannot .* pose, face, hand_left: choose one with part .*--part"
+    refused(several, read_landmarks, folder)
+    for part, values in parts.items():
+        found = read_landmarks(folder, part=part)
+        assert_array_equal(tracks_of(found)[0], values[:, :2])
+    assert found.skeleton is get_skeleton("hand-21")
+    refused(
+        "no points of hand_right, but of pose, face",
+        read_landmarks,
+        folder,
+        part="hand_right",
+    )
+    refused("part must be one of pose, face", read_landmarks, folder, part="feet")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"people": {}}, "b_keypoints.json: expected an object with a list of obj"),
+        ({"people": [3]}, "b_keypoints.json: expected an object with a list of obj"),
+        ([], "b_keypoints.json: expected an object with a list of objects called"),
+        (points_of_openpose(4), "a_keypoints.json has 5 points of pose, b_.* has 4"),
+        ([[1, 2]], "b_keypoints.json: pose_keypoints_2d .* each point; got 2 numbers"),
+        ([["1", 2, 3]], r"b_.*: pose_keypoints_2d should be .* got \['1', 2, 3\]"),
+        ([[1, 2, np.inf]], "b_.*: pose_keypoints_2d should be a list of finite"),
+        ([[10**400, 2, 1]], "b_.*: pose_keypoints_2d should be a list of finite"),
+    ],
+)
+def test_damaged_files_of_openpose_are_refused(tmp_path, content, message):
+    folder = files.write_openpose(tmp_path / "json", [])
+    good = [files.openpose_person(pose=points_of_openpose(5))]
+    files.write_json(folder / "a_keypoints.json", {"people": good})
+    if len(content) and not isinstance(content, dict):
+        person = files.openpose_person()
+        person["pose_keypoints_2d"] = [v for point in content for v in point]
+        content = {"people": [person]}
+    files.write_json(folder / "b_keypoints.json", content)
+    refused(f"json cannot .* openpose .*{message}", read_landmarks, folder)
+
+
+def test_openpose_in_shares_or_without_people_is_refused(tmp_path):
+    shares = points_of_openpose(25) / [640, 480, 1]
+    people = [[files.openpose_person(pose=shares)]]
+    folder = files.write_openpose(tmp_path / "json", people)
+    refused("shares of the image's size.* --keypoint_scale 0", read_landmarks, folder)
+    empty = files.write_openpose(tmp_path / "empty", [[], [files.openpose_person()]])
+    refused("it has no visible points", read_landmarks, empty)
+    refused("no files with names", read_landmarks, tmp_path, "openpose")
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from isa_nrsfm._parameters.choices import (
     CAMERA_NAMES,
     INDEPENDENCE,
     LOSSES,
+    OPENPOSE_PARTS,
     REFINEMENTS,
     SKELETON_NAMES,
 )
@@ -223,6 +224,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "image_size": _option(
         "WIDTHxHEIGHT", "size of the images for MediaPipe, in pixels, such as 1920x1080"
     ),
+    "part": _option(
+        "PART",
+        "the points of OpenPose to read, if the files have several: "
+        f"{', '.join(OPENPOSE_PARTS)}",
+        choices=OPENPOSE_PARTS,
+    ),
     "points": _option(
         "POINTS",
         "fit some of the points: inner (without the visible outline of a face, which "
@@ -388,7 +395,7 @@ DIFFERENT: dict[tuple[str, str], dict[str, Any]] = {
 }
 TABLE_OPTIONS = (
     *("format", "columns", "skip_rows", "zeros_missing", "missing_value"),
-    *("min_confidence", "image_size"),
+    *("min_confidence", "image_size", "part"),
 )
 DRAWING = (("edges", "skeleton"), "origin")
 
@@ -409,8 +416,8 @@ examples:
 
 Tables are .csv, .tsv or .parquet files. Landmark columns are recognised by their names,
 such as x0, y0 or nose_x, nose_y; all other columns are copied to the results. Files of
-OpenFace, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO and WFLW, and folders of .pts
-files, are recognised automatically."""
+OpenFace, OpenPose, py-feat, MediaPipe, DeepLabCut, SLEAP, COCO and WFLW, and folders of
+.pts files, are recognised automatically."""
 
 # Of each command: its line in the overview, description, examples, and the options of
 # each group. Of the options in a pair only one may be given.

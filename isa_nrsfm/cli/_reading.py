@@ -44,6 +44,8 @@ from isa_nrsfm.skeletons import (
     read_skeleton,
 )
 
+# Options of one format, and that format.
+_OF_FORMATS = {"image_size": "mediapipe", "part": "openpose"}
 INNER, WITHOUT = "inner", "without:"
 # Words for an empty cell in the column of a label or a group. "None" is a class, such
 # as that of people without glasses.
@@ -101,7 +103,11 @@ def read_frames(
     not_used: dict[str, int] = {}
     args.format = _format(args) if table is None else TABLE
     if args.format != TABLE:
-        options = {} if args.image_size is None else {"image_size": args.image_size}
+        options = {
+            name: getattr(args, name)
+            for name in _OF_FORMATS
+            if getattr(args, name) is not None
+        }
         found = read_landmarks(
             args.table, args.format, min_confidence=args.min_confidence, **options
         )
@@ -181,10 +187,12 @@ def _format(args: Namespace) -> str:
         found = TABLE if args.columns is not None else find_format(args.table)
     if args.columns is not None and found != TABLE:
         raise ValueError(f"--columns needs --format table; got --format {found}")
-    if args.image_size is not None and "image_size" not in FORMATS[found].options:
-        raise ValueError(
-            f"--image-size needs --format mediapipe; {args.table} has format {found}"
-        )
+    for name, of in _OF_FORMATS.items():
+        if getattr(args, name) is not None and name not in FORMATS[found].options:
+            option = "--" + name.replace("_", "-")
+            raise ValueError(
+                f"{option} needs --format {of}; {args.table} has format {found}"
+            )
     return found
 
 

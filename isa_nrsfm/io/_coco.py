@@ -1,6 +1,7 @@
 """Read the keypoints of COCO json files."""
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,24 @@ from isa_nrsfm.io._landmarks import Landmarks, assemble
 # Entries of an instance beside its image and its points.
 _OF_INSTANCE = ("id", "score", "iscrowd", "area", "category")
 _OF_IMAGE = ("file_name", "width", "height")
+_OPENPOSE = re.compile(rb'\{\s*("version"\s*:\s*[0-9.]+\s*,\s*)?"people"\s*:')
 
 
 def is_coco(path: Path) -> bool:
-    """Return whether a file begins as a json object or list."""
+    """Return whether a file begins as a json object or list, not of OpenPose."""
+    begins = _beginning(path)[:1] in (b"{", b"[")
+    return begins and not begins_as_openpose(path)
+
+
+def begins_as_openpose(path: Path) -> bool:
+    """Return whether a file begins as a json object with people, or their version."""
+    return _OPENPOSE.match(_beginning(path)) is not None
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the first bytes of a file, without a mark of their order and blanks."""
     with path.open("rb") as file:
-        return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
+        return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
 
 
 def read_coco(path: Path, category: str | None = None) -> Landmarks:
@@ -31,16 +44,21 @@ def read_coco(path: Path, category: str | None = None) -> Landmarks:
     without any has one without points. ``category`` chooses one of several with
     different keypoints.
     """
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            content = json.load(file)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"it is not json: {error}") from error
+    content = read_json(path)
     if isinstance(content, list):
         if category is not None:
             raise ValueError("results of a detector do not name their categories")
         return _results(content)
     return _annotations(content, category)
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a json file, or raise a ValueError."""
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            return json.load(file)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise ValueError(f"it is not json: {error}") from error
 
 
 def _results(entries: list[Any]) -> Landmarks:

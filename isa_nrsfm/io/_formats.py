@@ -140,7 +140,7 @@ def read_landmarks(
     Parameters
     ----------
     path : str or path-like
-        The file, or a folder of ``.pts`` files.
+        The file, or a folder of ``.pts`` files or of json files of OpenPose.
     format : str, default="auto"
         The format, one of `FORMATS`. With "auto", it is the one whose files begin like
         this one, which must be a single one. Files of separated values that no other
@@ -150,7 +150,8 @@ def read_landmarks(
     **options : dict
         Options of the format: ``image_size`` (width, height) of "mediapipe", in
         pixels, for coordinates in shares of the image's size; ``category`` of "coco",
-        the name of the category to read; ``columns`` and ``missing`` of "table", as in
+        the name of the category to read; ``part`` of "openpose", one of "pose", "face",
+        "hand_left" and "hand_right"; ``columns`` and ``missing`` of "table", as in
         `landmark_table`.
 
     Returns
@@ -342,6 +343,15 @@ _ALL = (
         (".json",),
         "_coco.coco",
         ("category",),
+    ),
+    LandmarkFormat(
+        "openpose",
+        "OpenPose",
+        "people with pose_keypoints_2d, face_keypoints_2d, ...; a folder has a file "
+        "..._keypoints.json for each frame",
+        (".json", _FOLDER),
+        "_openpose.openpose",
+        ("part",),
     ),
     LandmarkFormat(
         TABLE,

@@ -29,6 +29,7 @@ LAYOUTS_OF_READERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "pts": ("ibug-68", "ibug-51"),
         "wflw": ("wflw-98", "wflw-65"),
         "coco": ("coco-17", "coco-wholebody-133"),
+        "openpose": ("body-25", "hand-21"),
     }
 )
 
