@@ -593,6 +593,16 @@ def test_bad_tables_are_refused(name):
     refused(message, estimator().fit, table)
 
 
+def test_calibrated_cameras_need_seven_points():
+    model = AffineNRSfM(1, camera="weak_perspective")
+    refused(
+        "n_components=1 needs at least 7 points, the table", model.fit, TABLE[:, :12]
+    )
+    model.set_params(n_components=8)
+    message = "needs at least 8 points, the table has 7; .* largest .* is 7"
+    refused(message, model.fit, TABLE[:, :14])
+
+
 @pytest.mark.parametrize("method", ["transform", "decompose", "reproject", "score"])
 @pytest.mark.parametrize(
     ("table", "message"),

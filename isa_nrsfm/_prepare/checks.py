@@ -148,7 +148,7 @@ def check_size(
                 '(camera="weak_perspective")'
             )
         of_affine = camera in (None, "affine")
-        needed = 3 * n_components + 4 if of_affine else (n_components + 8) // 2
+        needed = 3 * n_components + 4 if of_affine else max(n_components // 2 + 4, 7)
         raise ValueError(
             f"n_components={n_components} needs at least {needed} points, the table "
             f"has {n_points}; {possible}"
