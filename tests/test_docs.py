@@ -9,12 +9,21 @@ from pkgutil import iter_modules
 import numpy as np
 import pandas as pd
 import pytest
+import sklearn
 from landmark_files import write_openface
 from scipy.io import savemat
+from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV
 
 import isa_nrsfm
+from isa_nrsfm import AffineNRSfM
+from isa_nrsfm.calibration import canonical_pose
 from isa_nrsfm.cli import main
+from isa_nrsfm.cli._options import build_parser
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.export import write_viewer
+from isa_nrsfm.io import save_model
+from isa_nrsfm.plotting import BasisShapeDisplay
 from isa_nrsfm.skeletons import SKELETONS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -249,6 +258,78 @@ def test_variables_of_matlab_are_the_model(sequence):
     shapes = names["S_bar"] + np.tensordot(names["Z"], names["V"].reshape(2, 3, P), 1)
     np.testing.assert_allclose(shapes.reshape(3 * F, P), names["S"], atol=1e-6)
     np.testing.assert_array_equal(names["R"][2:4], model.motion_[1])
+
+
+# Of these pages each runs in a test of its own.
+WITH_TESTS = ("README", "getting_started", "questions", "which_call", "migration")
+REFERENCE = ("conventions", "depth", "export", "formats", "large_tables", "skeletons")
+# Objects of other programs and of clusters, in test_io_formats.py and test_dask.py.
+OF_OTHERS = ("from_movement", "dask")
+
+
+def test_pages_with_code_have_tests():
+    pages = [path for path in (ROOT / "docs").rglob("*.md") if BLOCK.search(text(path))]
+    names = {path.stem for path in pages} | {"README"}
+    assert names == {*WITH_TESTS, *REFERENCE}
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """Return a table of faces, and models of faces, bodies and mice."""
+    faces = make_face_tracks(60, random_state=0)
+    models = [AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(faces.data)]
+    for n_points in (17, 7):
+        scene = make_nonrigid_tracks(
+            30, n_points, 1, camera="weak_perspective", random_state=0
+        )
+        model = AffineNRSfM(1, camera="weak_perspective", random_state=0)
+        models.append(model.fit(scene.data))
+    return faces, *models
+
+
+@pytest.mark.usefixtures("video")
+@pytest.mark.parametrize("page", REFERENCE)
+def test_code_of_reference_pages_runs(page, fitted):
+    faces, model, bodies, mice = fitted
+    Path("landmarks").mkdir()
+    for name in ("landmarks/0.npy", "landmarks/1.npy", "new.npy"):
+        np.save(name, faces.data)
+    save_model(model, "model.npz")
+    columns = [f"{axis}{j}" for j in range(68) for axis in "xy"]
+    names = {"AffineNRSfM": AffineNRSfM, "GridSearchCV": GridSearchCV}
+    names |= {"sklearn": sklearn, "BasisShapeDisplay": BasisShapeDisplay}
+    names |= {"write_viewer": write_viewer, "canonical_pose": canonical_pose}
+    names |= {"X": faces.data, "stream": faces.data[:2], "weights": np.ones((60, 68))}
+    names |= {"points": pd.DataFrame(faces.data, columns=columns), "model": model}
+    names |= {"expressions": ["a", "b"] * 30, "shape": bodies.mean_shape_}
+    others = {"coco-17": bodies, "mouse.html": mice}
+    with sklearn.config_context():
+        for code in blocks(f"docs/{page}.md"):
+            if any(word in code for word in OF_OTHERS):
+                continue
+            for word, other in others.items():
+                if word in code:
+                    names["model"] = other
+            exec(compile(code, page, "exec"), names)
+            if page == "skeletons":
+                names["model"] = clone(model)
+    if page == "depth":
+        assert round(names["model"].depth_uncertainty_, 3) == 0.006
+        assert names["depth_std"].shape == (200, 68)
+
+
+def test_commands_in_the_pages_have_their_options():
+    pages = [*(ROOT / "docs").rglob("*.md"), *examples(), ROOT / "README.md"]
+    commands = []
+    for page in pages:
+        lines = re.sub(r"\\\n#?", " ", text(page)).splitlines()
+        found = [re.match(r"(?:#? {4})?(isa-nrsfm [^`#]+)", line) for line in lines]
+        commands += [match[1] for match in found if match is not None]
+    assert len(commands) > 20
+    for command in commands:
+        # Capitals stand for what users write.
+        words = shlex.split(command.replace(" K ", " 3 "))
+        assert build_parser().parse_args(words[1:]).command, command
 
 
 def examples():
