@@ -431,6 +431,8 @@ def test_whole_tables_are_no_tables_of_points(estimator, further, number, first)
     unnamed = landmarks().set_axis([f"c{j}" for j in range(24)], axis=1)
     with pytest.raises(ValueError, match=r"X has texts: .*'Ann'.*landmark_table"):
         estimator.fit(unnamed.assign(c24="Ann", c25="Bob"))
+    message = r"the points of LandmarkTable: X\.points"
+    refused(message, estimator.fit, landmark_table(landmarks()), error=TypeError)
 
 
 @of_estimators

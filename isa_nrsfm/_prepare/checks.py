@@ -31,11 +31,15 @@ ONLY_POINTS = (
 
 
 def check_table(X: Any, layout: Layout) -> None:
-    """Raise if an array has more than two dimensions, or columns that are no points.
+    """Raise if X is no table of two dimensions, or has columns that are no points.
 
     Names of several levels, as DeepLabCut has them, are read as one.
     """
     shape: tuple[int, ...] = getattr(X, "shape", ())
+    if not shape and hasattr(X, "points"):
+        raise TypeError(
+            f"X must be a table; give the points of {type(X).__name__}: X.points"
+        )
     if isinstance(X, list | tuple):
         shape = np.shape(X)
     if len(shape) > 2:
