@@ -126,8 +126,9 @@ class AffineNRSfM(CallbackSupportMixin, TableTransformer):
     working_memory : float or None, default=None
         Largest memory of a block, in megabytes, of a table that is not in memory (a
         memory map or a table of `isa_nrsfm.io.open_table`). None is scikit-learn's
-        setting `working_memory`. The result does not depend on it. In addition, about
-        1 kB per frame is always in memory.
+        setting `working_memory`. Each thread has a block of a memory map, of at most
+        128 megabytes. The result does not depend on it. In addition, about 1 kB per
+        frame is always in memory.
     n_jobs : int or None, default=None
         Number of threads for the frames, in `fit` and in the methods for tables, and of
         joblib workers for strategies that use them and for the groups of the consensus.

@@ -217,7 +217,7 @@ def test_confidences_of_a_plain_table_are_weights(run, tmp_path):
     error = -model.score(X, point_weight=confidence[:, left])
     assert report["held_out_error"] == pytest.approx(error, rel=1e-4)
     assert error != pytest.approx(-model.score(X), rel=0.01)
-    assert " % (weighted): the same for" in " ".join(out.split())
+    assert "Points count by their weights here" in " ".join(out.split())
     table["p3_conf"] = "good"
     table.to_csv(path, index=False)
     _, _, err = run("fit", path, "-o", tmp_path / "fit", *options)

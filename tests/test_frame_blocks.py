@@ -130,12 +130,25 @@ def test_threads_are_used_for_several_blocks(array, make, n_threads, length, oth
         assert (threading.get_ident() not in threads) == others
 
 
-def test_an_error_in_a_thread_is_raised(array):
+def test_an_error_in_a_thread_is_raised_and_no_further_block_is_begun(array):
+    begun = []
+
     def fail(block):
+        begun.append(block)
         raise ValueError("no good")
 
     with pytest.raises(ValueError, match="no good"):
         list(FrameBlocks.of_array(array, 2, n_threads=2).map(fail))
+    assert len(begun) <= 3
+
+
+def test_threads_have_few_results_ahead(array):
+    begun = []
+    found = FrameBlocks.of_array(array, 2, n_threads=2).map(begun.append)
+    for number in range(1, 6):
+        next(found)
+        assert len(begun) <= number + 2
+    found.close()
 
 
 def test_no_frames():

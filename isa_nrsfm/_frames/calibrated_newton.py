@@ -57,10 +57,10 @@ REVERSED = np.array([1.0, 1.0, -1.0])[:, None]
 # hands and bodies ended in a higher minimum, with 0.5 seven. Saves a fifth of the time.
 SAME_WELL = 0.1
 # The reversed camera is not tried if the objective rises by more than this multiple of
-# itself on the way there. Tried all the same in 390,000 searches above 10 (motion
-# capture, bodies, hands, faces), it was lower in eight, the last at 15. In 210,000
-# above 20 it never was. Saves 27 to 45 % of the time of faces in weak perspective, and
-# nothing for bodies and hands, where most reversed cameras are tried.
+# itself on the way there. In 390,000 searches with a rise above 10 (motion capture,
+# bodies, hands, faces), it was lower in eight, the last at 15. In 210,000 above 20 it
+# never was. Saves 27 to 45 % of the time of faces in weak perspective. For bodies and
+# hands it saves nothing, because most of their reversed cameras are tried.
 LARGE_RISE = 20.0
 
 
@@ -251,8 +251,9 @@ def _rise(
     """Return the least rise (n,) of the objective on the way to the reversed camera.
 
     A reversal turns the third column z of M (2, 3, n) over. On the way ``<z', z> = 0``.
-    In the quadratic approximation with half the Hessian Y, the objective of affine
-    cameras is there higher by at least ``|z|^2 / <e, Y^-1 e>``, e = (0, 0, z) / |z|.
+    The objective of affine cameras is there higher by at least ``|z|^2 / <e, Y^-1 e>``,
+    ``e = (0, 0, z) / |z|``, in the quadratic approximation with half the Hessian Y.
+    This neglects the gradient at M, and Y bounds the log determinant from above.
     """
     K, n = len(posterior.alpha), M.shape[2]
     F = _changes(problem, M, posterior).reshape(K, 6, n)

@@ -6,8 +6,9 @@ functions of a block of frames.
 
 import mmap
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Self
 
@@ -87,8 +88,7 @@ class FrameBlocks:
         result, numbers = self._results(function, by_frame), range(len(self.lengths))
         if min(self.n_threads, len(self.lengths)) < 2:
             return map(result, numbers)
-        with ThreadPoolExecutor(self.n_threads) as pool:
-            return pool.map(result, numbers)
+        return in_threads(result, numbers, self.n_threads)
 
     def derive(self, function: Callable[..., Any], *by_frame: NDArray) -> Self:
         """Return blocks of the results of a function of each block (see `map`)."""
@@ -239,6 +239,27 @@ class DaskBlocks(FrameBlocks):
             # Cameras and coefficients of the frames of a block go with each task.
             warnings.filterwarnings("ignore", "Sending large graph")
             return getattr(import_optional("dask", extra="dask"), how)(*tasks)
+
+
+def in_threads(
+    function: Callable[[int], Any], numbers: range, n_threads: int
+) -> Iterator[Any]:
+    """Yield the results for all numbers in order, computed by threads.
+
+    At most one number more than there are threads is taken ahead, so that few results
+    are in memory. After an error or an interrupt no other number is begun.
+    """
+    with ThreadPoolExecutor(n_threads) as pool:
+        ahead: deque[Future[Any]] = deque()
+        try:
+            for number in numbers:
+                ahead.append(pool.submit(function, number))
+                if len(ahead) > n_threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def block_slices(n_frames: int, block_frames: int) -> list[slice]:

@@ -123,14 +123,17 @@ def table_section(table: dict[str, Any], unusable: str = "left out") -> Section:
 
 def quality_section(quality: dict[str, Any], remark: str = "") -> list[str | Cells]:
     """Return the quality of a fit, with a remark on its inverse SNR."""
-    weighted = " (weighted)" * quality["held_out_error_weighted"]
+    weighted = (
+        " Points count by their weights here, and equally in the inverse SNR."
+        * quality["held_out_error_weighted"]
+    )
     return [
         f"inverse SNR {_percent(quality['inverse_snr'])}{remark}: energy (sum of "
         "squares) of the residuals, relative to that of the centred points.",
-        f"held-out error {_percent(quality['held_out_error'])}{weighted}: the same for "
-        "points predicted from the other points of their frame. If it is much larger, "
-        "look first for wrong points (outliers, or missing points with coordinates "
-        "such as (0, 0)), then use fewer basis shapes.",
+        f"held-out error {_percent(quality['held_out_error'])}: the same for points "
+        f"predicted from the other points of their frame.{weighted} If it is much "
+        "larger, look first for wrong points (outliers, or missing points with "
+        "coordinates such as (0, 0)), then use fewer basis shapes.",
         f"reprojected points are off by {quality['rms_point_error']:.3g} (root mean "
         "square, in the units of the table)",
     ]

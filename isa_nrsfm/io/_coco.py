@@ -24,12 +24,12 @@ def is_coco(path: Path) -> bool:
 
 
 def begins_as_openpose(path: Path) -> bool:
-    """Return whether a file begins as a json object with people, or their version."""
+    """Return whether a file begins as a json object with people, or with a version."""
     return _OPENPOSE.match(_beginning(path)) is not None
 
 
 def _beginning(path: Path) -> bytes:
-    """Return the first bytes of a file, without a mark of their order and blanks."""
+    """Return the first bytes of a file, without byte order mark and leading blanks."""
     with path.open("rb") as file:
         return file.read(64).removeprefix(b"\xef\xbb\xbf").lstrip()
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._compat import pandas as pd
 from isa_nrsfm._compat.damaged_files import errors_of
 from isa_nrsfm._compat.texts import as_utf8, by_number
 from isa_nrsfm._parameters.choices import OPENPOSE_PARTS
@@ -27,9 +28,9 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     """Read a file, or all of a folder in the order of their names and numbers.
 
     A file has the list ``people``, and each person ``pose_keypoints_2d``: x, y and
-    confidence of each point in turn, confidence 0 of missing points. ``part`` chooses
-    between body, face and hands. Each person with points of this part has a row, and
-    each file without any has one without points.
+    confidence of each point in turn. The confidence of missing points is 0. ``part``
+    chooses between body, face and hands. Each person with points of this part has a
+    row. A file without such people has one row without points.
     """
     if part is not None and part not in OPENPOSE_PARTS:
         raise ValueError(
@@ -48,7 +49,10 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     known = {name for persons in people for person in persons for name in person}
     found = ", ".join(name for name in OPENPOSE_PARTS if name in known)
     if not known:
-        raise ValueError("it has no visible points")
+        raise ValueError(
+            "it has no visible points in the lists pose_keypoints_2d, "
+            "face_keypoints_2d, ... of people"
+        )
     if len(known) > 1 and part is None:
         raise ValueError(
             f"it has points of {found}: choose one with part (command line: --part)"
@@ -76,16 +80,17 @@ def read_openpose(path: Path, part: str | None = None) -> Landmarks:
     of_file, persons, values = zip(*rows, strict=True)
     tracks, confidence = np.split(np.stack(values), [2], axis=2)
     tracks = np.where(confidence == 0, np.nan, tracks)
-    if np.nanmax(np.abs(tracks)) <= 1:
+    # Points that are cut off can be outside of the image.
+    if np.nanmedian(np.abs(tracks)) <= 1:
         raise ValueError(
-            "the coordinates are shares of the image's size, between -1 and 1, which "
-            "stretch the shapes. Run OpenPose with --keypoint_scale 0 for pixels"
+            "the coordinates are shares of the image's size, which stretch the shapes. "
+            "Run OpenPose with --keypoint_scale 0 for pixels"
         )
     numbers = _numbers(files)
     frames = {
         "file": [as_utf8(files[i].name) for i in of_file],
         "frame": [numbers[i] for i in of_file],
-        "person": persons,
+        "person": pd.array(persons, dtype="Int64"),
     }
     return assemble(
         tracks, None, frames, format="openpose", confidence=confidence[..., 0]
