@@ -249,6 +249,15 @@ def test_damaged_files_of_openpose_are_refused(tmp_path, content, message):
     refused(f"json cannot .* openpose .*{message}", read_landmarks, folder)
 
 
+def test_file_of_a_folder_in_another_encoding_is_named_with_the_way(tmp_path):
+    person = files.openpose_person(pose=points_of_openpose(5))
+    folder = files.write_openpose(tmp_path / "json", [[person]])
+    other = folder / "b_keypoints.json"
+    other.write_text('{"people": [], "author": "Jos\xe9"}', encoding="latin-1")
+    message = "b_keypoints.json: its text is not in UTF-8 .* Save it as UTF-8"
+    refused(message, read_landmarks, folder)
+
+
 def test_openpose_in_shares_or_without_people_is_refused(tmp_path):
     shares = points_of_openpose(25) / [640, 480, 1]
     shares[3, 0] = 1.02  # a foot that the image cuts off

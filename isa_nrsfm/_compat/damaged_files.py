@@ -23,11 +23,8 @@ def reading(
         if isinstance(error, OSError) and error.errno is not None:
             error.filename = os.fspath(path)
             raise
-        said = str(error).strip().partition("\n")[0]
-        if isinstance(error, UnicodeDecodeError):
-            encoding = error.encoding.upper()
-            said = f"its text is not in {encoding} ({said}). Save it as {encoding}"
-        elif not isinstance(error, ValueError | OSError):
+        said = _message(error).strip().partition("\n")[0]
+        if not isinstance(error, ValueError | OSError):
             said = f"{type(error).__name__}: {said}"
         raise ValueError(
             f"{os.fspath(path)} cannot be read as {what}: {said}"
@@ -41,4 +38,12 @@ def errors_of(what: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
+        raise ValueError(f"{what}: {_message(error)}") from error
+
+
+def _message(error: Exception) -> str:
+    """Return the message of an error; of text in another encoding, with the way."""
+    if not isinstance(error, UnicodeDecodeError):
+        return str(error)
+    encoding = error.encoding.upper()
+    return f"its text is not in {encoding} ({error}). Save it as {encoding}"
