@@ -259,6 +259,7 @@ def _rise(
     F = _changes(problem, M, posterior).reshape(K, 6, n)
     A = problem.products.gram.moments(posterior.second_moments(problem.noise))
     Y = -packed_products(posterior.covaried(F).swapaxes(0, 1), F.swapaxes(0, 1))
+    # A for each row of the camera: the diagonal 3x3 blocks of the packed 6x6 matrix
     Y[[0, 1, 2, 6, 7, 11]] += A
     Y[15:] += A
     z = (M * (REVERSED < 0)).reshape(6, n)

@@ -43,6 +43,9 @@ class _Camera(NamedTuple):
     log_determinant: float
 
 
+_Moments = tuple[NDArray, NDArray, NDArray]
+
+
 class SingleSearch:
     """The search for shapes (K + 1, 3, J), rows centred, in the axes of a search."""
 
@@ -112,16 +115,17 @@ class SingleSearch:
         found = self._minimum(start, P, energy, noise)
         if found is None:
             return None
-        _, hessian, _, through = self._derivatives(found, P, noise)
-        objective = max(found.value - noise * found.log_determinant, 0.0)
-        if not self._rise(found, P, noise) > LARGE_RISE * found.value:
+        moments = self._moments(found, P, noise)
+        if not self._rise(found, moments) > LARGE_RISE * found.value:
             # A lower minimum from the reversed camera is left to the other search.
             other = self._camera(found.M * REVERSED.T, P, energy, noise)
             limit = found.value - 1e-10 * (energy + noise)
             if self._minimum(other, P, energy, noise, found, limit) is not None:
                 return None
+        _, hessian, _, through = self._derivatives(found, P, moments)
         turns = np.linalg.inv(hessian)
         covariance = noise * (found.Q + through @ turns @ through.T)
+        objective = max(found.value - noise * found.log_determinant, 0.0)
         turns = noise * turns[:3, :3]
         return SingleFit(found.M, found.alpha, covariance, turns, objective)
 
@@ -139,11 +143,10 @@ class SingleSearch:
         return _Camera(M, value, alpha, Q, log_determinant)
 
     def _derivatives(
-        self, camera: _Camera, P: NDArray, noise: float
+        self, camera: _Camera, P: NDArray, moments: _Moments
     ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return gradient, Hessian, its definite part, and Q times the coupling."""
-        M, n = camera.M, self.model.n_parameters
-        c, A, F = self._moments(camera, P, noise)
+        M, n, (c, A, F) = camera.M, self.model.n_parameters, moments
         G = M @ A - _sum(c, P)
         D = self.model.tangents(M)
         flat = D.reshape(n, 6)
@@ -156,9 +159,7 @@ class SingleSearch:
         through = camera.Q @ coupling
         return gradient, definite + bent - coupling.T @ through, definite, through
 
-    def _moments(
-        self, camera: _Camera, P: NDArray, noise: float
-    ) -> tuple[NDArray, NDArray, NDArray]:
+    def _moments(self, camera: _Camera, P: NDArray, noise: float) -> _Moments:
         """Return ``c = (1, alpha)``, A (3, 3) and F (K, 6) of `calibrated_newton`."""
         c = np.append(1.0, camera.alpha)
         E = np.outer(c, c)
@@ -167,9 +168,9 @@ class SingleSearch:
         F = (camera.M @ T[1:] - P[1:]).reshape(-1, 6)
         return c, (E.ravel() @ self.pairs).reshape(3, 3), F
 
-    def _rise(self, camera: _Camera, P: NDArray, noise: float) -> float:
+    def _rise(self, camera: _Camera, moments: _Moments) -> float:
         """Return the least rise of the objective on the way to the reversed camera."""
-        _, A, F = self._moments(camera, P, noise)
+        _, A, F = moments
         Y = -F.T @ camera.Q @ F
         Y[:3, :3] += A
         Y[3:, 3:] += A
@@ -192,7 +193,8 @@ class SingleSearch:
         tol, damping = 1e-12 * (energy + noise), 0.0
         radius = SAME_WELL * np.linalg.norm(camera.M - known.M) if known else 0.0
         for _ in range(MAX_STEPS):
-            gradient, hessian, definite, _ = self._derivatives(camera, P, noise)
+            moments = self._moments(camera, P, noise)
+            gradient, hessian, definite, _ = self._derivatives(camera, P, moments)
             while np.linalg.eigvalsh(hessian + damping * definite)[0] <= 0:
                 damping = max(8.0 * damping, 0.1)
                 if damping > LARGEST_DAMPING:

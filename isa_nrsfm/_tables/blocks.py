@@ -144,9 +144,8 @@ class FrameBlocks:
         chosen = np.zeros(self.n_frames, dtype=bool)
         chosen[frames] = True
         found: NDArray = self.joined(chosen_rows, chosen)
-        order = np.argsort(frames)
-        sorted_already = np.array_equal(order, np.arange(len(order)))
-        return found if sorted_already else found[np.argsort(order)]
+        in_order = (np.diff(frames) > 0).all()
+        return found if in_order else found[np.argsort(np.argsort(frames))]
 
     def whole(self) -> NDArray:
         """Return all frames. Blocks are arrays."""
@@ -249,17 +248,16 @@ def in_threads(
     At most one number more than there are threads is taken ahead, so that few results
     are in memory. After an error or an interrupt no other number is begun.
     """
-    with ThreadPoolExecutor(n_threads) as pool:
-        ahead: deque[Future[Any]] = deque()
-        try:
-            for number in numbers:
-                ahead.append(pool.submit(function, number))
-                if len(ahead) > n_threads:
-                    yield ahead.popleft().result()
-            while ahead:
+    pool, ahead = ThreadPoolExecutor(n_threads), deque[Future[Any]]()
+    try:
+        for number in numbers:
+            ahead.append(pool.submit(function, number))
+            if len(ahead) > n_threads:
                 yield ahead.popleft().result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def block_slices(n_frames: int, block_frames: int) -> list[slice]:
