@@ -5,14 +5,19 @@ import pytest
 from cameras import affinity, lorentz_cameras, rotations, weak_perspective
 from numpy.testing import assert_allclose
 from refusals import refused
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from isa_nrsfm._metric_upgrade.quadric import (
     LARGEST_STRETCH,
-    mean_gram,
     metric_quadric,
-    symmetric_power,
+    strain_basis,
     unit_cameras,
 )
+from isa_nrsfm.calibration import deformation_metric, metric_upgrade
+
+both_cameras = pytest.mark.parametrize("camera", ["orthographic", "weak_perspective"])
+few_cameras = pytest.mark.filterwarnings("ignore:the cameras hardly determine")
 
 
 def noisy_cameras(rng, n_frames=30):
@@ -98,26 +103,101 @@ class TestMetricQuadric:
         assert_allclose(metric_quadric(more), metric_quadric(motion))
 
 
-class TestParts:
-    def test_unit_cameras(self, rng):
-        motion = rng.standard_normal((5, 2, 3))
-        motion[1], motion[3, 0, 2] = 0.0, np.nan
-        unit = unit_cameras(motion)
-        assert_allclose(np.linalg.norm(unit, axis=(1, 2)), 1)
-        for got, given in zip(unit, motion[[0, 2, 4]], strict=True):
-            assert_allclose(got * np.linalg.norm(given), given)
-        refused("none among the 2 cameras", unit_cameras, motion[[1, 3]])
+def cost(Q, motion, camera):
+    """Return the sum of the squared residuals, by their definitions."""
+    s1, s2 = np.linalg.svd(motion @ Q, compute_uv=False).T
+    if camera == "orthographic":
+        return np.sum((s1**2 - 1) ** 2 + (s2**2 - 1) ** 2)
+    return np.sum(((s1**2 - s2**2) / (s1**2 + s2**2)) ** 2)
 
-    def test_mean_gram(self):
-        motion = np.random.default_rng(0).standard_normal((5, 2, 3))
-        expected = np.mean([M.T @ M for M in motion], axis=0)
-        assert_allclose(mean_gram(motion), expected)
 
-    @pytest.mark.parametrize("power", [0.5, -0.5, -1.0])
-    def test_symmetric_power(self, power):
-        root = np.random.default_rng(0).standard_normal((3, 3))
-        matrix = root @ root.T
-        got = symmetric_power(matrix, power)
-        assert_allclose(got, got.T)
-        found = np.linalg.matrix_power(got, 2 if abs(power) == 0.5 else 1)
-        assert_allclose(found, matrix if power > 0 else np.linalg.inv(matrix))
+class TestLeastResidual:
+    """`metric_upgrade` minimises the residuals over all metrics of space."""
+
+    @both_cameras
+    def test_is_a_minimum(self, camera):
+        rng = np.random.default_rng(1)
+        motion = noisy_cameras(rng) @ affinity(rng)
+        upgrade = metric_upgrade(motion, camera)
+        # Of all scales of an orthographic metric, that of the scales one is returned.
+        scales = np.linspace(0.7, 1.4, 2001) if camera == "orthographic" else [1.0]
+        Q = min(
+            (scale * upgrade.Q for scale in scales),
+            key=lambda Q: cost(Q, motion, camera),
+        )
+        least = cost(Q, motion, camera)
+        assert least > 0.1
+        assert upgrade.residual == pytest.approx(np.sqrt(least / 30), rel=1e-5)
+        for size in (1e-2, 1e-1):
+            steps = size * rng.standard_normal((20, 3, 3))
+            assert all(cost(Q @ (np.eye(3) + E), motion, camera) > least for E in steps)
+
+    @few_cameras
+    @pytest.mark.parametrize(("n", "noise", "seed"), [(6, 0.5, 47), (8, 0.3, 52)])
+    def test_where_the_linear_solution_is_indefinite(self, n, noise, seed):
+        rng = np.random.default_rng(seed)
+        spread = 0.4 if n == 6 else 0.3
+        turns = Rotation.from_rotvec(spread * rng.standard_normal((n, 3))).as_matrix()
+        motion = turns[:, :2] + noise * rng.standard_normal((n, 2, 3))
+        assert metric_quadric(motion) is None
+
+        def value(entries):
+            return cost(entries.reshape(3, 3), motion, "weak_perspective")
+
+        least = min(minimize(value, rng.standard_normal(9)).fun for _ in range(20))
+        assert n * metric_upgrade(motion).residual ** 2 <= least * (1 + 1e-6)
+
+    def test_orthographic_one_is_that_of_the_linear_equations(self):
+        # Where their solution is positive definite, as it is here.
+        rng = np.random.default_rng(2)
+        motion = noisy_cameras(rng) / np.sqrt(1.5) @ affinity(rng)
+        m1, m2 = np.moveaxis(motion, 1, 0)
+        pairs = [(m1, m1), (m2, m2), (m1, m2), (m2, m1)]
+        equations = [np.einsum("ia,ib->iab", a, b).reshape(-1, 9) for a, b in pairs]
+        linear = np.linalg.lstsq(np.vstack(equations), np.repeat([1.0, 0.0], 60))[0]
+        metric = np.linalg.matrix_power(metric_upgrade(motion, "orthographic").Q, 2)
+        linear = linear.reshape(3, 3)
+        assert_allclose(metric / np.trace(metric), linear / np.trace(linear), atol=1e-7)
+
+    @both_cameras
+    def test_many_frames_are_worked_on_in_blocks(self, camera):
+        rng = np.random.default_rng(3)
+        motion, alpha = noisy_cameras(rng), rng.standard_normal((30, 2))
+        many, copies = np.tile(motion, (70, 1, 1)), np.tile(alpha, (70, 1))
+        few, whole = metric_upgrade(motion, camera), metric_upgrade(many, camera)
+        assert_allclose(whole.Q, few.Q, atol=1e-8)
+        assert whole.residual == pytest.approx(few.residual, rel=1e-9)
+        assert_allclose(
+            deformation_metric(many[::-1], copies[::-1]).strain,
+            deformation_metric(many, copies).strain,
+            atol=1e-8,
+        )
+
+    @few_cameras
+    def test_condition_number(self):
+        turns = Rotation.random(3000, random_state=0).as_matrix()[:, :2]
+        assert metric_upgrade(turns).condition_number == pytest.approx(1, abs=0.1)
+        for unit in (1e-20, 1e20):
+            condition = metric_upgrade(unit * turns).condition_number
+            assert condition == pytest.approx(1, abs=0.1)
+        assert metric_upgrade(turns[:2]).condition_number == np.inf
+
+
+@both_cameras
+def test_basis_of_strains_is_orthonormal(camera):
+    basis = strain_basis(camera)
+    flat = basis.reshape(len(basis), 9)
+    assert_allclose(flat @ flat.T, np.eye(len(basis)), atol=1e-15)
+    assert_allclose(basis, basis.transpose(0, 2, 1))
+    assert len(basis) == (6 if camera == "orthographic" else 5)
+    assert_allclose(np.trace(basis[:5], axis1=1, axis2=2), 0, atol=1e-15)
+
+
+def test_unit_cameras(rng):
+    motion = rng.standard_normal((5, 2, 3))
+    motion[1], motion[3, 0, 2] = 0.0, np.nan
+    unit = unit_cameras(motion)
+    assert_allclose(np.linalg.norm(unit, axis=(1, 2)), 1)
+    for got, given in zip(unit, motion[[0, 2, 4]], strict=True):
+        assert_allclose(got * np.linalg.norm(given), given)
+    refused("none among the 2 cameras", unit_cameras, motion[[1, 3]])

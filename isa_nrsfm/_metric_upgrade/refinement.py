@@ -13,7 +13,7 @@ indefinite solution. The derivative of the exponential is that of Daleckii and K
 
 The strain of a frame, ``sum_k alpha_ik E_k``, has five or six coordinates in
 `strain_basis`. Derivatives with respect to those of E_k are alpha_ik times derivatives
-with respect to these. Only the sums ``J^T J`` and ``J^T r`` over the frames are formed.
+with respect to these.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS, OF_RANKS, OF_STEPS
-from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._metric_upgrade.quadric import (
     CalibratedCamera,
     mean_gram,
@@ -74,25 +73,25 @@ class MetricFit(NamedTuple):
 
 
 def orthonormality(gram: NDArray, camera: CalibratedCamera) -> NDArray:
-    """Return residuals (n, n_frames) of the products ``M_i G M_i^T`` (2, 2, n_frames).
+    """Return residuals (n_frames, n) of the products ``M_i G M_i^T`` (n_frames, 2, 2).
 
     For orthographic cameras ``(xx - 1, sqrt(2) xy, yy - 1)``, with the norm ``||M_i G
     M_i^T - I||_F``. For weak-perspective cameras ``(xx - yy, 2 xy) / (xx + yy)``, with
     the norm ``(s1^2 - s2^2) / (s1^2 + s2^2)``, s1 and s2 being the singular values of
     ``M_i Q``: it does not depend on roll and scale.
     """
-    entries = np.tensordot(_patterns(camera), gram, 2)
+    entries = _entries(gram, camera)
     if camera == "orthographic":
-        return entries - [[1.0], [0.0], [1.0]]
-    return entries / (gram[0, 0] + gram[1, 1])
+        return entries - [1.0, 0.0, 1.0]
+    return entries / np.trace(gram, axis1=1, axis2=2)[:, None]
 
 
-def _patterns(camera: CalibratedCamera) -> NDArray:
-    """Return symmetric F_c (n, 2, 2): raw residuals ``<F_c, M_i G M_i^T>``."""
+def _entries(products: NDArray, camera: CalibratedCamera) -> NDArray:
+    """Return the entries (..., n) of matrices (..., 2, 2) that are to be constant."""
+    xx, xy, yx, yy = np.moveaxis(products.reshape(*products.shape[:-2], 4), -1, 0)
     if camera == "orthographic":
-        across = np.array([[0.0, 1.0], [1.0, 0.0]]) / np.sqrt(2)
-        return np.stack([np.diag([1.0, 0.0]), across, np.diag([0.0, 1.0])])
-    return np.array([[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+        return np.stack([xx, np.sqrt(0.5) * (xy + yx), yy], axis=-1)
+    return np.stack([xx - yy, xy + yx], axis=-1)
 
 
 def fit_at(
@@ -103,90 +102,64 @@ def fit_at(
     camera: CalibratedCamera,
 ) -> MetricFit:
     """Evaluate a metric for cameras (I, 2, 3) and strain coefficients (I, K)."""
-    parts = []
+    sums = []
     for start in range(0, len(motion), BLOCK_FRAMES):
         part = slice(start, start + BLOCK_FRAMES)
-        M, coefficients = frames_last(motion[part]), alpha[part].T
-        linearised = _linearised(Q.T @ M, strain, coefficients, camera)
-        parts.append(_normal_equations(coefficients, *linearised))
-    costs, curvatures, gradients = zip(*parts, strict=True)
-    curvature, gradient = np.sum(curvatures, axis=0), np.sum(gradients, axis=0)
-    return MetricFit(Q, strain, len(motion), sum(costs), curvature, gradient)
+        r, J = linearised(motion[part] @ Q, alpha[part], strain, camera)
+        sums.append((float(r @ r), J.T @ J, J.T @ r))
+    cost, curvature, gradient = (sum(terms) for terms in zip(*sums, strict=True))
+    return MetricFit(Q, strain, len(motion), cost, curvature, gradient)
 
 
-def _linearised(
-    MQ: NDArray, strain: NDArray, alpha: NDArray, camera: CalibratedCamera
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Return residuals (n, I) of cameras ``M_i Q`` (2, 3, I), and two derivatives.
+def linearised(
+    MQ: NDArray, alpha: NDArray, strain: NDArray, camera: CalibratedCamera
+) -> tuple[NDArray, NDArray]:
+    """Return the residuals (m,) of cameras ``M_i Q`` (I, 2, 3), and their Jacobian.
 
-    The derivatives (n_numbers, n, I) are those in the coordinates of E_0 in
-    `strain_basis`, and of ``E = sum_k alpha_ik E_k``, with alpha (K, I).
+    The Jacobian (m, n_numbers * (K + 1)) is that by the coordinates of E_0, E_1, ... in
+    `strain_basis`.
     """
-    numbers = strain_basis(camera)
-    # M_i Q exp(E) is `grown`, and M_i G_i M_i^T the product of that with M_i Q. The
-    # eigenvectors of E are `axes`, and `seen` is M_i Q in these axes.
-    grown = MQ
-    if len(strain):
-        values, vectors = np.linalg.eigh(np.tensordot(alpha.T, strain, 1))
-        stretch, axes = values.T, frames_last(vectors)
-        seen = np.einsum("abn,pan->pbn", axes, MQ)
-        grown = np.einsum("abn,pbn->pan", axes, np.exp(stretch) * seen)
-    gram = np.einsum("pan,qan->pqn", grown, MQ)
-    residuals = orthonormality(gram, camera)
-    # Residual c changes by tr(F_c d(M_i G_i M_i^T)). The weak-perspective residual is a
-    # quotient: F_c is (pattern - residual * I) / (xx + yy).
-    F = np.broadcast_to(
-        _patterns(camera)[..., None], (len(residuals), 2, 2, MQ.shape[-1])
-    )
-    if camera == "weak_perspective":
-        F = F - residuals[:, None, None] * np.eye(2)[:, :, None]
-        F /= gram[0, 0] + gram[1, 1]
-
-    # Derivatives in E_0: exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by
-    # (E_0 exp(E) + exp(E) E_0) / 2.
-    turned = np.einsum("cpqn,qan->cpan", F, MQ)
-    by_common = np.einsum("cpan,pbn->abcn", turned, grown)
-    slopes = np.tensordot(numbers, by_common, 2)
-    if not len(strain):
-        return residuals, slopes, slopes
-    # Derivatives in E: in its axes, exp(E) changes by dE times, entry by entry, the
-    # divided differences of exp at two eigenvalues, which are
+    # In the axes of ``E = sum_k alpha_ik E_k`` its exponential changes by dE times,
+    # entry by entry, the divided differences of exp at two eigenvalues, which are
     # exp((a + b) / 2) sinh((a - b) / 2) / ((a - b) / 2).
-    half_gap = (stretch[:, None] - stretch) / 2
+    values, axes = np.linalg.eigh(np.tensordot(alpha, strain, 1))
+    half_gap = (values[:, :, None] - values[:, None]) / 2
     equal = half_gap == 0
     divided = np.where(equal, 1.0, np.sinh(half_gap) / np.where(equal, 1.0, half_gap))
-    root = np.exp(stretch / 2)
-    divided *= root[:, None] * root
-    turned = np.einsum("cpqn,qan->cpan", F, seen)
-    by_own = np.einsum("cpan,pbn->abcn", turned, seen) * divided[:, :, None]
-    # Back to the axes of space.
-    by_own = np.einsum("xan,abcn->xbcn", axes, by_own)
-    by_own = np.einsum("ybn,xbcn->xycn", axes, by_own)
-    return residuals, slopes, np.tensordot(numbers, by_own, 2)
+    divided *= np.exp((values[:, :, None] + values[:, None]) / 2)
+    seen, back = MQ @ axes, axes.swapaxes(1, 2)
+    grown = (seen * np.exp(values)[:, None]) @ back  # M_i Q exp(E)
+    gram = grown @ MQ.swapaxes(1, 2)
+    residuals = orthonormality(gram, camera)
+
+    def slopes(changes: NDArray) -> NDArray:
+        """Return the derivatives (I, c, n) for changes (I, 2, n, 2) of `gram`."""
+        changes = changes.swapaxes(1, 2)
+        entries = _entries(changes, camera)
+        if camera == "weak_perspective":  # a quotient
+            entries -= (
+                np.trace(changes, axis1=2, axis2=3)[..., None] * residuals[:, None]
+            )
+            entries /= np.trace(gram, axis1=1, axis2=2)[:, None, None]
+        return entries.swapaxes(1, 2)
+
+    basis = strain_basis(camera).swapaxes(0, 1).reshape(3, -1)
+    # exp(E_0 / 2) exp(E) exp(E_0 / 2) changes to first order by the symmetric part of
+    # E_0 exp(E).
+    columns = [slopes(_between(MQ, basis, grown))]
+    if len(strain):
+        turned = _between(back, basis, back) * divided[:, :, None]
+        own = slopes(_between(seen, turned.reshape(len(MQ), 3, -1), seen))
+        weighted = alpha[:, None, :, None] * own[:, :, None]
+        columns.append(weighted.reshape(*residuals.shape, -1))
+    J = np.concatenate(columns, axis=2)
+    return residuals.ravel(), J.reshape(residuals.size, -1)
 
 
-def _normal_equations(
-    alpha: NDArray, residuals: NDArray, slopes: NDArray, own_slopes: NDArray
-) -> tuple[float, NDArray, NDArray]:
-    """Return cost, curvature and gradient of `MetricFit` from `_linearised`."""
-    n_components, size = len(alpha), len(slopes)
-    rows = slopes.reshape(size, -1)
-    # Axes (k, a, m, b): coordinate a of E_k and coordinate b of E_m
-    curvature = np.empty((1 + n_components, size, 1 + n_components, size))
-    curvature[0, :, 0] = rows @ rows.T
-    gradient = np.empty((1 + n_components, size))
-    gradient[0] = rows @ residuals.ravel()
-    if n_components:
-        gradient[1:] = alpha @ np.einsum("acn,cn->na", own_slopes, residuals)
-        mixed = np.einsum("acn,bcn->abn", slopes, own_slopes) @ alpha.T
-        curvature[0, :, 1:] = mixed.transpose(0, 2, 1)
-        curvature[1:, :, 0] = mixed.transpose(2, 1, 0)
-        products = np.einsum("acn,bcn->abn", own_slopes, own_slopes)
-        pairs = (alpha[:, None] * alpha).reshape(n_components**2, -1)
-        own = (products @ pairs.T).reshape(size, size, n_components, n_components)
-        curvature[1:, :, 1:] = own.transpose(2, 0, 3, 1)
-    cost = float(np.vdot(residuals, residuals))
-    return cost, curvature.reshape(gradient.size, gradient.size), gradient.ravel()
+def _between(A: NDArray, matrices: NDArray, B: NDArray) -> NDArray:
+    """Return ``A_i D_n B_i^T`` (I, p, n, q), for matrices D_n side by side (3, 3 n)."""
+    products = (A @ matrices).reshape(len(A), -1, 3) @ B.swapaxes(1, 2)
+    return products.reshape(len(A), A.shape[1], -1, B.shape[1])
 
 
 def levenberg_marquardt(
