@@ -10,7 +10,7 @@ from sklearn.base import BaseEstimator
 from isa_nrsfm import AffineNRSfM, FastISA, baselines
 from isa_nrsfm._frames.projection import compose, project
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
-from isa_nrsfm._paper.svd import leading_triplets
+from isa_nrsfm._paper.factors import leading_triplets
 from isa_nrsfm._tables.tracks import (
     centred_tracks,
     measurement_matrix,

@@ -36,7 +36,7 @@ from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint import fit as joint_fit
-from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._joint.problem import JOINT_OPTIONS
 from isa_nrsfm._linalg.small_matrices import procrustes
 from isa_nrsfm._metric_upgrade.rigid import nearest_rotations
 from isa_nrsfm._parameters.choices import BLOCK_RECOVERIES
@@ -413,11 +413,11 @@ def noise_ratio(X, camera, n_components):
     """Return the noise without floor and prior, divided by that of the spectrum."""
     ratios, original = [], joint_fit.judged
 
-    def recorded(problem, result, start, cameras, spectrum):
-        free = joint_fit.unregularised(problem, result.state, cameras)
-        known = max(spectrum.noise, 1e-10)
+    def recorded(problem, result, start, noise_level, missing_share):
+        free = joint_fit.unregularised(problem, result.state)
+        known = max(noise_level, 1e-10)
         ratios.append(free.state.noise / problem.mean_square / known)
-        return original(problem, result, start, cameras, spectrum)
+        return original(problem, result, start, noise_level, missing_share)
 
     with mock.patch.object(joint_fit, "judged", recorded):
         fit_set(X, camera, n_components)

@@ -46,11 +46,10 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
+from isa_nrsfm._joint.fit import Start, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
-from isa_nrsfm._joint.options import JointOptions
-from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
+from isa_nrsfm._joint.problem import FactorisedTable, JointOptions, JointSettings
 from isa_nrsfm._joint.sample_posterior import (
     posterior_blocks,
     posterior_moments,
@@ -58,10 +57,14 @@ from isa_nrsfm._joint.sample_posterior import (
     shown_frames,
 )
 from isa_nrsfm._joint.starts import rigid_start
-from isa_nrsfm._paper.factors import Factorisation, factorise
+from isa_nrsfm._paper.factors import (
+    DENSE,
+    Factorisation,
+    block_triplets,
+    factorise,
+    sample_frames,
+)
 from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
-from isa_nrsfm._paper.sample import Sample, sample_frames
-from isa_nrsfm._paper.svd import DENSE, block_triplets
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import largest_n_components, most_components
 from isa_nrsfm._prepare.completion import complete_rows
@@ -160,7 +163,7 @@ def fit_ready_table(
         if estimator.refinement == "consensus":
             # A residual below the noise of the spectrum leaves nothing for groups.
             n_numbers, square = tracks.totals
-            share = Spectrum.of(factorised, n_components).noise
+            share = factorised.noise_level(n_components)
             if wanted > n_components or fitted.left > share * square / n_numbers:
                 model = _consensus_model(estimator, table, model, settings, wanted)
                 tracks = JointFrames.from_points(table.rows, table.complete)
@@ -185,8 +188,8 @@ def fit_ready_table(
     unit, fit = table.unit or 1.0, estimator._model
     estimator.mean_shape_, estimator.basis_ = fit.mean_shape, fit.basis
     estimator.camera_, estimator._n_features_out = estimator.camera, len(fit.basis)
-    estimator.rank_floor_ = factorised.triplets.rest_share
-    estimator.singular_values_ = unit * factorised.triplets.values
+    estimator.rank_floor_ = factorised.rest_share
+    estimator.singular_values_ = unit * factorised.singular_values
     estimator.mode_covariance_ *= unit**2
     cameras = frames.motion / table.sizes[:, None, None]
     energy = image_energies(cameras, fit.basis, frames.alpha)
@@ -311,15 +314,26 @@ def _factorised(
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = block_triplets(completed, shape, n_triplets, limits.dense)
+    singular_values, vectors, rest = triplets
     if estimator._is_joint:
-        rigid, first = triplets.vectors[:3], limits.sample
-        sample = sample_frames(completed, n_points, rigid, first, limits.small_table)
+        rigid, first = vectors[:3], limits.sample
+        W, parts = sample_frames(completed, n_points, rigid, first, limits.small_table)
     else:
-        sample = Sample(completed.whole().reshape(shape), [])
-    factors = factorise(sample.W, n_components, table.precision, triplets)
+        W, parts = completed.whole().reshape(shape), []
+    factors = factorise(W, n_components, table.precision, triplets)
     report("factorisation")
-    found = completed, table.n_seen, outliers, triplets, sample, factors
-    return FactorisedTable(table.rows, *found, table.weights)
+    return FactorisedTable(
+        table.rows,
+        completed,
+        table.n_seen,
+        outliers,
+        singular_values,
+        rest,
+        W,
+        parts,
+        factors,
+        table.weights,
+    )
 
 
 def _paper_result(
@@ -407,12 +421,14 @@ def _consensus_model(
     wanted = None if estimator.n_components == "auto" else n_components
     most = most_components(len(table.sizes), table.n_points, estimator.camera)
     most = min(most, MOST_COMPONENTS)
-    found = consensus(model, table.rows, settings, wanted, most, estimator.n_jobs)
+    shapes, noise, alpha, variances = consensus(
+        model, table.rows, settings, wanted, most, estimator.n_jobs
+    )
     # If the object hardly turns, groups share the errors of the depths.
     certainty = model.certainty
-    if found.variances is not None and certainty.determined:
-        certainty = certainty._replace(points=found.variances, leverage=1.0)
-    model = _frame_model(estimator, found.shapes, found.noise, found.alpha)
+    if variances is not None and certainty.determined:
+        certainty = certainty._replace(points=variances, leverage=1.0)
+    model = _frame_model(estimator, shapes, noise, alpha)
     return replace(model, certainty=certainty)
 
 

@@ -1,7 +1,6 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
 from functools import cache
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,12 +14,9 @@ from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm._estimator import limited
 from isa_nrsfm._fit import Limits
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._joint import fit as fit_module, problem as problem_module
-from isa_nrsfm._joint.fit import Spectrum, fit_jointly
-from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
+from isa_nrsfm._joint import problem as problem_module
+from isa_nrsfm._joint.problem import FactorisedTable
 from isa_nrsfm._joint.reweighting import residual_deviations
-from isa_nrsfm._paper.sample import Sample
-from isa_nrsfm._paper.svd import Triplets
 from isa_nrsfm._parameters.choices import LOSSES
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.metrics import affine_shape_error, mean_shape_error_3d
@@ -109,54 +105,18 @@ class TestStarts:
         assert np.isfinite(model.basis_).all()
 
 
-def table_of_squares(squares, rank, n_points=20):
-    """Return a table of complete frames with these squared singular values."""
-    vectors = np.empty((rank, n_points))
-    triplets = Triplets(np.sqrt(squares[:rank]), vectors, squares[rank:].sum())
-    sample = Sample(vectors, [])
-    seen = np.full(30, n_points)
-    return FactorisedTable(None, None, seen, None, triplets, sample, None)
-
-
-def spectrum_of(squares, n_components, n_points):
-    """Return the spectrum of complete frames with these squared singular values."""
-    table = table_of_squares(squares, 3 * n_components + 3, n_points)
-    return Spectrum.of(table, n_components)
-
-
-class TestSpectrum:
-    @pytest.mark.parametrize("n_components", [1, 2])
-    def test_of_complete_frames(self, n_components):
-        # Rows of 20 points that are centred: 19 singular values.
-        squares = np.sort(np.random.default_rng(0).exponential(size=19))[::-1]
-        found = spectrum_of(squares, n_components, 20)
-        others = squares[3 * n_components + 3 :].mean() / squares.mean()
-        assert found.noise == pytest.approx(others)
-        missing = squares[n_components + 3 :].sum() / squares.sum()
-        assert found.missing == pytest.approx(missing)
-
-    def test_of_a_fit_is_that_of_its_basis_shapes(self, monkeypatch):
-        squares = np.sort(np.random.default_rng(0).exponential(size=19))[::-1]
-
-        class JudgedError(Exception):
-            pass
-
-        def judged(*args):
-            raise JudgedError(args[-1])
-
-        fit = SimpleNamespace(camera_noise_ratio=1.0)
-        monkeypatch.setattr(fit_module, "_problems", lambda *args: ([None], None))
-        monkeypatch.setattr(fit_module, "_first_fit", lambda *args: (fit, None))
-        monkeypatch.setattr(fit_module, "judged", judged)
-        settings = JointSettings("affine", "linear", 1, 0.1)
-        with pytest.raises(JudgedError) as caught:
-            fit_jointly(table_of_squares(squares, 9), np.empty((3, 3, 20)), settings)
-        assert caught.value.args[0] == spectrum_of(squares, 2, 20)
-
-    def test_without_other_singular_values(self):
-        found = spectrum_of(np.ones(6), 1, 7)
-        assert found.noise == 0.0
-        assert found.missing == pytest.approx(2 / 6)
+@pytest.mark.parametrize(("n_components", "n_points"), [(1, 20), (2, 20), (1, 7)])
+def test_noise_level_and_missing_share_of_the_spectrum(n_components, n_points):
+    # Rows of points that are centred have one singular value less.
+    squares = np.random.default_rng(0).exponential(size=n_points - 1)
+    squares, rank = np.sort(squares)[::-1], 3 * n_components + 3
+    kept, rest = np.sqrt(squares[:rank]), squares[rank:].sum()
+    seen, W = np.full(30, n_points), np.empty((60, n_points))
+    table = FactorisedTable(None, None, seen, None, kept, rest, W, [], None)
+    others = squares[rank:].mean() / squares.mean() if n_points > 7 else 0.0
+    assert table.noise_level(n_components) == pytest.approx(others)
+    missing = squares[n_components + 3 :].sum() / squares.sum()
+    assert table.missing_share(n_components) == pytest.approx(missing)
 
 
 class TestCameras:

@@ -1,5 +1,6 @@
-"""Calibrated cameras to start the joint fit from, and the shapes that they see."""
+"""Starts of the joint fit, the choice between them, and the number of shapes."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -8,15 +9,22 @@ import pytest
 from frame_parts import assert_calibrated
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from scenes import random_scene as random_model, with_gaps
 
-from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
+from isa_nrsfm._frames.camera_models import CAMERAS
 from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
-from isa_nrsfm._joint.fit import Start, _calibrated_fit, _continued_fit, _first_fit
+from isa_nrsfm._joint.fit import (
+    Start,
+    _calibrated_fit,
+    _continued_fit,
+    _first_fit,
+    relevant_components,
+)
 from isa_nrsfm._joint.frames import JointFrames
+from isa_nrsfm._joint.likelihood import MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.starts import (
-    HELD_STEPS,
     affine_start,
     best_starts,
     extended_shapes,
@@ -26,7 +34,6 @@ from isa_nrsfm._joint.starts import (
     rigid_start,
 )
 from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._paper.sample import Sample
 from isa_nrsfm._selection.path import extended
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
@@ -81,26 +88,6 @@ class TestRigidStart:
         assert camera_error(size * motion, scene.motion) < 1e-8
         assert_allclose(motion @ shapes[0], scene.rows, atol=1e-8)
 
-    @BOTH
-    def test_images_of_all_shapes_are_those_of_the_nearest_affine_cameras(self, camera):
-        # The metric changes neither what rigid cameras see, nor the unit of what the
-        # calibrated ones see on average.
-        scene = random_scene(camera, amplitude=0.4)
-        factors = scene.factors
-        paper = np.random.default_rng(1).normal(size=(3, 3, N_POINTS))
-        scaled = camera == "weak_perspective"
-        motion, shapes = rigid_start(factors, paper, scaled)
-        assert_calibrated(motion, camera)
-        # All shapes change alike: one Q.
-        Q = np.linalg.lstsq(shapes[0].T, paper[0].T)[0].T
-        assert_allclose(Q @ shapes, paper, atol=1e-10)
-        rows, sizes = nearest_calibrated(factors.rigid_motion.reshape(-1, 2, 3) @ Q)
-        if scaled:
-            assert_allclose(motion, sizes[:, None, None] * rows, atol=1e-10)
-        else:
-            assert_allclose(motion, rows, atol=1e-10)
-            assert sizes.mean() == pytest.approx(1.0)
-
 
 class TestMixedCameras:
     @pytest.mark.parametrize("seed", range(4))
@@ -118,12 +105,6 @@ class TestMixedCameras:
         found = mixed_cameras(scene.rows, scene.scales, np.arange(60))
         assert min(camera_error(motion, scene.motion) for motion in found) < 1e-4
 
-    def test_of_some_frames_give_those_of_all(self):
-        scene = random_scene()
-        found = list(mixed_cameras(scene.rows, None, np.arange(0, 60, 2)))
-        assert all(motion.shape == (60, 2, 3) for motion in found)
-        assert min(camera_error(motion, scene.motion) for motion in found) < 1e-4
-
     @BOTH
     def test_are_calibrated(self, camera):
         scene = random_scene(camera, noise=0.05)
@@ -133,13 +114,6 @@ class TestMixedCameras:
         assert len(found) == 6
         for motion in found:
             assert_calibrated(motion, camera)
-
-    @pytest.mark.parametrize(("n_points", "expected"), [(5, 1), (8, 2), (15, 3)])
-    def test_no_wider_than_the_table(self, n_points, expected):
-        rows = random_scene(noise=0.05).rows[..., :n_points]
-        rows = rows - rows.mean(axis=2, keepdims=True)
-        found = list(mixed_cameras(rows, None, np.arange(60)))
-        assert len(found) == expected
 
 
 class TestLiftedShapes:
@@ -172,11 +146,6 @@ class TestLiftedShapes:
         assert_array_equal(shapes[5:], 0.0)
         assert np.isfinite(shapes).all()
 
-    def test_cameras_of_zero(self):
-        scene = random_scene("weak_perspective")
-        scene.motion[3] = 0.0
-        assert np.isfinite(lifted_shapes(scene.rows, scene.motion, 2)).all()
-
 
 def problem_of(scene, thorough=True):
     rows = FrameBlocks.of_array(scene.rows, 64)
@@ -196,35 +165,11 @@ def started(scene, camera, problem=None):
     factors = scene.factors
     problem = problem or problem_of(scene)
     paper = paper_shapes(factors)
-    table = FactorisedTable(*[None] * 5, Sample(scene.W, []), factors)
+    table = FactorisedTable(*[None] * 6, scene.W, [], factors)
     return best_starts(problem, table, paper, CAMERAS[camera])
 
 
 class TestBestStarts:
-    @BOTH
-    @pytest.mark.parametrize("noise", [0.0, 0.02])
-    def test_best_is_likelier_than_each_start(self, camera, noise):
-        scene = random_scene(camera, amplitude=0.4, noise=noise)
-        problem = problem_of(scene)
-        states = started(scene, camera, problem)
-        for state in states:
-            assert_calibrated(state.motion, camera)
-        value = min(problem.likelihood(*state).value for state in states)
-        scaled = camera == "weak_perspective"
-        rigid, _ = rigid_start(scene.factors, scene.shapes, scaled)
-        scales = np.linalg.norm(rigid, axis=(1, 2)) / np.sqrt(2)
-        candidates = [rigid]
-        mixed = mixed_cameras(scene.rows, scales if scaled else None, np.arange(60))
-        candidates += list(mixed)[:2]
-        least_noise = problem.settings.options.least_noise
-        for motion in candidates:
-            shapes = lifted_shapes(scene.rows, motion, 2)
-            noise_variance = 0.1 * np.mean((scene.rows - motion @ shapes[0]) ** 2)
-            noise_variance = max(noise_variance, least_noise * problem.mean_square)
-            start = JointState(shapes, motion, noise_variance)
-            held = problem.refined(start, AffineCameras(held=True), max_iter=HELD_STEPS)
-            assert value < held.history[-1]
-
     @pytest.mark.parametrize("seed", range(2))
     def test_has_nearly_the_true_cameras_where_the_rigid_ones_are_wrong(self, seed):
         scene = random_scene(seed=seed, amplitude=0.6)
@@ -276,14 +221,6 @@ class TestAffineStart:
             alpha = np.sum(images * scene.rows, axis=(1, 2)) / norms
             assert_allclose(after, np.std(alpha) * before, rtol=1e-10)
 
-    def test_basis_shapes_that_no_camera_sees_are_zero(self):
-        scene = random_scene()
-        paper = paper_shapes(scene.factors)
-        paper[2] = 0.0
-        state = affine_start(problem_of(scene), scene.W, paper)
-        assert_array_equal(state.shapes[2], 0.0)
-        assert np.isfinite(state.shapes).all()
-
 
 def random_frames(seed=0, n_frames=40, n_points=30, n_components=2):
     """Return shapes, cameras and coefficients."""
@@ -316,12 +253,6 @@ class TestLikelyBasis:
         for _ in range(10):
             step = 0.01 * rng.normal(size=2), np.eye(2) + 0.01 * rng.normal(size=(2, 2))
             assert objective(*step) > least
-
-    def test_coefficients_that_are_all_zero(self):
-        truth, motion, alpha = random_frames()
-        shapes = likely_basis(truth, motion, 0 * alpha, 0.0)
-        assert_allclose(shapes[0], truth[0])
-        assert np.isfinite(shapes).all()
 
 
 @pytest.mark.parametrize("n_frames", [150, 300])
@@ -361,7 +292,102 @@ def test_the_likeliest_fit_of_the_starts_counts():
     problem, factors = problem_of(scene), scene.factors
     camera, states = CAMERAS["orthographic"], started(scene, "orthographic", problem)
     ends = [_calibrated_fit(problem, state, camera).value for state in states]
-    table = FactorisedTable(*[None] * 5, Sample(scene.W, []), factors)
+    table = FactorisedTable(*[None] * 6, scene.W, [], factors)
     fit, _ = _first_fit(problem, table, paper_shapes(factors))
     assert max(ends) > min(ends)
     assert fit.value == min(ends)
+
+
+NOISE, FEW_POINTS = 0.05, 12
+
+
+def random_problem(kind="complete", n_frames=30, **options):
+    """Return the problem of a random table, and a state with its shapes and cameras."""
+    scene = random_model(0, n_frames, FEW_POINTS, noise=NOISE, **options)
+    complete, tracks, shapes = kind != "missing", scene.centred, scene.shapes
+    if not complete:
+        tracks = with_gaps(tracks, 0.2)
+    rows = FrameBlocks.of_array(tracks.transpose(0, 2, 1), 64)
+    frames = JointFrames.from_points(rows, complete)
+    if kind == "directions":
+        directions = np.linalg.svd(shapes.reshape(-1, FEW_POINTS))[2][: FEW_POINTS - 1]
+        frames = JointFrames.from_directions(rows, directions)
+        shapes = frames.coordinates(shapes)
+    settings = JointSettings("affine", "linear", 100, 1e-3)
+    problem = JointProblem(frames, settings, penalty=0.02)
+    return problem, JointState(shapes, scene.motion, NOISE**2)
+
+
+def counted(problem, state, threshold=None):
+    """Return the number of relevant shapes, by another threshold of shares."""
+    settings = problem.settings
+    if threshold is not None:
+        options = settings.options._replace(determined=threshold)
+        settings = settings._replace(options=options)
+    return relevant_components(replace(problem, settings=settings), state)
+
+
+def mean_images(state):
+    """Return the mean over frames of the products <M B_k, M B_l>."""
+    images = [(M @ state.shapes[1:]).reshape(3, -1) for M in state.motion]
+    return np.mean([image @ image.T for image in images], axis=0)
+
+
+def shares_and_variances(problem, state, penalty):
+    """Return g_k and v_k after a round from prior variances 1 / (n_frames penalty)."""
+    curvature = MarginalLikelihood(problem.frames, penalty)(*state).shape_curvature
+    C = np.mean([M.T @ M for M in state.motion], axis=0)
+    traces = np.zeros(3)
+    for j in range(FEW_POINTS):
+        covariance = NOISE**2 * np.linalg.inv(curvature[j % len(curvature)])
+        for k in range(3):
+            of_shape = slice(3 * k + 3, 3 * k + 6)
+            traces[k] += np.trace(C @ covariance[of_shape, of_shape])
+    v = 1 / (len(state.motion) * penalty)
+    g = 1 - traces / (3 * FEW_POINTS * v)
+    return g, np.diag(mean_images(state)) / (3 * FEW_POINTS * g)
+
+
+class TestRelevantComponents:
+    @pytest.mark.parametrize("kind", ["complete", "missing", "directions"])
+    def test_rounds_by_their_definition(self, kind, monkeypatch):
+        problem, state = random_problem(kind)
+        rounds = []
+
+        def held(problem, state, **options):
+            rounds.append((problem.penalty, state))
+            return SimpleNamespace(state=state)
+
+        monkeypatch.setattr(JointProblem, "refined", held)
+        counted(problem, state)
+        assert_allclose(rounds[0][0], np.full(3, problem.penalty))
+        assert len(rounds) == 3
+        prices = [penalty for penalty, _ in rounds[1:]] + [None]
+        for (penalty, reached), following in zip(rounds, prices, strict=True):
+            # Another basis of the same shapes, whose images are orthogonal
+            assert_allclose(reached.shapes[0], state.shapes[0])
+            before = np.linalg.pinv(state.shapes[1:].reshape(3, -1))
+            mixing = reached.shapes[1:].reshape(3, -1) @ before
+            assert_allclose(mixing @ mixing.T, np.eye(3), atol=1e-10)
+            energies = np.linalg.eigvalsh(mean_images(state))[::-1]
+            assert_allclose(mean_images(reached), np.diag(energies), atol=1e-9)
+            shares, variances = shares_and_variances(problem, reached, penalty)
+            if following is not None:
+                expected = 1 / (variances * len(state.motion))
+                assert_allclose(following, expected, rtol=1e-6)
+        for n, threshold in enumerate(np.sort(shares)[::-1]):
+            assert 0.0 < threshold < 1.0
+            assert counted(problem, state, threshold + 1e-6) == n
+            assert counted(problem, state, threshold - 1e-6) == n + 1
+
+    def test_true_shapes_are_and_those_of_noise_are_not(self):
+        problem, state = random_problem(n_frames=60, n_components=2)
+        spare = 0.05 * np.random.default_rng(1).normal(size=(2, 3, FEW_POINTS))
+        spare -= spare.mean(axis=2, keepdims=True)
+        shapes = np.concatenate([state.shapes, spare])
+        assert counted(problem, state._replace(shapes=shapes)) == 2
+
+    def test_of_a_rigid_object(self):
+        problem, state = random_problem()
+        rigid = np.array([1.0, 0.0, 0.0, 0.0])[:, None, None]
+        assert counted(problem, state._replace(shapes=rigid * state.shapes)) == 0

@@ -11,17 +11,21 @@ from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.fit import fit_jointly
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
-from isa_nrsfm._paper.alternating import refine_alternating
-from isa_nrsfm._paper.block_structure import (
+from isa_nrsfm._paper.factors import (
+    Factorisation,
+    factorise,
+    leading_triplets,
+    sample_frames,
+)
+from isa_nrsfm._paper.pipeline import (
+    PaperResult,
     lifted_moments,
     motion_products,
     recover_blocks,
+    refine_alternating,
+    run_paper_pipeline,
     structure_energies,
 )
-from isa_nrsfm._paper.factors import Factorisation, factorise
-from isa_nrsfm._paper.pipeline import PaperResult, run_paper_pipeline
-from isa_nrsfm._paper.sample import sample_frames
-from isa_nrsfm._paper.svd import leading_triplets
 from isa_nrsfm._prepare.completion import completion_model, filled_in
 from isa_nrsfm._prepare.scaling import scaled_table
 from isa_nrsfm._tables.sources import open_table
@@ -225,7 +229,7 @@ class JointRefinement(Stage):
         self.rows, self.n_seen = scaled_rows.rows, scaled_rows.n_seen
         n_points = self.W.shape[1]
         self.sample = sample_frames(self.rows, n_points, self.factors.rigid_shape)
-        self.of_sample = factorise(self.sample.W, self.K)
+        self.of_sample = factorise(self.sample[0], self.K)
 
     def run(self):
         table = FactorisedTable(
@@ -233,8 +237,8 @@ class JointRefinement(Stage):
             self.rows,
             self.n_seen,
             None,
-            leading_triplets(self.W, 3 * self.K + 3),
-            self.sample,
+            *leading_triplets(self.W, 3 * self.K + 3)[::2],
+            *self.sample,
             self.of_sample,
         )
         settings = JointSettings("affine", "linear", max_iter=1000, tol=0.05)

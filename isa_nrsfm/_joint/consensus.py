@@ -43,57 +43,26 @@ from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm._tables.ordering import representative_frames, spread
 from isa_nrsfm._tables.tracks import FEWEST_POINTS
 
+# docs/benchmarks/consensus.md has the errors with other values of these constants.
 # Numbers of points of the groups without and with a fit of their own, and the largest
-# share of all points. Without groups of 6 the error of the depths of yoga is 2.40 %
-# instead of 2.34, of pickup 3.3 instead of 3.1, of a dance 9.7 instead of 6.9. Without
-# groups of 30 it is 2.1 for yoga, but 7.6 instead of 5.1 if its images have 2 % noise.
-# Groups that share nearly all points agree, however large their error: with groups of
-# all points the error of 25 markers of yoga is .0241 instead of .0187. Groups have as
-# many basis shapes as the joint fit: with 8 instead of 10, the error of pickup with 15
-# joints is .060 instead of .028.
+# share of all points. Groups that share nearly all points agree, however large their
+# error. Groups have as many basis shapes as the joint fit.
 SMALLEST, SIZES, LARGEST_SHARE = 6, (12, 30), 0.75
-# Groups that contain a point, on average, of each size. With 4 and 6 the error of yoga
-# is .0100 and .0108, that of pickup .0136 and .0130, that of 68 points of faces .0446
-# and .0442; 6 takes a quarter longer.
+# Groups that contain a point, on average, of each size
 COVER = 4
 # Weight of the mean distance of two points beside its standard deviation, in the
-# choice of neighbours: of two rigidly connected points the near one comes first. With
-# 0, 0.15 and 0.5 the error of yoga is .0121, .0116, .0124, that of pickup .0152, .0149,
-# .0144.
+# choice of neighbours: of two rigidly connected points the near one comes first.
 NEARNESS = 0.15
-# Floor of the noise variance of the groups, as a share of that of the joint fit. With
-# 0.2, 0.1 and 0.04 the error of yoga, groups of 12, is .0137, .0131, .0148.
+# Floor of the noise variance of the groups, as a share of that of the joint fit
 FLOOR_SHARE = 0.2
-# Steps without the prior of the basis shapes, and most steps after them. Without, with
-# 10 and with 30 of the first the error of yoga, groups of 12, is .0169, .0163, .0132.
+# Steps without the prior of the basis shapes, and most steps after them
 FREE_STEPS, MOST_STEPS = 30, 300
-# Largest numbers of frames and of points of the groups. With 400, 500, 600 and 1200
-# frames the error of drink is .0055, .0054, .0051 and .0051. With 30 of 41 points the
-# error of yoga is .0135 instead of .0116.
+# Largest numbers of frames and of points of the groups
 MOST_FRAMES, MOST_POINTS = 500, 100
-# Mean square that free numbers of components leave, as a share of the noise variance.
-# With 1 the error of drink is .0106 instead of .0067.
+# Mean square that free numbers of components leave, as a share of the noise variance
 LEFT = 0.01
-# Largest number of basis shapes of the joint fit, and of the consensus if it is free.
-# With 8, 12 and 16 of the joint fit the error of yoga is .0108, .0116, .0116, that of
-# pickup .0147, .0149, .0149. With at most 20, 40 and 60 of the consensus it is .0119,
-# .0116, .0116 and .0155, .0149, .0149.
+# Largest number of basis shapes of the joint fit, and of the consensus if it is free
 MOST_FIRST, MOST_COMPONENTS = 12, 60
-
-
-class Consensus(NamedTuple):
-    """Result of the consensus, for frames of size one.
-
-    shapes (K + 1, 3, J): centred, for coefficients of variance one.
-    noise: noise variance of a coordinate.
-    alpha (n, K): coefficients of some frames.
-    variances (J,): mean squared errors of the depths, None without groups.
-    """
-
-    shapes: NDArray
-    noise: float
-    alpha: NDArray
-    variances: NDArray | None
 
 
 class Scene(NamedTuple):
@@ -132,22 +101,26 @@ def consensus(
     n_components: int | None,
     most: int,
     n_jobs: int | None = None,
-) -> Consensus:
+) -> tuple[NDArray, float, NDArray, NDArray | None]:
     """Fit groups of neighbouring points, and merge them.
 
     The model is a joint fit with calibrated cameras, the rows are frames (I, 2, J) of
     size one, NaN where a point is missing. Without a number of basis shapes, as many
     are kept as exceed the noise, at most `most`.
+
+    Returns centred shapes (K + 1, 3, J) for coefficients of variance one, the noise
+    variance of a coordinate, the coefficients (n, K) of some frames, and the mean
+    squared errors (J,) of the depths, None without groups.
     """
     few = representative_frames(rows, MOST_FRAMES)
-    part, found = inlying_rows(model, np.asarray(rows.take(few), dtype=np.float64))
-    known = np.isfinite(found.motion).all(axis=(1, 2))
-    part, found = part[known], found.take(known)
+    part, fit = inlying_rows(model, np.asarray(rows.take(few), dtype=np.float64))
+    known = np.isfinite(fit.motion).all(axis=(1, 2))
+    part, fit = part[known], fit.take(known)
     # Shapes of the joint fit, in the axes of the object and of the cameras
-    shapes = model.shapes[0] + np.tensordot(found.alpha, model.shapes[1:], 1)
-    rotations, scales = full_rotations(found.motion)
+    shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
+    rotations, scales = full_rotations(fit.motion)
     first = scales[:, None, None] * rotations @ shapes
-    first[:, :2] += found.translation[:, :, None]
+    first[:, :2] += fit.translation[:, :, None]
     # Groups of some of the points
     n_points, options = part.shape[2], settings.options
     chosen = spread(np.arange(n_points), min(n_points, MOST_POINTS))
@@ -155,7 +128,7 @@ def consensus(
     scene = Scene(
         part[:, :, chosen],
         first[:, :, chosen],
-        found.motion,
+        fit.motion,
         1.0 / (options.basis_std**2 * mean_square),
         FLOOR_SHARE * options.least_noise * mean_square,
     )
@@ -183,10 +156,10 @@ def consensus(
         R = aligning_rotations(centred(S[:, :, chosen]), noise)
         S = R.transpose(0, 2, 1) @ S
     if n_components is None:
-        fitted, alpha, rest = principal_shapes(S, most, LEFT * noise)
+        merged_shapes, alpha, rest = principal_shapes(S, most, LEFT * noise)
     else:
-        fitted, alpha, rest = principal_shapes(S, n_components)
-    return Consensus(fitted, noise + rest, alpha, variances)
+        merged_shapes, alpha, rest = principal_shapes(S, n_components)
+    return merged_shapes, noise + rest, alpha, variances
 
 
 def together(
@@ -221,14 +194,9 @@ def fitted_groups(
     n_jobs: int | None,
 ) -> list[Group]:
     """Return the fits of all groups."""
-    n_points = len(distances)
-    largest = max(LARGEST_SHARE * n_points, SIZES[0])
-    tasks = [
-        task
-        for size in SIZES
-        if size <= largest
-        for task in neighbourhoods(distances, size)
-    ]
+    largest = max(LARGEST_SHARE * len(distances), SIZES[0])
+    sizes = [size for size in SIZES if size <= largest]
+    tasks = [task for size in sizes for task in neighbourhoods(distances, size)]
     quiet = settings._replace(on_step=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
     fits = Parallel(n_jobs=n_jobs, return_as="generator")(
@@ -258,15 +226,8 @@ def neighbour_distances(shapes: NDArray) -> NDArray:
     The standard deviation over the frames of the distance of two points, plus a share
     of its mean.
     """
-    n_points = shapes.shape[2]
-    total, square = np.zeros((2, n_points, n_points))
-    for shape in shapes:
-        distance = cdist(shape.T, shape.T)
-        total += distance
-        square += distance**2
-    mean = total / len(shapes)
-    variance = np.maximum(square / len(shapes) - mean**2, 0.0)
-    return np.sqrt(variance) + NEARNESS * mean
+    distances = np.array([cdist(shape.T, shape.T) for shape in shapes])
+    return distances.std(axis=0) + NEARNESS * distances.mean(axis=0)
 
 
 def neighbourhoods(distances: NDArray, size: int) -> list[tuple[NDArray, int]]:
@@ -310,40 +271,33 @@ def group_fit(
     shapes = centred(lifted_shapes(rows, motion, n_components))
     noise = max(0.1 * float(np.mean((rows - motion @ shapes[0]) ** 2)), scene.floor)
     start = JointState(shapes, motion, noise)
-    # Cameras held, without the prior, which would make basis shapes vanish
-    part = JointFrames.from_points(
-        FrameBlocks.of_array(tracks, len(tracks)), bool(seen.all())
-    )
+    # Fixed cameras, without the prior, which would make basis shapes vanish
+    blocks = FrameBlocks.of_array(tracks, len(tracks))
+    part = JointFrames.from_points(blocks, bool(seen.all()))
     free = MarginalLikelihood(part, 0.0)
     refined = partial(
         refine_joint,
         least_noise=scene.floor * free.n_seen / free.square,
         tol=0.1 * settings.tol,
     )
-    held = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
+    start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
     likelihood = MarginalLikelihood(part, scene.price / len(frames))
-    alpha = free.coefficients(*held)
-    shapes = likely_basis(held.shapes, motion, alpha, likelihood.penalty)
-    shapes, motion, noise = refined(
-        likelihood,
-        held._replace(shapes=shapes),
-        CAMERAS["orthographic"],
-        max_iter=min(settings.max_iter, MOST_STEPS),
-    ).state
-    alpha = likelihood.coefficients(shapes, motion, noise)
-    rotations, scales = full_rotations(motion)
-    found = (
-        scales[:, None, None]
-        * rotations
-        @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    )
+    alpha = free.coefficients(*start)
+    shapes = likely_basis(start.shapes, motion, alpha, likelihood.penalty)
+    start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
+    most = min(settings.max_iter, MOST_STEPS)
+    state = refined(likelihood, start, orthographic, max_iter=most).state
+    alpha = likelihood.coefficients(*state)
+    rotations, scales = full_rotations(state.motion)
+    turned = scales[:, None, None] * rotations
+    S = turned @ (state.shapes[0] + np.tensordot(alpha, state.shapes[1:], 1))
     # Positions from the visible points, and the mirror image nearest to the joint fit
-    off = np.where(seen[:, None], tracks - found[:, :2], 0.0).sum(axis=2)
-    found[:, :2] += (off / seen.sum(axis=1)[:, None])[:, :, None]
-    if np.sum(centred(first[:, 2]) * found[:, 2]) < 0:
-        found[:, 2] *= -1.0
-    return frames, found, noise
+    off = np.where(seen[:, None], tracks - S[:, :2], 0.0).sum(axis=2)
+    S[:, :2] += (off / seen.sum(axis=1)[:, None])[:, :, None]
+    if np.sum(centred(first[:, 2]) * S[:, 2]) < 0:
+        S[:, 2] *= -1.0
+    return frames, S, state.noise
 
 
 def frames_showing(rows: NDArray) -> NDArray:
@@ -358,7 +312,7 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
     Each group disagrees with the merge of the groups of its size.
     """
     rounding = OF_DISTANCES**2 * float(np.mean(scene.first**2))
-    found = []
+    weighted_groups = []
     for size in sorted({len(group.points) for group in groups}):
         same = [group for group in groups if len(group.points) == size]
         merged = merge(scene, same)[:, 2]
@@ -369,8 +323,10 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
         ]
         total = sum(group.weight for group in same)
         weight = 1.0 / (size * (sum(off) / total + rounding))
-        found += [group._replace(weight=weight * group.weight) for group in same]
-    return found
+        weighted_groups += [
+            group._replace(weight=weight * group.weight) for group in same
+        ]
+    return weighted_groups
 
 
 def merge(scene: Scene, groups: list[Group], share: float = 0.0) -> NDArray:

@@ -5,55 +5,43 @@
    Otherwise unmodelled deformation would distort depths and cameras.
 3. The fit of affine cameras, from 2 and from the paper's result. The one with the lower
    objective is kept. With calibrated cameras it only serves for comparison.
-4. The decision whether K is sufficient. If the noise is at most that of the spectrum,
-   the fit is repeated without floor and prior.
+4. The decision whether K is sufficient: if the residual does not exceed the noise level
+   of the spectrum. Then the fit is repeated without floor and prior.
 
 For large tables, the first steps use a sample and the last ones all frames.
+
+The number of basis shapes that a table determines: the images of the 3J coordinates of
+each basis shape have a prior variance v_k, which is estimated (automatic relevance
+determination: MacKay, "Bayesian interpolation", 1992; Bishop, "Bayesian PCA", 1999).
+With the posterior covariance ``cov B_k``, the coefficients' moments held fixed, and ``C
+= mean_i M_i^T M_i`` the iteration is
+
+    g_k = 1 - tr(C cov B_k) / (3J v_k),   v_k <- mean_i ||M_i B_k||^2 / (3J g_k).
+
+g_k is the share of the 3J numbers of B_k that the table determines rather than the
+prior. Shapes that fit noise get smaller, and less determined, with each round.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
-from isa_nrsfm._joint.frames import JointFrames, WeightedRows
+from isa_nrsfm._joint.frames import JointFrames, without
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
-from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointFit, JointState
-from isa_nrsfm._joint.relevance import relevant_components
+from isa_nrsfm._joint.quasi_newton import NOISE_FLOOR, JointFit, JointState, regular
 from isa_nrsfm._joint.reweighting import reweighted
-from isa_nrsfm._joint.starts import affine_start, best_starts, settled, with_prior
+from isa_nrsfm._joint.starts import (
+    affine_start,
+    best_starts,
+    camera_moments,
+    settled,
+    with_prior,
+)
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
-
-
-class Spectrum(NamedTuple):
-    """Noise level and missing energy of a rank-(3K+3) model, from the singular values.
-
-    noise: share of the mean square, the mean of the squared singular values beyond 3K +
-    3 (Tipping, Bishop, "Probabilistic principal component analysis", 1999, eq. 8).
-    missing: share of the energy beyond the K + 3 largest singular values. For motion
-    capture, it is about the share of the shapes outside the best K basis shapes.
-    """
-
-    noise: float
-    missing: float
-
-    @classmethod
-    def of(cls, table: FactorisedTable, n_components: int) -> "Spectrum":
-        """Return the spectrum of a table for K basis shapes."""
-        rest_share = table.triplets.rest_share
-        # Mean energy of the dimensions beyond, over that of all seen - 1 dimensions
-        seen = float(np.mean(table.n_seen))
-        n_others = seen - 1 - (3 * n_components + 3)
-        noise = rest_share * (seen - 1) / n_others if n_others > 0 else 0.0
-        # Points that were filled in add to the energy of the table, but have no noise.
-        noise *= table.sample.W.shape[1] / seen
-        squares = table.triplets.values**2
-        beyond = np.sum(squares[n_components + 3 :]) / (np.sum(squares) or 1.0)
-        return cls(noise, float(rest_share + (1 - rest_share) * beyond))
 
 
 class Start(NamedTuple):
@@ -82,40 +70,40 @@ def fit_jointly(
     such that alpha ~ N(0, I). The noise is corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
-    first, sampled = problems[0], len(problems) > 1
-    camera, cameras = settings.camera, CAMERAS[settings.camera]
+    first, sampled, n_components = problems[0], len(problems) > 1, len(paper_shapes) - 1
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if starts:
         fit, start = _continued_fit(first, starts)
     else:
         fit, start = _first_fit(first, table, paper_shapes)
     ratio = fit.camera_noise_ratio
-    spectrum = Spectrum.of(table, len(paper_shapes) - 1)
-    fit, least_noise, right = judged(first, fit, start, cameras, spectrum)
-    refined = partial(JointProblem.refined, cameras=cameras, least_noise=least_noise)
-    if right:
-        problems = [replace(each, penalty=0.0) for each in problems]
-        if not sampled:  # for a right model a smaller tolerance is safe
-            fit = refined(problems[0], fit.state, tol=0.1**2 * settings.tol)
+    levels = table.noise_level(n_components), table.missing_share(n_components)
+    fit, least_noise, sufficient = judged(first, fit, start, *levels)
+    if sufficient:
+        problems = [replace(problem, penalty=0.0) for problem in problems]
+        if not sampled:  # for a sufficient model a smaller tolerance is safe
+            tol = 0.1**2 * settings.tol
+            fit = problems[0].refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames
     for problem in problems[1:]:
-        fit = refined(problem, problem.aligned(fit.state, camera))
+        fit = problem.refined(problem.aligned(fit.state), least_noise=least_noise)
     # After completed frames, the points that are seen, and robust weights
     problem = problems[-1]
     if seen is not None:
         shapes = problem.frames.points(fit.state.shapes)
         problem = replace(problem, frames=seen)
-        fit = refined(problem, fit.state._replace(shapes=shapes))
-    noise, n_pose = fit.state.noise, 2 + cameras.n_parameters
+        state = fit.state._replace(shapes=shapes)
+        fit = problem.refined(state, least_noise=least_noise)
+    noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
     if table.outliers is not None:
         # This noise variance is corrected for the unknowns of the frames already.
-        fit, noise = reweighted(problem, table.rows, table.outliers, fit, refined)
+        fit, noise = reweighted(problem, table.rows, table.outliers, fit, least_noise)
         n_pose = 0
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
     state = fit.state._replace(shapes=first.frames.coordinates(shapes))
     if sampled:
-        state = state._replace(motion=state.motion[table.sample.parts[0]])
+        state = state._replace(motion=state.motion[table.parts[0]])
     noise *= _freedom_correction(table.n_seen, shapes.shape, n_pose)
     centred = shapes - shapes.mean(axis=2, keepdims=True)
     end = JointState(centred, fit.state.motion, max(noise, OF_DISTANCES**2))
@@ -132,7 +120,47 @@ def count_components(
     """
     problem = _problems(table, paper_shapes, settings)[0][0]
     fit, _ = _first_fit(problem, table, paper_shapes)
-    return max(relevant_components(problem, fit.state, CAMERAS[settings.camera]), 1)
+    return max(relevant_components(problem, fit.state), 1)
+
+
+def relevant_components(problem: JointProblem, state: JointState) -> int:
+    """Return the number of relevant basis shapes of a fit with more of them."""
+    n_points = problem.frames.points(state.shapes).shape[2]
+    n_numbers, n_frames = 3 * n_points, problem.frames.n_frames
+    penalty = np.full(len(state.shapes) - 1, problem.penalty)
+    determined = np.ones(len(penalty))
+    for _ in range(3):
+        part = replace(problem, penalty=penalty)
+        # Basis shapes whose images are orthogonal on average
+        axes = np.linalg.eigh(_image_moments(state)[1])[1][:, ::-1]
+        basis = np.tensordot(axes.T, state.shapes[1:], 1)
+        shapes = np.concatenate([state.shapes[:1], basis])
+        start = state._replace(shapes=shapes)
+        tol = part.settings.tol
+        state = part.refined(start, max_iter=30, tol=tol).state
+        C, images = _image_moments(state)
+        energy = np.diagonal(images)
+        if not energy.any():
+            return 0  # nothing deforms
+        # Posterior covariance of each point: half the Hessian is curvature / s2.
+        curvature = part.likelihood(*state).shape_curvature
+        covariance = state.noise * np.linalg.inv(regular(curvature))
+        # If all weights are one, one matrix is valid for all points.
+        total = covariance.sum(axis=0) * (n_points / len(covariance))
+        total = total.reshape(len(shapes), 3, len(shapes), 3)
+        uncertain = np.einsum("ab,kakb->k", C, total)[1:]
+        # g_k and v_k, with penalty = 1 / (v_k n_frames)
+        determined = 1.0 - uncertain * penalty * n_frames / n_numbers
+        determined = np.maximum(determined, 1e-9)
+        variance = np.maximum(energy / (n_numbers * determined), 1e-9 * energy.max())
+        penalty = 1.0 / (variance * n_frames)
+    return int(np.sum(determined > problem.settings.options.determined))
+
+
+def _image_moments(state: JointState) -> tuple[NDArray, NDArray]:
+    """Return ``C = mean_i M_i^T M_i`` and the moments ``mean_i <M_i B_k, M_i B_l>``."""
+    C, basis = camera_moments(state.motion), state.shapes[1:]
+    return C, np.einsum("ab,kaj,lbj->kl", C, basis, basis, optimize=True)
 
 
 def _problems(
@@ -146,36 +174,35 @@ def _problems(
     """
     n_shapes, _, n_points = paper_shapes.shape
     options, seen = settings.options, None
-    complete = bool((table.n_seen == n_points).all())
     if n_points > max(24 * n_shapes, options.many_points):
         directions = np.concatenate([table.factors.rigid_shape, table.factors.signals])
         directions = directions[directions.any(axis=1)] / np.sqrt(n_points)
         frames = JointFrames.from_directions(table.completed, directions)
+        complete = bool((table.n_seen == n_points).all())
         if not complete or table.outliers is not None or table.weights is not None:
-            seen = _visible_frames(table, complete)
+            seen = _visible_frames(table, n_points)
     else:
-        frames = _visible_frames(table, complete)
+        frames = _visible_frames(table, n_points)
     thorough = frames.n_frames <= options.few_frames
     penalty = frames.basis_penalty(options.basis_std)
     problem = JointProblem(frames, settings, thorough, penalty)
-    # By chance, each fitted parameter lowers the objective by about one. Steps on a
+    # Each parameter that fits noise only lowers -2 log L by about one. Steps on a
     # sample end when they gain less than 3 % of the number of shape parameters.
     chance = 0.03 * frames.coordinates(paper_shapes).size
     problems = [
         problem.part(part, tol=max(settings.tol, chance / len(part)))
-        for part in table.sample.parts
+        for part in table.parts
     ]
     return [*problems, problem], seen
 
 
-def _visible_frames(table: FactorisedTable, complete: bool) -> JointFrames:
+def _visible_frames(table: FactorisedTable, n_points: int) -> JointFrames:
     """Return the frames by their visible points, without outliers, weighted."""
     if table.weights is not None:
         return JointFrames.from_repeated(table.rows, table.weights)
     if table.outliers is not None and table.outliers.any():
-        rows = table.rows.derive(WeightedRows.without, table.outliers)
-        return JointFrames.from_weighted(rows)
-    return JointFrames.from_points(table.rows, complete)
+        return JointFrames.from_weighted(table.rows.derive(without, table.outliers))
+    return JointFrames.from_points(table.rows, bool((table.n_seen == n_points).all()))
 
 
 def _first_fit(
@@ -183,26 +210,25 @@ def _first_fit(
 ) -> tuple[JointFit, JointState]:
     """Return the fit of the sample, with its noise ratio, and one of its starts."""
     # Calibrated cameras, from the best starts
-    settings, affine = problem.settings, CAMERAS["affine"]
-    camera = settings.camera
-    calibrated = CAMERAS["weak_perspective" if camera == "affine" else camera]
+    cameras, affine = problem.cameras, CAMERAS["affine"]
+    calibrated = cameras if cameras.calibrated else CAMERAS["weak_perspective"]
     starts = best_starts(problem, table, paper_shapes, calibrated)
     fit = _least(_calibrated_fit(problem, state, calibrated) for state in starts)
     # Affine cameras, from the calibrated fit and from the paper's result
-    rigid = affine_start(problem, table.sample.W, paper_shapes)
-    states = [problem.aligned(fit.state, "affine"), settled(problem, rigid, affine)]
-    max_iter = settings.max_iter
-    if camera != "affine":  # only compared
+    rigid = affine_start(problem, table.W, paper_shapes)
+    states = [problem.aligned(fit.state, affine), settled(problem, rigid, affine)]
+    max_iter = problem.settings.max_iter
+    if cameras.calibrated:  # only compared
         max_iter = min(max_iter, 60)
     if not problem.thorough:  # only the better one continues
         few = min(max_iter, 5)
-        raced = [problem.refined(each, affine, max_iter=few) for each in states]
+        raced = [problem.refined(state, affine, max_iter=few) for state in states]
         states = [_least(raced).state]
     other = _least(problem.refined(s, affine, max_iter=max_iter) for s in states)
     ratio = fit.left / min(other.left, fit.left)
-    if camera == "affine":
-        return other._replace(camera_noise_ratio=ratio), rigid
-    return fit._replace(camera_noise_ratio=ratio), starts[0]
+    if cameras.calibrated:
+        return fit._replace(camera_noise_ratio=ratio), starts[0]
+    return other._replace(camera_noise_ratio=ratio), rigid
 
 
 def _continued_fit(
@@ -213,39 +239,34 @@ def _continued_fit(
     A later start is dropped if repeating the gain of its second half would not suffice
     to catch up.
     """
-    settings = problem.settings
-    cameras = CAMERAS[settings.camera]
+    settings, cameras = problem.settings, problem.cameras
     n_steps = min(settings.options.catching_up, settings.max_iter)
     fitted = _calibrated_fit if cameras.calibrated else JointProblem.refined
     fits: list[tuple[JointFit, JointState]] = []
     for start in starts:
         state = given = _aligned_start(problem, start)
         if fits:
-            tried = problem.refined(state, cameras, max_iter=n_steps)
+            tried = problem.refined(state, max_iter=n_steps)
             gained = tried.history[len(tried.history) // 2] - tried.value
             if tried.value - min(fit.value for fit, _ in fits) > gained:
                 continue
             state = tried.state
         fits.append((fitted(problem, state, cameras), given))
-    return min(fits, key=lambda found: found[0].value)
+    return min(fits, key=lambda pair: pair[0].value)
 
 
 def _aligned_start(problem: JointProblem, start: Start) -> JointState:
     """Return a given start with cameras, after calibrated ones if it asks for them."""
-    camera = problem.settings.camera
+    settings, calibrated = problem.settings, CAMERAS["weak_perspective"]
     shapes = problem.frames.coordinates(start.shapes)
     state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
-    if start.calibrated_first and not CAMERAS[camera].calibrated:
+    if start.calibrated_first and not problem.cameras.calibrated:
         # As many steps as starts of the search make
-        settings, calibrated = problem.settings, "weak_perspective"
         state = problem.aligned(state, calibrated)
-        state = problem.refined(
-            state,
-            CAMERAS[calibrated],
-            max_iter=min(30, settings.max_iter),
-            tol=settings.tol,
-        ).state
-    return problem.aligned(state, camera)
+        steps = min(30, settings.max_iter)
+        fit = problem.refined(state, calibrated, max_iter=steps, tol=settings.tol)
+        state = fit.state
+    return problem.aligned(state)
 
 
 def _least(fits: Iterable[JointFit]) -> JointFit:
@@ -273,43 +294,41 @@ def judged(
     problem: JointProblem,
     fit: JointFit,
     start: JointState,
-    cameras: CameraModel,
-    spectrum: Spectrum,
+    noise_level: float,
+    missing_share: float,
 ) -> tuple[JointFit, float, bool]:
     """Decide whether K is sufficient and refit accordingly.
 
-    Returns the fit, its noise floor and the decision. A model is right if its residual
-    is at most the noise of the spectrum. Then the fit is repeated without floor and
-    prior, from its result and from its start. The result lacks deformation below the
-    floor.
+    Returns the fit, its noise floor and the decision. K is sufficient if the residual
+    does not exceed the noise level of the spectrum. Then the fit is repeated without
+    floor and prior, from its result and from its start. The result lacks deformation
+    below the floor.
 
-    Otherwise there are too few basis shapes, and cameras or depths explain the missing
-    deformation. Calibrated cameras are fitted again, with a noise floor as high as that
-    deformation; orthographic ones only if their noise is at the lower floor.
+    Otherwise cameras or depths explain the missing deformation. Calibrated cameras are
+    fitted again, with a noise floor as high as that deformation; orthographic ones only
+    if their noise is at the lower floor.
     """
     options, mean_square = problem.settings.options, problem.mean_square
-    least_noise = options.least_noise
+    cameras, least_noise = problem.cameras, options.least_noise
     # A spectrum of only 3K + 3 singular values has no noise.
-    right_noise = max(options.right * spectrum.noise, 1e-10) * mean_square
+    threshold = max(options.right * noise_level, 1e-10) * mean_square
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
-    # Right: without floor and prior
-    if at_floor or fit.state.noise < right_noise:
+    # Sufficient: without floor and prior
+    if at_floor or fit.state.noise < threshold:
         for state in (fit.state, start):
-            released = unregularised(problem, state, cameras)
-            if released.state.noise < right_noise:
+            released = unregularised(problem, state)
+            if released.state.noise < threshold:
                 return released, NOISE_FLOOR, True
-    # Not right: with a floor as high as the missing deformation
+    # Not sufficient: with a floor as high as the missing deformation
     follows = cameras.scaled or at_floor
-    if cameras.calibrated and follows and spectrum.noise > 0:
-        missing = options.cut_off * spectrum.missing
+    if cameras.calibrated and follows and noise_level > 0:
+        missing = options.cut_off * missing_share
         least_noise = np.clip(missing, least_noise, options.most_noise)
         fit = _calibrated_fit(problem, fit.state, cameras, least_noise)
     return fit, least_noise, False
 
 
-def unregularised(
-    problem: JointProblem, state: JointState, cameras: CameraModel
-) -> JointFit:
+def unregularised(problem: JointProblem, state: JointState) -> JointFit:
     """Return the fit without prior and floor. It ends when the noise hardly falls."""
     problem = replace(problem, penalty=0.0)
     state = with_prior(problem, state)
@@ -317,12 +336,12 @@ def unregularised(
     steps = min(60, max_iter)
     for _ in range(max_iter // steps):
         before = state.noise
-        fit = problem.refined(state, cameras, NOISE_FLOOR, max_iter=steps)
+        fit = problem.refined(state, least_noise=NOISE_FLOOR, max_iter=steps)
         state = fit.state
         if state.noise > 0.95 * before:
             break
-        if cameras.calibrated:
-            state, _ = problem.reversed_back(state, cameras)
+        if problem.cameras.calibrated:
+            state, _ = problem.reversed_back(state, problem.cameras)
     return fit
 
 

@@ -6,7 +6,7 @@ products with directions that span the shapes: cheap for any number of points.
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,13 @@ from isa_nrsfm._linalg.small_matrices import energies
 from isa_nrsfm._tables.blocks import BLOCK_FRAMES, FrameBlocks
 from isa_nrsfm._tables.tracks import seen_points
 
+# Rows (n, 2, J), NaN where a point is missing, and weights (n, J), zero there.
+WeightedRows = tuple[NDArray, NDArray]
 
-class WeightedRows(NamedTuple):
-    """Frames of a table with a weight for each point."""
 
-    rows: NDArray  # (n_frames, 2, n_points), NaN where a point is missing
-    weights: NDArray  # (n_frames, n_points), zero where a point is missing
-
-    @classmethod
-    def without(cls, rows: NDArray, left_out: NDArray) -> Self:
-        """Return frames with weight zero for some points (n_frames, n_points)."""
-        seen = seen_points(rows.transpose(0, 2, 1))
-        return cls(rows, (seen & ~left_out) * 1.0)
+def without(rows: NDArray, left_out: NDArray) -> WeightedRows:
+    """Return rows (n, 2, J), with weight zero for missing points and those left out."""
+    return rows, (seen_points(rows.transpose(0, 2, 1)) & ~left_out) * 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,17 +67,12 @@ class JointFrames:
     @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
         """Return frames by points, from blocks of `WeightedRows`."""
-        return cls(
-            weighted.derive(
-                lambda b: frame_tracks(b.rows.transpose(0, 2, 1), b.weights)
-            )
-        )
+        return cls(weighted.derive(lambda block: _weighted_frames(*block)))
 
     @classmethod
     def from_repeated(cls, rows: FrameBlocks, weights: NDArray) -> Self:
         """Return frames by points, from rows (n, 2, J) and observations (I, J)."""
-        weighted = cls.from_weighted(rows.derive(WeightedRows, weights))
-        return replace(weighted, repeated=True)
+        return cls(rows.derive(_weighted_frames, weights), repeated=True)
 
     @classmethod
     def from_directions(cls, rows: FrameBlocks, directions: NDArray) -> Self:
@@ -116,6 +106,11 @@ def _totals(block: FrameTracks, repeated: bool) -> tuple[float, float]:
     if block.weights is not None and not repeated:
         n_seen = np.count_nonzero(block.weights)
     return 2.0 * n_seen, block.energy.sum()
+
+
+def _weighted_frames(rows: NDArray, weights: NDArray) -> FrameTracks:
+    """Return frames of rows (n, 2, J) with weights (n, J)."""
+    return frame_tracks(rows.transpose(0, 2, 1), weights)
 
 
 def _plain_frames(rows: NDArray, complete: bool) -> FrameTracks:

@@ -22,10 +22,9 @@ from scipy.spatial.transform import Rotation
 from isa_nrsfm._frames.camera_models import CAMERAS, full_rotations
 from isa_nrsfm._frames.depth import NOT_ESTIMATED, DepthCertainty
 from isa_nrsfm._frames.models import PosteriorFrames
-from isa_nrsfm._joint.extents import EXTENT_WEIGHT
 from isa_nrsfm._joint.frames import JointFrames
-from isa_nrsfm._joint.likelihood import MarginalLikelihood
-from isa_nrsfm._joint.options import JOINT_OPTIONS
+from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT, MarginalLikelihood
+from isa_nrsfm._joint.problem import JOINT_OPTIONS
 from isa_nrsfm._joint.quasi_newton import JointState, refine_joint
 from isa_nrsfm._joint.sample_posterior import inlying_rows
 from isa_nrsfm._tables.blocks import FrameBlocks

@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel
+from isa_nrsfm._frames.camera_models import CameraModel
 from isa_nrsfm._frames.projection import compose, distances
-from isa_nrsfm._joint.frames import JointFrames, WeightedRows
+from isa_nrsfm._joint.frames import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.problem import JointProblem
-from isa_nrsfm._joint.quasi_newton import JointFit, JointState, regular
+from isa_nrsfm._joint.quasi_newton import JointFit, regular
 from isa_nrsfm._linalg.rounding import OF_DISTANCES
 from isa_nrsfm._linalg.small_matrices import frames_last
 from isa_nrsfm._prepare.robust import frame_weights, median_noise, robust_sizes
@@ -24,7 +24,7 @@ def reweighted(
     rows: FrameBlocks,
     left_out: NDArray,
     fit: JointFit,
-    refined: Callable[[JointProblem, JointState], JointFit],
+    least_noise: float,
 ) -> tuple[JointFit, float]:
     """Iterate refinement and weights until the weights agree with the residuals.
 
@@ -32,14 +32,13 @@ def reweighted(
     the refinement and the noise variance of a coordinate, from the median of the
     residuals, corrected for the degrees of freedom.
     """
-    settings = problem.settings
-    cameras = CAMERAS[settings.camera]
+    cameras, loss = problem.cameras, problem.settings.loss
     sizes = rows.joined(lambda block: robust_sizes(block.transpose(0, 2, 1)))
-    weighted = rows.derive(WeightedRows.without, left_out)
+    weighted = rows.derive(without, left_out)
     # Estimate the noise from the residuals of at most about 2,000 frames.
     few = representative_frames(rows, 2000)
     few_rows = rows.take(few)
-    weights = WeightedRows.without(few_rows, left_out[few]).weights
+    weights = without(few_rows, left_out[few])[1]
     for _ in range(20):
         shapes, motion, variance = fit.state
         alpha = problem.likelihood.coefficients(*fit.state)
@@ -50,15 +49,15 @@ def reweighted(
         distance /= residual_deviations(M, a, shapes, weights, variance, cameras)
         deviation = max(median_noise(distance[np.isfinite(distance)]), OF_DISTANCES)
         # Weights from the residuals, and convergence test
-        new = partial(_weighted, shapes=shapes, loss=settings.loss, deviation=deviation)
+        new = partial(_weighted, shapes=shapes, loss=loss, deviation=deviation)
         change = max(weighted.map(partial(_change, new=new), *model))
         if change < 1e-2:
             break
         # Refinement with the new weights
         weighted = rows.derive(new, *model)
-        weights = new(few_rows, M, t, a, few_sizes).weights
+        weights = new(few_rows, M, t, a, few_sizes)[1]
         problem = replace(problem, frames=JointFrames.from_weighted(weighted))
-        fit = refined(problem, fit.state)
+        fit = problem.refined(fit.state, least_noise=least_noise)
     return fit, deviation**2
 
 
@@ -106,11 +105,12 @@ def _positions(
     block: WeightedRows, motion: NDArray, alpha: NDArray, shapes: NDArray
 ) -> NDArray:
     """Return the positions (n, 2) of frames, the weighted means of residuals."""
+    rows, weights = block
     stacked = shapes.transpose(0, 2, 1)
     model = compose(stacked[0], stacked[1:], alpha) @ motion.swapaxes(1, 2)
-    rest = np.nan_to_num(block.rows.transpose(0, 2, 1) - model)
-    total = block.weights.sum(axis=1, keepdims=True)  # zero where no point counts
-    position = np.einsum("ij,ijc->ic", block.weights, rest)
+    rest = np.nan_to_num(rows.transpose(0, 2, 1) - model)
+    total = weights.sum(axis=1, keepdims=True)  # zero where no point counts
+    position = np.einsum("ij,ijc->ic", weights, rest)
     return position / np.where(total > 0, total, 1.0)
 
 
@@ -120,11 +120,12 @@ def _weighted(
     """Return frames (n, 2, J) with the weights of their residuals from a fit."""
     *model, sizes = fit
     distance = distances(rows.transpose(0, 2, 1), shapes, *model)
-    return WeightedRows(rows, frame_weights(loss, distance, deviation, sizes))
+    return rows, frame_weights(loss, distance, deviation, sizes)
 
 
 def _change(
     before: WeightedRows, *fit: NDArray, new: Callable[..., WeightedRows]
 ) -> float:
     """Return the largest change of the weights."""
-    return float(np.abs(new(before.rows, *fit).weights - before.weights).max())
+    rows, weights = before
+    return float(np.abs(new(rows, *fit)[1] - weights).max())

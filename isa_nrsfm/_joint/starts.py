@@ -19,8 +19,7 @@ from isa_nrsfm._frames.camera_models import (
     nearest_calibrated,
     rigid_cameras,
 )
-from isa_nrsfm._joint.options import JOINT_OPTIONS
-from isa_nrsfm._joint.problem import FactorisedTable, JointProblem
+from isa_nrsfm._joint.problem import JOINT_OPTIONS, FactorisedTable, JointProblem
 from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._linalg.rounding import OF_PRODUCTS
 from isa_nrsfm._linalg.small_matrices import frames_last
@@ -29,12 +28,11 @@ from isa_nrsfm._metric_upgrade.orthonormal_cameras import (
     principal_columns,
 )
 from isa_nrsfm._metric_upgrade.rigid import best_metric
-from isa_nrsfm._paper.factors import Factorisation
-from isa_nrsfm._paper.sample import rigid_energy
+from isa_nrsfm._paper.factors import Factorisation, rigid_energy
 from isa_nrsfm._tables.ordering import spread
 
-# Largest number of steps of a start with its cameras held.
-HELD_STEPS = 6
+# Largest number of steps of a start with fixed cameras.
+FIXED_STEPS = 6
 
 
 def rigid_start(
@@ -77,8 +75,8 @@ def mixed_cameras(
     mixing, _ = orthonormal_mixture(few[:, :3], np.eye(3), max_iter=20)
     for n in sorted({min(n, rank) for n in widths if n < rank + 3}):
         mixing, _ = orthonormal_mixture(few[:, :n], mixing, max_iter=20)
-        found, sizes = nearest_calibrated(P[..., :n] @ mixing)
-        yield found if scales is None else (scales * sizes)[:, None, None] * found
+        cameras, sizes = nearest_calibrated(P[..., :n] @ mixing)
+        yield cameras if scales is None else (scales * sizes)[:, None, None] * cameras
 
 
 def lifted_shapes(rows: NDArray, motion: NDArray, n_components: int) -> NDArray:
@@ -135,7 +133,7 @@ def settled(
     With the large noise of a start the prior would make basis shapes vanish.
     """
     free, tol = replace(problem, penalty=0.0), problem.settings.tol
-    fit = free.refined(state, cameras, max_iter=HELD_STEPS, tol=tol)
+    fit = free.refined(state, cameras, max_iter=FIXED_STEPS, tol=tol)
     return with_prior(problem, fit.state)
 
 
@@ -149,7 +147,7 @@ def best_starts(
     frames, options = problem.frames, problem.settings.options
     factors, thorough = table.factors, problem.thorough
     # Frames for the comparison, spread evenly from the most to the least rigid
-    rows = frames.coordinates(table.sample.W).reshape(frames.n_frames, 2, -1)
+    rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
     few = np.sort(spread(order, min(400 if thorough else 200, len(order))))
     # No prior: with the large noise of a start it would make basis shapes vanish.
@@ -157,10 +155,12 @@ def best_starts(
     seen, n_components = rows[few], len(paper_shapes) - 1
     trials: list[tuple[float, JointState, NDArray]] = []
 
-    def compare(motion: NDArray, shapes: NDArray) -> None:
-        """Refine the shapes of a start with fixed cameras, and add it to the trials."""
+    def compare(motion: NDArray, shapes: NDArray | None = None) -> None:
+        """Refine shapes, or lifted ones, with fixed cameras, and add the trial."""
+        if shapes is None:
+            shapes = lifted_shapes(seen, motion[few], n_components)
         state = _first_state(part, seen, motion[few], shapes)
-        fit = part.refined(state, AffineCameras(held=True), max_iter=HELD_STEPS)
+        fit = part.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
         trials.append((fit.value, fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
@@ -168,32 +168,29 @@ def best_starts(
         factors, frames.coordinates(paper_shapes), cameras.scaled
     )
     compare(motion, _scaled(seen, motion[few], shapes))
-    compare(motion, lifted_shapes(seen, motion[few], n_components))
+    compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
     # mixtures, without and with scales, because a few steps do not identify the best
     # one.
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
-    families = [scales, None] if cameras.scaled and thorough else [scales]
+    families = [scales, None] if thorough else [scales]
     for given in families if cameras.scaled else [None]:
         before = np.inf
         for mixed in mixed_cameras(rows, given, few, options.widths):
-            compare(mixed, lifted_shapes(seen, mixed[few], n_components))
+            compare(mixed)
             if not thorough and trials[-1][0] > before:
                 break
             before = trials[-1][0]
-    # The best ones, with their cameras freed
-    freed = []
+    # The best ones, with free cameras
     trials.sort(key=itemgetter(0))
+    freed = []
     for _, state, motion in trials if thorough else trials[:1]:
         fit = part.refined(state, cameras, max_iter=30)
         motion = motion.copy()
         motion[few] = fit.state.motion
-        freed.append((fit.value, fit.state, motion))
+        freed.append((fit.value, fit.state._replace(motion=motion)))
     freed.sort(key=itemgetter(0))
-    return [
-        with_prior(problem, state._replace(motion=motion))
-        for _, state, motion in freed[: 3 if thorough else 1]
-    ]
+    return [with_prior(problem, state) for _, state in freed[: 3 if thorough else 1]]
 
 
 def _first_state(
@@ -230,23 +227,28 @@ def likely_basis(
 
         a_k^2 = 2 / (1 + sqrt(1 + 4 penalty H_kk / n)).
     """
-    M, n_frames = frames_last(motion), len(motion)
     # Coefficients of mean zero
     mean = alpha.mean(axis=0)
     mean_shape = shapes[0] + np.tensordot(mean, shapes[1:], 1)
     # Coefficients of covariance one
     rest = alpha - mean
-    covariance = rest.T @ rest / n_frames
+    covariance = rest.T @ rest / len(motion)
     # A ridge, as the covariance can be singular
     covariance += (OF_PRODUCTS * np.trace(covariance) or 1.0) * np.eye(len(mean))
     basis = np.tensordot(np.linalg.cholesky(covariance).T, shapes[1:], 1)
     # Diagonal H / n, and the scales a_k
-    cameras = np.einsum("rai,rbi->ab", M, M) / n_frames
-    energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", cameras, basis, basis))
+    C = camera_moments(motion)
+    energy, axes = np.linalg.eigh(np.einsum("ab,kaj,lbj->kl", C, basis, basis))
     price = penalty * np.maximum(energy, 0.0)
     scale = np.sqrt(2.0 / (1.0 + np.sqrt(1.0 + 4.0 * price)))
     basis = scale[:, None, None] * np.tensordot(axes.T, basis, 1)
     return np.concatenate([mean_shape[None], basis])
+
+
+def camera_moments(motion: NDArray) -> NDArray:
+    """Return ``mean_i M_i^T M_i`` (3, 3) of cameras (I, 2, 3)."""
+    M = frames_last(motion)
+    return np.einsum("rai,rbi->ab", M, M) / len(motion)
 
 
 def _scaled(rows: NDArray, motion: NDArray, shapes: NDArray) -> NDArray:
