@@ -36,7 +36,7 @@ from isa_nrsfm._tables.tracks import (
     table_to_tracks,
     weighting_sizes,
 )
-from isa_nrsfm._transformer import frames_of
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.datasets import make_body_tracks, make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.export import pose_function

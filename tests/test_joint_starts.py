@@ -1,6 +1,5 @@
 """Calibrated cameras to start the joint fit from, and the shapes that they see."""
 
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import CAMERAS, AffineCameras, nearest_calibrated
-from isa_nrsfm._frames.models import FrameMap, PosteriorFrames
 from isa_nrsfm._joint.fit import Start, _calibrated_fit, _continued_fit, _first_fit
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointSettings
@@ -19,7 +17,6 @@ from isa_nrsfm._joint.starts import (
     HELD_STEPS,
     affine_start,
     best_starts,
-    extended_shapes,
     lifted_shapes,
     likely_basis,
     mixed_cameras,
@@ -27,7 +24,6 @@ from isa_nrsfm._joint.starts import (
 )
 from isa_nrsfm._paper.factors import Factorisation, factorise
 from isa_nrsfm._paper.sample import Sample
-from isa_nrsfm._selection.path import extended
 from isa_nrsfm._tables.blocks import FrameBlocks
 from isa_nrsfm.datasets import make_nonrigid_tracks
 
@@ -322,28 +318,6 @@ class TestLikelyBasis:
         shapes = likely_basis(truth, motion, 0 * alpha, 0.0)
         assert_allclose(shapes[0], truth[0])
         assert np.isfinite(shapes).all()
-
-
-@pytest.mark.parametrize("n_frames", [150, 300])
-def test_more_basis_shapes_come_from_residuals_of_some_frames(n_frames):
-    shapes, motion, alpha = random_frames(n_frames=n_frames, n_components=3)
-    shapes -= shapes.mean(axis=2, keepdims=True)
-    rows = motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1))
-    moved = rows + np.random.default_rng(1).normal(size=(n_frames, 2, 1))
-    still = np.zeros((0, 1)), "linear", FrameMap.identity(1)
-    frames = PosteriorFrames(shapes[:2], 1e-3, *still)
-    table = SimpleNamespace(rows=FrameBlocks.of_array(moved, 64))
-    start = extended(frames, table, 3)
-    assert start.noise_variance == 1e-3
-    few = np.linspace(0, n_frames - 1, min(n_frames, 200)).round().astype(int)
-    fit = frames.posterior(rows[few].transpose(0, 2, 1))
-    centred = rows[few] - fit.translation[:, :, None]
-    expected = extended_shapes(centred, shapes[:2], fit.motion, fit.alpha, 2)
-    assert start.shapes.shape == (4, 3, 30)
-    # The signs of principal components are free.
-    sign = np.sign(np.einsum("kaj,kaj->k", start.shapes, expected))[:, None, None]
-    assert_array_equal(start.shapes[:2], shapes[:2])
-    assert_allclose(sign * start.shapes, expected, atol=1e-6)
 
 
 def test_the_better_given_start_is_taken_whatever_the_order():

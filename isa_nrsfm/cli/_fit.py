@@ -22,10 +22,9 @@ from isa_nrsfm._compat.whole_files import (
     files_together,
     folder_for_writing,
 )
-from isa_nrsfm._fit import joint_camera
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._prepare.checks import most_components
-from isa_nrsfm._selection.choice import standard_errors
+from isa_nrsfm._selection import standard_errors
 from isa_nrsfm.cli._columns import Columns, asked_columns, column_results
 from isa_nrsfm.cli._figures import ALWAYS, Fit, figures_of, write_figures
 from isa_nrsfm.cli._options import AUTO, NONE
@@ -272,7 +271,8 @@ def choice_report(search: AffineNRSfMCV, X: "pd.DataFrame") -> dict[str, Any]:
         "chosen": search.n_components_,
     }
     fitted = len(X) - -(-len(X) // N_PARTS)  # frames, of the smallest part
-    camera = joint_camera(search.best_estimator_)
+    best = search.best_estimator_
+    camera = best.camera_ if best.refinement in JOINT_REFINEMENTS else None
     most = most_components(fitted, X.shape[1] // 2, camera)
     following = np.arange(tried[-1] + 1, min(tried[-1] + 3, most) + 1)
     if search.n_components_ == tried[-1] and len(following):

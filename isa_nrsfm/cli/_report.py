@@ -18,9 +18,9 @@ from isa_nrsfm._diagnostics import (
     camera_meaning,
     outlier_advice,
 )
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.cli._outputs import fitted_table
 from isa_nrsfm.cli._reading import Frames
 from isa_nrsfm.export._names import names_of_components

@@ -18,7 +18,7 @@ import numpy as np
 
 from isa_nrsfm._compat.texts import as_utf8, first_items
 from isa_nrsfm._compat.whole_files import write_whole
-from isa_nrsfm._selection.choice import NO_SHAPE
+from isa_nrsfm._selection import NO_SHAPE
 from isa_nrsfm.cli._options import AUTO, PROGRAM
 from isa_nrsfm.cli._outputs import PAGE, REPORT, digests_of
 from isa_nrsfm.cli._report import MOST_CLASSES, MOST_LISTED

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._metric_upgrade.rigid import LARGEST_CONDITION
 from isa_nrsfm._parameters.choices import JOINT_REFINEMENTS
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.calibration import angle_deviations, view_angles
 from isa_nrsfm.export._names import frames_of_table
 from isa_nrsfm.export._upright import (

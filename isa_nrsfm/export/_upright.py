@@ -13,7 +13,7 @@ from sklearn.utils import gen_batches
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._estimator import check_class
+from isa_nrsfm._estimator import check_class, check_frames_kept, frames_of
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._frames.projection import compose
 from isa_nrsfm._metric_upgrade.deforming import (
@@ -25,7 +25,6 @@ from isa_nrsfm._metric_upgrade.deforming import (
 from isa_nrsfm._metric_upgrade.quadric import unit_cameras
 from isa_nrsfm._metric_upgrade.rigid import usable_cameras
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import check_frames_kept, frames_of
 from isa_nrsfm.plotting._edges import (
     UPSIDE_DOWN,
     Origin,

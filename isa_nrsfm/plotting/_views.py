@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from isa_nrsfm._estimator import frames_of
 from isa_nrsfm._metric_upgrade.quadric import (
     mean_gram,
     metric_quadric,
@@ -18,7 +19,6 @@ from isa_nrsfm._metric_upgrade.quadric import (
     unit_cameras,
 )
 from isa_nrsfm._tables.column_names import names_of_points
-from isa_nrsfm._transformer import frames_of
 from isa_nrsfm.plotting._edges import Origin, choose_lines
 from isa_nrsfm.skeletons import Skeleton
 

@@ -1,14 +1,25 @@
-"""AffineNRSfMCV: the number of basis shapes by cross-validation along a path."""
+"""AffineNRSfMCV: the number of basis shapes by cross-validation along a path.
+
+All frames, and those that each split fits, are fitted with more and more basis shapes.
+The fit of all frames starts from the one with fewer basis shapes, extended by the
+leading directions of its residuals. The fit of a split starts from that of the same
+frames with fewer basis shapes, and from the fit of all frames. The one with the lower
+objective continues: held-out frames can contribute a start, but never select one.
+"""
 
 import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from numbers import Integral
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 from sklearn import get_config
 from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import check_cv
 from sklearn.utils import get_tags, indexable
@@ -18,9 +29,13 @@ from sklearn.utils.metadata_routing import (
     MethodMapping,
     process_routing,
 )
+from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted
 
+from isa_nrsfm._compat.callbacks import NoProgress
+from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import (
+    CoefficientNamesMixin,
     HasMethods,
     Interval,
     StrOptions,
@@ -29,18 +44,60 @@ from isa_nrsfm._compat.scikit_learn import (
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
+from isa_nrsfm._fit import JOINT_TOL, ready_table
+from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
-from isa_nrsfm._selection.choice import (
-    SELECTIONS,
-    line,
-    results_of,
-    selected,
-    warn_of_no_shape,
-    warn_of_unconverged,
-)
-from isa_nrsfm._selection.path import ready_part, walk
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
-from isa_nrsfm._transformer import CoefficientNamesMixin
+
+# Rows that are fitted, and rows that are held out.
+Split = tuple[NDArray, NDArray]
+# For held-out errors of 100 % and more.
+NO_SHAPE = (
+    "no number of basis shapes predicts held-out points better than the centroid of "
+    "their frame does (an error of 100 %): the fitted frames share no shape with the "
+    "others. Check that each column is the same point in all frames."
+)
+
+
+class PathFit(NamedTuple):
+    """The fit of some rows: their model, score of held-out rows, seconds."""
+
+    model: TableModel
+    score: float
+    fit_seconds: float
+    score_seconds: float
+    converged: bool
+
+
+class PathStep(NamedTuple):
+    """The fits with K basis shapes, of each split, and of all rows (one or none)."""
+
+    n_components: int
+    splits: list[PathFit]
+    whole: list[PathFit]
+
+    @property
+    def scores(self) -> NDArray:
+        """Scores (n_splits,) of held-out rows."""
+        return np.array([fit.score for fit in self.splits])
+
+    @property
+    def n_unconverged(self) -> int:
+        """Number of fits that did not converge."""
+        return sum(not fit.converged for fit in self.splits + self.whole)
+
+    def line(self, held_out: bool) -> str:
+        """Return scores and time as text; a held-out error is minus the score."""
+        mean, error = self.scores.mean(), standard_errors(self.scores)
+        score = f"score {mean:.4g}, standard error {error:.2g}"
+        if held_out:
+            score = (
+                f"held-out error {-100 * mean:.3g} %, standard error "
+                f"{100 * error:.2g} %"
+            )
+        fits = self.splits + self.whole
+        seconds = sum(fit.fit_seconds + fit.score_seconds for fit in fits)
+        return f"n_components={self.n_components}: {score}, {seconds:.1f} s"
 
 
 class AffineNRSfMCV(
@@ -159,7 +216,7 @@ class AffineNRSfMCV(
         "estimator": [None, HasMethods(["fit", "get_params", "set_params"])],
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
-        "select": [StrOptions(set(SELECTIONS))],
+        "select": [StrOptions({"best", "one_standard_error"})],
         "n_jobs": [None, Integral],
         "verbose": ["verbose"],
     }
@@ -226,38 +283,36 @@ class AffineNRSfMCV(
         X, y = indexable(X, y)
         routed = self._routed("fit", params)
         scorer = self._scorer()
-        table = ready_part(estimator, X, candidates[-1])
         splits = [
             (np.asarray(train), np.asarray(held_out))
             for train, held_out in self._splitter().split(X, y, **routed["splitter"])
         ]
-        rows = []
-        for row in walk(
-            table,
-            candidates,
-            splits,
-            partial(held_out_score, scorer=scorer, X=X, y=y, params=routed["scorer"]),
-            any_basis=self.scoring is None,
-            n_jobs=self.n_jobs,
-        ):
-            rows.append(row)
+        trial = clone(estimator).set_params(frames_folder=None)
+        if trial.refinement == "consensus":  # only of the chosen K
+            trial.set_params(refinement="joint")
+        if self.scoring is None and trial.refinement == "joint":
+            trial.set_params(independence=None)  # which the score does not depend on
+        check_rows(trial, X, splits, candidates[-1])
+        metadata = routed["scorer"]
+        score = partial(held_out_score, scorer=scorer, X=X, y=y, params=metadata)
+        path = []
+        for step in path_steps(trial, X, candidates, splits, score, self.n_jobs):
+            path.append(step)
             if self.verbose:
-                print(
-                    f"[{type(self).__name__}] {line(row, self.scoring is None)}",
-                    flush=True,
-                )
-        warn_of_unconverged(rows)
-        scores = np.array([row.scores for row in rows])
-        best = selected(scores, self.select)
-        if self.scoring is None:
-            warn_of_no_shape(scores)
+                text = step.line(held_out=self.scoring is None)
+                print(f"[{type(self).__name__}] {text}", flush=True)
+        warn_of_unconverged(path)
+        results = results_of(path)
+        best = selected(np.array([step.scores for step in path]), self.select)
+        if self.scoring is None and np.nanmax(results["mean_test_score"]) <= -1:
+            warn_caller(NO_SHAPE)
         since = time.perf_counter()
         fitted = estimator.set_params(n_components=candidates[best]).fit(X)
         self.refit_time_ = time.perf_counter() - since
         self.best_estimator_, self.scorer_ = fitted, scorer
-        self.cv_results_, self.n_splits_ = results_of(rows), len(splits)
+        self.cv_results_, self.n_splits_ = results, len(splits)
         self.best_index_, self.n_components_ = best, candidates[best]
-        self.best_score_ = float(self.cv_results_["mean_test_score"][best])
+        self.best_score_ = float(results["mean_test_score"][best])
         if hasattr(fitted, "feature_names_in_"):
             self.feature_names_in_ = fitted.feature_names_in_
         elif hasattr(self, "feature_names_in_"):
@@ -519,3 +574,161 @@ def held_out_score(
     }
     y = None if y is None else taken_rows(y, held_out)
     return float(scorer(model, taken_rows(X, held_out), y, **own))
+
+
+def check_rows(
+    estimator: AffineNRSfM, X: Any, splits: Sequence[Split], n_components: int
+) -> None:
+    """Refuse a table, or rows that a split fits, not enough for K basis shapes."""
+
+    def check(rows: Any, k: int) -> None:
+        table = clone(estimator).set_params(n_components=k)
+        with warnings.catch_warnings(action="ignore"):  # the last fit warns
+            source, weights, settings = table._ready(rows)
+            ready_table(source, weights, k, settings)
+
+    def allowed(rows: Any, k: int) -> bool:
+        try:
+            check(rows, k)
+        except ValueError:
+            return False
+        return True
+
+    check(X, n_components)
+    for number, (train, _) in enumerate(splits):
+        rows = taken_rows(X, train)
+        try:
+            check(rows, n_components)
+        except ValueError as error:
+            fewer = (k for k in range(n_components - 1, 0, -1) if allowed(rows, k))
+            raise ValueError(
+                f"split {number} of cv fits {len(train)} frames, enough for "
+                f"n_components={next(fewer, 0)} at most: {error}"
+            ) from error
+
+
+def path_steps(
+    estimator: AffineNRSfM,
+    X: Any,
+    candidates: Sequence[int],
+    splits: Sequence[Split],
+    score: Callable[[AffineNRSfM, NDArray], float],
+    n_jobs: int | None,
+) -> Iterator[PathStep]:
+    """Yield the fits of all rows and of each split, for ascending numbers of shapes.
+
+    `n_jobs` splits are fitted at a time. Without the joint refinement no fit starts
+    from another one, and the fit of all rows is left out.
+    """
+    joint = estimator.refinement == "joint"
+    # Fits of all frames are only starts: their tolerance is larger.
+    tol = JOINT_TOL if estimator.tol is None else estimator.tol
+    loose = clone(estimator).set_params(tol=4.0 * tol)
+    before: list[list[TableModel]] = [[] for _ in range(len(splits) + 1)]
+    with Parallel(n_jobs=n_jobs) as parallel:
+        for k in candidates:
+            whole = [fitted_rows(loose, X, k, before[0])] if joint else []
+            starts = [fit.model for fit in whole]
+            fits = parallel(
+                delayed(fitted_rows)(estimator, X, k, [*own, *starts], split, score)
+                for split, own in zip(splits, before[1:], strict=True)
+            )
+            yield PathStep(k, fits, whole)
+            if joint:
+                before = [[fit.model] for fit in (*whole, *fits)]
+
+
+def fitted_rows(
+    estimator: AffineNRSfM,
+    X: Any,
+    n_components: int,
+    starts: Sequence[TableModel],
+    split: Split | None = None,
+    score: Callable[[AffineNRSfM, NDArray], float] | None = None,
+) -> PathFit:
+    """Return the fit of all rows, or of a split and its score, from given starts."""
+    since = time.perf_counter()
+    model = clone(estimator).set_params(n_components=n_components)
+    # The last fit warns.
+    with warnings.catch_warnings(record=True, action="ignore") as unconverged:
+        warnings.simplefilter("always", ConvergenceWarning)
+        rows = X if split is None else taken_rows(X, split[0])
+        model._fit(rows, None, NoProgress(), starts=starts)
+        between = time.perf_counter()
+        value = np.nan if split is None or score is None else score(model, split[1])
+    seconds = between - since, time.perf_counter() - between
+    return PathFit(model._model, value, *seconds, not unconverged)
+
+
+def results_of(path: Sequence[PathStep]) -> dict[str, Any]:
+    """Return `cv_results_` of `AffineNRSfMCV`, as in `GridSearchCV`."""
+    scores = np.array([step.scores for step in path])
+    mean = scores.mean(axis=1)
+    results: dict[str, Any] = {
+        "param_n_components": np.array([step.n_components for step in path]),
+        "params": [{"n_components": step.n_components} for step in path],
+        **{f"split{i}_test_score": column for i, column in enumerate(scores.T)},
+        "mean_test_score": mean,
+        "std_test_score": scores.std(axis=1),
+        # Unknown scores rank last.
+        "rank_test_score": rankdata(
+            -np.nan_to_num(mean, nan=-np.inf), method="min"
+        ).astype(np.int32),
+        "path_fit_time": np.array(
+            [sum(fit.fit_seconds for fit in step.whole) for step in path]
+        ),
+    }
+    for name in ("fit", "score"):
+        seconds = np.array(
+            [[getattr(fit, f"{name}_seconds") for fit in step.splits] for step in path]
+        )
+        results[f"mean_{name}_time"] = seconds.mean(axis=1)
+        results[f"std_{name}_time"] = seconds.std(axis=1)
+    return results
+
+
+def selected(scores: NDArray, select: str) -> int:
+    """Return the index of the chosen number of basis shapes.
+
+    Scores are (n_candidates, n_splits), by ascending number of basis shapes. "best"
+    takes the best mean. "one_standard_error" takes the fewest basis shapes with a mean
+    at most one standard error below the best (Hastie, Tibshirani, Friedman, "The
+    elements of statistical learning", 2009, section 7.10).
+    """
+    mean = scores.mean(axis=1)
+    if np.isnan(mean).all():
+        raise ValueError(
+            "n_components cannot be chosen by held-out points: too few points are "
+            "visible. Give n_components, or take frames with more visible points"
+        )
+    best = int(np.nanargmax(mean))
+    if select == "best":
+        return best
+    n_splits = scores.shape[1]
+    if n_splits < 2:
+        raise ValueError(
+            f"select={select!r} needs the standard error over at least two splits; cv "
+            "has one"
+        )
+    error = standard_errors(scores)[best]
+    return int(np.argmax(mean >= mean[best] - error))
+
+
+def standard_errors(scores: NDArray) -> NDArray:
+    """Return the standard errors of mean scores (..., n_splits); NaN with one split."""
+    n_splits = scores.shape[-1]
+    if n_splits < 2:
+        return np.full(scores.shape[:-1], np.nan)
+    return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))
+
+
+def warn_of_unconverged(path: Sequence[PathStep]) -> None:
+    """Warn if fits of a path did not converge."""
+    which = [str(step.n_components) for step in path if step.n_unconverged]
+    if which:
+        n_fits = sum(step.n_unconverged for step in path)
+        warn_caller(
+            f"not all fits converged while n_components was chosen: {n_fits} with "
+            f"n_components of {', '.join(which)} did not. Increase max_iter or tol",
+            ConvergenceWarning,
+        )
