@@ -3,7 +3,6 @@
 import copy
 import os
 import warnings
-from collections.abc import Sequence
 from functools import partial
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
@@ -521,13 +520,13 @@ class AffineNRSfM(
         point_weight: Any,
         progress: FitProgress | NoProgress,
         *,
-        starts: Sequence[TableModel] = (),
+        start: TableModel | None = None,
         keep: Keep = dict,
         errors: bool = False,
     ) -> None:
         """Fit a table, and set all attributes at once.
 
-        The joint fit starts from models of similar tables, if `starts` are given.
+        The joint fit starts from the model of a similar table, if given.
         `errors`: estimate those of the depths, and warn of those not determined.
         """
         opened = copy.copy(self)  # a fit that fails sets no attribute
@@ -547,7 +546,7 @@ class AffineNRSfM(
                 )
         table = ready_table(source, weights, n_components, settings)
         fit = fit_table(
-            table, n_components, isa, settings, progress, starts, auto, errors
+            table, n_components, isa, settings, progress, start, auto, errors
         )
         if not fit.converged:
             warn_caller(

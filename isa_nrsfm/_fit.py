@@ -17,7 +17,7 @@ has an estimator: `fit_table` returns a `TableFit`, and `AffineNRSfM.fit` shows 
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -49,11 +49,12 @@ from isa_nrsfm._gauge.canonical import (
 )
 from isa_nrsfm._gauge.independent import independent_gauge
 from isa_nrsfm._joint.consensus import MOST_COMPONENTS, MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import Spectrum, Start, count_components, fit_jointly
+from isa_nrsfm._joint.fit import Spectrum, count_components, fit_jointly
 from isa_nrsfm._joint.frames import JointFrames
 from isa_nrsfm._joint.jackknife import depth_certainty
 from isa_nrsfm._joint.options import JointOptions
 from isa_nrsfm._joint.problem import FactorisedTable, JointSettings
+from isa_nrsfm._joint.quasi_newton import JointState
 from isa_nrsfm._joint.sample_posterior import (
     posterior_blocks,
     posterior_moments,
@@ -143,8 +144,8 @@ class TableFit(NamedTuple):
 
     model: the model of new tables. frames: cameras and coefficients of all rows, NaN
     for rows without visible points. sizes (n_rows,): those of the frames. isa: the
-    fitted strategy, None if the fit started from others. attributes: the other public
-    attributes of `AffineNRSfM`, by name.
+    fitted strategy, None if the fit started from another one. attributes: the other
+    public attributes of `AffineNRSfM`, by name.
     """
 
     model: TableModel
@@ -190,13 +191,13 @@ def fit_table(
     isa: Any,
     settings: FitSettings,
     progress: FitProgress | NoProgress,
-    starts: Sequence[TableModel] = (),
+    start: TableModel | None = None,
     free: bool = False,
     errors: bool = False,
 ) -> TableFit:
     """Fit a table with K basis shapes and a clone of the strategy `isa`.
 
-    The joint fit starts from models of similar tables, if `starts` are given, instead
+    The joint fit starts from the model of a similar table, if `start` is given, instead
     of the paper's result. `free`: a consensus has all components that exceed the noise
     instead of K. `errors`: estimate those of the depths.
     """
@@ -206,14 +207,17 @@ def fit_table(
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
-    given = [_start(table, start, n_components) for start in starts]
-    paper, isa = None, None if given else clone(isa)
-    if isa is not None:
+    paper = given = None
+    if start is None:
+        isa = clone(isa)
         paper = _paper_result(factorised.factors, n_components, isa, settings, progress)
+        shapes = paper.shapes
+    else:
+        isa, given = None, _started(table, start, n_components)
+        shapes = given.shapes
     # 5. Refinement, gauge and frames
     if settings.joint:
         joint = settings.of_joint_fit(progress.step)
-        shapes = given[0].shapes if paper is None else paper.shapes
         fit, tracks, alpha = fit_jointly(factorised, shapes, joint, given)
         model = _frame_model(fit.state.shapes, fit.state.noise, alpha, settings)
         progress(JOINT_STAGE)
@@ -310,8 +314,8 @@ def _factorised(
     return FactorisedTable(table.rows, *parts, table.weights)
 
 
-def _start(table: ScaledTable, model: TableModel, n_components: int) -> Start:
-    """Return the shapes of a model, in units of a table, as a start of its fit.
+def _started(table: ScaledTable, model: TableModel, n_components: int) -> JointState:
+    """Return shapes and noise of a model, in units of a table, without cameras.
 
     Missing basis shapes are directions of the residuals of at most 200 frames.
     """
@@ -319,14 +323,13 @@ def _start(table: ScaledTable, model: TableModel, n_components: int) -> Start:
     assert isinstance(frames, PosteriorFrames)
     n_frames, n_more = table.rows.n_frames, n_components + 1 - len(frames.shapes)
     shapes, noise = unit * frames.shapes, unit**2 * frames.noise_variance
-    if not n_more:
-        return Start(shapes, noise, calibrated_first=True)
-    rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
-    frames = replace(frames, shapes=shapes, noise_variance=noise)
-    fit = frames.posterior(rows.transpose(0, 2, 1))
-    rows = rows - fit.translation[:, :, None]
-    shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
-    return Start(shapes, noise)
+    if n_more:
+        rows = table.rows.take(spread(np.arange(n_frames), min(n_frames, 200)))
+        frames = replace(frames, shapes=shapes, noise_variance=noise)
+        fit = frames.posterior(rows.transpose(0, 2, 1))
+        rows = rows - fit.translation[:, :, None]
+        shapes = extended_shapes(rows, shapes, fit.motion, fit.alpha, n_more)
+    return JointState(shapes, np.empty((0, 2, 3)), noise)
 
 
 def _paper_result(

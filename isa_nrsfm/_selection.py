@@ -1,18 +1,16 @@
 """AffineNRSfMCV: the number of basis shapes by cross-validation along a path.
 
-All frames, and those that each split fits, are fitted with more and more basis shapes.
-The fit of all frames starts from the one with fewer basis shapes, extended by the
-leading directions of its residuals. The fit of a split starts from that of the same
-frames with fewer basis shapes, and from the fit of all frames. The one with the lower
-objective continues: held-out frames can contribute a start, but never select one.
+All frames are fitted with more and more basis shapes: each fit starts from the one
+before, extended by the leading directions of its residuals. The fit of the rows of a
+split starts from that of all frames with the same number of basis shapes.
 """
 
+import copy
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Sequence
 from numbers import Integral
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +19,7 @@ from sklearn import get_config
 from sklearn.base import BaseEstimator, MetaEstimatorMixin, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.metrics import check_scoring
-from sklearn.model_selection import check_cv
+from sklearn.model_selection import check_cv, cross_validate
 from sklearn.utils import get_tags, indexable
 from sklearn.utils.metadata_routing import (
     UNUSED,
@@ -29,7 +27,6 @@ from sklearn.utils.metadata_routing import (
     MethodMapping,
     process_routing,
 )
-from sklearn.utils.parallel import Parallel, delayed
 from sklearn.utils.validation import check_is_fitted
 
 from isa_nrsfm._compat.callbacks import NoProgress
@@ -40,7 +37,6 @@ from isa_nrsfm._compat.scikit_learn import (
     Interval,
     StrOptions,
     fit_context,
-    number_of_rows,
     taken_rows,
 )
 from isa_nrsfm._estimator import AffineNRSfM, check_class
@@ -49,8 +45,6 @@ from isa_nrsfm._fitted_model import TableModel
 from isa_nrsfm._frames.models import Decomposition
 from isa_nrsfm._tables.sources import StoredTable, is_on_dask
 
-# Rows that are fitted, and rows that are held out.
-Split = tuple[NDArray, NDArray]
 # For held-out errors of 100 % and more.
 NO_SHAPE = (
     "no number of basis shapes predicts held-out points better than the centroid of "
@@ -59,45 +53,23 @@ NO_SHAPE = (
 )
 
 
-class PathFit(NamedTuple):
-    """The fit of some rows: their model, score of held-out rows, seconds."""
+class StartedNRSfM(AffineNRSfM):
+    """A fit that starts from another one, without warnings and errors of depths."""
 
-    model: TableModel
-    score: float
-    fit_seconds: float
-    score_seconds: float
-    converged: bool
+    start: TableModel | None = None
+    unconverged = False
 
+    def __sklearn_clone__(self) -> Self:
+        """Return a copy with the same start."""
+        return copy.copy(self)
 
-class PathStep(NamedTuple):
-    """The fits with K basis shapes, of each split, and of all rows (one or none)."""
-
-    n_components: int
-    splits: list[PathFit]
-    whole: list[PathFit]
-
-    @property
-    def scores(self) -> NDArray:
-        """Scores (n_splits,) of held-out rows."""
-        return np.array([fit.score for fit in self.splits])
-
-    @property
-    def n_unconverged(self) -> int:
-        """Number of fits that did not converge."""
-        return sum(not fit.converged for fit in self.splits + self.whole)
-
-    def line(self, held_out: bool) -> str:
-        """Return scores and time as text; a held-out error is minus the score."""
-        mean, error = self.scores.mean(), standard_errors(self.scores)
-        score = f"score {mean:.4g}, standard error {error:.2g}"
-        if held_out:
-            score = (
-                f"held-out error {-100 * mean:.3g} %, standard error "
-                f"{100 * error:.2g} %"
-            )
-        fits = self.splits + self.whole
-        seconds = sum(fit.fit_seconds + fit.score_seconds for fit in fits)
-        return f"n_components={self.n_components}: {score}, {seconds:.1f} s"
+    def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
+        """Fit a table, and remember whether the fit has not converged."""
+        with warnings.catch_warnings(record=True, action="ignore") as unconverged:
+            warnings.simplefilter("always", ConvergenceWarning)
+            self._fit(X, point_weight, NoProgress(), start=self.start)
+        self.unconverged = bool(unconverged)
+        return self
 
 
 class AffineNRSfMCV(
@@ -198,16 +170,6 @@ class AffineNRSfMCV(
     (90, 2)
     """
 
-    n_components_: int
-    best_estimator_: AffineNRSfM
-    cv_results_: dict[str, Any]
-    best_index_: int
-    best_score_: float
-    refit_time_: float
-    scorer_: Any
-    n_splits_: int
-    feature_names_in_: NDArray
-
     # `groups` go to the splitter, not to this estimator.
     __metadata_request__fit: ClassVar[dict[str, str]] = {"groups": UNUSED}
 
@@ -277,46 +239,77 @@ class AffineNRSfMCV(
             As in `AffineNRSfM.fit`, and if fits of the path have not converged or all
             held-out errors are above 100 %.
         """
-        estimator = self._estimator()
+        estimator, scorer = self._estimator(), self._scorer()
         candidates = checked_candidates(self.n_components)
-        refuse_blocks(X)
+        if is_on_dask(X) or isinstance(X, StoredTable):
+            raise ValueError(
+                "choosing n_components needs a table in memory or a memory map; got a "
+                f"{type(X).__name__}: take some thousand of its frames"
+            )
         X, y = indexable(X, y)
         routed = self._routed("fit", params)
-        scorer = self._scorer()
-        splits = [
-            (np.asarray(train), np.asarray(held_out))
-            for train, held_out in self._splitter().split(X, y, **routed["splitter"])
-        ]
-        trial = clone(estimator).set_params(frames_folder=None)
+        splits = list(self._splitter().split(X, y, **routed["splitter"]))
+        trial = StartedNRSfM(**estimator.get_params(deep=False))
+        trial.set_params(frames_folder=None)
         if trial.refinement == "consensus":  # only of the chosen K
             trial.set_params(refinement="joint")
-        if self.scoring is None and trial.refinement == "joint":
-            trial.set_params(independence=None)  # which the score does not depend on
-        check_rows(trial, X, splits, candidates[-1])
-        metadata = routed["scorer"]
-        score = partial(held_out_score, scorer=scorer, X=X, y=y, params=metadata)
-        path = []
-        for step in path_steps(trial, X, candidates, splits, score, self.n_jobs):
-            path.append(step)
+        joint = trial.refinement == "joint"
+        if self.scoring is None and joint:  # the score does not depend on the basis
+            trial.set_params(independence=None)
+        check_rows(trial, X, [train for train, _ in splits], candidates[-1])
+        # Fits of all frames are only starts: their tolerance is larger.
+        whole = copy.copy(trial)
+        whole.set_params(tol=4.0 * (JOINT_TOL if trial.tol is None else trial.tol))
+        parts, n_unconverged = [], []
+        for k in candidates:
+            since = time.perf_counter()
+            if joint:
+                whole.set_params(n_components=k).fit(X)
+                whole.start = trial.start = whole._model
+            seconds = time.perf_counter() - since
+            part = cross_validate(
+                trial.set_params(n_components=k),
+                X,
+                y,
+                cv=splits,
+                scoring=scorer,
+                params=routed["scorer"],
+                n_jobs=self.n_jobs,
+                return_estimator=True,
+                error_score="raise",
+            )
+            fits = [whole, *part.pop("estimator")]
+            n_unconverged.append(sum(fit.unconverged for fit in fits))
+            parts.append(part | {"path_time": seconds})
             if self.verbose:
-                text = step.line(held_out=self.scoring is None)
-                print(f"[{type(self).__name__}] {text}", flush=True)
-        warn_of_unconverged(path)
-        results = results_of(path)
-        best = selected(np.array([step.scores for step in path]), self.select)
-        if self.scoring is None and np.nanmax(results["mean_test_score"]) <= -1:
+                seconds += sum(part["fit_time"] + part["score_time"])
+                text = line(k, part["test_score"], self.scoring is None)
+                print(f"[{type(self).__name__}] {text}, {seconds:.1f} s", flush=True)
+        if any(n_unconverged):
+            which = [
+                str(k) for k, n in zip(candidates, n_unconverged, strict=True) if n
+            ]
+            warn_caller(
+                "not all fits converged while n_components was chosen: "
+                f"{sum(n_unconverged)} with n_components of {', '.join(which)} did "
+                "not. Increase max_iter or tol",
+                ConvergenceWarning,
+            )
+        self.cv_results_ = results_of(candidates, parts)
+        scores = np.array([part["test_score"] for part in parts])
+        best = selected(scores, self.select)
+        if self.scoring is None and np.nanmax(scores.mean(axis=1)) <= -1:
             warn_caller(NO_SHAPE)
         since = time.perf_counter()
         fitted = estimator.set_params(n_components=candidates[best]).fit(X)
         self.refit_time_ = time.perf_counter() - since
         self.best_estimator_, self.scorer_ = fitted, scorer
-        self.cv_results_, self.n_splits_ = results, len(splits)
         self.best_index_, self.n_components_ = best, candidates[best]
-        self.best_score_ = float(results["mean_test_score"][best])
-        if hasattr(fitted, "feature_names_in_"):
-            self.feature_names_in_ = fitted.feature_names_in_
-        elif hasattr(self, "feature_names_in_"):
-            del self.feature_names_in_
+        self.n_splits_, self.best_score_ = len(splits), float(scores[best].mean())
+        for name in ("n_features_in_", "feature_names_in_", "_n_features_out"):
+            self.__dict__.pop(name, None)
+            if hasattr(fitted, name):
+                setattr(self, name, getattr(fitted, name))
         return self
 
     def fit_transform(self, X: Any, y: Any = None, **params: Any) -> NDArray:
@@ -455,21 +448,6 @@ class AffineNRSfMCV(
         routed = self._routed("score", params)
         return float(self.scorer_(self.best_estimator_, X, y, **routed["scorer"]))
 
-    @property
-    def n_features_in_(self) -> int:
-        """Number of columns of the fitted table."""
-        try:
-            check_is_fitted(self)
-        except ValueError as error:
-            name = type(self).__name__
-            raise AttributeError(f"{name} has no n_features_in_ before fit") from error
-        return self.best_estimator_.n_features_in_
-
-    @property
-    def _n_features_out(self) -> int:
-        """Number of columns of the result of `transform`."""
-        return self.n_components_
-
     def get_metadata_routing(self) -> MetadataRouter:
         """
         Return the metadata routing of this object.
@@ -535,155 +513,59 @@ class AffineNRSfMCV(
 def checked_candidates(n_components: Any) -> list[int]:
     """Return different numbers of basis shapes above zero in ascending order."""
     given = np.atleast_1d(np.asarray(n_components))
-    if given.ndim != 1 or not len(given) or given.dtype.kind not in "iu":
+    candidates = sorted(set(given.ravel().tolist()))
+    whole = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
+    if not whole or candidates[0] < 1 or len(candidates) < len(given):
         raise ValueError(
-            "n_components must be numbers of basis shapes, such as range(1, 9); got "
-            f"{n_components!r}"
-        )
-    candidates = sorted(given.tolist())
-    if candidates[0] < 1 or len(set(candidates)) < len(candidates):
-        raise ValueError(
-            "n_components must be different numbers of at least 1; got "
-            f"{n_components!r}"
+            "n_components must be numbers of basis shapes, such as range(1, 9), "
+            f"different numbers of at least 1; got {n_components!r}"
         )
     return candidates
 
 
-def refuse_blocks(X: Any) -> None:
-    """Raise an error if the rows of a table cannot be taken one by one."""
-    if is_on_dask(X) or isinstance(X, StoredTable):
-        raise ValueError(
-            "choosing n_components needs a table in memory or a memory map; got a "
-            f"{type(X).__name__}: take some thousand of its frames"
-        )
-
-
-def held_out_score(
-    model: AffineNRSfM, held_out: NDArray, scorer: Any, X: Any, y: Any, params: Any
-) -> float:
-    """Return the score of a fitted estimator on held-out rows of X and y.
-
-    Metadata `params` with an entry for each row are split in the same way.
-    """
-    n_rows = number_of_rows(X)
-    own = {
-        name: taken_rows(value, held_out)
-        if hasattr(value, "__len__") and len(value) == n_rows
-        else value
-        for name, value in params.items()
-    }
-    y = None if y is None else taken_rows(y, held_out)
-    return float(scorer(model, taken_rows(X, held_out), y, **own))
-
-
 def check_rows(
-    estimator: AffineNRSfM, X: Any, splits: Sequence[Split], n_components: int
+    estimator: AffineNRSfM, X: Any, splits: Sequence[NDArray], n_components: int
 ) -> None:
-    """Refuse a table, or rows that a split fits, not enough for K basis shapes."""
+    """Refuse a table, or rows of it that are fitted, not enough for K basis shapes."""
 
-    def check(rows: Any, k: int) -> None:
-        table = clone(estimator).set_params(n_components=k)
+    def refused(rows: Any, k: int) -> ValueError | None:
         with warnings.catch_warnings(action="ignore"):  # the last fit warns
-            source, weights, settings = table._ready(rows)
-            ready_table(source, weights, k, settings)
+            try:
+                source, weights, settings = clone(estimator)._ready(rows)
+                ready_table(source, weights, k, settings)
+            except ValueError as error:
+                return error
+        return None
 
-    def allowed(rows: Any, k: int) -> bool:
-        try:
-            check(rows, k)
-        except ValueError:
-            return False
-        return True
-
-    check(X, n_components)
-    for number, (train, _) in enumerate(splits):
+    if error := refused(X, n_components):
+        raise error
+    for number, train in enumerate(splits):
         rows = taken_rows(X, train)
-        try:
-            check(rows, n_components)
-        except ValueError as error:
-            fewer = (k for k in range(n_components - 1, 0, -1) if allowed(rows, k))
+        if error := refused(rows, n_components):
+            fewer = (k for k in range(n_components)[:0:-1] if not refused(rows, k))
             raise ValueError(
                 f"split {number} of cv fits {len(train)} frames, enough for "
                 f"n_components={next(fewer, 0)} at most: {error}"
             ) from error
 
 
-def path_steps(
-    estimator: AffineNRSfM,
-    X: Any,
-    candidates: Sequence[int],
-    splits: Sequence[Split],
-    score: Callable[[AffineNRSfM, NDArray], float],
-    n_jobs: int | None,
-) -> Iterator[PathStep]:
-    """Yield the fits of all rows and of each split, for ascending numbers of shapes.
-
-    `n_jobs` splits are fitted at a time. Without the joint refinement no fit starts
-    from another one, and the fit of all rows is left out.
-    """
-    joint = estimator.refinement == "joint"
-    # Fits of all frames are only starts: their tolerance is larger.
-    tol = JOINT_TOL if estimator.tol is None else estimator.tol
-    loose = clone(estimator).set_params(tol=4.0 * tol)
-    before: list[list[TableModel]] = [[] for _ in range(len(splits) + 1)]
-    with Parallel(n_jobs=n_jobs) as parallel:
-        for k in candidates:
-            whole = [fitted_rows(loose, X, k, before[0])] if joint else []
-            starts = [fit.model for fit in whole]
-            fits = parallel(
-                delayed(fitted_rows)(estimator, X, k, [*own, *starts], split, score)
-                for split, own in zip(splits, before[1:], strict=True)
-            )
-            yield PathStep(k, fits, whole)
-            if joint:
-                before = [[fit.model] for fit in (*whole, *fits)]
-
-
-def fitted_rows(
-    estimator: AffineNRSfM,
-    X: Any,
-    n_components: int,
-    starts: Sequence[TableModel],
-    split: Split | None = None,
-    score: Callable[[AffineNRSfM, NDArray], float] | None = None,
-) -> PathFit:
-    """Return the fit of all rows, or of a split and its score, from given starts."""
-    since = time.perf_counter()
-    model = clone(estimator).set_params(n_components=n_components)
-    # The last fit warns.
-    with warnings.catch_warnings(record=True, action="ignore") as unconverged:
-        warnings.simplefilter("always", ConvergenceWarning)
-        rows = X if split is None else taken_rows(X, split[0])
-        model._fit(rows, None, NoProgress(), starts=starts)
-        between = time.perf_counter()
-        value = np.nan if split is None or score is None else score(model, split[1])
-    seconds = between - since, time.perf_counter() - between
-    return PathFit(model._model, value, *seconds, not unconverged)
-
-
-def results_of(path: Sequence[PathStep]) -> dict[str, Any]:
-    """Return `cv_results_` of `AffineNRSfMCV`, as in `GridSearchCV`."""
-    scores = np.array([step.scores for step in path])
-    mean = scores.mean(axis=1)
+def results_of(
+    candidates: Sequence[int], parts: Sequence[dict[str, NDArray]]
+) -> dict[str, Any]:
+    """Return `cv_results_` as in `GridSearchCV`, from results of `cross_validate`."""
     results: dict[str, Any] = {
-        "param_n_components": np.array([step.n_components for step in path]),
-        "params": [{"n_components": step.n_components} for step in path],
-        **{f"split{i}_test_score": column for i, column in enumerate(scores.T)},
-        "mean_test_score": mean,
-        "std_test_score": scores.std(axis=1),
-        # Unknown scores rank last.
-        "rank_test_score": rankdata(
-            -np.nan_to_num(mean, nan=-np.inf), method="min"
-        ).astype(np.int32),
-        "path_fit_time": np.array(
-            [sum(fit.fit_seconds for fit in step.whole) for step in path]
-        ),
+        "param_n_components": np.array(candidates),
+        "params": [{"n_components": k} for k in candidates],
+        "path_fit_time": np.array([part["path_time"] for part in parts]),
     }
-    for name in ("fit", "score"):
-        seconds = np.array(
-            [[getattr(fit, f"{name}_seconds") for fit in step.splits] for step in path]
-        )
-        results[f"mean_{name}_time"] = seconds.mean(axis=1)
-        results[f"std_{name}_time"] = seconds.std(axis=1)
+    for name in ("fit_time", "score_time", "test_score"):
+        values = np.array([part[name] for part in parts])
+        results |= {f"mean_{name}": values.mean(axis=1)}
+        results |= {f"std_{name}": values.std(axis=1)}
+    # Of the scores. Unknown ones rank last.
+    results |= {f"split{i}_{name}": column for i, column in enumerate(values.T)}
+    known = np.nan_to_num(results["mean_test_score"], nan=-np.inf)
+    results["rank_test_score"] = rankdata(-known, method="min").astype(np.int32)
     return results
 
 
@@ -722,13 +604,12 @@ def standard_errors(scores: NDArray) -> NDArray:
     return np.asarray(scores.std(axis=-1, ddof=1) / np.sqrt(n_splits))
 
 
-def warn_of_unconverged(path: Sequence[PathStep]) -> None:
-    """Warn if fits of a path did not converge."""
-    which = [str(step.n_components) for step in path if step.n_unconverged]
-    if which:
-        n_fits = sum(step.n_unconverged for step in path)
-        warn_caller(
-            f"not all fits converged while n_components was chosen: {n_fits} with "
-            f"n_components of {', '.join(which)} did not. Increase max_iter or tol",
-            ConvergenceWarning,
+def line(n_components: int, scores: NDArray, held_out: bool) -> str:
+    """Return scores (n_splits,) as text; a held-out error is minus the score."""
+    mean, error = scores.mean(), standard_errors(scores)
+    score = f"score {mean:.4g}, standard error {error:.2g}"
+    if held_out:
+        score = (
+            f"held-out error {-100 * mean:.3g} %, standard error {100 * error:.2g} %"
         )
+    return f"n_components={n_components}: {score}"

@@ -11,7 +11,7 @@
 For large tables, the first steps use a sample and the last ones all frames.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -56,39 +56,30 @@ class Spectrum(NamedTuple):
         return cls(noise, float(rest_share + (1 - rest_share) * beyond))
 
 
-class Start(NamedTuple):
-    """Shapes and noise of a similar table from which a joint fit may start.
-
-    Basis shapes (K, 3, J) are as long as the standard deviation of their coefficients.
-    With `calibrated_first` a fit with calibrated cameras precedes that with affine
-    ones.
-    """
-
-    shapes: NDArray
-    noise_variance: float
-    calibrated_first: bool = False
-
-
 def fit_jointly(
     table: FactorisedTable,
     paper_shapes: NDArray,
     settings: JointSettings,
-    starts: Sequence[Start] = (),
+    start: JointState | None = None,
 ) -> tuple[JointFit, JointFrames, NDArray]:
     """Run the joint fit: starts, fit of the sample, judgement, fit of all frames.
 
-    `paper_shapes` (K + 1, 3, J) are unused if `starts` are given. Returns the fit, the
-    fitted frames, and alpha (n_chosen, K) of the sample. Shapes are centred and mixed
-    such that alpha ~ N(0, I). The noise is corrected for degrees of freedom.
+    A fit from a given start uses only its shapes and noise, and of `paper_shapes` (K +
+    1, 3, J) only the shape. Returns the fit, the fitted frames, and alpha (n_chosen, K)
+    of the sample. Shapes are centred and mixed such that alpha ~ N(0, I). The noise is
+    corrected for degrees of freedom.
     """
     problems, seen = _problems(table, paper_shapes, settings)
     first, sampled = problems[0], len(problems) > 1
     camera, cameras = settings.camera, CAMERAS[settings.camera]
     # Fit of the sample (of all frames if it is the table), and judgement of the model
-    if starts:
-        fit, start = _continued_fit(first, starts)
-    else:
+    if start is None:
         fit, start = _first_fit(first, table, paper_shapes)
+    else:
+        shapes = first.frames.coordinates(start.shapes)
+        start = first.aligned(start._replace(shapes=shapes), camera)
+        continued = _calibrated_fit if cameras.calibrated else JointProblem.refined
+        fit = continued(first, start, cameras)
     ratio = fit.camera_noise_ratio
     spectrum = Spectrum.of(table, len(paper_shapes) - 1)
     fit, least_noise, right = judged(first, fit, start, cameras, spectrum)
@@ -203,49 +194,6 @@ def _first_fit(
     if camera == "affine":
         return other._replace(camera_noise_ratio=ratio), rigid
     return fit._replace(camera_noise_ratio=ratio), starts[0]
-
-
-def _continued_fit(
-    problem: JointProblem, starts: Sequence[Start]
-) -> tuple[JointFit, JointState]:
-    """Return the fit from the best of given starts, and that start.
-
-    A later start is dropped if repeating the gain of its second half would not suffice
-    to catch up.
-    """
-    settings = problem.settings
-    cameras = CAMERAS[settings.camera]
-    n_steps = min(settings.options.catching_up, settings.max_iter)
-    fitted = _calibrated_fit if cameras.calibrated else JointProblem.refined
-    fits: list[tuple[JointFit, JointState]] = []
-    for start in starts:
-        state = given = _aligned_start(problem, start)
-        if fits:
-            tried = problem.refined(state, cameras, max_iter=n_steps)
-            gained = tried.history[len(tried.history) // 2] - tried.value
-            if tried.value - min(fit.value for fit, _ in fits) > gained:
-                continue
-            state = tried.state
-        fits.append((fitted(problem, state, cameras), given))
-    return min(fits, key=lambda found: found[0].value)
-
-
-def _aligned_start(problem: JointProblem, start: Start) -> JointState:
-    """Return a given start with cameras, after calibrated ones if it asks for them."""
-    camera = problem.settings.camera
-    shapes = problem.frames.coordinates(start.shapes)
-    state = JointState(shapes, np.empty((0, 2, 3)), start.noise_variance)
-    if start.calibrated_first and not CAMERAS[camera].calibrated:
-        # As many steps as starts of the search make
-        settings, calibrated = problem.settings, "weak_perspective"
-        state = problem.aligned(state, calibrated)
-        state = problem.refined(
-            state,
-            CAMERAS[calibrated],
-            max_iter=min(30, settings.max_iter),
-            tol=settings.tol,
-        ).state
-    return problem.aligned(state, camera)
 
 
 def _least(fits: Iterable[JointFit]) -> JointFit:

@@ -29,8 +29,7 @@ class JointOptions(NamedTuple):
     tables all starts find the same minimum. widths: columns of the mixtures from which
     cameras start, three for each shape. compared_tol: convergence tolerance of compared
     starts, for each frame. The objectives of different minima differ by tens per frame.
-    catching_up: number of steps after which a further given start is dropped if it can
-    no longer become the best (``benchmarks.choice``). many_points: frames with more
+    many_points: frames with more
     points are represented by directions. determined: threshold of a relevant basis
     shape, the share of its numbers that the table determines. On artificial tables with
     2 % noise true shapes have 0.998 and more, others 0.83 and less
@@ -45,7 +44,6 @@ class JointOptions(NamedTuple):
     few_frames: int = 2000
     widths: tuple[int, ...] = (6, 9, 12, 18, 24, 36)
     compared_tol: float = 0.5
-    catching_up: int = 10
     many_points: int = 200
     determined: float = 0.95
 
